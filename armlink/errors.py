@@ -6,6 +6,10 @@ class ArmlinkError(Exception):
 
     exit_status = 2
 
+    def __str__(self) -> str:
+        """The message as one line, whatever names of files, joints or topics are in it."""
+        return " ".join(super().__str__().splitlines())
+
 
 class BadInput(ArmlinkError):
     """A file, key, value or option that cannot be used: says which, what was expected and how to fix it."""

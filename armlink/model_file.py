@@ -4,6 +4,7 @@ import logging
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +168,7 @@ def _find(name: str, *folders: Path) -> Path | None:
         tries += [folder / rest for folder in above if folder.name == package]
     else:
         tries = [folder / name.removeprefix("file://") for folder in folders]
-    return next((each for each in tries if each.is_file()), None)
+    return next((each for each in tries if isfile(each)), None)
 
 
 def _is_readable(mesh: Path) -> bool:

@@ -4,6 +4,7 @@ Times have the microsecond resolution that all three formats keep. Frames record
 replayed from a log (`LogBus`) carry the same times, so that both decode to the same samples bit for bit.
 """
 
+import math
 import struct
 import zlib
 from collections.abc import Generator, Iterator
@@ -131,6 +132,9 @@ class LogReader:
         """Time since the first message [µs], identifier with flags and data of each data frame."""
         first = None
         for message in self._messages():
+            if not math.isfinite(message.timestamp):
+                self.warning = f"cut frame log, a time that is no number: loaded {self.count} frames up to there"
+                return
             stamp = round(message.timestamp * 1e6)
             first = stamp if first is None else first
             if is_data(message):

@@ -210,7 +210,7 @@ class Policy:
             }
             self.stop = [(int(can_id), bytes.fromhex(data)) for can_id, data in content["stop"]]
             self.restarts = {int(key): int(answers) for key, answers in content.get("restarts", {}).items()}
-        except (KeyError, TypeError, ValueError, AttributeError, struct.error) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, AttributeError, struct.error) as error:
             raise PolicyError(f"{type(error).__name__}: {error}") from None
         self._sources: dict[int, list[tuple[Source, Field]]] = {}
         for frame in self.frames.values():

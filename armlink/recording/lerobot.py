@@ -25,34 +25,26 @@ def load_lerobot(path: Path) -> dict[str, Recording]:
     names = _names(path)
     if len(names) > MOST_JOINTS:
         raise BadInput(f"{path}: {len(names)} joints in {STATE}, expected at most {MOST_JOINTS}")
-    tables, size = [], 0
+    size, parts = 0, []
     for file in sorted((path / "data").rglob("*.parquet")):
         try:
             size += 8 * (2 * len(names) + 2) * pa_parquet.read_metadata(file).num_rows
             require_size(size, str(path))
             table = pa_parquet.read_table(file, columns=list(_COLUMNS))
-        except (pa.ArrowException, KeyError, OSError) as error:
+        except (pa.ArrowException, KeyError, ValueError, OSError) as error:
             raise BadInput(f"{file}: not the data of a LeRobot data set: {str(error).partition(chr(10))[0]}") from None
         missing = [column for column in _COLUMNS if column not in table.column_names]
         if missing:
             raise BadInput(f"{file}: column {missing[0]} is missing: expected {', '.join(_COLUMNS)}")
-        tables.append(table)
-    if not tables:
-        raise BadInput(f"{path}: no Parquet file under data/: download the data set with its data")
-    whole = pa.concat_tables(tables)
-    episodes = np.asarray(whole["episode_index"].to_numpy(), dtype=int)
-    times = np.asarray(whole["timestamp"].to_numpy(), dtype=float)
-    state, action = (_matrix(whole[column], path, column) for column in (STATE, ACTION))
-    if state.shape != action.shape or state.shape[1] != len(names):
-        raise BadInput(
-            f"{path}: {STATE} has {state.shape[1]} values, {ACTION} {action.shape[1]}, for {len(names)} names: "
-            "expected one a joint in each"
-        )
+        parts.append([_values(table[column], file, column, len(names)) for column in _COLUMNS])
+    if not sum(len(part[0]) for part in parts):
+        raise BadInput(f"{path}: no row in Parquet files under data/: download the data set with its data")
+    episodes, times, state, action = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = {}
     for episode in np.unique(episodes):
         rows = np.flatnonzero(episodes == episode)
         rows = rows[np.argsort(times[rows], kind="stable")]
-        found[f"{path}#{episode}"] = Recording(
+        found[f"{path}#{episode:.0f}"] = Recording(
             t=times[rows], position=state[rows], position_command=action[rows], names=names
         )
     return found
@@ -63,7 +55,7 @@ def _names(path: Path) -> tuple[str, ...]:
     try:
         info = json.loads((path / "meta" / "info.json").read_text())
         names: Any = info["features"][STATE]["names"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
         raise BadInput(f"{path}/meta/info.json: no names of {STATE} ({type(error).__name__} {error})") from None
     while isinstance(names, dict):
         names = next(iter(names.values()), [])
@@ -72,9 +64,16 @@ def _names(path: Path) -> tuple[str, ...]:
     return tuple(name.removesuffix(".pos") for name in names)
 
 
-def _matrix(column: Any, path: Path, name: str) -> Array:
+def _values(column: pa.ChunkedArray, file: Path, name: str, joints: int) -> Array:
+    """The numbers of a column (K,), for state and action (K, joints)."""
+    width = joints if name in (STATE, ACTION) else 0
     rows = column.to_pylist()
-    widths = {len(row) if row is not None else 0 for row in rows}
-    if len(widths) != 1:
-        raise BadInput(f"{path}: {name} has rows of {min(widths)} to {max(widths)} values: expected one a joint")
-    return np.asarray(rows, dtype=float)
+    if width and (wrong := {len(row) if isinstance(row, list) else 0 for row in rows} - {width}):
+        raise BadInput(f"{file}: {name} has rows of {min(wrong)} values for {width} names: expected one a joint")
+    try:
+        values = np.asarray(rows, dtype=float).reshape(len(rows), *([width] if width else []))
+    except (TypeError, ValueError):
+        raise BadInput(f"{file}: {name} holds {column.type}: expected numbers") from None
+    if name == "episode_index" and not (values == np.round(values)).all():
+        raise BadInput(f"{file}: {name} is not a whole number in every row")
+    return values

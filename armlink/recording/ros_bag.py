@@ -42,7 +42,7 @@ def load_bag(path: Path, topic: str = "") -> Recording:
     """
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            readable = [connection for connection in reader.connections if _short(connection.msgtype) in _READERS]
+            readable = [c for c in reader.connections if isinstance(c.topic, str) and _short(c.msgtype) in _READERS]
             states = _state_connections(readable, topic, reader.connections, path)
             samples: dict[str, list[Sample]] = defaultdict(list)
             size = 0

@@ -141,7 +141,7 @@ class ServiceView:
 
     def events(self, after: int = 0, limit: int = 500) -> tuple[api_models.EventRecord, ...]:
         """Events with a larger id, oldest first."""
-        return tuple(api_models.EventRecord(**row) for row in self._service.journal.events(after, limit))
+        return tuple(self._service.journal.events(after, limit))
 
     def history(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
@@ -159,7 +159,8 @@ class ServiceView:
         chosen = reader.chosen(since, until, most)
         for j in range(len(names)) if joint is None else (names.index(joint),):
             for page in reader.pages(chosen):
-                yield tuple(_point(names[j], j, *point) for point in page if len(point[3]["gain"]) > j)
+                points = (_point(names[j], j, *row) for row in page)
+                yield tuple(point for point in points if point is not None)
 
     def proposals(self, limit: int = 200) -> tuple[api_models.Proposal, ...]:
         """Newest first."""
@@ -229,6 +230,10 @@ def _joint(
 
 def _point(
     joint: str, j: int, time: datetime, t: float, record: str | None, estimate: dict[str, list[float]]
-) -> api_models.HistoryPoint:
-    values = {name: estimate[name][j] for name in ("gain", "gain_std", "offset", "offset_std")}
-    return api_models.HistoryPoint(time=time, t=t, joint=joint, record=record, **values)
+) -> api_models.HistoryPoint | None:
+    """None for a row of fewer joints, or a damaged one."""
+    try:
+        values = {name: estimate[name][j] for name in ("gain", "gain_std", "offset", "offset_std")}
+        return api_models.HistoryPoint(time=time, t=t, joint=joint, record=record, **values)
+    except (LookupError, TypeError, ValueError):
+        return None

@@ -158,7 +158,9 @@ class Observer:
     def restore(self, values: dict[str, Any]) -> bool:
         """Continue from saved values of the same arm and records; False, and nothing changed, if they do not fit."""
         tracking, rest, investigation = copy(self._tracking), copy(self._rest), copy(self._investigation)
-        if values.get("schema") != SCHEMA or not (tracking.restore(values) and rest.restore(values)):
+        if not isinstance(values, dict) or values.get("schema") != SCHEMA:
+            return False
+        if not (tracking.restore(values) and rest.restore(values)):
             return False
         if not investigation.restore(values, tracking.cause_test):
             return False

@@ -271,7 +271,7 @@ def parse_record(content: Any, origin: str) -> CalibrationRecord | GravityRecord
         "gravity": GravityRecord,
     }
     kind = content.get("kind") if isinstance(content, dict) else None
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise BadInput(f"{origin}: key kind: expected calibration or gravity (value {kind!r})")
     body = {key: value for key, value in content.items() if key != "id"}
     try:

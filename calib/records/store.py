@@ -118,7 +118,7 @@ class RecordStore:
         """The JSON of a row; raises StoreFault where it is damaged."""
         try:
             return json.loads(body)
-        except (ValueError, TypeError):
+        except (ValueError, RecursionError, TypeError):
             raise StoreFault(f"record store {self.url}: a row is damaged: restore the store from a copy") from None
 
     def _current_id(self, kind: str, arm: ArmFile) -> str | None:

@@ -255,7 +255,7 @@ def _read_manifest(path: Path) -> Manifest:
         return Manifest.model_validate(json.loads(file.read_text(encoding="utf-8")))
     except ValidationError as error:
         raise BadInput(f"{file}: {describe(error)}") from None
-    except (ValueError, OSError) as error:
+    except (ValueError, RecursionError, OSError) as error:
         raise BadInput(f"{file}: not readable as JSON: {error}") from None
 
 

@@ -2,7 +2,9 @@
 
 import logging
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,7 +77,7 @@ def place_chain(
 ) -> PlacedChain:
     """As load_model, with the bodies of each link; raises BadModel likewise."""
     model = compile_model(path)
-    return _place(model, _chain(model, path, base, tip), gravity)
+    return _place(model, _chain(model, path, base, tip), gravity, path)
 
 
 def compile_model(path: Path) -> "mujoco.MjModel":
@@ -102,7 +104,7 @@ def compile_model(path: Path) -> "mujoco.MjModel":
 
 def _drop_absent_meshes(spec: "mujoco.MjSpec", folder: Path) -> None:
     for mesh in list(spec.meshes):
-        if mesh.file and not (folder / mesh.file).is_file():
+        if mesh.file and not isfile(folder / mesh.file):
             for geom in [each for each in spec.geoms if each.meshname == mesh.name]:
                 spec.delete(geom)
             spec.delete(mesh)
@@ -184,7 +186,7 @@ def _refuse_couplings(model: "mujoco.MjModel", chain: list[int], path: Path) -> 
             raise BadModel(f"{path}: joint {model.joint(coupled).name} mimics another: one drive per joint is needed")
 
 
-def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None) -> PlacedChain:
+def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None, path: Path) -> PlacedChain:
     """Axes, points and inertials in the model's reference configuration, then Denavit-Hartenberg form."""
     import mujoco
 
@@ -195,6 +197,11 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None)
     limits = np.where(limited[:, None], model.jnt_range[chain], [-np.inf, np.inf])
     reference = np.array([model.qpos0[model.jnt_qposadr[joint]] for joint in chain])
     link_of = _links(model, chain)
+    own = {"its gravity": model.opt.gravity} if gravity is None else {}
+    for joint, at_rest in zip(chain, reference, strict=True):
+        own[f"joint {model.joint(joint).name}"] = [at_rest, *data.xaxis[joint], *data.xanchor[joint]]
+    own |= {f"body {model.body(body).name}": [model.body_mass[body], *data.xipos[body]] for body in link_of}
+    _refuse_what_is_no_number(own, path)
     mass, first_moment = np.zeros(len(chain)), np.zeros((len(chain), 3))
     bodies: list[list[int]] = [[] for _ in chain]
     for body, link in link_of.items():
@@ -213,6 +220,13 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None)
     names = tuple(tuple(model.body(body).name for body in of_link) for of_link in bodies)
     arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments), mass, moments, names)
     return PlacedChain(model, data, arm, geometry, data.xanchor[chain], reference, tuple(map(tuple, bodies)))
+
+
+def _refuse_what_is_no_number(values: Mapping[str, ArrayLike], path: Path) -> None:
+    """MuJoCo takes NaN and infinity from a file, and all that follows from them is NaN."""
+    for of, numbers in values.items():
+        if not np.isfinite(numbers).all():
+            raise BadModel(f"{path}: {of}: NaN or infinity where a finite number is expected")
 
 
 def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, FiniteFloat, ValidationError
+
 from armlink.errors import ArmlinkError, BadInput
 
 MODELS = ("sim.xml", "sim.urdf", "sim.yaml")
@@ -85,6 +87,44 @@ def diagnose_fleet(cases: list[Case], client: Any) -> Iterator[tuple[str, dict[s
         future.release()
 
 
+class _Parameter(BaseModel):
+    value: FiniteFloat | None
+    unit: str
+
+
+class _Cause(BaseModel):
+    effect: str
+    parameters: dict[str, dict[str, _Parameter]]
+    joints: list[str] = []
+    shrink: float | None = None
+    confidence: float | None = None
+    confounded_with: list[str] = []
+
+
+class _Watched(BaseModel):
+    effect: str
+    joint: str
+    parameter: str
+    value: FiniteFloat
+    ci95: tuple[FiniteFloat, FiniteFloat]
+    unit: str
+
+
+class _Answer(BaseModel):
+    verdict: str = ""
+    error: str = ""
+    causes: list[_Cause] = []
+    minor: list[_Cause] = []
+    watched: list[_Watched] = []
+
+
+class _Line(BaseModel):
+    """What table and trends read of the result of one case."""
+
+    case: str
+    answer: _Answer
+
+
 class Answers:
     """Results by case in a file of JSON lines, append-only; a line truncated by a kill is ignored."""
 
@@ -102,14 +142,15 @@ class Answers:
             raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
         for number, line in enumerate(whole.splitlines(), start=1):
             try:
-                entry = json.loads(line)
-                self.found[str(entry["case"])] = entry["answer"]
-            except ValueError:
-                continue
-            except (KeyError, TypeError):
+                _Line.model_validate_json(line, strict=True)
+            except ValidationError as error:
+                if error.errors()[0]["type"] == "json_invalid":
+                    continue
                 raise BadInput(
                     f"{path}: line {number} is not a result of a fleet: give another file with --out"
                 ) from None
+            entry = json.loads(line)
+            self.found[entry["case"]] = entry["answer"]
 
     def add(self, case: str, answer: dict[str, Any]) -> None:
         """Append a result; raises BadInput if it cannot be written."""

@@ -209,7 +209,7 @@ def _values(
         if not cause["effect"].startswith("law.") and cause["effect"] not in leave
         for joint, parameters in cause["parameters"].items()
         for name, one in parameters.items()
-        if name not in NO_WEAR
+        if name not in NO_WEAR and one["value"] is not None
     }
 
 

@@ -166,3 +166,12 @@ def test_a_file_that_yaml_chokes_on_is_one_line(tmp_path, text, says):
 def test_a_name_is_one_line_and_no_path(tmp_path, keys, value):
     with pytest.raises(BadInput, match=rf"(key {'.'.join(map(str, keys))}|name is '\.\.')"):
         load_arm(written(tmp_path, changed(keys, value)))
+
+
+def test_a_rated_torque_that_no_drive_can_be_told_is_one_line():
+    from fake_joints import make_arm
+
+    from armlink.link.joints.groups import make_groups
+
+    with pytest.raises(BadInput, match=r"joint_1: rated_torque 1e-300 N·m: expected at least 0\.001"):
+        make_groups(make_arm(2, joint={"rated_torque": 1e-300, "max_torque": 1e-300}))

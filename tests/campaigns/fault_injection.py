@@ -64,7 +64,11 @@ def main() -> int:
     parser.add_argument("--stride", type=int, default=40)
     parser.add_argument("--runs", type=int, default=0, help="only this many of the runs, evenly spread")
     parser.add_argument(
-        "--rests", type=int, nargs=2, metavar=("FROM", "TO"), help="only the runs from one to before another"
+        "--rests",
+        type=int,
+        nargs=2,
+        metavar=("FROM", "TO"),
+        help="only the runs from one to before another, of bursts by their place",
     )
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--bursts", action="store_true")
@@ -80,6 +84,7 @@ def main() -> int:
             for burst in BURSTS
             for which in DEPENDENCIES
         ]
+        runs = runs if given.rests is None else runs[slice(*given.rests)]
     else:
         kept = np.linspace(0, given.stride, given.runs or given.stride, endpoint=False).astype(int).tolist()
         kept = kept if given.rests is None else range(*given.rests)

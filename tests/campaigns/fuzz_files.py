@@ -1,228 +1,157 @@
-"""Campaign: mutated arm files, records and recordings of every format. Each loads, or is refused in one line.
+"""Campaign: mutated arm files, records, recordings, models and more. Each loads, or is refused in one line.
 
-python tests/campaigns/fuzz_files.py [--seconds 3600] [--kinds arm record csv gz parquet mcap] [--seed 0] [--keep DIR]
+python tests/campaigns/fuzz_files.py [--seconds 3600] [--round 300] [--kinds arm record …] [--seed 0] [--keep DIR]
 
-Of each kind for so many seconds of processor time: bytes flipped, cut out, doubled and spliced, numbers made extreme,
-keys and lines moved, of whole files too. Exit status 1 for an exception other than ArmlinkError, a message of several
-lines, more than 5 s for a file, or memory that grows by more than 500 MB; what did it is kept in DIR.
+Of each kind for so many seconds of processor time, in rounds and a process of its own each: bytes, words, lines, trees,
+tables and messages changed (`fuzz_mutators`). Exit status 1 for an exception other than ArmlinkError, a message of
+several lines, more than 5 s for a file, memory that grows by more than 500 MB, or a process that dies; what did it is
+kept in DIR. What was run is noted in `fuzz_runs.jsonl`.
 """
 
 import argparse
-import gzip
 import json
 import logging
+import multiprocessing
 import random
 import resource
+import shutil
 import signal
 import sys
 import tempfile
 import time
 import traceback
+import warnings
 import zlib
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
+sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "calib"))
+from fuzz_journal import memory, note
+from fuzz_kinds import KINDS, Kind, Seed
+from fuzz_mutators import mutated
 
-from made_records import arm_file, calibration, gravity
-
-from armlink.arm_file import bundled_arms, load_arm
 from armlink.errors import ArmlinkError
-from armlink.recording.files import load_recording, save_recording
-from armlink.recording.recording import Recording
-from calib.arm.sweep_section import sweep_section
-from calib.records.store import RecordStore
 
-LONGEST = 5.0
-GROWTH = 500_000_000
-HOSTILE = (
-    *("", "-1", "0", "1e999", "-.inf", ".nan", "9" * 400, "1e308", "nan", "null", "~", "[]", "{}", "[[[[]]]]"),
-    *(
-        "'../..'",
-        "2026-11-22",
-        "0x7fffffffffffffff",
-        "!!python/object:os.system",
-        "&a [*a]",
-        "<<: *a",
-        "\x00",
-        "\u2028",
-    ),
-    *("q_²", "1_000", "0o777", "-9223372036854775809", "1e-320", "é" * 200, "a: b: c", "%", "@", "`", "\t", "\u2028"),
-)
+LONGEST, GROWTH, ADDRESSES = 5.0, 500.0, 8_000_000_000
+"""Of a file [s]; of a round's memory [MB]; of its process [bytes]."""
 
 
-class TooSlow(Exception):
-    """A file took longer than it may."""
+class TooSlow(BaseException):
+    """A file took longer than it may; no Exception, so that nothing takes it for a damaged file."""
 
 
-def mutated_text(content: bytes, draw: random.Random) -> bytes:
-    """Values, words and lines of a text replaced, moved, doubled or left out."""
-    lines = content.decode("utf-8", "replace").split("\n")
-    for _ in range(draw.choice([1, 1, 1, 2, 5])):
-        at, kind = draw.randrange(len(lines)), draw.random()
-        if kind < 0.5:
-            words = lines[at].replace(",", " , ").split(" ")
-            words[draw.randrange(len(words))] = draw.choice(HOSTILE)
-            lines[at] = " ".join(words)
-        elif kind < 0.6:
-            lines.insert(at, draw.choice(lines))
-        elif kind < 0.7:
-            del lines[at : at + draw.randrange(1, 4)]
-        elif kind < 0.8:
-            lines[at] = " " * draw.randrange(9) + lines[at]
-        elif kind < 0.9:
-            key, colon, _ = lines[at].partition(":")
-            lines[at] = key + colon + " " + draw.choice(HOSTILE)
-        else:
-            lines[at] = lines[at] * draw.choice([2, 50])
-        lines = lines or [""]
-    return "\n".join(lines).encode("utf-8", "replace")
+def mutant_of(seeds: list[Seed], draw: random.Random) -> Seed:
+    """One of the files of one seed mutated."""
+    seed = draw.choice(seeds)
+    name = draw.choice(sorted(seed.files))
+    return Seed({**seed.files, name: mutated(name, seed.files[name], draw)}, seed.given)
 
 
-def mutated_bytes(content: bytes, draw: random.Random) -> bytes:
-    """Bits flipped, pieces cut out, doubled, moved or made random; lengths and numbers made extreme."""
-    data = bytearray(content)
-    for _ in range(draw.choice([1, 1, 2, 4, 16])):
-        if not data:
-            break
-        at, kind = draw.randrange(len(data)), draw.random()
-        size = draw.choice([1, 2, 4, 8, 64, 512])
-        if kind < 0.35:
-            data[at] ^= 1 << draw.randrange(8)
-        elif kind < 0.5:
-            data[at : at + size] = draw.randbytes(min(size, len(data) - at))
-        elif kind < 0.65:
-            data[at : at + draw.choice([1, 4, 8])] = draw.choice([b"\xff" * 8, bytes(8), b"\x7f" + b"\xff" * 7])
-        elif kind < 0.75:
-            del data[at : at + size]
-        elif kind < 0.85:
-            data[at:at] = data[draw.randrange(len(data)) :][:size]
-        elif kind < 0.93:
-            del data[at:]
-        else:
-            other = draw.randrange(len(data))
-            data[at : at + size] = data[other : other + size]
-    return bytes(data)
-
-
-def either(content: bytes, draw: random.Random) -> bytes:
-    return (mutated_text if draw.random() < 0.7 else mutated_bytes)(content, draw)
-
-
-def packed(content: bytes, draw: random.Random) -> bytes:
-    """The text within, or the packed file."""
-    if draw.random() < 0.5:
-        return gzip.compress(either(gzip.decompress(content), draw), mtime=0)
-    return mutated_bytes(content, draw)
-
-
-def load_whole_arm(path: Path) -> None:
-    """As commands do: the file, and the sections that they use."""
-    arm = load_arm(path)
-    arm.require_link()
-    sweep_section(arm)
-
-
-def seeds(folder: Path) -> dict[str, list[tuple[str, bytes]]]:
-    """Kind → files to begin with, by suffix."""
-    t = np.arange(120) * 0.01
-    wave = np.sin(t)[:, None] * np.ones(2)
-    recording = Recording(t=t, position=wave, torque=2 * wave, names=("a", "b"))
-    found: dict[str, list[tuple[str, bytes]]] = {
-        "arm": [(".yaml", path.read_bytes()) for path in bundled_arms().values()],
-        "record": [(".yaml", each.model_dump_json(indent=1).encode()) for each in (calibration(), gravity())],
-    }
-    for kind, suffix in {"csv": ".csv", "gz": ".csv.gz", "parquet": ".parquet", "mcap": ".mcap"}.items():
-        save_recording(recording, folder / f"seed{suffix}")
-        found[kind] = [(suffix, (folder / f"seed{suffix}").read_bytes())]
-    return found
-
-
-def import_record(path: Path) -> None:
-    """As `armlink history --import` does."""
-    store = RecordStore(str(path.parent / "records.db"))
+def judged(kind: Kind, path: Path, tried: Counter[str]) -> str:
+    """What is wrong with how this input is taken; empty if nothing."""
+    signal.setitimer(signal.ITIMER_PROF, LONGEST)
     try:
-        store.import_yaml(path, arm_file())
+        kind.load(path)
+        tried["loaded"] += 1
+    except (ArmlinkError, *kind.refusals) as error:
+        tried["refused"] += 1
+        return f"a message of several lines: {error}" if "\n" in str(error) else ""
+    except (Exception, TooSlow) as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {str(error)[:200]}"
     finally:
-        store.close()
+        signal.setitimer(signal.ITIMER_PROF, 0)
+    return ""
 
 
-LOAD: dict[str, Callable[[Path], object]] = {"arm": load_whole_arm, "record": import_record}
-MUTATE: dict[str, Callable[[bytes, random.Random], bytes]] = {
-    "arm": either,
-    "record": either,
-    "csv": either,
-    "gz": packed,
-}
+def keep(mutant: Seed, name: str, folder: Path) -> None:
+    """The input in a folder of its own."""
+    shutil.rmtree(folder / name, ignore_errors=True)
+    (folder / name).mkdir(parents=True)
+    mutant.put(folder / name)
 
 
-def fuzz(kind: str, files: list[tuple[str, bytes]], seconds: float, seed: int, folder: Path, keep: Path) -> list[str]:
-    """Mutants of one kind for so long; what was wrong, each once."""
-    draw, tried, wrong = random.Random(f"{kind} {seed}"), Counter[str](), dict[str, str]()
-    load, mutate = LOAD.get(kind, load_recording), MUTATE.get(kind, mutated_bytes)
-    end, slowest, before = time.process_time() + seconds, 0.0, memory()
-    while time.process_time() < end:
-        suffix, content = draw.choice(files)
-        mutant = mutate(content, draw)
-        path = folder / f"mutant{suffix}"
-        path.write_bytes(mutant)
-        began, what = time.process_time(), ""
-        signal.setitimer(signal.ITIMER_PROF, LONGEST)
-        try:
-            load(path)
-            tried["loaded"] += 1
-        except ArmlinkError as error:
-            tried["refused"] += 1
-            what = "a message of several lines" if "\n" in str(error) else ""
-        except (Exception, RecursionError) as error:
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            what = f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {str(error)[:200]}"
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0)
-        slowest = max(slowest, time.process_time() - began)
-        if what and what.partition(": ")[0] not in wrong:
-            name = f"{kind}-{zlib.crc32(mutant):08x}{suffix}"
-            wrong[what.partition(": ")[0]] = f"{kind}: {what} ({name})"
-            (keep / name).write_bytes(mutant)
-    grown = memory() - before
+def fuzz(name: str, seconds: float, seed: str, kept: Path) -> None:
+    """One round, in a process of its own: mutants of a kind for so long; what came of it goes to `kept/round.json`."""
+    logging.disable(logging.CRITICAL)
+    warnings.simplefilter("ignore")
+    signal.signal(signal.SIGPROF, too_slow)
+    resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, ADDRESSES))
+    kind, draw = KINDS[name], random.Random(f"{name} {seed}")
+    tried, wrong, slowest = Counter[str](), dict[str, str](), 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        (begin := Path(folder) / "seeds").mkdir()
+        seeds = kind.seeds(begin)
+        for each in seeds:
+            kind.load(each.put(fresh(Path(folder) / "sound")))
+        before, started = memory(), time.process_time()
+        while time.process_time() - started < seconds:
+            mutant = mutant_of(seeds, draw)
+            path = mutant.put(fresh(Path(folder) / "mutant"))
+            keep(mutant, f"{name}-last", kept) if name in NATIVE else None
+            began = time.process_time()
+            what = judged(kind, path, tried)
+            slowest = max(slowest, time.process_time() - began)
+            if what and (place := what.partition(": ")[0]) not in wrong:
+                label = f"{name}-{zlib.crc32(repr(mutant).encode()):08x}"
+                wrong[place] = f"{name}: {what} ({label})"
+                keep(mutant, label, kept)
+    spent, grown = time.process_time() - started, memory() - before
     if grown > GROWTH:
-        wrong["memory"] = f"{kind}: memory grew by {grown / 1e6:.0f} MB"
-    print(
-        json.dumps({"kind": kind, **tried, "slowest_s": round(slowest, 2), "grown_mb": round(grown / 1e6)}), flush=True
-    )
-    return list(wrong.values())
+        wrong["memory"] = f"{name}: memory grew by {grown:.0f} MB"
+    found = {"cpu_s": spent, **tried, "slowest_s": round(slowest, 2), "grown_mb": round(grown)}
+    (kept / f"{name}-round.json").write_text(json.dumps({"found": found, "wrong": list(wrong.values())}))
 
 
-def memory() -> float:
-    """Largest resident size until now [bytes]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0
+NATIVE = ("model",)
+"""Kinds read by code that could end the process: their last mutant is kept beforehand."""
+
+
+def fresh(folder: Path) -> Path:
+    """An empty folder."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
 
 def too_slow(*_: object) -> None:
     raise TooSlow(f"more than {LONGEST:g} s")
 
 
+def one_round(name: str, seconds: float, seed: int, number: int, kept: Path) -> list[str]:
+    """Run a round and note it; what was wrong."""
+    said = kept / f"{name}-round.json"
+    said.unlink(missing_ok=True)
+    began = time.monotonic()
+    round_of = multiprocessing.get_context("fork").Process(target=fuzz, args=(name, seconds, f"{seed} {number}", kept))
+    round_of.start()
+    round_of.join()
+    if not said.exists():
+        return [f"{name}: the process ended with {round_of.exitcode}: {name}-last"]
+    told = json.loads(said.read_text())
+    said.unlink()
+    note(name, seed, told["found"].pop("cpu_s"), time.monotonic() - began, **told["found"], wrong=len(told["wrong"]))
+    return list(told["wrong"])
+
+
 def main() -> int:
-    """Fuzz one kind after the other."""
+    """Fuzz the kinds by turns."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=3600.0)
-    parser.add_argument("--kinds", nargs="+", default=["arm", "record", "csv", "gz", "parquet", "mcap"])
+    parser.add_argument("--round", type=float, default=300.0)
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, default=Path("fuzz-corpus"))
     given = parser.parse_args()
-    logging.disable(logging.CRITICAL)
-    signal.signal(signal.SIGPROF, too_slow)
     given.keep.mkdir(parents=True, exist_ok=True)
-    wrong: list[str] = []
-    with tempfile.TemporaryDirectory() as name:
-        for kind, files in seeds(Path(name)).items():
-            if kind in given.kinds:
-                wrong += fuzz(kind, files, given.seconds, given.seed, Path(name), given.keep)
-    for line in wrong:
-        print(f"FAILED: {line}")
+    wrong = dict[str, str]()
+    for number in range(max(1, round(given.seconds / given.round))):
+        for name in given.kinds:
+            for line in one_round(name, min(given.round, given.seconds), given.seed, number, given.keep):
+                if wrong.setdefault(line.partition(": ")[2].partition(": ")[0], line) == line:
+                    print(f"FAILED: {line}", flush=True)
     return int(bool(wrong))
 
 

@@ -1,6 +1,8 @@
 """Campaign: a million random and mutated frames into the decoder, the SDO client and the gate.
 
-python tests/campaigns/fuzz_frames.py [--frames 1000000] [--seed 1]
+python tests/campaigns/fuzz_frames.py [--frames 1000000] [--seed 1] [--seconds 0]
+With --seconds for so much processor time instead, noted in `fuzz_runs.jsonl`.
+
 Exit status 1 on an exception other than the link's own refusals and faults, or on a frame that exceeds a limit.
 """
 
@@ -15,6 +17,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "armlink"))
+sys.path.insert(0, str(Path(__file__).parent))
+from fuzz_journal import for_seconds
+
 from armlink.drives.orders import Order, Power
 from armlink.errors import ArmlinkError
 from armlink.link.link import Link
@@ -22,8 +27,8 @@ from armlink.link.types import Command
 from tests.armlink.fake_joints import make_arm
 from tests.armlink.link.test_gate_bytes import N, Observed, judge
 
-BATCH = 25
-"""Frames a cycle."""
+BATCH, A_GO = 25, 20_000
+"""Frames a cycle; frames of each seed, with --seconds."""
 SHARES = {"decoder": 0.6, "link": 0.3, "sdo": 0.1}
 BASES = (0x000, 0x080, 0x180, 0x200, 0x280, 0x300, 0x380, 0x580, 0x600, 0x700)
 
@@ -65,7 +70,7 @@ def fuzz_decoder(rng: random.Random, frames: int) -> int:
     while done < frames:
         bus.out.extend(random_frame(rng) for _ in range(BATCH))
         link._loop.drain()
-        link._loop.exchange(idle)
+        link._loop.exchange(idle, link.clock.now())
         done += BATCH
         bus.sent.clear()
         bus.left.clear()
@@ -139,18 +144,24 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=0.0)
     given = parser.parse_args()
-    rng, start = random.Random(given.seed), time.monotonic()
-    decoded = fuzz_decoder(rng, int(given.frames * SHARES["decoder"]))
-    print(f"{decoded} random frames into the decoder: no exception", flush=True)
-    passed, refused = fuzz_link(rng, int(given.frames * SHARES["link"]))
-    print(
-        f"{passed} mutated frames and {passed // BATCH} commands into a link: {refused} refused or faulted, none unsafe"
-    )
-    answers, starts = fuzz_sdo(rng, int(given.frames * SHARES["sdo"]))
-    print(f"{answers} SDO answers, one in thirty mutated: {starts} starts refused in words, no other exception")
-    print(f"{decoded + passed + answers} frames, seed {given.seed}, {time.monotonic() - start:.0f} s")
+    if given.seconds:
+        for_seconds("frames of canopen", given.seconds, given.seed, lambda seed: fuzz(A_GO, seed))
+        return 0
+    start = time.monotonic()
+    print(f"{fuzz(given.frames, given.seed)}, none unsafe, no other exception; {time.monotonic() - start:.0f} s")
     return 0
+
+
+def fuzz(frames: int, seed: int) -> dict[str, int]:
+    """Frames into decoder, link and SDO client; how many, and how often commands and starts were refused."""
+    rng = random.Random(seed)
+    decoded = fuzz_decoder(rng, int(frames * SHARES["decoder"]))
+    passed, refused = fuzz_link(rng, int(frames * SHARES["link"]))
+    answers, starts = fuzz_sdo(rng, int(frames * SHARES["sdo"]))
+    found = {"frames": decoded + passed + answers, "commands": passed // BATCH, "refused": refused}
+    return found | {"answers": answers, "starts_refused": starts}
 
 
 if __name__ == "__main__":

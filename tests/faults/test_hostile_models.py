@@ -29,10 +29,13 @@ MODELS = {
     "another file as an STL mesh": f'<mujoco><asset><mesh name="m" file="SECRET.stl"/></asset>{SHAPE}</mujoco>',
     "another file as heights": f'<mujoco><asset><hfield file="SECRET" size="1 1 1 1"/></asset>{BODY}</mujoco>',
     "a device as heights": f'<mujoco><asset><hfield file="/dev/zero" size="1 1 1 1"/></asset>{BODY}</mujoco>',
+    "a mesh whose name is longer than a file's": f'<mujoco><asset><mesh name="m" file="{"a" * 5000}"/></asset>{SHAPE}'
+    "</mujoco>",
     "a plugin": f'<mujoco><extension><plugin plugin="../../evil"/></extension>{BODY}</mujoco>',
     "bodies without end": f"<mujoco><worldbody>{'<body>' * 5000}{'</body>' * 5000}</worldbody></mujoco>",
 }
 HARMLESS = {"an entity of another file", "a bomb of entities", "another file as a mesh"}
+HARMLESS |= {"a mesh whose name is longer than a file's"}
 """Models that may also compile, since what is hostile in them is left out."""
 
 

@@ -61,7 +61,13 @@ def units_from(
 
 
 def assumed_units(joints: Sequence[LinkJoint]) -> tuple[Units, ...]:
-    """Scales from the arm file's rated torques and USER_UNITS per revolution, for listeners, which read no objects."""
+    """Scales from the arm file's rated torques and USER_UNITS per revolution, for listeners, which read no objects.
+
+    Raises BadInput for a rated torque that 6076h cannot hold, whose step is 1 mN·m.
+    """
+    for joint in joints:
+        if not round(joint.rated_torque * 1e3):
+            raise BadInput(f"{joint.name}: rated_torque {joint.rated_torque:g} N·m: expected at least 0.001 N·m")
     return tuple(units_from(round(joint.rated_torque * 1e3), (1, 1), (1, 1), (USER_UNITS, 1)) for joint in joints)
 
 

@@ -30,17 +30,24 @@ class HistoryReader:
         return [number for (number,) in found[::step]][::-1]
 
     def pages(self, ids: Sequence[int]) -> Iterator[list[HistoryRow]]:
-        """The rows of these ids, in their order, PAGE at a time; one that was thinned out meanwhile is left out."""
+        """The rows of these ids, in their order, PAGE at a time; those thinned out or damaged are left out."""
         for begin in range(0, len(ids), PAGE):
             page = ids[begin : begin + PAGE]
             marks = ",".join("?" * len(page))
             query = f"SELECT time, t, record, estimate FROM history WHERE id IN ({marks}) ORDER BY id"
-            found = self._rows(query, tuple(page))
-            yield [(datetime.fromisoformat(time), t, record, json.loads(row)) for time, t, record, row in found]
+            yield [row for row in map(_row, self._rows(query, tuple(page))) if row is not None]
 
     def _rows(self, query: str, values: tuple[Any, ...]) -> list[tuple[Any, ...]]:
         with closing(sqlite3.connect(self._url, uri=True, timeout=LOCK_SECONDS)) as db:
             return db.execute(query, values).fetchall()
+
+
+def _row(found: tuple[Any, ...]) -> HistoryRow | None:
+    time, t, record, estimate = found
+    try:
+        return datetime.fromisoformat(time), t, record, json.loads(estimate)
+    except (ValueError, TypeError):
+        return None
 
 
 def _iso(time: datetime) -> str:

@@ -13,11 +13,14 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from armlink.errors import BadInput
-from calib.daemon.state.proposal_row import ProposalRow
+from calib.daemon.state.proposal_row import PROPOSALS, ProposalRow, proposal_of
+from calib.daemon.view.api_models import EventRecord
 from calib.observer.decision import Finding
+
+R = TypeVar("R")
 
 SCHEMA = 1
 LOCK_SECONDS = 0.05
@@ -79,6 +82,8 @@ class Journal:
         self._db: sqlite3.Connection = None  # type: ignore[assignment]
         try:
             self._open()
+        except UnicodeDecodeError:  # of SQLite's own message, which quotes what it could not read
+            self._begin_anew()
         except sqlite3.DatabaseError as error:
             if not _is_damage(error):
                 raise self._not_opened(error) from None
@@ -198,6 +203,19 @@ class Journal:
         except sqlite3.Error as error:
             self.failed(error)
 
+    def _read(self, take: Callable[[tuple[Any, ...]], R], query: str, values: tuple[Any, ...]) -> list[R]:
+        """Rows as `take` makes them; raises sqlite3.Error, and remembers damage: a page may be damaged unseen."""
+        try:
+            return [take(row) for row in self._db.execute(query, values)]
+        except (ValueError, TypeError, KeyError, IndexError) as error:
+            damage = sqlite3.DatabaseError(f"a malformed row ({type(error).__name__})")
+            self.failed(damage)
+            raise damage from None
+        except sqlite3.Error as error:
+            if _is_damage(error):
+                self.failed(error)
+            raise
+
     # ---- events
 
     def add_event(
@@ -212,14 +230,10 @@ class Journal:
         assert cursor.lastrowid is not None
         return cursor.lastrowid
 
-    def events(self, after: int = 0, limit: int = 500) -> list[dict[str, Any]]:
+    def events(self, after: int = 0, limit: int = 500) -> list[EventRecord]:
         """Events with a larger id, oldest first."""
-        rows = self._db.execute(
-            "SELECT id, time, t, kind, joint, text, evidence FROM events WHERE id > ? ORDER BY id LIMIT ?",
-            (max(-(2**63), min(after, 2**63 - 1)), limit),
-        )
-        names = ("id", "time", "t", "kind", "joint", "text", "evidence")
-        return [dict(zip(names, (*row[:6], json.loads(row[6])), strict=True)) for row in rows]
+        query = "SELECT id, time, t, kind, joint, text, evidence FROM events WHERE id > ? ORDER BY id LIMIT ?"
+        return self._read(_event, query, (max(-(2**63), min(after, 2**63 - 1)), limit))
 
     @property
     def last_event(self) -> int:
@@ -253,7 +267,7 @@ class Journal:
 
     def proposals(self, limit: int = 200) -> list[ProposalRow]:
         """Newest first."""
-        return [_proposal(row) for row in self._db.execute(_PROPOSALS + " ORDER BY p.id DESC LIMIT ?", (limit,))]
+        return self._read(proposal_of, PROPOSALS + " ORDER BY p.id DESC LIMIT ?", (limit,))
 
     def pending(self) -> int:
         """Number of pending proposals, as last read where they cannot be read now."""
@@ -265,8 +279,7 @@ class Journal:
         """The proposal of that id."""
         if not 0 < number < 2**63:
             return None
-        row = self._db.execute(_PROPOSALS + " WHERE p.id = ?", (number,)).fetchone()
-        return None if row is None else _proposal(row)
+        return next(iter(self._read(proposal_of, PROPOSALS + " WHERE p.id = ?", (number,))), None)
 
     # ---- belief and history
 
@@ -301,29 +314,12 @@ class Journal:
 
 
 def _is_damage(error: sqlite3.Error) -> bool:
-    return "malformed" in str(error) or "not a database" in str(error)
+    return any(words in str(error) for words in ("malformed", "not a database", "decode to UTF-8"))
 
 
-_PROPOSALS = (
-    "SELECT p.id, p.time, p.joint, p.record, p.base, p.finding, d.state, d.by, d.time, d.note FROM proposals p "
-    "LEFT JOIN decisions d ON d.id = (SELECT MAX(id) FROM decisions WHERE proposal = p.id)"
-)
-
-
-def _proposal(row: tuple[Any, ...]) -> ProposalRow:
-    number, opened, joint, record, base, finding, state, by, decided, note = row
-    return ProposalRow(
-        id=number,
-        time=datetime.fromisoformat(opened),
-        joint=joint,
-        record=record,
-        base=base,
-        values=json.loads(finding),
-        state=state or "pending",
-        by=by,
-        decided=None if decided is None else datetime.fromisoformat(decided),
-        note=note or "",
-    )
+def _event(row: tuple[Any, ...]) -> EventRecord:
+    number, time, t, kind, joint, text, evidence = row
+    return EventRecord(id=number, time=time, t=t, kind=kind, joint=joint, text=text, evidence=json.loads(evidence))
 
 
 def _iso(time: datetime) -> str:

@@ -1,5 +1,6 @@
 """A proposal as the journal keeps it, with the newest decision on it."""
 
+import json
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -54,3 +55,29 @@ class ProposalRow:
             decided_by=self.by,
             note=self.note,
         )
+
+
+PROPOSALS = (
+    "SELECT p.id, p.time, p.joint, p.record, p.base, p.finding, d.state, d.by, d.time, d.note FROM proposals p "
+    "LEFT JOIN decisions d ON d.id = (SELECT MAX(id) FROM decisions WHERE proposal = p.id)"
+)
+"""What `proposal_of` takes."""
+
+
+def proposal_of(row: tuple[Any, ...]) -> ProposalRow:
+    """A row of PROPOSALS; raises ValueError, TypeError, KeyError or IndexError for one that holds something else."""
+    number, opened, joint, record, base, finding, state, by, decided, note = row
+    made = ProposalRow(
+        id=number,
+        time=datetime.fromisoformat(opened),
+        joint=joint,
+        record=record,
+        base=base,
+        values=json.loads(finding),
+        state=state or "pending",
+        by=by,
+        decided=None if decided is None else datetime.fromisoformat(decided),
+        note=note or "",
+    )
+    made.answer()
+    return made

@@ -176,3 +176,11 @@ def test_the_command_decodes_shows_and_refuses(tmp_path, capsys):
     assert run(["replay", "sarcos", str(tmp_path / "a.csv"), str(tmp_path / "b.mcap")]) == 0
     assert load_recording(tmp_path / "b.mcap").t.size == 2
     assert run(["replay", "sarcos", str(tmp_path / "a.csv"), "--bus", "socketcan:can0"]) == 2
+
+
+def test_a_time_that_is_infinite_ends_the_log(tmp_path):
+    path = tmp_path / "run.log"
+    path.write_text("(1.0) can0 080#\n(2.0) can0 081#01\n(1e999) can0 080#\n(3.0) can0 080#\n")
+    reader = LogReader(path)
+    assert len(list(reader.frames())) == 2
+    assert "a time that is no number" in reader.warning

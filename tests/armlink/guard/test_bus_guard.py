@@ -480,6 +480,8 @@ def broken(change):
         (broken(lambda c: c["frames"]["513"]["fields"][0].pop("most")), "needs values, or least and most"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(least=math.nan)), "least is no number"),
         (broken(lambda c: c.update(stop=[[1, "xy"]])), "ValueError"),
+        (broken(lambda c: c["frames"]["513"]["fields"][0].update(at=math.inf)), "OverflowError"),
+        (broken(lambda c: c["frames"]["513"]["fields"][0].update(most=10**400)), "OverflowError"),
     ],
 )
 def test_a_wrong_policy_is_refused_in_one_line(content, said):

@@ -150,6 +150,16 @@ def test_a_broken_bag_is_one_line(tmp_path):
         load_recording(tmp_path)
 
 
+def test_a_topic_that_is_no_text_is_left_out(tmp_path):
+    """The index of a bag is a file of its own, YAML; `.nan` there is a number, and equals nothing."""
+    samples = [(k * 10**7, states("ba", [0.1 * k, 1.0])) for k in range(1, 5)]
+    write(tmp_path / "bag", [("/state", "sensor_msgs/msg/JointState", samples)], StoragePlugin.SQLITE3)
+    index = tmp_path / "bag" / "metadata.yaml"
+    index.write_text(index.read_text().replace("name: /state", "name: .nan"))
+    with pytest.raises(BadInput, match="no sensor_msgs/msg/JointState on /joint_states or another topic"):
+        load_recording(tmp_path / "bag")
+
+
 def lerobot(folder):
     names = {"motors": ["shoulder.pos", "elbow.pos"]}
     (folder / "meta").mkdir(parents=True)
@@ -178,6 +188,60 @@ def test_a_lerobot_data_set_is_a_recording_an_episode(tmp_path):
     np.testing.assert_allclose(second.position_command[0], [1.1, 2.1])
     with pytest.raises(BadInput, match=r"holds 2 recordings: choose one, such as .*#0"):
         load_recording(tmp_path / "set")
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "says"),
+    [
+        ("observation.state", [[1.0, 2.0], [1.0]], "rows of 1 values for 2 names"),
+        ("observation.state", [[1.0, 2.0], None], "rows of 0 values for 2 names"),
+        ("observation.state", [1.0, 2.0], "rows of 0 values for 2 names"),
+        ("observation.state", [["a", "b"]] * 2, "expected numbers"),
+        ("action", [[[1.0, 2.0], [1.0, 2.0]]] * 2, "expected numbers"),
+        ("timestamp", ["x", "y"], "expected numbers"),
+        ("timestamp", [{"a": 1}] * 2, "expected numbers"),
+        ("episode_index", [0.5, 1.0], "not a whole number"),
+        ("episode_index", [None, 1], "not a whole number"),
+        ("observation.\udcd2", [0, 1], "column observation.state is missing"),
+    ],
+)
+def test_lerobot_files_that_do_not_fit_together_are_one_line(tmp_path, name, column, says):
+    """Files of one data set may differ in their columns' types."""
+    lerobot(tmp_path)
+    first = tmp_path / "data" / "chunk-000" / "file-000.parquet"
+    if "\udcd2" in name:
+        place = first.read_bytes().replace(b"observation.state", b"observation.\xd2tate")
+        first.with_name("file-001.parquet").write_bytes(place)
+        says = "not the data of a LeRobot data set|column observation.state is missing"
+    else:
+        good = pa_parquet.read_table(first).slice(0, 2)
+        changed = good.set_column(good.column_names.index(name), name, pa.array(column))
+        pa_parquet.write_table(changed, first.with_name("file-001.parquet"))
+    with pytest.raises(BadInput, match=says) as refused:
+        load_recordings(tmp_path)
+    assert "\n" not in str(refused.value)
+
+
+def test_lerobot_files_of_integers_and_floats_are_one_data_set(tmp_path):
+    lerobot(tmp_path)
+    first = tmp_path / "data" / "chunk-000" / "file-000.parquet"
+    good = pa_parquet.read_table(first)
+    whole = good.set_column(2, "observation.state", pa.array([[1, 2]] * 5))
+    whole = whole.set_column(0, "episode_index", pa.array([2, 2, 2, 3, 3]))
+    pa_parquet.write_table(whole, first.with_name("file-001.parquet"))
+    assert [label.rpartition("#")[2] for label in load_recordings(tmp_path)] == ["0", "1", "2", "3"]
+
+
+@pytest.mark.parametrize("info", ["[" * 100_000, "{", '{"features": []}'])
+def test_a_lerobot_data_set_without_names_or_rows_is_one_line(tmp_path, info):
+    lerobot(tmp_path)
+    first = tmp_path / "data" / "chunk-000" / "file-000.parquet"
+    pa_parquet.write_table(pa_parquet.read_table(first).slice(0, 0), first)
+    with pytest.raises(BadInput, match="no row in Parquet"):
+        load_recording(tmp_path)
+    (tmp_path / "meta" / "info.json").write_text(info)
+    with pytest.raises(BadInput, match="no names of observation"):
+        load_recording(tmp_path)
 
 
 def test_a_foreign_table_gets_a_map_to_paste(tmp_path):

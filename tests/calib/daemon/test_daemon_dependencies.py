@@ -1,5 +1,6 @@
 """A dependency of the daemon fails: it goes on, says so, loses no event, and is right again when that has passed."""
 
+import contextlib
 import shutil
 import sqlite3
 from pathlib import Path
@@ -253,6 +254,83 @@ def test_a_journal_that_is_damaged_under_way_is_set_aside_too(tmp_path: Path) ->
     daemon.run(5)
     assert [event.text.partition(":")[0] for event in daemon.of_kind("fault")] == ["the journal was damaged"]
     assert daemon.view.status().detail == ""
+
+
+EVENTS = "UPDATE events SET "
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        "INSERT INTO decisions(proposal, time, state, by, note) VALUES (1, '2026-01-01', 'appro\x01ed', 'ann', '')",
+        "UPDATE proposals SET finding = '{\"joint\": 2'",
+        "UPDATE proposals SET finding = '[]'",
+        "UPDATE proposals SET time = 'x'",
+        EVENTS + "evidence = substr(evidence, 2)",
+        EVENTS + "evidence = '[1]'",
+        EVENTS + "time = 'x'",
+        EVENTS + "text = x'ff'",
+        EVENTS + "text = CAST(x'ff' AS TEXT)",
+    ],
+)
+def test_a_row_that_is_damaged_and_still_a_row_is_damage_of_the_journal(tmp_path: Path, spoil: str) -> None:
+    """SQLite's own check does not see it: the status, each second, and the API failed for good."""
+    daemon = drifted(tmp_path)
+    daemon.service.save(history=True)
+    assert daemon.view.proposals()
+    daemon.service.close("end")
+    spoiled(tmp_path / "state" / "journal.db", spoil)
+    daemon.start()
+    daemon.run(3)
+    with contextlib.suppress(sqlite3.Error):  # 503 of the API
+        daemon.view.events()
+    daemon.run(3)
+    assert [event.text.partition(":")[0] for event in daemon.of_kind("fault")] == ["the journal was damaged"]
+    assert daemon.view.status().state is State.OBSERVING
+    assert daemon.view.proposals() == ()
+
+
+@pytest.mark.parametrize("spoil", ["estimate = '{'", "estimate = '{}'", "estimate = '7'", "time = '2026'", "t = 'x'"])
+def test_a_damaged_row_of_history_is_left_out(tmp_path: Path, spoil: str) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(10)
+    for _ in range(3):
+        daemon.service.save(history=True)
+        daemon.run(1)
+    _, second, *others = whole = [point.time for point in daemon.view.history(daemon.arm.joint_names[0])]
+    daemon.service.close("end")
+    spoiled(tmp_path / "state" / "journal.db", f"UPDATE history SET {spoil} WHERE id = 2")
+    daemon.start()
+    daemon.run(3)
+    left = {point.time for point in daemon.view.history(daemon.arm.joint_names[0])}
+    assert left >= {whole[0], *others}
+    assert second not in left
+
+
+@pytest.mark.parametrize("state", ["7.5", "[1]", "null", "{"])
+def test_a_damaged_belief_is_none(tmp_path: Path, state: str) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon.run(10)
+    daemon.service.close("end")
+    spoiled(tmp_path / "state" / "journal.db", f"UPDATE belief SET state = '{state}'")
+    daemon.start()
+    daemon.run(3)
+    assert daemon.view.status().state is State.OBSERVING
+
+
+def test_a_schema_that_sqlite_cannot_quote_is_damage(tmp_path: Path) -> None:
+    Journal(tmp_path / "journal.db", lambda: 0.0).close()
+    content = (tmp_path / "journal.db").read_bytes()
+    (tmp_path / "journal.db").write_bytes(content.replace(b"CREATE TABLE events", b"CREATE \xd2\xff\xfeLE events"))
+    assert Journal(tmp_path / "journal.db", lambda: 0.0).set_aside.startswith("journal.db.damaged-")
+
+
+def spoiled(journal: Path, statement: str) -> None:
+    """A bit that flipped in a row, as far as SQLite is concerned."""
+    with contextlib.closing(sqlite3.connect(journal)) as db, db:
+        for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
+            db.execute(f"DROP TRIGGER {name}")
+        db.execute(statement)
 
 
 def test_a_journal_that_is_no_database_is_set_aside(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ class Running:
         self.arm_file.write_text(yaml.safe_dump(content))
 
     def kinds(self) -> list[str]:
-        return [event["kind"] for event in self.daemon.service.journal.events()]
+        return [event.kind for event in self.daemon.service.journal.events()]
 
 
 def with_daemon(folder: Path, patch: pytest.MonkeyPatch, act: Callable[[Running], None]) -> None:

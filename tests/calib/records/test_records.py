@@ -217,3 +217,12 @@ def test_the_default_store_is_in_the_state_directory(monkeypatch: pytest.MonkeyP
 def test_parse_record_takes_only_mappings() -> None:
     with pytest.raises(BadInput, match="key kind"):
         parse_record(["calibration"], "x.yaml")
+
+
+@pytest.mark.parametrize("kind", [["calibration"], {}, None, "other"])
+def test_a_kind_that_is_none_is_refused_in_one_line(kind: object) -> None:
+    from armlink.errors import BadInput
+    from calib.records.records import parse_record
+
+    with pytest.raises(BadInput, match="key kind: expected calibration or gravity"):
+        parse_record({"kind": kind}, "record.yaml")

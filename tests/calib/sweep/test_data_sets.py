@@ -13,7 +13,7 @@ from armlink.errors import BadInput
 from calib.fit.sensor_fit import fit_sensors
 from calib.plan.sweep_plan import plan_sweep
 from calib.sweep.data_sets import data_sets, labels
-from calib.sweep.dataset import DataWriter, Manifest, PlanLine
+from calib.sweep.dataset import MANIFEST, DataWriter, Manifest, PlanLine, load_data
 from sim_bus.truth import Truth
 
 ARM = random_arm(1, 3)
@@ -85,3 +85,11 @@ def test_folders_of_one_name_stay_apart(tmp_path: Path) -> None:
 def test_the_folder_that_one_stands_in_has_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert labels([Path()]) == [tmp_path.name]
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, "{", "[1]", '{"schema": "armlink.sweep/1"}'])
+def test_a_manifest_that_is_none_is_refused_in_one_line(content: str, tmp_path: Path) -> None:
+    (tmp_path / MANIFEST).write_text(content)
+    with pytest.raises(BadInput, match=MANIFEST) as refused:
+        load_data(tmp_path)
+    assert "\n" not in str(refused.value)

@@ -109,6 +109,34 @@ def test_prismatic_and_mimic_joints_are_refused_by_name(tmp_path: Path) -> None:
         load_model(path)
 
 
+@pytest.mark.parametrize("value", ["nan", "inf"])
+@pytest.mark.parametrize(
+    ("sound", "spoilt", "says"),
+    [
+        ("0 0 -9.81", "{} 0 -9.81", "its gravity"),
+        ("0 0 1", "{} 0 1", "joint elbow"),
+        ("0 1 0", "{} 1 0", "joint elbow"),
+        ("0.5", "{}", "joint elbow"),
+        ("2", "{}", "body lower|MuJoCo refuses it"),
+    ],
+)
+def test_numbers_that_are_none_are_refused_by_name(
+    sound: str, spoilt: str, says: str, value: str, tmp_path: Path
+) -> None:
+    """MuJoCo takes them with a warning, and the gravity of an infinite mass was NaN."""
+    inertial = '<inertial pos="0 0 0.1" mass="2" diaginertia="1 1 1"/>'
+    joint = '<joint name="elbow" axis="0 1 0" ref="0.5"/>'
+    text = f'<body name="lower" pos="0 0 1">{joint}{inertial}</body>'
+    text = f'<mujoco><option gravity="0 0 -9.81"/><worldbody>{text}</worldbody></mujoco>'
+    path = tmp_path / "arm.xml"
+    path.write_text(text)
+    assert np.isfinite(load_model(path).beta).all()
+    assert text.count(f'"{sound}"') == 1
+    path.write_text(text.replace(f'"{sound}"', f'"{spoilt.format(value)}"'))
+    with pytest.raises(BadModel, match=says):
+        load_model(path)
+
+
 def test_branches_unknown_tips_and_files_that_are_no_models_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "arm.xml"
     path.write_text(

@@ -137,3 +137,29 @@ def test_a_file_of_something_else_is_not_added_to(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="line 1 is not a result of a fleet"):
         Answers(other)
     assert other.read_text(encoding="utf-8") == '{"mine": 1}\n'
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        "7",
+        '{"causes": 1.5}',
+        '{"causes": ["x"]}',
+        '{"causes": [{"effect": "friction.coulomb", "joints": [{}], "parameters": {}}]}',
+        '{"causes": [{"effect": "friction.coulomb", "parameters": {"a": {"torque": {"value": "x", "unit": "N·m"}}}}]}',
+        '{"causes": [{"effect": "friction.coulomb", "parameters": {"a": {"torque": {"value": 1' + "0" * 400 + ","
+        ' "unit": "N·m"}}}}]}',
+        '{"watched": [{"effect": "friction.coulomb"}]}',
+    ],
+)
+def test_a_line_that_is_no_answer_is_refused_before_anything_is_diagnosed(tmp_path: Path, answer: str) -> None:
+    path = tmp_path / "answers.jsonl"
+    path.write_text(f'{{"case": "a/2026-11-22", "answer": {answer}}}\n', encoding="utf-8")
+    with pytest.raises(BadInput, match="line 1 is not a result of a fleet"):
+        Answers(path)
+
+
+@pytest.mark.parametrize("torn", ["[" * 100_000, '{"case": "a", "ans', ""])
+def test_a_torn_line_is_ignored(tmp_path: Path, torn: str) -> None:
+    (tmp_path / "answers.jsonl").write_text(torn, encoding="utf-8")
+    assert Answers(tmp_path / "answers.jsonl").found == {}
