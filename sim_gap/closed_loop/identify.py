@@ -16,6 +16,7 @@ from sim_gap.closed_loop.controller import nominal_controller, nominal_point, sc
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Covariance, Stage, covariance, groups_of, rms_on, stages
 from sim_gap.closed_loop.search import Search, taken_out
+from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit
 from sim_gap.closed_loop.windows import Windows, thinned, windows_of
@@ -47,9 +48,9 @@ class Identified:
     train_after: Array
     heldout_before: Array
     heldout_after: Array
-    tracking: Array
-    """RMS of command minus position on held-out data [rad], (J,)."""
     margin: Array
+    sound: Sound | None
+    """The nominal model's gap beside what small errors make of it; None if the controller had to be found."""
     native: Fit
     export: Exported | None
     """None if the model did not come from a file."""
@@ -89,7 +90,9 @@ def identify(
     fit = improve(fitted, replace(fit, rms=None), scales, 6)
     progress("each effect on held-out data")
     margin = _margin(search, fit, floor)
-    found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, margin))
+    split = sound(search, judged, margin) if own.complete else None
+    matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
+    found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
     spread = covariance(search, fit)
@@ -107,8 +110,8 @@ def identify(
         train_after=rms_on(fitted, fit),
         heldout_before=rms_on(judged, before),
         heldout_after=rms_on(judged, fit),
-        tracking=np.sqrt(np.mean((judged.command - judged.recorded) ** 2, axis=(0, 2))),
         margin=margin,
+        sound=split,
         native=native,
         export=exported(sim, search, fit, native) if sim.path is not None else None,
         recordings=tuple(heldout),

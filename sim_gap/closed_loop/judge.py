@@ -63,12 +63,12 @@ class Stage:
     """Effects that would do as well."""
 
 
-def stages(search: Search, fit: Fit, heldout: Windows, margin: Array) -> list[Stage]:
+def stages(search: Search, fit: Fit, heldout: Windows, matters: Array) -> list[Stage]:
     """The groups in order of what each lowers when it is added to the nominal model and those above it.
 
-    `margin` is the gap that counts as one at each joint, (J,) [rad].
+    `matters` is the gap that counts as one at each joint, (J,) [rad].
     """
-    groups, matters = groups_of(fit, search), what_matters(search, margin, search.scales.angle)
+    groups = groups_of(fit, search)
 
     def with_only(some: Sequence[Group]) -> Fit:
         """The fit without the other groups, the rest fitted again from where it is."""
@@ -90,12 +90,6 @@ def stages(search: Search, fit: Fit, heldout: Windows, margin: Array) -> list[St
         out.append(Stage(group, joint_rms(heldout, before), joint_rms(heldout, after), share, evidence, rivals))
         before = after
     return out
-
-
-def what_matters(search: Search, margin: Array, error: Array) -> Array:
-    """Gap that matters at each joint, (J,) [rad]: more than the margin, and more than gains make of the tracking error
-    that are off by as much as no recording shows (twice `SYSTEMATIC`). Gains that are fitted are not off."""
-    return margin if search.open_controller else np.asarray(np.maximum(margin, 2.0 * SYSTEMATIC * error))
 
 
 def _rms(data: Windows, fit: Fit) -> Array:

@@ -44,20 +44,18 @@ def test_names_the_controller_and_the_friction(answer) -> None:
 
 
 def test_a_gap_that_matters_nowhere_is_none() -> None:
-    """A few per cent of the tracking error: causes that make it smaller are as minor as the gap. A controller that is
-    fitted itself makes no such gap."""
+    """Causes that make a gap within the margin smaller are as minor as it; so are those of a sound arm's gap."""
 
-    def verdict(*gaps: float, fitted: bool = False) -> str:
-        gap, error = np.array(gaps), np.array([0.03, 0.05])
-        search = SimpleNamespace(scales=SimpleNamespace(angle=error), open_controller=fitted)
-        found = SimpleNamespace(margin=np.full(2, 1e-4), tracking=error, search=search, train_before=gap)
+    def verdict(*gaps: float, sound: SimpleNamespace | None = None) -> str:
+        gap, search = np.array(gaps), SimpleNamespace(open_controller=sound is None)
+        found = SimpleNamespace(margin=np.full(2, 1e-4), sound=sound, search=search, train_before=gap)
         found.heldout_before, found.heldout_after = gap, 0.1 * gap
         return _verdict(found, [SimpleNamespace(confounded_with=(), confidence=0.75)], 0.01)
 
-    assert verdict(0.0010, 0.0018) == "no_gap"
-    assert verdict(0.0010, 0.0022) == "explained"
-    assert verdict(0.0010, 0.0018, fitted=True) == "explained"
-    assert verdict(0.00009, 0.00008, fitted=True) == "no_gap"
+    assert verdict(0.00009, 0.00008) == "no_gap"
+    assert verdict(0.0010, 0.0018) == "explained"
+    assert verdict(0.0010, 0.0018, sound=SimpleNamespace(explained=False)) == "explained"
+    assert verdict(0.0010, 0.0018, sound=SimpleNamespace(explained=True)) == "no_gap"
 
 
 def test_joints_that_go_further_than_in_training_are_noted() -> None:

@@ -1,0 +1,50 @@
+import mujoco
+import numpy as np
+import pytest
+from servo_arm import model_text, record
+
+from sim_gap.closed_loop.columns import with_columns
+from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
+from sim_gap.closed_loop.fit import Fit, evaluate
+from sim_gap.closed_loop.identify import _margin, noise_floor
+from sim_gap.closed_loop.judge import rms_on
+from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.sound import sound
+from sim_gap.closed_loop.windows import windows_of
+from sim_gap.model.load import load_model
+
+NOMINAL = model_text(kp=40.0, friction=0.05)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model(mujoco.MjModel.from_xml_string(NOMINAL), (), 2)
+
+
+def split(model, real: str):
+    """The gap of the nominal model against an arm, split, with its margin and the RMS that it has [rad]."""
+    train, heldout = (with_columns(windows_of(model.arm, [record(real, seed, 26.0)], ["run"])) for seed in (1, 2))
+    nominal = nominal_point(train, nominal_controller(model))
+    search = Search(train, scales_of(train), nominal, noise_floor(train))
+    fit = evaluate(train, Fit(nominal, ((),) * 2))
+    margin = _margin(search, fit, search.floor)
+    return sound(search, heldout, margin), margin, rms_on(train, fit)
+
+
+def test_errors_of_a_hundredth_are_those_of_a_sound_arm(model) -> None:
+    found, margin, gap = split(model, model_text(kp=40.4, friction=0.06, damping=0.808))
+    assert found.explained
+    assert (gap < 3.0 * np.maximum(found.usual, margin)).all()
+    assert (found.left < 1.3 * margin).all()
+
+
+def test_a_tilt_is_no_error_of_a_sound_arm(model) -> None:
+    """It acts where other poses feel gravity least, as no gain or mass does."""
+    found, margin, _ = split(model, NOMINAL.replace("<option", '<option gravity="2.43 0 -9.5"'))
+    assert not found.explained
+    assert (found.left > margin).any()
+
+
+def test_a_gain_that_is_far_off_is_no_error_of_a_sound_arm(model) -> None:
+    found, _, _ = split(model, model_text(kp=36.0, friction=0.05))
+    assert not found.explained
