@@ -28,7 +28,7 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
     if "t" in stated.clock or recording.t.size < 50:
         return recording, []
     steps = np.diff(recording.t)
-    period = float(np.median(steps))
+    period = _period(recording.t)
     if float(np.std(np.clip(steps, 0.0, 5.0 * period))) < JITTER * period:
         return recording, []
     sampled = _sample_times(recording.t)
@@ -58,14 +58,19 @@ def _sample_times(t: Array) -> Array | None:
     return np.asarray(even)
 
 
+def _period(t: Array) -> float:
+    """Time from row to row [s], by the median over many, for rows that wait in a buffer are received together."""
+    ahead = min(2 * HALF, t.size - 1)
+    return float(np.median(t[ahead:] - t[:-ahead])) / ahead
+
+
 def _missed(t: Array) -> Array:
     """Number of samples missing before each row (K,).
 
     By whole periods the rows after a gap come later than those before it, each by the median of some, for any one may
     be received late; of the steps about such a place, the longest are the gaps.
     """
-    rows, steps, ahead = np.arange(t.size), np.diff(t), min(2 * HALF, t.size - 1)
-    period = float(np.median(t[ahead:] - t[:-ahead])) / ahead
+    rows, steps, period = np.arange(t.size), np.diff(t), _period(t)
     late = median_filter(t / period - rows, size=2 * HALF + 1, mode="nearest")
     before, after = late[np.maximum(rows[:-1] - HALF, 0)], late[np.minimum(rows[1:] + HALF, t.size - 1)]
     jump = after - before

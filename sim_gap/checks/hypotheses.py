@@ -55,7 +55,7 @@ def hypotheses(arm: RigidArm, channel: str, stated: Corrections, follows: Sequen
                 moved = [name for name in positions if name != "dq"]
                 text = option("zero", moved, f"{angle:.5f}", j)
                 yield Hypothesis("zero", ("q",), (j,), f"has its zero off by {angle:+.2f} rad", text, _moved(j, angle))
-    if stated.columns or stated.joints:
+    if stated.order or stated.joints:
         return
     orders = [_exchanged(arm.n, i, k) for i, k in combinations(range(arm.n), 2)]
     if arm.n > 3:

@@ -183,17 +183,6 @@ def dropped(recording: Recording, random: np.random.Generator) -> Recording:
     return slice_rows(recording, random.random(recording.t.size) > 0.3)
 
 
-def missing(recording: Recording, random: np.random.Generator) -> Recording:
-    """No numbers in any channel for seconds, twice."""
-    made = recording
-    for _ in range(2):
-        start = recording.t[0] + random.uniform(0.1, 0.8) * np.ptp(recording.t)
-        gone = (recording.t > start) & (recording.t < start + 0.08 * np.ptp(recording.t))
-        values = {name: np.where(gone[:, None], np.nan, x) for name, x in made.channels().items()}
-        made = replace(made, **values)
-    return made
-
-
 def glued(recording: Recording, random: np.random.Generator) -> Recording:
     """A piece in the middle is lost, and the clock does not show it."""
     share = random.uniform(0.1, 0.3)
@@ -270,7 +259,6 @@ CORRUPTIONS: dict[str, Corruption] = {
     "held": held,
     "repeats": repeats,
     "dropped": dropped,
-    "missing": missing,
     "glued": glued,
     "clock set back": backwards,
     "rounded times": rounded,
