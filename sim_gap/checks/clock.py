@@ -103,7 +103,7 @@ def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:
     """The recording without rows that repeat the one before while the arm moves."""
     columns = np.column_stack(list(recording.channels().values()))
     same = np.concatenate([[False], np.all((columns[1:] == columns[:-1]) | ~np.isfinite(columns[1:]), axis=1)])
-    moving = _fast(recording.position)
+    moving = fast_rows(recording.position)
     share = float(same[moving].mean()) if moving.any() else 0.0
     if share < REPEATED:
         return recording, []
@@ -127,7 +127,7 @@ def find_dropped(recording: Recording) -> list[Finding]:
     return [Finding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)]
 
 
-def _fast(position: Array) -> NDArray[np.bool_]:
+def fast_rows(position: Array) -> NDArray[np.bool_]:
     """Rows at which some joint travels at least three of its smallest steps a row, over ten rows, (K,)."""
     span = 5
     fast = np.zeros(len(position), bool)

@@ -278,8 +278,8 @@ def prepare(
     span = float(recording.t[-1] - recording.t[0])
     if span > MOST_FILLED * raw_step * recording.t.size:
         raise BadInput(
-            f"{label}: {recording.t.size} rows over {span:.3g} s, most of them {raw_step:.2g} s apart: stamped together? "
-            "Record the times at which they were sampled"
+            f"{label}: {recording.t.size} rows over {span:.3g} s, mostly {raw_step:.2g} s apart: stamped together? "
+            "Record the times of sampling"
         )
     even = np.arange(recording.t[0], recording.t[-1] + 0.5 * raw_step, raw_step)
     stride = max(1, int(1.0 / raw_step / WORK_HZ + 0.1))
