@@ -22,7 +22,7 @@ STEMS = {
     "dq": ("actual_qd", "velocity", "velocities", "vel", "qd", "dq", "speed", "qdot", "q_dot"),
     "tau_motor": ("actual_current", "current", "motor_torque", "tau_motor", "motor_effort", "load"),
     "tau_cmd": ("target_torque", "tau_cmd", "torque_cmd", "commanded_torque"),
-    "tau": ("torque", "effort", "tau", "torques", "efforts"),
+    "tau": ("torque", "effort", "tau", "torques", "efforts", "eff"),
     "q": ("actual_q", "position", "positions", "pos", "angle", "angles", "joint", "state", "q"),
     "temp": ("temperature", "temperatures", "temp"),
 }
