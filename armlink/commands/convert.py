@@ -5,22 +5,43 @@ from typing import Annotated
 
 import typer
 
+from armlink.commands.options import Clock, Columns, EffortIs, Joints, Json, Sign, Topic, Units, Zero
+
 
 def convert(
     source: Annotated[Path, typer.Argument(help="Recording: .csv, .csv.gz, .parquet or .mcap (a ROS 2 bag too).")],
     target: Annotated[Path, typer.Argument(help="File to write; its suffix says the format.")],
-    json: Annotated[Path | None, typer.Option(help="Write what was converted here; - is standard output.")] = None,
+    columns: Columns = None,
+    joints: Joints = "",
+    units: Units = None,
+    sign: Sign = None,
+    zero: Zero = None,
+    clock: Clock = None,
+    effort_is: EffortIs = "",
+    topic: Topic = "",
+    json: Json = None,
 ) -> int:
-    """Convert a recording; joint names are kept where the format has them (Parquet, MCAP).
+    """Convert a recording, with corrections if any; joint names are kept where the format has them (Parquet, MCAP).
 
     Example: armlink convert run.mcap run.csv.gz
     """
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
+    from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recording, save_recording
 
-    recording = load_recording(source)
+    stated = parse_corrections(
+        columns=columns or (),
+        sign=sign or (),
+        units=units or (),
+        zero=zero or (),
+        clock=clock or (),
+        effort=effort_is,
+        joints=joints,
+        topic=topic,
+    )
+    recording = load_recording(source, stated)
     try:
         save_recording(recording, target)
     except OSError as error:

@@ -25,7 +25,9 @@ class Corrections:
     """Corrections by column (`tau_3`) or by channel for all joints (`tau`); empty: the recording as it is."""
 
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Column of docs/formats.md → column of the file that holds it."""
+    """Column of docs/formats.md → the file's own name of the column that holds it."""
+    order: Mapping[str, str] = field(default_factory=dict)
+    """Column of docs/formats.md → the one of these whose values it takes."""
     sign: Mapping[str, float] = field(default_factory=dict)
     """1 or −1."""
     units: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -46,13 +48,16 @@ class Corrections:
         stated: Mapping[str, object] = getattr(self, kind)
         return column in stated or column.rpartition("_")[0] in stated
 
+    def of_reading(self) -> "Corrections":
+        """Those that say what of a file is read. The others number the joints from base to tip, in which order a file
+        whose joints have names need not have them."""
+        return Corrections(columns=self.columns, joints=self.joints, topic=self.topic)
+
     def apply(self, recording: Recording, source: str) -> Recording:
         """The corrected recording; raises BadInput for a column that it does not have."""
         channels = {COLUMNS[name]: values.copy() for name, values in recording.channels().items()}
         before = {prefix: values.copy() for prefix, values in channels.items()}
-        for column, other in self.columns.items():
-            if channel_column(other) is None:
-                continue  # a table's own column name: taken as it was read
+        for column, other in self.order.items():
             (channel, to), (source_channel, of) = (_place(before, name, source, "--map") for name in (column, other))
             channels[channel][:, to] = before[source_channel][:, of]
         for column, factor in self.sign.items():
@@ -98,8 +103,10 @@ def parse_corrections(
     """
     if effort not in ("", "motor", "link"):
         raise BadInput(f"--effort-is {effort}: expected motor or link")
+    mapped = _pairs("--map", columns)
     return Corrections(
-        columns=dict(_pairs("--map", columns)),
+        columns={column: other for column, other in mapped if channel_column(other) is None},
+        order={column: other for column, other in mapped if channel_column(other) is not None},
         sign={column: _sign(column, text) for column, text in _pairs("--sign", sign)},
         units={column: _factors(column, text) for column, text in _pairs("--units", units)},
         zero={column: _number("--zero", column, text) for column, text in _pairs("--zero", zero)},

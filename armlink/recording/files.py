@@ -13,8 +13,8 @@ SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
 def load_recording(path: str | Path, stated: Corrections | None = None) -> Recording:
     """Load one recording (docs/formats.md): a file, or the folder of a ROS 2 bag.
 
-    `stated` are corrections of the file's columns, signs, units and clocks. Raises BadInput that names row or column,
-    also for a data set of several recordings.
+    `stated` are corrections of the file's columns, signs, units and clocks, its joints numbered as it has them. Raises
+    BadInput that names row or column, also for a data set of several recordings.
     """
     found = load_recordings(path, stated)
     if len(found) != 1:
@@ -31,7 +31,7 @@ def load_recordings(path: str | Path, stated: Corrections | None = None) -> dict
         if str(path) not in found:
             raise BadInput(f"{path}: no such episode: {folder} has {len(found)}, counted from 0")
         found = {str(path): found[str(path)]}
-    return {label: _chosen(stated.apply(r, label), stated, label).check(label) for label, r in found.items()}
+    return {label: stated.apply(_chosen(r, stated, label), label).check(label) for label, r in found.items()}
 
 
 def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
@@ -45,9 +45,9 @@ def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
 
         return {str(path): load_bag(path, stated.topic)}
     if path.is_dir():
-        raise BadInput(
-            f"{path}: neither the folder of a ROS 2 bag (metadata.yaml) nor a LeRobot data set (meta/info.json)"
-        )
+        return _of_folder(path, stated)
+    if path.suffix == ".zstd":
+        raise BadInput(f"{path}: give the folder of the bag, with its metadata.yaml, or unpack it: zstd -d {path.name}")
     suffix = _suffix(path)
     if not path.is_file():
         raise BadInput(f"no recording {path}: give a {', '.join(SUFFIXES)} file")
@@ -62,6 +62,20 @@ def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
     from armlink.recording.tables import load_csv, load_parquet
 
     return {str(path): (load_parquet if suffix == ".parquet" else load_csv)(path, stated.columns)}
+
+
+def _of_folder(path: Path, stated: Corrections) -> dict[str, Recording]:
+    """The recording of a bag without `metadata.yaml`, as a recorder leaves it that was killed."""
+    files = sorted(each for each in path.iterdir() if each.suffix in (".mcap", ".db3"))
+    if len(files) == 1:
+        return {str(path): next(iter(_loaded(files[0], stated).values()))}
+    if not files:
+        raise BadInput(
+            f"{path}: neither the folder of a ROS 2 bag (.mcap or .db3 files) nor a LeRobot data set (meta/info.json)"
+        )
+    from armlink.recording.ros_bag import load_bag
+
+    return {str(path): load_bag(files, stated.topic)}
 
 
 def _chosen(recording: Recording, stated: Corrections, label: str) -> Recording:

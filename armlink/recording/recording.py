@@ -178,7 +178,10 @@ def _check_time(t: Array, source: str) -> None:
     back = np.flatnonzero(np.diff(t) <= 0)
     if back.size:
         row = back[0] + 1
-        raise BadInput(f"{source}: row {row + 1}: t {t[row]:.9g} does not follow {t[row - 1]:.9g}: time must increase")
+        alike = " (more digits, or the times of sampling)" if t[row] == t[row - 1] else ""
+        raise BadInput(
+            f"{source}: row {row + 1}: t {t[row]:.9g} does not follow {t[row - 1]:.9g}: time must increase{alike}"
+        )
 
 
 def _check_finite_or_nan(values: Array, prefix: str, source: str) -> None:

@@ -34,14 +34,18 @@ class Sample:
     channels: Mapping[str, Sequence[float]]
 
 
-def load_bag(path: Path, topic: str = "") -> Recording:
-    """Load a bag: the joint states of `topic`, by default `/joint_states` or the only topic that carries some.
+def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
+    """Load a bag, or the files of one without its `metadata.yaml`: the joint states of `topic`.
+
+    By default that is `/joint_states` or the only topic that carries some.
 
     Joints are those of the most frequent message; other topics' messages go to the row nearest in time. Raises BadInput
     where the topic must be named, or nothing can be read.
     """
+    files = [path] if isinstance(path, Path) else list(path)
+    path = files[0] if len(files) == 1 else files[0].parent
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             readable = [c for c in reader.connections if isinstance(c.topic, str) and _short(c.msgtype) in _READERS]
             states = _state_connections(readable, topic, reader.connections, path)
             samples: dict[str, list[Sample]] = defaultdict(list)

@@ -1,12 +1,10 @@
 """Recordings as tables: CSV, gzipped CSV and Parquet, through pyarrow."""
 
-import csv
 import gzip
 import json
 import math
 import zlib
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -14,12 +12,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pa_compute
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
 from armlink.errors import BadInput
-from armlink.recording.column_names import suggested_map
+from armlink.recording.column_names import joint_names, suggested_map
+from armlink.recording.csv_text import Layout, is_number, layout_of
 from armlink.recording.recording import (
     Recording,
     channel_column,
@@ -47,22 +47,27 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> R
     `columns`: column of docs/formats.md → the file's name for it.
     """
     _require_header(path)
-    content, cut = _content(path)
-    header = _header(path, content)
-    require_width(header, str(path))
-    header = _renamed(header, columns, path)
+    content, cut, layout = _content(path)
+    _require_each_once(layout.header, path)
+    require_width(layout.header, str(path))
+    header = _renamed(list(layout.header), columns, path)
     wanted = [column for column in header if is_channel(column)]
+    kinds = dict.fromkeys(wanted, pa.float64())
+    first = layout.first_value(header.index("t")).replace(layout.decimal, ".") if "t" in kinds else ""
+    if first and not is_number(first):
+        del kinds["t"]  # dates: for Arrow to recognise
     try:
         table = pa_csv.read_csv(
             pa.BufferReader(content),
-            read_options=pa_csv.ReadOptions(column_names=header, skip_rows=1),
+            read_options=pa_csv.ReadOptions(column_names=_unnamed_apart(header), skip_rows=layout.lines),
+            parse_options=pa_csv.ParseOptions(delimiter=layout.separator),
             convert_options=pa_csv.ConvertOptions(
-                include_columns=wanted, column_types=dict.fromkeys(wanted, pa.float64())
+                include_columns=wanted, column_types=kinds, decimal_point=layout.decimal
             ),
         )
     except (pa.ArrowInvalid, OSError, EOFError) as error:
         raise BadInput(f"{path}: {_first_line(error)}") from None
-    loaded = _recording(table, header, str(path), ())
+    loaded = _recording(table, header, str(path), _names_of_columns(columns, header))
     del table, content
     pa.default_memory_pool().release_unused()
     if cut:
@@ -77,14 +82,43 @@ def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) 
         with pa_parquet.ParquetFile(path) as file:  # `read_table` looks through data sets, and imports pandas
             schema = file.schema_arrow
             require_width(schema.names, str(path))
-            header = _renamed(list(schema.names), columns, path)
-            wanted = {column: name for column, name in zip(header, schema.names, strict=True) if is_channel(column)}
-            require_size(8 * len(wanted) * file.metadata.num_rows, str(path))
-            table = file.read(columns=list(wanted.values())).select(list(wanted.values()))
-        table = table.rename_columns(list(wanted)).cast(pa.schema([(column, pa.float64()) for column in wanted]))
+            require_size(8 * file.metadata.num_columns * file.metadata.num_rows, str(path))
+            apart = columns_of_lists(file)
+            header = _renamed(list(apart), columns, path)
+            wanted = {column: apart[name] for column, name in zip(header, apart, strict=True) if is_channel(column)}
+            table = file.read(columns=sorted({name for name, _ in wanted.values()}))
+        taken = {
+            column: table[name] if k is None else pa_compute.list_element(table[name], k)
+            for column, (name, k) in wanted.items()
+        }
+        made = pa.table({c: x if pa.types.is_timestamp(x.type) else x.cast(pa.float64()) for c, x in taken.items()})
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise BadInput(f"{path}: {_first_line(error)}") from None
-    return _recording(table, header, str(path), _names((schema.metadata or {}).get(NAMES_KEY), str(path)))
+    names = _names((schema.metadata or {}).get(NAMES_KEY), str(path)) or _names_of_columns(columns, header)
+    return _recording(made, header, str(path), names)
+
+
+def columns_of_lists(file: Any) -> dict[str, tuple[str, int | None]]:
+    """Name → column and place in it, of a Parquet file; a column of lists `q` counts as columns `q_1`, `q_2` …"""
+    found: dict[str, tuple[str, int | None]] = {}
+    for field in file.schema_arrow:
+        kind = field.type
+        if not (pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)):
+            found[field.name] = field.name, None
+            continue
+        first = next(file.iter_batches(1, columns=[field.name]), None)
+        width = 0 if first is None or not len(first) else len(first.column(0)[0].as_py() or ())
+        found |= {f"{field.name}_{k + 1}": (field.name, k) for k in range(width)}
+    return found
+
+
+def _names_of_columns(columns: Mapping[str, str], header: Sequence[str]) -> tuple[str, ...]:
+    """Joint names that the file's own names of its position columns hold; empty where they hold none."""
+    return joint_names([columns.get(f"q_{i}", "") for i in range(1, 1 + sum(_is_position(c) for c in header))])
+
+
+def _is_position(column: str) -> bool:
+    return (channel_column(column) or ("", 0))[0] == "q"
 
 
 def _names(content: bytes | None, source: str) -> tuple[str, ...]:
@@ -137,14 +171,31 @@ def save_parquet(recording: Recording, path: Path) -> None:
 
 
 def _recording(table: Any, header: list[str], source: str, names: tuple[str, ...]) -> Recording:
-    columns = {column: numbers(table.column(column)) for column in table.column_names}
+    columns = {
+        column: (_seconds(table.column(column), source) if column == "t" else numbers(table.column(column)))
+        for column in table.column_names
+    }
     channels = channels_of(columns, source)
-    ignored = [column for column in header if not is_channel(column)]
+    ignored = [column for column in header if column and not is_channel(column)]
     warning = f"columns ignored because they are no channels: {', '.join(ignored)}" if ignored else ""
     n = joint_count(header, source)
     if names and len(names) != n:
         raise BadInput(f"{source}: {len(names)} joint names for {n} joints")
     return Recording(t=columns["t"], names=names or default_names(n), warning=warning, **channels)  # type: ignore[arg-type]
+
+
+def _seconds(column: Any, source: str) -> Array:
+    """Times in seconds: numbers as they are, dates from the first."""
+    if pa.types.is_float64(column.type):
+        return numbers(column)
+    if not pa.types.is_timestamp(column.type):
+        first = column[0].as_py() if len(column) else ""
+        raise BadInput(
+            f"{source}: row 1: t is {first!r}, expected a number [s] or a date such as 2026-11-24 12:00:00.25"
+        )
+    whole = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64())
+    ticks = np.concatenate([np.zeros(0, np.int64), *(chunk.to_numpy(zero_copy_only=False) for chunk in whole.chunks)])
+    return np.asarray((ticks - ticks[:1]) * 1e-9, dtype=float)
 
 
 def numbers(column: Any) -> Array:
@@ -166,8 +217,8 @@ def _table(recording: Recording) -> Any:
     return pa.table({name: pa.array(values, from_pandas=True) for name, values in columns_of(recording).items()})
 
 
-def _content(path: Path) -> tuple[bytes, str]:
-    """Complete lines of the file, uncompressed, and why it is truncated (empty if it is not)."""
+def _content(path: Path) -> tuple[bytes, str, Layout]:
+    """Complete lines of the file, uncompressed, why it is truncated (empty if it is not), and how it is written."""
     try:
         require_size(path.stat().st_size, str(path))
         content = path.read_bytes()
@@ -177,12 +228,13 @@ def _content(path: Path) -> tuple[bytes, str]:
             cut = "" if ended else "the file ends early"
     except (OSError, zlib.error) as error:
         raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
+    layout = layout_of(content, str(path))
     if content.endswith((b"\n", b"\r")) or not content:
-        return content, cut
+        return content, cut, layout
     whole = content.rfind(b"\n") + 1
-    if not cut and _looks_whole(content):
-        return content, ""
-    return content[:whole], cut or "its last line is not complete"
+    if not cut and _looks_whole(content, layout):
+        return content, "", layout
+    return content[:whole], cut or "its last line is not complete", layout
 
 
 def _unpacked(packed: bytes, source: str) -> tuple[bytes, bool]:
@@ -203,31 +255,23 @@ def _unpacked(packed: bytes, source: str) -> tuple[bytes, bool]:
     return b"".join(parts), ended
 
 
-def _looks_whole(content: bytes) -> bool:
+def _looks_whole(content: bytes, layout: Layout) -> bool:
     """Whether a last line without newline is complete: all columns, its last number as long as any above it.
 
     A truncated number has fewer decimals than the others of its column, or is shorter.
     """
     lines = content[-_LOOK_BACK:].decode("utf-8", "replace").splitlines()
-    *before, last = (line.split(",") for line in lines)
+    *before, last = (line.replace(layout.decimal, ".").split(layout.separator) for line in lines)
     if len(content) > _LOOK_BACK:
         before = before[1:]
     before = [cells for cells in before if len(cells) == len(last)]
-    rest = [cells[-1] for cells in before if _is_number(cells[-1])]
-    if not before or len(last) < 2 or not (_is_number(last[-1]) or not rest):
+    rest = [cells[-1] for cells in before if is_number(cells[-1])]
+    if not before or len(last) < 2 or not (is_number(last[-1]) or not rest):
         return False
     digits = [len(cell.partition(".")[2]) for cell in (*rest, last[-1])]
     if any(digits):
         return digits[-1] >= max(digits[:-1], default=0)
     return len(last[-1]) >= max(map(len, rest), default=0)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _require_header(path: Path) -> None:
@@ -242,16 +286,15 @@ def _require_header(path: Path) -> None:
         raise BadInput(f"{path}: its header row has more than {_MOST_HEADER // 1024} kB, expected names of columns")
 
 
-def _header(path: Path, content: bytes) -> list[str]:
-    try:
-        line = content.partition(b"\n")[0].decode("utf-8-sig")
-        header = [column.strip() for column in next(csv.reader([line]), [])]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
-    twins = sorted(column for column, count in Counter(header).items() if count > 1)
+def _require_each_once(header: Sequence[str], path: Path) -> None:
+    twins = sorted(column for column in set(header) if column and header.count(column) > 1)
     if twins:
         raise BadInput(f"{path}: column {twins[0]!r} occurs twice in the header row")
-    return header
+
+
+def _unnamed_apart(header: Sequence[str]) -> list[str]:
+    """The header with a name each for columns that have none."""
+    return [column or f"column {k + 1} without a name" for k, column in enumerate(header)]
 
 
 def _first_line(error: Exception) -> str:

@@ -71,7 +71,8 @@ def diagnose(
         labels: names of the recordings for messages, train first.
         groups: `NAME=REC[,REC…]`: recordings (by label) that share a body; without any, it is found which do.
         withhold: ids of effects to leave out of the library (blind check).
-        stated: corrections that the user stated when the recordings were loaded; the check leaves those as they are.
+        stated: corrections that the user states, not made yet, with joints numbered from base to tip; the check looks
+            into none of them again.
         gains: `RECORDING=VALUE`: gain of the position controller in recordings that differ in it; only without torque.
         base, tip: bodies of the model between which the recorded arm lies, where the model has more joints than it.
         progress: gets the stage that begins; used where no recording has a torque channel.
@@ -198,7 +199,7 @@ def _checked(
     matched, findings = [], []
     for recording, label in zip(recordings, labels, strict=False):
         taken, found = match_joints(recording, list(hinges), stated, label)
-        matched.append(taken)
+        matched.append(stated.apply(taken, label).check(label))
         findings += [finding for finding in found if finding not in findings]
     names = () if matched[0].names == default_names(matched[0].n) else matched[0].names
     sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n, hinges)

@@ -14,6 +14,7 @@ from sim_gap.checks.clock import even_times, find_dropped, without_repeats
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_mapping
+from sim_gap.checks.position_rows import find_jumps, unwrapped, without_held
 from sim_gap.checks.rigid_fit import Motion, as_mounted, beside_slow_torques, fit_rigid, motion_of
 from sim_gap.checks.torque_source import (
     find_absent,
@@ -56,14 +57,18 @@ def check_recording(
     """Check and correct one recording. Raises BadInput for a finding that is not certain."""
     for finding in find_counts(recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
+    recording, wrapped = unwrapped(recording)
+    for finding in find_jumps(recording, stated):
+        raise BadInput(f"{label}: {finding.sentence()}")
     recording, repeated = without_repeats(recording)
+    recording, held = without_held(recording)
     recording, jitter = even_times(recording, stated)
     same = find_same(recording, stated)
     for finding in same:
         recording = _corrected(recording, finding, label)
     if same and (law := find_gain_command(recording, stated)):
         same, recording = [*same, *law], replace(recording, torque_command=None)
-    found = [*repeated, *jitter, *([] if repeated else find_dropped(recording)), *same]
+    found = [*wrapped, *repeated, *held, *jitter, *([] if repeated else find_dropped(recording)), *same]
     s = prepare(recording, arm, label)
     for channel in s.channels:
         motion = motion_of(s, channel)

@@ -28,7 +28,7 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
     if "t" in stated.clock or recording.t.size < 50:
         return recording, []
     steps = np.diff(recording.t)
-    period = float(np.median(steps))
+    period = _period(recording.t)
     if float(np.std(np.clip(steps, 0.0, 5.0 * period))) < JITTER * period:
         return recording, []
     sampled = _sample_times(recording.t)
@@ -58,14 +58,19 @@ def _sample_times(t: Array) -> Array | None:
     return np.asarray(even)
 
 
+def _period(t: Array) -> float:
+    """Time from row to row [s], by the median over many, for rows that wait in a buffer are received together."""
+    ahead = min(2 * HALF, t.size - 1)
+    return float(np.median(t[ahead:] - t[:-ahead])) / ahead
+
+
 def _missed(t: Array) -> Array:
     """Number of samples missing before each row (K,).
 
     By whole periods the rows after a gap come later than those before it, each by the median of some, for any one may
     be received late; of the steps about such a place, the longest are the gaps.
     """
-    rows, steps, ahead = np.arange(t.size), np.diff(t), min(2 * HALF, t.size - 1)
-    period = float(np.median(t[ahead:] - t[:-ahead])) / ahead
+    rows, steps, period = np.arange(t.size), np.diff(t), _period(t)
     late = median_filter(t / period - rows, size=2 * HALF + 1, mode="nearest")
     before, after = late[np.maximum(rows[:-1] - HALF, 0)], late[np.minimum(rows[1:] + HALF, t.size - 1)]
     jump = after - before
@@ -98,7 +103,7 @@ def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:
     """The recording without rows that repeat the one before while the arm moves."""
     columns = np.column_stack(list(recording.channels().values()))
     same = np.concatenate([[False], np.all((columns[1:] == columns[:-1]) | ~np.isfinite(columns[1:]), axis=1)])
-    moving = _fast(recording.position)
+    moving = fast_rows(recording.position)
     share = float(same[moving].mean()) if moving.any() else 0.0
     if share < REPEATED:
         return recording, []
@@ -122,7 +127,7 @@ def find_dropped(recording: Recording) -> list[Finding]:
     return [Finding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)]
 
 
-def _fast(position: Array) -> NDArray[np.bool_]:
+def fast_rows(position: Array) -> NDArray[np.bool_]:
     """Rows at which some joint travels at least three of its smallest steps a row, over ten rows, (K,)."""
     span = 5
     fast = np.zeros(len(position), bool)

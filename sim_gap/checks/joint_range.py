@@ -56,7 +56,7 @@ def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) 
     for j, (low, high) in enumerate(arm.range):
         q, column = recording.position[:, j], f"q_{j + 1}"
         least, most = float(np.nanmin(q)), float(np.nanmax(q))
-        settled = stated.joints or stated.columns or any(stated.states(k, column) for k in ("sign", "zero", "units"))
+        settled = stated.joints or stated.order or any(stated.states(k, column) for k in ("sign", "zero", "units"))
         if settled or (least > low - BEYOND and most < high + BEYOND):
             continue
         evidence = (

@@ -36,6 +36,8 @@ def match_joints(
     if own == default_names(recording.n):
         return recording, []
     matched = _by_words(own, model)
+    if matched is None and any(column.startswith("q_") for column in stated.columns):
+        return replace(recording, names=default_names(recording.n)), []  # the order is that of --map
     if matched is None:
         raise BadInput(
             f"{label}: its joints {', '.join(own)} are not those of the model, {', '.join(model)}: give them in the "

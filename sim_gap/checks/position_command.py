@@ -72,7 +72,7 @@ def _require_pairs(recording: Recording, label: str, stated: Corrections) -> Non
     match, slope = _match(x, y), _slope(x, y)
     holds = _of_others(x, match, stated)
     for j, name in enumerate(recording.names):
-        if x[:, j].std() < MOVES or stated.states("columns", f"q_cmd_{j + 1}"):
+        if x[:, j].std() < MOVES or stated.states("order", f"q_cmd_{j + 1}"):
             continue
         column = f"q_cmd_{j + 1}"
         if (other := holds.get(j)) is not None:
@@ -100,7 +100,7 @@ def _of_others(x: Array, match: Array, stated: Corrections) -> dict[int, int]:
     for j in np.flatnonzero(x.std(0) >= MOVES).tolist():
         best = int(np.abs(match[j]).argmax())
         clear = abs(match[j, best]) > CLEARLY and abs(match[j, j]) < FOLLOWS
-        if best != j and clear and not stated.states("columns", f"q_cmd_{j + 1}"):
+        if best != j and clear and not stated.states("order", f"q_cmd_{j + 1}"):
             found[j] = best
     return found
 

@@ -24,12 +24,13 @@ GEAR_FRICTION = 0.13
 of two real arms show 0.04 to 0.07, motors of four others 0.26 to 0.6."""
 LAG, LAG_STEP = 1.5, 0.02
 """Longest delay that is looked for, and its step [s]."""
-OWN_LAG = 0.12
-"""Delay up to which it is an effect of drive or sensor, which the diagnosis finds by itself [s]."""
+OWN_LAG = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 0.12)}
+"""Delays of a channel between which they are an effect of drive or sensor, which the diagnosis finds by itself [s]:
+sensors read late, drives follow a command late, and positions are some milliseconds old."""
 SURE, SCREENED = 0.7, 0.3
 """Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
-REPEATS = 0.5
-"""Share of that fall by which any other minimum of the cost must be higher."""
+REPEATS, APART = 0.5, 0.12
+"""Share of that fall by which any other minimum of the cost must be higher that is so far away [s]."""
 LAWFUL, STEPS = 0.3, 50
 """Least share of the variance of a command's steps that a law of gains explains (half on OpenArm, where positions,
 velocities and targets are rounded on the bus); least number of such steps."""
@@ -67,7 +68,7 @@ def find_absent(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Correction
     A column that varies with another joint's motion may fit as well as the joint's own, by a spring or a rotor that no
     arm has, so that nothing is gained by an exchange. A motor is not judged: its gear's friction may hold the load.
     """
-    if motion.channel != "tau" or stated.states("units", f"{motion.channel}_1") or stated.columns or stated.joints:
+    if motion.channel != "tau" or stated.states("units", f"{motion.channel}_1") or stated.order or stated.joints:
         return []
     found = []
     for j in np.flatnonzero((fit.own_share > ABSENT) & (fit.scale < HELD)).tolist():
@@ -169,11 +170,20 @@ def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) 
             costs[rows / rate] = _delayed_cost(model, motion, int(rows))
     lag = min(costs, key=costs.__getitem__, default=0.0)
     fall = start - costs.get(lag, start)
-    if not OWN_LAG < abs(lag) < LAG - 2.0 * LAG_STEP or fall < SURE or _repeats(costs, lag):
+    early, late = OWN_LAG[motion.channel]
+    if early <= lag <= late or abs(lag) >= LAG - 2.0 * LAG_STEP or fall < SURE or _repeats(costs, lag):
         return [], 0.0
+    lag = _between_rows(model, motion, round(lag * rate)) / rate
     evidence = f"is {abs(lag):.2f} s {'late' if lag > 0 else 'early'} against the positions"
     option = f"--clock {motion.channel}={-lag:.3f}"
     return [Finding("clock", motion.channel, "all", evidence, option, True)], fall
+
+
+def _between_rows(model: Array, motion: Motion, rows: int) -> float:
+    """The delay in rows at which the cost is least, by the parabola through a minimum and its neighbours."""
+    before, least, after = (_delayed_cost(model, motion, k) for k in (rows - 1, rows, rows + 1))
+    bend = before - 2.0 * least + after
+    return rows + (float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend > 0.0 else 0.0)
 
 
 def _repeats(costs: Mapping[float, float], lag: float) -> bool:
@@ -181,7 +191,7 @@ def _repeats(costs: Mapping[float, float], lag: float) -> bool:
     order = sorted(costs)
     values = [np.inf, *(costs[at] for at in order), np.inf]
     minima = [at for k, at in enumerate(order, start=1) if values[k] <= min(values[k - 1], values[k + 1])]
-    return any(abs(at - lag) > OWN_LAG and costs[at] - costs[lag] < REPEATS * SURE for at in minima)
+    return any(abs(at - lag) > APART and costs[at] - costs[lag] < REPEATS * SURE for at in minima)
 
 
 def _delayed_cost(model: Array, motion: Motion, rows: int, step: int = 1) -> float:

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from armlink.commands.options import Clock, Columns, EffortIs, Joints, Sign, Topic, Units, Zero
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
@@ -20,26 +22,20 @@ def diagnose(
         list[Path] | None,
         typer.Option(help="Held-out recording to judge on; may be repeated. Default: the end of each --train."),
     ] = None,
-    columns: Annotated[
-        list[str] | None,
-        typer.Option("--map", help="Column of the file for one of ours: t=time,q_1=pos_a or q_1=q_2,q_2=q_1."),
-    ] = None,
-    joints: Annotated[str, typer.Option(help="Joints of the recordings to take, base to tip: a,b,c.")] = "",
+    columns: Columns = None,
+    joints: Joints = "",
     base: Annotated[
         str | None, typer.Option(help="Body of the model that carries the recorded arm; default: the world.")
     ] = None,
     tip: Annotated[
         str | None, typer.Option(help="Body of the model that the recorded arm ends in, where it has several arms.")
     ] = None,
-    units: Annotated[
-        list[str] | None,
-        typer.Option(help="Unit of a channel: q=deg, q=counts:4096, tau_motor=A:12.5 (N·m/A), t=ms."),
-    ] = None,
-    sign: Annotated[list[str] | None, typer.Option(help="Sign of a channel or column: tau_3=-1.")] = None,
-    zero: Annotated[list[str] | None, typer.Option(help="Angle to add to a position: q_2=1.5708 [rad].")] = None,
-    clock: Annotated[list[str] | None, typer.Option(help="Time to add to a channel: tau=-0.02 [s].")] = None,
-    effort_is: Annotated[str, typer.Option(help="Source of the efforts: motor or link (sensor).")] = "",
-    topic: Annotated[str, typer.Option(help="Topic of a bag that holds the joint states.")] = "",
+    units: Units = None,
+    sign: Sign = None,
+    zero: Zero = None,
+    clock: Clock = None,
+    effort_is: EffortIs = "",
+    topic: Topic = "",
     group: Annotated[
         list[str] | None,
         typer.Option(
@@ -106,9 +102,10 @@ def diagnose(
         joints=joints,
         topic=topic,
     )
+    reading = stated.of_reading()
     with console.status(f"reading {len(paths)} recordings"):
-        fitted = {name: each for path in train for name, each in load_recordings(path, stated).items()}
-        judged = {name: each for path in heldout or () for name, each in load_recordings(path, stated).items()}
+        fitted = {name: each for path in train for name, each in load_recordings(path, reading).items()}
+        judged = {name: each for path in heldout or () for name, each in load_recordings(path, reading).items()}
     with console.status("checking the data, and fitting effects to the gap") as status:
         answer = diagnosis.diagnose(
             sim,

@@ -39,6 +39,8 @@ TRIM_S = 0.3
 COLUMNS = 8
 """Number of columns that are filtered at a time."""
 SHORTEST_S = 3.0
+MOST_FILLED = 100.0
+"""Most even samples for each recorded row."""
 ABSENT = -1
 """Number of a recording without the body that training recordings have."""
 CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
@@ -273,6 +275,12 @@ def prepare(
     if recording.n != arm.n:
         raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
     raw_step = float(np.median(np.diff(recording.t)))
+    span = float(recording.t[-1] - recording.t[0])
+    if span > MOST_FILLED * raw_step * recording.t.size:
+        raise BadInput(
+            f"{label}: {recording.t.size} rows over {span:.3g} s, mostly {raw_step:.2g} s apart: stamped together? "
+            "Record the times of sampling"
+        )
     even = np.arange(recording.t[0], recording.t[-1] + 0.5 * raw_step, raw_step)
     stride = max(1, int(1.0 / raw_step / WORK_HZ + 0.1))
     rate = 1.0 / (raw_step * stride)

@@ -268,3 +268,55 @@ def test_a_joint_whose_friction_outweighs_the_models_torque_tells_no_zero():
     reading = arm.torque(q, v, a) + np.tanh(v / 0.01)
     reading[:, 2] += 300.0 * arm.torque(q + np.array([0.0, 0.0, np.pi / 2]), v, a)[:, 2]
     assert find_mapping(arm, Motion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
+
+
+def test_friction_tells_the_sign_where_the_model_says_nothing(arm, motor):
+    """A joint of which friction is all that its motor reads: position or torque is turned, and it is asked which."""
+    lone = motor.motor_torque.copy()
+    moves = np.gradient(motor.position[:, 2], motor.t)
+    lone[:, 2] = 3.0 * np.tanh(moves / 0.01) + 0.4 * moves
+    massless = replace(arm, inertial=arm.inertial * np.array([1.0, 1.0, 1e-6])[:, None])
+    sound = replace(motor, motor_torque=lone, velocity=None)
+    assert [each.joint for each in check(massless, sound)[1]] == []
+    with pytest.raises(BadInput, match=r"--sign tau_motor_3=-1, or --sign q_3=-1"):
+        check(massless, turned(sound, "motor_torque", [2]))
+
+
+def test_torque_stamped_early_is_moved_back(arm, motor):
+    early = replace(motor, motor_torque=np.roll(motor.motor_torque, -11, axis=0), velocity=None)
+    _, (finding,) = check(arm, early)
+    assert finding.finding == "clock"
+    assert float(finding.option.rpartition("=")[2]) == pytest.approx(0.11, abs=0.02)
+
+
+def test_positions_that_are_held_are_filled_in(arm, motor):
+    rows = np.arange(motor.t.size) // 5 * 5
+    held = motor.position[rows]
+    corrected, (finding,) = check(arm, replace(motor, position=held, velocity=None))
+    assert (finding.finding, finding.channel) == ("duplicate", "q")
+    assert np.std(corrected.position - motor.position) < 0.2 * np.std(held - motor.position)
+
+
+def test_pieces_put_together_are_refused(arm, motor):
+    rows = np.r_[0 : motor.t.size // 4, motor.t.size // 2 : motor.t.size]
+    pieces = replace(motor, **{name: values[rows] for name, values in motor.channels().items()}, t=motor.t[: rows.size])
+    with pytest.raises(BadInput, match=r"jumps by .* rad from one row to the next"):
+        check(arm, replace(pieces, velocity=None))
+
+
+def test_positions_that_wrap_around_are_turned_on(arm, motor):
+    far = motor.position + np.array([np.pi, 0.0, 0.0])
+    wrapped = (far + np.pi) % (2.0 * np.pi) - np.pi
+    corrected, found = check(arm, replace(motor, position=wrapped, velocity=None))
+    assert {each.finding for each in found} <= {"zero"}
+    assert np.abs(np.diff(corrected.position[:, 0])).max() < 0.5
+
+
+def test_rows_stamped_together_are_put_on_even_times_or_refused(arm, motor):
+    together = motor.t[np.minimum(np.arange(motor.t.size) // 4 * 4 + 3, motor.t.size - 1)]
+    stamped = together + 1e-9 * np.arange(motor.t.size)
+    corrected, (finding,) = check(arm, replace(motor, t=stamped, velocity=None))
+    assert finding.finding == "jitter"
+    assert np.diff(corrected.t).min() > 0.009
+    with pytest.raises(BadInput, match="stamped together"):
+        check(arm, replace(motor, t=stamped, velocity=None), parse_corrections(clock=["t=0"]))

@@ -59,3 +59,9 @@ def test_a_stated_order_counts():
 def test_a_file_without_names_keeps_its_order():
     taken, found = match_joints(recording(), MODEL, AS_IT_IS, "r")
     assert (order(taken), found) == ([0.0, 1.0, 2.0], [])
+
+
+def test_a_table_mapped_by_hand_keeps_its_order_where_names_do_not_match():
+    stated = parse_corrections(columns=["q_1=pos_left,q_2=pos_mid,q_3=pos_right"])
+    taken, found = match_joints(recording("left", "mid", "right"), MODEL, stated, "r")
+    assert (order(taken), taken.names, found) == ([0.0, 1.0, 2.0], ("joint_1", "joint_2", "joint_3"), [])

@@ -15,8 +15,10 @@ def found(monkeypatch: pytest.MonkeyPatch, fall: float, explained: tuple[float, 
     arm, rows = load_model(model()).arm, np.zeros((8, 3))
     ones = np.ones(3)
     fit = RigidFit(np.array(explained), ones, ones, np.array([0.9, 0.1, 0.1]), 0.0 * ones, ones)
-    exchanged = mapping.Hypothesis("order", "q", (1, 2), "is in another order", "--map q_2=q_3", lambda motion: motion)
-    answers = [(exchanged, fit, fall, False), None]
+    exchanged = mapping.Hypothesis(
+        "order", ("q",), (1, 2), "is in another order", "--map q_2=q_3", lambda motion: motion
+    )
+    answers = [mapping.Change(exchanged, fit, fall, doubted=False), None]
     monkeypatch.setattr(mapping, "_as_an_arm", lambda *_: fit)
     monkeypatch.setattr(mapping, "_best", lambda *_: answers.pop(0))
     return mapping.find_mapping(arm, Motion(rows, rows, rows, rows, "tau"), AS_IT_IS, (), arm)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armlink.recording.corrections import Corrections
-from sim_gap.checks import mapping
+from sim_gap.checks import hypotheses
 from sim_gap.checks.clock import _sample_times
 from sim_gap.checks.joint_range import _degrees
 from sim_gap.checks.rigid_fit import Motion, RigidFit, _partial, fit_models
@@ -84,7 +84,7 @@ def test_a_motor_torque_of_one_sign_that_follows_the_model_is_no_amount(similar:
 
 def test_degrees_become_radians() -> None:
     turned = np.array([[180.0, -90.0]])
-    found = mapping._degrees(Motion(turned, turned, turned, turned, "tau"))
+    found = hypotheses._degrees(Motion(turned, turned, turned, turned, "tau"))
     for x in (found.q, found.v, found.a):
         np.testing.assert_allclose(x, [[np.pi, -0.5 * np.pi]], rtol=1e-12)
     assert found.reading is turned
