@@ -103,7 +103,7 @@ def _migrate(engine: sa.Engine) -> None:
             return
         if found is not None and found not in MIGRATIONS:
             raise BadInput(
-                f"record store {engine.url.render_as_string(hide_password=True)}: its schema {' '.join(found.split())}"
+                f"record store {engine.url.render_as_string(hide_password=True)}: its schema {found}"
                 f" is newer than this armlink knows ({HEAD}): install a newer armlink; nothing was changed"
             )
         _upgrade(connection, stamp=found is None and sa.inspect(connection).has_table("records"))

@@ -40,6 +40,8 @@ OF_FAULTS = ("fault", "recovered", "started", "refused", "roll-back")
 RIGHT_AGAIN = 5.0
 """State and status are right this long after the last failure [s]."""
 WATCHDOG = 10.0
+HEARD_AGAIN = 1.0
+"""A sign of life is there this long after systemd's socket failed last, however long it failed [s]."""
 RECORD = re.compile(r"record [0-9a-f]{8}")
 STEP = 0.1
 """Between two turns of the event loop [s]."""
@@ -171,6 +173,7 @@ class FailingDaemon(FastDaemon):
     def __init__(self, folder: Path, fails: Callable[[str, int], bool], patch: Any) -> None:
         self.failing, self.heard, self.wrong, self.said = Failing(fails), list[bytes](), list[str](), set[Any]()
         self._patch, self._failed_at, self._alive_at, self._judged_at = patch, -np.inf, 0.0, 0.0
+        self._deaf, self._deaf_at = 0, -np.inf
         super().__init__(folder, 1, DaemonSection.model_validate({"policy": "apply", "recording": {"rate": 1.0}}))
 
     def start(self, up: bool = True) -> None:
@@ -284,7 +287,9 @@ class FailingDaemon(FastDaemon):
         if any(b"WATCHDOG=1" in each for each in self.heard):
             self._alive_at = now
         self.heard.clear()
-        if now - self._alive_at > WATCHDOG:
+        if self.failing.failed["notify"] > self._deaf:
+            self._deaf, self._deaf_at = self.failing.failed["notify"], now
+        if now - self._alive_at > WATCHDOG and now - self._deaf_at > HEARD_AGAIN:
             self.wrong.append(f"{now:.1f} s: no sign of life for {now - self._alive_at:.1f} s")
 
     def _judge(self, now: float) -> None:

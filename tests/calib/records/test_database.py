@@ -140,6 +140,17 @@ def test_a_store_of_session_1_is_brought_up_to_date_and_keeps_its_rows(tmp_path:
     assert len(RecordStore(str(path)).activations(ARM)) == 2
 
 
+def test_a_schema_whose_number_is_damaged_is_refused_in_one_line(tmp_path: Path) -> None:
+    """SQLite keeps bytes in a column of text."""
+    url = f"sqlite:///{tmp_path / 'records.db'}"
+    RecordStore(url).close()
+    engine = open_database(url)
+    with engine.begin() as connection:
+        connection.execute(sa.text("UPDATE alembic_version SET version_num = x'30ff'"))
+    with pytest.raises(BadInput, match="is newer than this armlink knows"):
+        RecordStore(url)
+
+
 @pytest.mark.parametrize("newer", ["0999", "09\n99"])
 def test_a_store_of_a_newer_armlink_is_refused_in_one_line(url: str, newer: str) -> None:
     RecordStore(url).put(calibration(), ARM, by="ann", reason="sweep")

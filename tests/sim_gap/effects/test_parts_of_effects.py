@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sim_gap.effects.drive import _lag
+from sim_gap.effects.effect import added_or_taken_off
 from sim_gap.effects.inertials import point, pseudo_inertia
 from sim_gap.effects.registry import effects
 
@@ -24,6 +25,15 @@ def test_no_more_can_be_missing_than_the_last_link_has() -> None:
     assert not can(np.array([-1.5, 0.0, 0.0, 0.0]), (), tip)
     assert can(np.array([5.0, 0.0, 0.0, 1.0]), (), tip)
     assert not can(np.array([5.0, 0.0, 0.0, 4.0]), (), tip)
+
+
+def test_little_is_taken_off_only_where_another_effect_builds_on_it() -> None:
+    can = lambda coefficient, needed: added_or_taken_off(coefficient, 2.0, {"needed": np.array([needed])})  # noqa: E731
+    assert not can(-0.06, 0.0)
+    assert can(-0.06, 1.0)
+    assert can(-0.12, 0.0)
+    assert not can(-2.1, 1.0)
+    assert can(0.01, 0.0)
 
 
 @pytest.mark.parametrize("time", [0.005, 0.05])

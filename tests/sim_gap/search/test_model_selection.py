@@ -12,7 +12,7 @@ from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.model_selection import candidates, refine, without_doubtful
+from sim_gap.search.model_selection import candidates, refine, with_lost, without_doubtful
 from sim_gap.search.normal_equations import NormalEquations, Weighted
 from sim_gap.search.stepwise import Search
 from sim_gap.search.term import Term
@@ -94,6 +94,10 @@ def test_a_limit_that_got_lost_comes_back_at_the_level_at_which_it_can_exist():
     (refined,) = refine(search.normal.store, search.active)
     assert level(refined) <= level(search.active[0])
     assert Search(NormalEquations(search.normal.store, [refined]), [refined]).active == [refined]
+    far = Term("torque.saturation", 1, (1e-3 * limit,))
+    _, kept = with_lost(search.normal.store, [far], search.normal.store, [])
+    assert [term.key for term in kept] == [far.key]
+    assert level(kept[0]) < 0.05 * limit
 
 
 def test_errors_of_folds_predicted_from_the_others_are_those_of_fits_one_by_one():
