@@ -27,6 +27,8 @@ LATE_S, APART_S = 2e-3, 5e-4
 each by itself [s]: clocks, cycles of bus and servo, filters of velocity."""
 PROBABLE = 0.99
 """Share of sound arms whose errors are less improbable."""
+LEAST_SHOWN = 0.5
+"""Least share of its variance by which an error is judged by itself: what shows less takes on what others leave."""
 STEPS = 3
 """Gauss-Newton steps to the most probable errors."""
 
@@ -47,8 +49,9 @@ def sound(search: Search, heldout: Windows, margin: Array) -> Sound:
     """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
     sizes = _sizes(search)
     deviations = np.array([size for each in sizes for size in each.values()])
-    errors, usual, shown = np.zeros(deviations.size), np.zeros(search.data.joints), 0.0
-    prior = np.linalg.inv(_correlation(sizes))
+    errors, usual = np.zeros(deviations.size), np.zeros(search.data.joints)
+    usually = _correlation(sizes)
+    spread, prior = usually, np.linalg.inv(usually)
     for step in range(STEPS):
         gaps, changes = _weighed(search, _fit(search, sizes, errors), sizes, deviations)
         usual = usual if step else np.array([np.linalg.norm(x) for x in changes])
@@ -56,13 +59,25 @@ def sound(search: Search, heldout: Windows, margin: Array) -> Sound:
         for gap, x, samples, least in zip(gaps, changes, search.samples, margin, strict=True):
             normal += samples / least**2 * x @ x.T
             right -= samples / least**2 * x @ (gap - errors @ x)
-        spread = np.linalg.inv(normal)
-        errors, shown = spread @ right, errors.size - float(np.trace(prior @ spread))
+        spread = np.asarray(np.linalg.inv(normal))
+        errors = spread @ right
     found, other = _fit(search, sizes, errors), replace(search, data=heldout)
     pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
     small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
-    probable = bool(errors @ prior @ errors < _rare(max(shown, 1.0)))
-    return Sound(usual, np.maximum(pairs[0][0], pairs[1][0]) * margin, probable and all(small))
+    explained = all(small) and probable(errors, usually, spread)
+    return Sound(usual, np.maximum(pairs[0][0], pairs[1][0]) * margin, explained)
+
+
+def probable(errors: Array, usually: Array, spread: Array) -> bool:
+    """Whether sound arms have such most probable errors: all of them together, and the largest by itself.
+
+    `usually` is the covariance of errors, `spread` that of what the recordings leave open of them, (K, K).
+    """
+    shown = usually - spread
+    prior = np.linalg.inv(usually)
+    together = float(errors @ prior @ errors) < float(_rare(max(float(np.trace(prior @ shown)), 1.0)))
+    largest = (errors**2 / np.maximum(np.diag(shown), LEAST_SHOWN)).max()
+    return together and bool(largest < chi2.ppf(PROBABLE ** (1.0 / errors.size), 1))
 
 
 def _rare(count: Array | float) -> Array:

@@ -9,7 +9,7 @@ from sim_gap.closed_loop.fit import Fit, evaluate
 from sim_gap.closed_loop.identify import _margin, noise_floor
 from sim_gap.closed_loop.judge import rms_on
 from sim_gap.closed_loop.search import Search
-from sim_gap.closed_loop.sound import sound
+from sim_gap.closed_loop.sound import probable, sound
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
 
@@ -48,3 +48,20 @@ def test_a_tilt_is_no_error_of_a_sound_arm(model) -> None:
 def test_a_gain_that_is_far_off_is_no_error_of_a_sound_arm(model) -> None:
     found, _, _ = split(model, model_text(kp=36.0, friction=0.05))
     assert not found.explained
+
+
+def test_one_large_error_among_many_small_ones_is_no_error_of_a_sound_arm() -> None:
+    """Twenty errors together may have a sum of squares of 37; one by itself may be 3.5 standard deviations large."""
+    usually, spread = np.eye(20), 0.2 * np.eye(20)
+    small = np.linspace(-1.2, 1.2, 20)
+    assert probable(small, usually, spread)
+    assert probable(np.where(np.arange(20) == 3, 2.8, small), usually, spread)
+    assert not probable(np.where(np.arange(20) == 3, 4.0, 0.2 * small), usually, spread)
+
+
+def test_an_error_is_judged_by_as_much_of_it_as_recordings_show() -> None:
+    """Where 0.77 is usual 3 is much; what hardly shows is not judged so, since it takes on what others leave."""
+    errors = np.array([3.0, *np.zeros(19)])
+    assert probable(errors, np.eye(20), 0.1 * np.eye(20))
+    assert not probable(errors, np.eye(20), 0.4 * np.eye(20))
+    assert probable(0.5 * errors, np.eye(20), 0.9 * np.eye(20))
