@@ -13,7 +13,7 @@ from armlink.recording.recording import Recording
 from sim_gap.checks.clock import even_times, find_dropped, without_repeats
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
-from sim_gap.checks.mapping import SURE, find_mapping
+from sim_gap.checks.mapping import SURE, find_changed_order, find_mapping
 from sim_gap.checks.position_rows import find_jumps, unwrapped, without_held
 from sim_gap.checks.rigid_fit import Motion, as_mounted, beside_slow_torques, fit_rigid, motion_of
 from sim_gap.checks.torque_source import (
@@ -108,7 +108,7 @@ def _mapping(
     rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
     delay, fall = find_delay(mounted, motion, rate, stated)
     if not delay or fall <= SURE + sum(finding.fall for finding in mapping):
-        return mapping
+        return mapping or find_changed_order(arm, motion, stated, mounted)
     in_time = prepare(_corrected(recording, delay[0], s.label), arm, s.label)
     return [*delay, *find_mapping(arm, motion_of(in_time, motion.channel), stated, follows)]
 

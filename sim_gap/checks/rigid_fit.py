@@ -247,9 +247,9 @@ def _positive_fit(gram: Array, signs: Sequence[tuple[float, ...]]) -> tuple[floa
     return float(coefficients[0]), float(1.0 - rest**2)
 
 
-def few_rows(motion: Motion) -> Motion:
-    """The motion with few rows, for a first look."""
-    q, v, a, reading = (x[::FEW] for x in (motion.q, motion.v, motion.a, motion.reading))
+def rows_of(motion: Motion, rows: slice) -> Motion:
+    """The motion in some of its rows."""
+    q, v, a, reading = (x[rows] for x in (motion.q, motion.v, motion.a, motion.reading))
     return Motion(q, v, a, reading, motion.channel)
 
 

@@ -50,7 +50,7 @@ def searched_again(
         if rounds == ROUNDS and not gone:
             break
         rounds += not gone
-        offered = [term for term in offered if term.key not in gone]  # it cannot exist about itself
+        offered = [term for term in offered if gone.isdisjoint({term.key, *term.beneath})]  # cannot exist about itself
         search.added.update(dict.fromkeys(gone, TRIES))
         search.least = AGAIN
         search.run()

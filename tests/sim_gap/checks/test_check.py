@@ -320,3 +320,10 @@ def test_rows_stamped_together_are_put_on_even_times_or_refused(arm, motor):
     assert np.diff(corrected.t).min() > 0.009
     with pytest.raises(BadInput, match="stamped together"):
         check(arm, replace(motor, t=stamped, velocity=None), parse_corrections(clock=["t=0"]))
+
+
+def test_torques_exchanged_midway_are_refused(arm, motor):
+    exchanged = motor.motor_torque.copy()
+    exchanged[motor.t.size // 2 :] = exchanged[motor.t.size // 2 :][:, [0, 2, 1]]
+    with pytest.raises(BadInput, match=r"second half of the recording alone .* --map tau_motor_2=tau_motor_3"):
+        check(arm, replace(motor, motor_torque=exchanged, velocity=None))

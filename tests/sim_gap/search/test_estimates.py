@@ -212,3 +212,21 @@ def test_one_body_in_place_of_several_errors_of_links_is_kept_if_it_scores_bette
     monkeypatch.setattr(model_selection, "one_body", lambda store, search, offered: [PAYLOAD])
     monkeypatch.setattr(model_selection, "drives_are_off", lambda search: False)
     assert select_model(SimpleNamespace(keep=lambda terms: None), []).name == kept
+
+
+def test_what_needs_a_term_that_cannot_exist_is_not_offered_again(monkeypatch) -> None:
+    """Asymmetric friction needs Coulomb friction: alone it could not be judged."""
+    asymmetric, viscous = Term("friction.asymmetric", 1), Term("friction.viscous", 1)
+    given: list[list[Term]] = []
+
+    def about(_store, _chosen, offered, *_):
+        given.append(offered)
+        search = SimpleNamespace(active=[viscous] if given[1:] else [], added={})
+        search.normal = SimpleNamespace(store=SimpleNamespace(values={}))
+        search.run = lambda: setattr(search, "active", [viscous])
+        return search
+
+    monkeypatch.setattr(model_selection, "about_itself", about)
+    monkeypatch.setattr(model_selection, "refine", lambda _store, terms: terms)
+    model_selection.searched_again(None, [COULOMB], [COULOMB, asymmetric, viscous])
+    assert given == [[COULOMB, asymmetric, viscous], [viscous]]
