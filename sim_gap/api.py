@@ -28,7 +28,8 @@ def diagnose(
         model: path of an MJCF, URDF or arm file, a bundled arm's name, or a compiled `mujoco.MjModel`: the nominal arm.
         train: one or several recordings to fit, or their paths.
         heldout: recordings to judge on, which the fit does not see; by default the end of each training recording.
-        base, tip: bodies of the model between which the recorded arm lies, if the model has several arms or a torso.
+        base: body of the model that carries the recorded arm, such as a torso; by default the world.
+        tip: body of the model that the recorded arm ends in, if it has several arms.
 
     Raises BadInput if the recordings cannot be used with the model.
     """

@@ -74,7 +74,8 @@ def diagnose(
         stated: corrections that the user states, not made yet, with joints numbered from base to tip; the check looks
             into none of them again.
         gains: `RECORDING=VALUE`: gain of the position controller in recordings that differ in it; only without torque.
-        base, tip: bodies of the model between which the recorded arm lies, where the model has more joints than it.
+        base: body of the model that carries the recorded arm; by default the world, or that of the arm file.
+        tip: body of the model that the recorded arm ends in, where it has several arms.
         progress: gets the stage that begins; used where no recording has a torque channel.
 
     Without a torque channel in any recording, `q_cmd` and `q` are explained instead (`position_only`).
