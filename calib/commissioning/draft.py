@@ -54,7 +54,6 @@ class Draft:
 
     name: str
     model: Path
-    base: str | None
     tip: str | None
     gravity: tuple[float, float, float]
     joints: list[JointDraft]
@@ -63,6 +62,7 @@ class Draft:
     bus: dict[str, str | int] | None = None
     """None: the simulated arm that this file describes."""
     serial: str = "unknown"
+    base: str | None = None
     servo: str | None = None
     """Why resting joints are held by their servos rather than pressed on stops; None: they are pressed."""
 
@@ -96,7 +96,7 @@ def draft_of_model(
     ]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
     servo = f"{', '.join(free)}: no stop to press on" if free else None
-    return Draft(path.stem, path, base, tip, gravity, joints, chain.aside, notes, servo=servo)
+    return Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, base=base, servo=servo)
 
 
 def narrow(draft: Draft, found: ClearRange) -> None:

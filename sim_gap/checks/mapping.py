@@ -110,7 +110,7 @@ def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections, mount
     for half, rows in halves.items():
         for found in find_mapping(arm, rows_of(motion, rows), stated):
             if found.finding == "order" and found.fall > CHANGED:
-                option = f"give both halves as recordings of their own, this one after armlink convert {found.option}"
+                option = f"give both halves as recordings of their own, this one with {found.option}"
                 evidence = f"in the {half} half of the recording alone {found.evidence}"
                 return [replace(found, evidence=evidence, option=option, corrected=False)]
     return []
