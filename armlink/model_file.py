@@ -14,6 +14,8 @@ log = logging.getLogger(__name__)
 READABLE_MESHES = (".stl", ".obj", ".msh")
 STL_HEADER, STL_FACE = 84, 50
 """Bytes of a binary STL file: header with the number of faces, and each face. MuJoCo reads no others."""
+STL_FACES = range(1, 200_001)
+"""Numbers of faces that MuJoCo reads."""
 PACKAGE = "package://"
 NEGLIGIBLE = 1e-14
 """Mass [kg] and inertia [kg·m²] of massless moving bodies, which are common in URDF files and MuJoCo refuses."""
@@ -176,9 +178,12 @@ def _is_readable(mesh: Path) -> bool:
     suffix = mesh.suffix.lower()
     if suffix != ".stl":
         return suffix in READABLE_MESHES
-    with mesh.open("rb") as file:
-        faces = int.from_bytes(file.read(STL_HEADER)[STL_HEADER - 4 :], "little")
-    return mesh.stat().st_size == STL_HEADER + STL_FACE * faces
+    try:
+        with mesh.open("rb") as file:
+            faces = int.from_bytes(file.read(STL_HEADER)[STL_HEADER - 4 :], "little")
+        return faces in STL_FACES and mesh.stat().st_size == STL_HEADER + STL_FACE * faces
+    except OSError:
+        return False
 
 
 def _negative_inertias_removed(spec: Any) -> tuple[str, ...]:

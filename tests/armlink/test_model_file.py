@@ -75,6 +75,13 @@ def test_a_mesh_in_the_text_form_of_stl_costs_its_shape_alone(tmp_path):
     assert compile_model(path).ngeom == 0
 
 
+def test_an_stl_file_without_faces_costs_its_shape_alone(tmp_path):
+    path = urdf(tmp_path)
+    binary_stl(tmp_path / "l1.stl", [])
+    assert read_model(path).unreadable == ("l1.stl",)
+    assert compile_model(path).ngeom == 0
+
+
 def test_a_mesh_of_hardly_any_volume_is_read_where_the_link_has_an_inertial(tmp_path):
     corners = 1e-6 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     faces = corners[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]]
