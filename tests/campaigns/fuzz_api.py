@@ -135,6 +135,9 @@ def exchange(server: Served, sent: bytes, tcp: bool, draw: random.Random) -> byt
                 answer += piece
         except (ConnectionResetError, BrokenPipeError):
             pass
+        except TimeoutError:
+            Path("fuzz-corpus-api.http").write_bytes(sent)
+            raise AssertionError(f"nothing for 30 s: {len(answer)} bytes answered, {sent[:300]!r}") from None
     return answer
 
 
