@@ -86,6 +86,7 @@ def diagnose(
     from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
+    from sim_gap.commands.gap_tables import show
 
     console = PlainConsole()
     paths = [*train, *(heldout or [])]
@@ -124,7 +125,7 @@ def diagnose(
             console.print(f"{name}: {recording.warning}", style="yellow")
     for finding in answer.checks:
         console.print(finding.sentence(), style="yellow")
-    _show(answer, console)
+    show(answer, console)
     if report is not None:
         from sim_gap.report.page import write_report
 
@@ -160,10 +161,17 @@ def _positions_of(answer: "Diagnosis", option: str) -> "Identified":
 
 
 def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
+    from sim_gap.better_model.samples import drawn_parameters, write_rows
     from sim_gap.closed_loop.training.posterior import write_samples
 
     target = path or Path("samples.csv")
-    write_samples(_positions_of(answer, "--samples"), count, target)
+    if answer.unit == "rad":
+        write_samples(_positions_of(answer, "--samples"), count, target)
+    elif answer.internals.estimate is None:
+        console.print("no draws of parameters: there is no gap that any would explain", style="yellow")
+        return
+    else:
+        write_rows(drawn_parameters(answer.internals.estimate, answer.names, count), target)
     console.print(f"{count} draws of all parameters: {target}")
 
 
@@ -189,28 +197,3 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
         console.print(f"not in MJCF: {line}", style="yellow")
     if missing:
         console.print(f"{module_path(path)} applies these effects in a MuJoCo simulation")
-
-
-def _show(answer: "Diagnosis", console: "Console") -> None:
-    """Print verdict, causes and gap as tables."""
-    from rich.table import Column, Table
-
-    from sim_gap.report.effect_text import sentence
-
-    console.print(sentence(answer), style="bold")
-    if answer.causes:
-        effect = Column("effect", no_wrap=True)
-        headers = "joints", "RMS before", "after", "confidence", "confounded with"
-        table = Table(effect, *headers, title="causes, on held-out data")
-        for cause in answer.causes:
-            joints = f"all {len(answer.names)}" if cause.joints == answer.names else ", ".join(cause.joints)
-            numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
-            table.add_row(cause.effect, joints, *numbers, ", ".join(cause.confounded_with))
-        console.print(table)
-    table = Table("joint", "noise floor", "before", "after", title=f"gap on {answer.heldout_is}, RMS in {answer.unit}")
-    for j, name in enumerate(answer.names):
-        numbers = answer.noise_floor[j], answer.heldout_before[j], answer.heldout_after[j]
-        table.add_row(name, *(f"{value:.3g}" for value in numbers))
-    console.print(table)
-    for note in answer.notes:
-        console.print(note, style="yellow")
