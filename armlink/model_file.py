@@ -95,7 +95,7 @@ def read_model(path: Path) -> ModelFile:
         raise BadInput(f"{path}: a number is NaN: expected finite numbers")
     for line in warned:
         log.info(line)
-    kind = "URDF" if _is_urdf(path) else "MJCF"
+    kind = "URDF" if is_urdf(path) else "MJCF"
     if kind == "URDF":
         compiler = spec.compiler
         compiler.boundmass = compiler.boundinertia = NEGLIGIBLE
@@ -185,7 +185,7 @@ def one_line(error: ValueError) -> str:
     return " ".join(str(error).split())
 
 
-def _is_urdf(path: Path) -> bool:
+def is_urdf(path: Path) -> bool:
     """Whether the root element is `robot`; without namespaces, whose prefixes published files do not declare."""
     from xml.parsers import expat
 

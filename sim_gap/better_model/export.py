@@ -11,8 +11,10 @@ from armlink.errors import BadInput
 from sim_gap.better_model.coupled_motors import add_to, coupled_motors
 from sim_gap.better_model.effects_module import joint_effects, module_path, module_text
 from sim_gap.better_model.forward_effects import GEARED, JointEffect
+from sim_gap.better_model.urdf import URDF, urdf_of
 from sim_gap.better_model.with_effects import compiled_copy, spec_of, with_effects
-from sim_gap.model.load import SimModel
+from sim_gap.better_model.xml_comment import xml_comment
+from sim_gap.model.load import SimModel, urdf_behind
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
 
@@ -79,27 +81,22 @@ def written(
 
 
 def write_model(sim: SimModel, estimate: Estimate | None, path: Path, laws: Sequence[JointEffect] = ()) -> list[str]:
-    """Write the model with the effects as MJCF, and beside it a module for those that MJCF cannot hold, and for laws.
+    """Write the model with the effects as MJCF, or as URDF if the path ends so, and beside it a module for the rest.
 
-    Returns a line per effect that MJCF cannot hold; the file lists them in a comment. Raises BadInput if the nominal
-    model did not come from a file or a file cannot be written.
+    The module has the effects that MJCF cannot hold, and laws. Returns a line per effect that the file cannot hold; it
+    lists them in a comment. Raises BadInput if the nominal model did not come from a file or a file cannot be written.
     """
     files = written(sim, estimate, path.name, laws=laws)
+    text, lines = files.xml, files.lines
+    if path.suffix == URDF:
+        text, lines = urdf_of(files.spec.compile(), urdf_behind(sim.path), lines)
     try:
-        path.write_text(files.xml, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
         if files.module:
             module_path(path).write_text(files.module, encoding="utf-8")
     except OSError as error:
         raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
-    return files.lines
-
-
-def xml_comment(lines: list[str]) -> str:
-    """Lines as an XML comment; two hyphens, which would end it, are parted."""
-    text = "\n  ".join(lines)
-    while "--" in text:
-        text = text.replace("--", "- -")
-    return f"<!-- {text}\n-->\n"
+    return lines
 
 
 def _gains(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term]) -> dict[str, float]:

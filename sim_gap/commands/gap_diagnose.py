@@ -72,7 +72,8 @@ def diagnose(
     out_model: Annotated[
         Path | None,
         typer.Option(
-            help="Write the corrected model here (MJCF), and beside it a module for effects MJCF cannot hold."
+            help="Write the corrected model here (MJCF, or URDF if the name ends so), and beside it a module for "
+            "effects that MJCF cannot hold."
         ),
     ] = None,
 ) -> None:
@@ -176,12 +177,14 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
 
 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
+    kind = "URDF" if path.suffix == ".urdf" else "MJCF"
     if answer.unit == "rad":
         from sim_gap.closed_loop.training.posterior import batch_path, write_exported
 
+        with_actuators = " with its position actuators" if kind == "MJCF" else ""
         for line in write_exported(answer.internals, path):
-            console.print(f"not in MJCF: {line}", style="yellow")
-        console.print(f"corrected model with its position actuators: {path}")
+            console.print(f"not in {kind}: {line}", style="yellow")
+        console.print(f"corrected model{with_actuators}: {path}")
         if batch_path(path).is_file():
             console.print(f"the same without PID actuators, for MuJoCo Warp: {batch_path(path)}")
         return
@@ -194,6 +197,6 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     )
     console.print(f"corrected model: {path}")
     for line in missing:
-        console.print(f"not in MJCF: {line}", style="yellow")
-    if missing:
+        console.print(f"not in {kind}: {line}", style="yellow")
+    if missing and module_path(path).is_file():
         console.print(f"{module_path(path)} applies these effects in a MuJoCo simulation")
