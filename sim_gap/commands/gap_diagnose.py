@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from rich.status import Status
 
     from sim_gap.attribution.diagnosis import Diagnosis
-    from sim_gap.closed_loop.identify import Identified
 
 
 def diagnose(
@@ -62,9 +61,7 @@ def diagnose(
     ] = None,
     out_actuators: Annotated[
         Path | None,
-        typer.Option(
-            help="Write actuator entries for Isaac Lab and mjlab here (.py); only if there is no torque channel."
-        ),
+        typer.Option(help="Write actuator entries for Isaac Lab and mjlab here (.py)."),
     ] = None,
     physics_step: Annotated[
         float, typer.Option(help="Step of the training simulation in which --out-actuators counts delays [s].")
@@ -137,9 +134,7 @@ def diagnose(
     if samples:
         _write_samples(answer, samples, out_samples, console)
     if out_actuators is not None:
-        from sim_gap.closed_loop.training.actuators import write_actuators
-
-        write_actuators(_positions_of(answer, "--out-actuators"), out_actuators, physics_step)
+        _write_actuators(answer, out_actuators, physics_step)
         console.print(f"actuator entries for Isaac Lab and mjlab: {out_actuators}")
     write_json(json, answer.to_json())
 
@@ -151,14 +146,14 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
         console.print(stage)
 
 
-def _positions_of(answer: "Diagnosis", option: str) -> "Identified":
-    """The fit of positions; raises BadInput if the diagnosis is of torques."""
-    from armlink.errors import BadInput
-    from sim_gap.closed_loop.identify import Identified
+def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
+    from sim_gap.better_model.motor_entries import write_motor_entries
+    from sim_gap.closed_loop.training.actuators import write_actuators
 
-    if not isinstance(answer.internals, Identified):
-        raise BadInput(f"{option}: written where no recording has a torque channel (q_cmd and q): leave it out")
-    return answer.internals
+    if answer.unit == "rad":
+        write_actuators(answer.internals, path, step)
+    else:
+        write_motor_entries(answer.internals.model, answer.internals.estimate, path, step)
 
 
 def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
@@ -167,7 +162,7 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
 
     target = path or Path("samples.csv")
     if answer.unit == "rad":
-        write_samples(_positions_of(answer, "--samples"), count, target)
+        write_samples(answer.internals, count, target)
     elif answer.internals.estimate is None:
         console.print("no draws of parameters: there is no gap that any would explain", style="yellow")
         return

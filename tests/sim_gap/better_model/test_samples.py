@@ -2,14 +2,18 @@
 
 import csv
 import json
+import sys
+import types
 
 import numpy as np
 import pytest
 from wrong_arms import THREE, Wrong, model, record
 
 from armlink import cli
+from armlink.errors import BadInput
 from armlink.recording.files import save_recording
 from sim_gap.attribution.diagnose import diagnose
+from sim_gap.better_model.motor_entries import write_motor_entries
 from sim_gap.better_model.samples import drawn_parameters
 
 TRUE = np.array([0.6, 0.4, 0.02])
@@ -59,7 +63,9 @@ def test_no_draw_is_what_no_arm_has(arm):
 def test_the_command_writes_draws_and_shows_intervals(arm, capsys):
     folder = arm[0]
     run = ["gap", "diagnose", "--sim", str(folder / "arm.xml"), "--train", str(folder / "run.csv"), "--json", "-"]
-    assert cli.run([*run, "--samples", "5", "--out-samples", str(folder / "draws.csv")]) == 0
+    more = ["--samples", "5", "--out-samples", str(folder / "draws.csv"), "--out-actuators", str(folder / "motors.py")]
+    assert cli.run([*run, *more]) == 0
+    assert "BuiltinMotorActuatorCfg" in (folder / "motors.py").read_text()
     said = capsys.readouterr()
     with (folder / "draws.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -69,3 +75,30 @@ def test_the_command_writes_draws_and_shows_intervals(arm, capsys):
     assert "friction.coulomb" in said.err
     assert f"{coulomb['value']:.4g}" in said.err
     assert f"{coulomb['ci95'][0]:.3g} to {coulomb['ci95'][1]:.3g}" in said.err
+
+
+def test_actuator_entries_of_motors_hold_the_corrected_model(arm, tmp_path, monkeypatch):
+    """The frameworks' names stand in here: they need a GPU and gigabytes."""
+    for package, name, entry in (
+        ("isaaclab", "isaaclab.actuators", "DelayedPDActuatorCfg"),
+        ("mjlab", "mjlab.actuator", "BuiltinMotorActuatorCfg"),
+    ):
+        module = types.ModuleType(name)
+        setattr(module, entry, dict)
+        monkeypatch.setitem(sys.modules, package, types.ModuleType(package))
+        monkeypatch.setitem(sys.modules, name, module)
+    inside = arm[1].internals
+    write_motor_entries(inside.model, inside.estimate, tmp_path / "motors.py")
+    made: dict = {}
+    exec((tmp_path / "motors.py").read_text(), made)
+    isaac, mjlab = made["isaac_lab"](), made["mjlab"]()
+    for j, name in enumerate(arm[1].names):
+        (other,) = [entry for entry in mjlab if entry["target_names_expr"] == (name,)]
+        assert isaac[name]["stiffness"] is None
+        assert "stiffness" not in other
+        assert isaac[name]["friction"] == other["frictionloss"] == pytest.approx(TRUE[j], abs=0.1)
+        assert isaac[name]["armature"] == other["armature"]
+        assert (isaac[name]["min_delay"], isaac[name]["max_delay"]) == (0, 0)
+    assert isaac["joint_2"]["viscous_friction"] == mjlab[1]["viscous_damping"] == pytest.approx(0.5, abs=0.1)
+    with pytest.raises(BadInput, match=r"ends in \.py"):
+        write_motor_entries(inside.model, inside.estimate, tmp_path / "motors.yaml")
