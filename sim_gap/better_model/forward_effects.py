@@ -48,8 +48,6 @@ CREEPING = 0.01
 """Speed below which the direction of a motion is not defined [rad/s]."""
 GRADUAL = (0.25, 0.75, 1.25, 1.75)
 """Half widths of the plays of a hysteresis that sets in gradually, as shares of its width."""
-GEARED = "actuator.gain in the model's gear"
-"""A drive's gain that the model's actuators have; a torque that is applied past them needs it too."""
 HORIZON_S, WINDOWS, STEP_S = 0.5, 40, 0.002
 """Length of a forward simulation from a recorded state, number of them over a recording, largest time step."""
 AROUND_S = 0.06
@@ -150,7 +148,10 @@ class Effects:
     # ---- the drives
 
     def made(self, command: Array, time: float) -> Array:
-        """Torque of the drives with `command` from now on: delayed, lagging, clipped, scaled."""
+        """Torque of the drives with `command` from now on: delayed, lagging, clipped, scaled.
+
+        The model's own motors have all that in the file: their `ctrl` is the command as it is.
+        """
         self._commands.append((time, np.array(command, float)))
         due = _past(self._commands, time, self.values("actuator.delay", "time"), held=True)
         before = self._commands[-2][0] if len(self._commands) > 1 else time
@@ -170,7 +171,7 @@ class Effects:
         if source == "sensor":
             drift = self.values("torque.drift", "rate") * t[:, None] + self.values("torque.offset", "offset")
             return np.asarray((torque - drift) / self.values("torque.gain", "gain", 1.0))
-        return np.asarray(torque * self.values("actuator.gain", "gain", 1.0) * self.values(GEARED, "gain", 1.0))
+        return np.asarray(torque * self.values("actuator.gain", "gain", 1.0))
 
     # ---- the sensors
 
