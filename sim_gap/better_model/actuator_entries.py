@@ -45,12 +45,10 @@ def write_entries(
 ) -> None:
     """Write `isaac_lab()` and `mjlab()`, functions that return the entries of the joints in `rows`, by their names.
 
-    Delays are counted in `step` [s]. Raises BadInput if the file cannot be written, or does not end in .py.
+    Their delays are counted in `step` [s]. Raises BadInput if the file cannot be written, or does not end in .py.
     """
     if path.suffix != ".py":
         raise BadInput(f"--out-actuators {path}: expected a name that ends in .py")
-    if not step > 0.0:
-        raise BadInput(f"--physics-step {step:g}: expected a time above 0 [s]")
     note = f"Not in these entries: {', '.join(left)}.\n" if left else ""
     isaac = "\n".join(_isaac(name, row) for name, row in rows.items())
     mjlab = "\n".join(_mjlab(name, row, kind) for name, row in rows.items())
@@ -72,7 +70,9 @@ def write_entries(
 
 
 def steps_of(delay: Array, step: float) -> dict[str, float]:
-    """Ends of a delay's range [s], (2,), in whole physics steps."""
+    """Ends of a delay's range [s], (2,), in whole physics steps. Raises BadInput for a step that is none."""
+    if not step > 0.0:
+        raise BadInput(f"--physics-step {step:g}: expected a time above 0 [s]")
     least, most = np.floor(np.maximum(delay, 0.0) / step + 0.5)
     return {"least": float(least), "most": float(most)}
 
