@@ -83,6 +83,8 @@ def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) 
             schema = file.schema_arrow
             require_width(schema.names, str(path))
             require_size(8 * file.metadata.num_columns * file.metadata.num_rows, str(path))
+            if twins := sorted({name for name in schema.names if schema.names.count(name) > 1}):
+                raise BadInput(f"{path}: column {twins[0]!r} occurs twice")
             apart = columns_of_lists(file)
             header = _renamed(list(apart), columns, path)
             wanted = {column: apart[name] for column, name in zip(header, apart, strict=True) if is_channel(column)}
