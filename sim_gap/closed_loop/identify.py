@@ -15,6 +15,7 @@ from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Covariance, Stage, covariance, groups_of, rms_on, stages
+from sim_gap.closed_loop.limits import unreached
 from sim_gap.closed_loop.search import Search, taken_out
 from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
@@ -95,7 +96,7 @@ def identify(
     found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
-    spread = covariance(search, fit)
+    spread = replace(covariance(search, fit), limits=unreached(search, fit))
     return Identified(
         sim=sim,
         search=search,

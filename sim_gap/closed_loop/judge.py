@@ -8,7 +8,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.closed_loop.columns import UNIT, shared_effects
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, evaluate, improve, jacobian, moved
-from sim_gap.closed_loop.limits import Unreached, draw_limits, unreached
+from sim_gap.closed_loop.limits import Unreached, draw_limits
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
 from sim_gap.closed_loop.rivals import rivals_of
 from sim_gap.closed_loop.search import Group, Search, effect_there, taken_out
@@ -191,7 +191,7 @@ def covariance(search: Search, fit: Fit) -> Covariance:
     meat = scores.T @ scores
     matrix = inverse @ meat @ inverse * count / max(count - size / max(search.data.joints, 1), 1.0)
     own = np.array([1.0 if name in LOGARITHMIC else abs(_coordinate(search, fit, j, name)) for j, name in names])
-    return Covariance(names, matrix + np.diag((SYSTEMATIC * own) ** 2), unreached(search, fit))
+    return Covariance(names, matrix + np.diag((SYSTEMATIC * own) ** 2))
 
 
 def _coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:

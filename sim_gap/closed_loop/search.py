@@ -91,7 +91,7 @@ def level_of(search: Search, fit: Fit, name: str) -> Array:
     elsewhere with a level some tenths off.
     """
     if name == "ki":
-        size, most = fit.point["kp"], np.inf
+        size, most = fit.point["kp"], np.full(search.data.joints, np.inf)
     else:
         size = np.abs(search.data.speed).max(axis=(0, 2)) if name == "slew" else search.scales.of(name)
         most = fit.point[name]

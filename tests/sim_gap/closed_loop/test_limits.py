@@ -45,7 +45,7 @@ def test_the_least_limit_is_what_the_training_motion_asks_for(arm) -> None:
 
 def test_draws_go_from_there_to_ten_times_as_much(arm) -> None:
     search, fit = arm
-    spread = covariance(search, fit)
+    spread = replace(covariance(search, fit), limits=limits.unreached(search, fit))
     rows = draw(search, fit, spread, 2000)
     least = next(x.least for x in spread.limits if (x.joint, x.name) == (1, "limit"))
     drawn = np.log10(np.array([row["elbow.limit"] for row in rows]) / least)
@@ -67,7 +67,7 @@ def test_a_limit_that_is_stated_fitted_or_left_out_is_not_drawn(arm) -> None:
 
 def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> None:
     search, fit = arm
-    spread = covariance(search, fit)
+    spread = replace(covariance(search, fit), limits=limits.unreached(search, fit))
     data = search.data
     faster = windows_of(data.arm, [record(TEXT, 2, 28.0)], ["other"], data.dt)
     faster = replace(faster, command=FASTER * faster.command, measured=FASTER * faster.measured)
