@@ -15,11 +15,11 @@ from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Covariance, Stage, covariance, groups_of, rms_on, stages
-from sim_gap.closed_loop.limits import unreached
 from sim_gap.closed_loop.search import Search, taken_out
 from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit
+from sim_gap.closed_loop.training.limits import unreached
 from sim_gap.closed_loop.windows import Windows, thinned, windows_of
 from sim_gap.model.load import SimModel
 

@@ -8,10 +8,10 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.closed_loop.columns import UNIT, shared_effects
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, evaluate, improve, jacobian, moved
-from sim_gap.closed_loop.limits import Unreached, draw_limits
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
 from sim_gap.closed_loop.rivals import rivals_of
 from sim_gap.closed_loop.search import Group, Search, effect_there, taken_out
+from sim_gap.closed_loop.training.limits import Unreached, draw_limits
 from sim_gap.closed_loop.windows import Windows
 
 SYSTEMATIC = 0.02

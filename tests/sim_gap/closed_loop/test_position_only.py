@@ -12,8 +12,7 @@ from servo_arm import model_text, record, written
 
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.attribution.position_notes import _beyond
-from sim_gap.attribution.position_only import _verdict
+from sim_gap.attribution.position_only import _beyond, _verdict
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
 from sim_gap.closed_loop.training.posterior import batch_path, batched, write_exported, write_samples

@@ -80,3 +80,12 @@ def draw_limits(limits: Sequence[Unreached], count: int, random: np.random.Gener
         at = random.choice(each.levels, size=count, p=each.weights)
         out.append(np.asarray(at * ratio ** random.uniform(-0.5, 0.5, count)))
     return out
+
+
+def described(limits: Sequence[Unreached], names: Sequence[str]) -> str:
+    """The limits and their least values in words; nothing if there is none."""
+    told = []
+    for name, what, unit in (("limit", "torque", "N·m"), ("slew", "speed of the command", "rad/s")):
+        if least := [f"{names[each.joint]} {each.least:.3g}" for each in limits if each.name == name]:
+            told.append(f"{what} at least {', '.join(least)} {unit}")
+    return "; ".join(told)
