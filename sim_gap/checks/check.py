@@ -12,19 +12,20 @@ from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.clock import even_times, find_dropped, without_repeats
 from sim_gap.checks.finding import Finding
+from sim_gap.checks.held_positions import without_held
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
+from sim_gap.checks.jumps import find_jumps, find_seam, unwrapped
 from sim_gap.checks.mapping import SURE, find_changed_order, find_mapping
-from sim_gap.checks.position_rows import find_jumps, unwrapped, without_held
-from sim_gap.checks.rigid_fit import Motion, as_mounted, beside_slow_torques, fit_rigid, motion_of
+from sim_gap.checks.mounting import as_mounted
+from sim_gap.checks.rigid_fit import Motion, beside_slow_torques, fit_rigid, motion_of
 from sim_gap.checks.torque_source import (
-    find_absent,
     find_delay,
     find_gain_command,
     find_same,
-    find_scale,
     find_source,
     find_unsigned,
 )
+from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import TRIM_S, Signals, prepare
@@ -90,6 +91,8 @@ def check_recording(
     for finding in find_beyond_range(arm, recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, velocity = sound_velocity(recording, stated)
+    for finding in find_seam(recording, stated):
+        raise BadInput(f"{label}: {finding.sentence()}")
     return recording, [*found, *velocity]
 
 
@@ -118,7 +121,11 @@ def _source(
 ) -> list[Finding]:
     """Findings on the channel's scale and on what it is a reading of."""
     fit = beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
-    scale = find_scale(arm, fit, motion, stated) or find_absent(arm, fit, motion, stated)
+    scale = (
+        find_scale(arm, fit, motion, stated)
+        or find_absent(arm, fit, motion, stated)
+        or find_joint_scale(mounted, motion, stated)
+    )
     return [*scale, *find_source(fit, s, motion, stated)]
 
 
