@@ -122,9 +122,9 @@ def _source(
     """Findings on the channel's scale and on what it is a reading of."""
     fit = beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
     scale = (
-        find_scale(arm, fit, motion, stated)
+        find_joint_scale(mounted, motion, stated)
+        or find_scale(arm, fit, motion, stated)
         or find_absent(arm, fit, motion, stated)
-        or find_joint_scale(mounted, motion, stated)
     )
     return [*scale, *find_source(fit, s, motion, stated)]
 

@@ -21,7 +21,6 @@ back with a coefficient below this; on recordings of real arms the first stays b
 JOINTS = 0.2, 2.4
 """Coefficient of a joint that follows the model, the load at the tip in it, outside which it has a unit of its own; on
 real arms and parts of their recordings, and on simulated arms, it stays between 0.33 and 1.6."""
-
 SLIM = 0.03
 """Least share of the largest model torque (standard deviations) that a joint's must have for its coefficient to tell a
 unit: at a slim wrist a tool, a hose or a spring may be more."""
@@ -52,13 +51,15 @@ def find_joint_scale(arm: RigidArm, motion: Motion, stated: Corrections) -> list
     """Joints that follow the model's torque in another unit than the others: one driver gives amperes, say.
 
     A load at the tip counts many times at a slim wrist. It is fitted to all readings, and to those of the other joints
-    alone, for it may follow a wrong one; a spring is tried beside it. A joint is asked about if none explains it.
+    alone, for it may follow a wrong one; a spring is tried beside it. A joint is asked about if none explains it, and
+    as many others are in the model's unit.
     """
     loaded = as_loaded(arm, motion)
     fit = fit_rigid(loaded, motion)
     found = []
-    follows = (fit.correlation > STRONG_CORRELATION) & ((fit.scale < JOINTS[0]) | (fit.scale > JOINTS[1]))
-    for j in np.flatnonzero(follows).tolist():
+    follows = fit.correlation > STRONG_CORRELATION
+    odd = (fit.scale < JOINTS[0]) | (fit.scale > JOINTS[1])
+    for j in np.flatnonzero(follows & odd).tolist():
         column = f"{motion.channel}_{j + 1}"
         others = as_loaded(arm, motion, without=j)
         alone = fit_rigid(others, motion)
@@ -73,7 +74,7 @@ def find_joint_scale(arm: RigidArm, motion: Motion, stated: Corrections) -> list
         )
         option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
         found.append(Finding("scale", motion.channel, arm.names[j], evidence, option, False))
-    return found
+    return found if len(found) <= np.count_nonzero(follows & ~odd) else []
 
 
 def find_absent(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:
