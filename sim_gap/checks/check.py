@@ -10,7 +10,7 @@ from dataclasses import replace
 from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.clock import even_times, find_dropped, without_repeats
+from sim_gap.checks.clock import even_times, find_dropped, find_time_unit, without_repeats
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.held_positions import without_held
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
@@ -56,7 +56,7 @@ def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections
 ) -> tuple[Recording, list[Finding]]:
     """Check and correct one recording. Raises BadInput for a finding that is not certain."""
-    for finding in find_counts(recording, stated):
+    for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, wrapped = unwrapped(recording)
     for finding in find_jumps(recording, stated):

@@ -8,7 +8,7 @@ import pytest
 from wrong_arms import THREE, Wrong, model, motion, record
 
 from armlink.errors import BadInput
-from armlink.recording.corrections import AS_IT_IS, parse_corrections
+from armlink.recording.corrections import AS_IT_IS, TIME_UNITS, parse_corrections
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording, take_joints
 from sim_gap.attribution.diagnose import diagnose
@@ -354,3 +354,12 @@ def test_amperes_of_one_joint_are_asked_about(arm, motor, joint, constant):
 def test_a_load_that_counts_many_times_at_a_slim_wrist_is_no_unit(arm, payload):
     carried = replace(record(model(), replace(REAL, payload=payload), seconds=30.0, rate=100.0), torque=None)
     assert check(arm, carried)[1] == []
+
+
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+def test_times_in_a_smaller_unit_are_asked_about(arm, motor, unit):
+    fine = replace(motor, t=motor.t / TIME_UNITS[unit])
+    with pytest.raises(BadInput, match=rf"travel .* --units t={unit}, or t=s if it is right"):
+        check(arm, fine)
+    in_seconds = parse_corrections(units=[f"t={unit}"])
+    assert check(arm, in_seconds.apply(fine, "r"), in_seconds)[1] == []
