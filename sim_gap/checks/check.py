@@ -18,6 +18,7 @@ from sim_gap.checks.jumps import find_jumps, find_seam, unwrapped
 from sim_gap.checks.mapping import SURE, find_changed_order, find_mapping
 from sim_gap.checks.mounting import as_mounted
 from sim_gap.checks.rigid_fit import Motion, beside_slow_torques, fit_rigid, motion_of
+from sim_gap.checks.small_zero import find_small_zero
 from sim_gap.checks.torque_source import (
     find_delay,
     find_gain_command,
@@ -111,7 +112,11 @@ def _mapping(
     rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
     delay, fall = find_delay(mounted, motion, rate, stated)
     if not delay or fall <= SURE + sum(finding.fall for finding in mapping):
-        return mapping or find_changed_order(arm, motion, stated, mounted)
+        return (
+            mapping
+            or find_changed_order(arm, motion, stated, mounted)
+            or find_small_zero(mounted, motion, stated, follows)
+        )
     in_time = prepare(_corrected(recording, delay[0], s.label), arm, s.label)
     return [*delay, *find_mapping(arm, motion_of(in_time, motion.channel), stated, follows)]
 

@@ -1,9 +1,11 @@
 """The arm as it hangs and with what it carries, as far as a recording tells: effects of the arm, no faults."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.checks.rigid_fit import FLOOR, Motion, fit_rigid
 from sim_gap.model.rigid_body import RigidArm
 
@@ -49,18 +51,8 @@ def as_loaded(arm: RigidArm, motion: Motion, without: int | None = None) -> Rigi
     A tool that outweighs a slim last link turns the direction of its mass moment: alone, that looks as if the joint's
     zero were off. A zero that is off needs a moment without a mass.
     """
-    direction, tip = motion.direction, arm.n - 1
-    columns = arm.link_regressor(arm.motion(motion.q, motion.v, motion.a), tip)[:, :, :4]
-    left = motion.reading - arm.carried(motion.q, motion.v, motion.a)
-    wide, sides = [], []
-    believed = [j for j in range(arm.n) if j != without]
-    for j in believed:  # friction, rotor and offset of each joint are its own
-        own = np.stack([direction[:, j], motion.v[:, j], motion.a[:, j], np.ones(len(left))], axis=1)
-        both = np.column_stack([columns[:, j], left[:, j]])
-        rest = (both - own @ np.linalg.lstsq(own, both, rcond=None)[0]) / (motion.reading[:, j].std() + 1e-9)
-        wide.append(rest[:, :4])
-        sides.append(rest[:, 4])
-    body = np.linalg.lstsq(np.concatenate(wide), np.concatenate(sides), rcond=None)[0]
+    tip, believed = arm.n - 1, [j for j in range(arm.n) if j != without]
+    body, _ = body_at(arm, motion, tip, believed)
     reach = float(np.linalg.norm(arm.offset[1:], axis=1).sum())
     if body[0] <= 0.0 or float(np.linalg.norm(body[1:])) > TOOL_REACH * max(reach, 1e-9) * body[0]:
         return arm
@@ -69,3 +61,21 @@ def as_loaded(arm: RigidArm, motion: Motion, without: int | None = None) -> Rigi
     loaded = arm.with_inertial(inertial)
     found, plain = fit_rigid(loaded, motion).cost[believed], fit_rigid(arm, motion).cost[believed]
     return loaded if found.sum() < plain.sum() and found.mean() < np.log(MOUNTED + FLOOR) else arm
+
+
+def body_at(arm: RigidArm, motion: Motion, link: int, joints: Sequence[int] | None = None) -> tuple[Array, Array]:
+    """Mass and mass moment (4,) of a body at a link that fits best, of any sign, and its torque (K, n).
+
+    `joints` are those whose readings are fitted, by default all; friction, rotor and offset of each joint are its own.
+    """
+    columns = arm.link_regressor(arm.motion(motion.q, motion.v, motion.a), link)[:, :, :4]
+    left = motion.reading - arm.carried(motion.q, motion.v, motion.a)
+    wide, sides = [], []
+    for j in range(arm.n) if joints is None else joints:
+        own = np.stack([motion.direction[:, j], motion.v[:, j], motion.a[:, j], np.ones(len(left))], axis=1)
+        both = np.column_stack([columns[:, j], left[:, j]])
+        rest = (both - own @ np.linalg.lstsq(own, both, rcond=None)[0]) / (motion.reading[:, j].std() + 1e-9)
+        wide.append(rest[:, :4])
+        sides.append(rest[:, 4])
+    body = np.linalg.lstsq(np.concatenate(wide), np.concatenate(sides), rcond=None)[0]
+    return body, columns @ body

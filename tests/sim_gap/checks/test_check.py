@@ -363,3 +363,19 @@ def test_times_in_a_smaller_unit_are_asked_about(arm, motor, unit):
         check(arm, fine)
     in_seconds = parse_corrections(units=[f"t={unit}"])
     assert check(arm, in_seconds.apply(fine, "r"), in_seconds)[1] == []
+
+
+@pytest.mark.parametrize(("joint", "angle"), [(1, 0.25), (1, -0.3)])
+def test_a_zero_that_is_off_by_tenths_of_a_radian_is_asked_about(arm, motor, joint, angle):
+    position = motor.position.copy()
+    position[:, joint] += angle
+    with pytest.raises(BadInput, match=r"may have its zero off by about .* or q_2=0 if it is right"):
+        check(arm, replace(motor, position=position, velocity=None))
+    stated = parse_corrections(zero=["q_2=0"])
+    assert check(arm, replace(motor, position=position, velocity=None), stated)[1] == []
+
+
+@pytest.mark.parametrize("moved", [{1: (0.03, 0.0, 0.02)}, {0: (0.0, 0.03, 0.03)}, {2: (0.04, 0.04, 0.0)}])
+def test_a_mass_that_is_elsewhere_is_no_zero(arm, moved):
+    made = replace(record(model(), replace(REAL, moved=moved), seconds=30.0, rate=100.0), torque=None)
+    assert check(arm, made)[1] == []
