@@ -100,6 +100,10 @@ def worse_by(model: mujoco.MjModel, sound: Recording, spoiled: Recording) -> flo
     return size(spoiled) - size(sound)
 
 
+NAMED = 0.25
+"""Least confidence of a cause that fits a corruption, for it to count as named."""
+
+
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--draws", type=int, default=200)
@@ -129,7 +133,8 @@ def main() -> int:
             model = asked.realdata / folder / "sim.xml"
             answer = diagnose(str(model), [spoiled])
             causes = [f"{cause.effect} {cause.confidence:.2f}" for cause in answer.causes]
-            if not any(cause.effect in EFFECTS.get(kind, ()) for cause in answer.causes):
+            fitting = [cause for cause in answer.causes if cause.effect in EFFECTS.get(kind, ())]
+            if not any(cause.confidence >= NAMED for cause in fitting):
                 explained += answer.verdict == "explained"
                 worse = worse_by(mujoco.MjModel.from_xml_path(str(model)), recording, spoiled)
                 unseen[kind] += worse <= AS_WELL
