@@ -10,14 +10,14 @@ from dataclasses import replace
 from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.clock import even_times, find_dropped, find_time_unit, without_repeats
 from sim_gap.checks.finding import Finding
-from sim_gap.checks.held_positions import without_held
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
-from sim_gap.checks.jumps import find_jumps, find_seam, unwrapped
 from sim_gap.checks.mapping import SURE, find_changed_order, find_mapping
 from sim_gap.checks.mounting import as_mounted
 from sim_gap.checks.rigid_fit import Motion, beside_slow_torques, fit_rigid, motion_of
+from sim_gap.checks.rows.clock import even_times, find_dropped, find_time_unit, without_repeats
+from sim_gap.checks.rows.held_positions import without_held
+from sim_gap.checks.rows.jumps import find_jumps, find_seam, unwrapped
 from sim_gap.checks.small_zero import find_small_zero
 from sim_gap.checks.torque_source import (
     find_delay,

@@ -8,9 +8,9 @@ import pytest
 
 from armlink.recording.corrections import Corrections
 from sim_gap.checks import hypotheses
-from sim_gap.checks.clock import _sample_times
 from sim_gap.checks.joint_range import _degrees
 from sim_gap.checks.rigid_fit import Motion, RigidFit, _partial, fit_models
+from sim_gap.checks.rows.clock import _sample_times
 from sim_gap.checks.torque_source import REPEATS, SURE, _repeats, find_unsigned
 
 NOTHING_STATED = Corrections()

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.checks.clock import fast_rows
 from sim_gap.checks.finding import Finding
+from sim_gap.checks.rows.clock import fast_rows
 
 HELD = 0.3
 """Share of the rows in fast motion that repeat all positions, from which they are held."""
