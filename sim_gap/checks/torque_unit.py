@@ -18,6 +18,8 @@ on which something else pulls, tells nothing of the others."""
 ABSENT, HELD = 3.0, 0.2
 """The model's torque is absent from a joint's reading if its own part is this multiple of all that is read, and comes
 back with a coefficient below this; on recordings of real arms the first stays below 1.2."""
+STUCK = 1e6
+"""From this multiple on the reading does not change at all: it is stuck, which the diagnosis says by itself."""
 JOINTS = 0.2, 2.4
 """Coefficient of a joint that follows the model, the load at the tip in it, outside which it has a unit of its own; on
 real arms and parts of their recordings, and on simulated arms, it stays between 0.33 and 1.6."""
@@ -86,7 +88,8 @@ def find_absent(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Correction
     if motion.channel != "tau" or stated.states("units", f"{motion.channel}_1") or stated.order or stated.joints:
         return []
     found = []
-    for j in np.flatnonzero((fit.own_share > ABSENT) & (fit.scale < HELD)).tolist():
+    read = (fit.own_share > ABSENT) & (fit.own_share < STUCK)
+    for j in np.flatnonzero(read & (fit.scale < HELD)).tolist():
         evidence = (
             f"varies by {fit.spread[j]:.2g} N·m, while the model's torque varies by {fit.own_share[j]:.0f} times as "
             "much and is not in it: another joint's column?"
