@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import shlex
 from functools import cache, cached_property
 from importlib.metadata import entry_points
@@ -373,7 +374,7 @@ def _with_simulated_bus(content: dict[str, Any], path: Path) -> dict[str, Any]:
     bus = link.get("bus") if isinstance(link, dict) else None
     if isinstance(link, dict) and isinstance(bus, dict) and bus.get("interface") == SIMULATED:
         beside = path.resolve().parent / str(bus.get("channel"))
-        if beside.is_file():
+        if os.path.isfile(beside):  # False for what cannot be a path, where Path raises
             content["link"] = {**link, "bus": {**bus, "channel": str(beside)}}
     return content
 

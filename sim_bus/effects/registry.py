@@ -1,5 +1,6 @@
 """All effects of the simulated arm: checks an arm file's settings and folds them into one state."""
 
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -78,7 +79,7 @@ def _check_value(effect: Effect, parameter: Parameter, value: Any) -> None:
         return
     numbers = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     size = len(numbers) if isinstance(value, Sequence) else 0
-    finite = all(isinstance(number, int | float) and np.isfinite(number) for number in numbers)
+    finite = all(isinstance(number, int | float) and abs(number) <= sys.float_info.max for number in numbers)
     if finite and not all(parameter.accepts(number) for number in numbers):
         raise ValueError(f"{expected} a number{parameter.bound}, not {value!r}")
     if not finite or size not in parameter.sizes:

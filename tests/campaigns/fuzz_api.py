@@ -135,7 +135,19 @@ def exchange(server: Served, sent: bytes, tcp: bool, draw: random.Random) -> byt
                 answer += piece
         except (ConnectionResetError, BrokenPipeError):
             pass
+        except TimeoutError:
+            Path("fuzz-corpus-api.http").write_bytes(sent)
+            raise AssertionError(f"nothing for 30 s: {len(answer)} bytes answered, {sent[:300]!r}") from None
     return answer
+
+
+def statuses(sent: bytes, answer: bytes, tcp: bool) -> list[str]:
+    """Status and first words of each answer. Raises AssertionError for one that must not be."""
+    assert not answer or answer.startswith(b"HTTP/1.1 "), (sent[:300], answer[:200])
+    found = re.findall(rb"(?:^|\r\n|\})HTTP/1\.1 (\d{3} [^\r]*)", answer)
+    assert all(status < b"500" for status in found), (sent[:500], answer[:500])
+    assert not (tcp and TOKEN.encode() not in sent and SERIAL in answer), (sent[:500], answer[:500])
+    return [status.decode("latin-1") for status in found]
 
 
 class Tracebacks(logging.Handler):
@@ -157,11 +169,8 @@ def raw(server: Served, seed: int, told: Tracebacks) -> dict[str, int]:
         sent, tcp = hostile(draw), draw.random() < 0.5
         answer = exchange(server, sent, tcp, draw)
         found["connections"] += 1
-        assert not answer or answer.startswith(b"HTTP/1.1 "), (sent[:300], answer[:200])
-        for status in re.findall(rb"(?:^|\r\n|\})HTTP/1\.1 (\d{3}) ", answer):
-            assert status < b"500", (sent[:500], answer[:500])
-            found[f"{status.decode()[0]}xx"] += 1
-        assert not (tcp and TOKEN.encode() not in sent and SERIAL in answer), (sent[:500], answer[:500])
+        for status in statuses(sent, answer, tcp):
+            found[f"{status[0]}xx"] += 1
         assert not told.seen, (sent[:500], told.seen)
     with server.client() as sound:
         assert sound.get("/api/status").status_code == 200

@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "armlink" / "drives"))
 
 from fuzz_journal import for_seconds
-from fuzzing import fuzz
+from fuzzing import FAMILIES, fuzz
 
 A_GO = 5000
 """Frames before the drives are set up anew, with --seconds."""
@@ -23,8 +23,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=0.0)
-    arms = ["six-damiao", "six-cubemars", "six-robstride", "six-moteus", "six-odrive", "six-cia402"]
-    parser.add_argument("--arm", nargs="*", default=arms)
+    parser.add_argument("--arm", nargs="*", default=FAMILIES, choices=FAMILIES)
     asked = parser.parse_args()
     for arm in asked.arm:
         if asked.seconds:

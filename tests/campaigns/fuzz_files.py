@@ -49,8 +49,9 @@ def mutant_of(seeds: list[Seed], draw: random.Random) -> Seed:
     return Seed({**seed.files, name: mutated(name, seed.files[name], draw)}, seed.given)
 
 
-def judged(kind: Kind, path: Path, tried: Counter[str]) -> str:
+def judged(kind: Kind, path: Path, tried: Counter[str] | None = None) -> str:
     """What is wrong with how this input is taken; empty if nothing."""
+    tried = Counter() if tried is None else tried
     signal.setitimer(signal.ITIMER_PROF, LONGEST)
     try:
         kind.load(path)
@@ -112,7 +113,7 @@ NATIVE = ("model",)
 def fresh(folder: Path) -> Path:
     """An empty folder."""
     shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
+    folder.mkdir(parents=True)
     return folder
 
 

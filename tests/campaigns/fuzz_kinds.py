@@ -91,6 +91,13 @@ def whole(folder: Path) -> Seed:
     return Seed({str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()})
 
 
+def path_to_give(kept: Path, folder: Path) -> Path:
+    """An input of the corpus in a folder of its own: the arm file, the only file, or the folder."""
+    whole(kept).put(folder)
+    files = [path for path in folder.rglob("*.yaml" if kept.parent.name == "arm" else "*") if path.is_file()]
+    return files[0] if len(files) == 1 else folder
+
+
 def load_whole_arm(path: Path) -> None:
     """As commands do: the file, its sections, the drives' settings, the arm's geometry, and the simulated one."""
     arm = load_arm(path)

@@ -63,11 +63,12 @@ def units_from(
 def assumed_units(joints: Sequence[LinkJoint]) -> tuple[Units, ...]:
     """Scales from the arm file's rated torques and USER_UNITS per revolution, for listeners, which read no objects.
 
-    Raises BadInput for a rated torque that 6076h cannot hold, whose step is 1 mN·m.
+    Raises BadInput for a rated torque that 6076h cannot hold: an UNSIGNED32 in mN·m.
     """
     for joint in joints:
-        if not round(joint.rated_torque * 1e3):
-            raise BadInput(f"{joint.name}: rated_torque {joint.rated_torque:g} N·m: expected at least 0.001 N·m")
+        if not 0.5 < joint.rated_torque * 1e3 < 2**32:
+            what = f"{joint.name}: rated_torque {joint.rated_torque:g} N·m"
+            raise BadInput(f"{what}: expected 0.001 to {2**32 // 1000} N·m, as object 6076h holds it")
     return tuple(units_from(round(joint.rated_torque * 1e3), (1, 1), (1, 1), (USER_UNITS, 1)) for joint in joints)
 
 
