@@ -17,6 +17,15 @@ STL_HEADER, STL_FACE = 84, 50
 STL_FACES = range(1, 200_001)
 """Numbers of faces that MuJoCo reads."""
 PACKAGE = "package://"
+FINITE = {
+    "body_": ("mass", "inertia", "pos", "quat", "ipos", "iquat"),
+    "geom_": ("pos", "quat", "size"),
+    "jnt_": ("pos", "axis", "stiffness", "range"),
+    "dof_": ("armature", "damping", "frictionloss"),
+}
+"""Fields of a compiled model that must be finite; a range may be infinite."""
+KEYS = {"ipos": "centre of mass", "iquat": "axes of the inertia", "quat": "rotation", "pos": "position"}
+"""Their names for people, where they differ."""
 NEGLIGIBLE = 1e-14
 """Mass [kg] and inertia [kg·m²] of massless moving bodies, which are common in URDF files and MuJoCo refuses."""
 
@@ -74,12 +83,19 @@ def read_model(path: Path) -> ModelFile:
     """
     import mujoco
 
-    mujoco.set_mju_user_warning(log.info)
+    warned: list[str] = []
+    mujoco.set_mju_user_warning(warned.append)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise BadInput(f"{path}: not a model that MuJoCo reads: {one_line(error)}") from None
-    kind = "URDF" if _is_urdf(path) else "MJCF"
+    finally:
+        mujoco.set_mju_user_warning(log.info)
+    if any("NaN" in line for line in warned):  # it takes some of them for values that are not given
+        raise BadInput(f"{path}: a number is NaN: expected finite numbers")
+    for line in warned:
+        log.info(line)
+    kind = "URDF" if is_urdf(path) else "MJCF"
     if kind == "URDF":
         compiler = spec.compiler
         compiler.boundmass = compiler.boundinertia = NEGLIGIBLE
@@ -128,9 +144,31 @@ def compile_spec(spec: Any, path: Path, hint: str = "") -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are in the log
-            return spec.compile()
+            model = spec.compile()
     except ValueError as error:
         raise BadInput(f"{path}: MuJoCo cannot compile it{hint}: {one_line(error)}") from None
+    _refuse_what_is_no_number(model, path)
+    return model
+
+
+def _refuse_what_is_no_number(model: Any, path: Path) -> None:
+    """MuJoCo takes NaN and infinity from a file, and all that follows from them is NaN."""
+    import numpy as np
+
+    of_joint = [f"joint {model.joint(joint).name!r}" for joint in range(model.njnt)]
+    owners = {
+        "body_": [f"body {model.body(body).name!r}" for body in range(model.nbody)],
+        "geom_": [f"a shape of body {model.body(body).name!r}" for body in model.geom_bodyid],
+        "jnt_": of_joint,
+        "dof_": [of_joint[joint] for joint in model.dof_jntid],
+    }
+    for place, names in owners.items():
+        for key in FINITE[place] if names else ():
+            rows = np.reshape(getattr(model, place + key), (len(names), -1))
+            right = (~np.isnan(rows) if key == "range" else np.isfinite(rows)).all(axis=1)
+            if not right.all():
+                what = f"{names[int(np.argmin(right))]}: {KEYS.get(key, key)}"
+                raise BadInput(f"{path}: {what}: NaN or infinity where a finite number is expected")
 
 
 def _quaternion(turned: tuple[float, float, float]) -> Any:
@@ -147,7 +185,7 @@ def one_line(error: ValueError) -> str:
     return " ".join(str(error).split())
 
 
-def _is_urdf(path: Path) -> bool:
+def is_urdf(path: Path) -> bool:
     """Whether the root element is `robot`; without namespaces, whose prefixes published files do not declare."""
     from xml.parsers import expat
 

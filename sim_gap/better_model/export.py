@@ -10,9 +10,12 @@ import numpy as np
 from armlink.errors import BadInput
 from sim_gap.better_model.coupled_motors import add_to, coupled_motors
 from sim_gap.better_model.effects_module import joint_effects, module_path, module_text
-from sim_gap.better_model.forward_effects import GEARED, JointEffect
+from sim_gap.better_model.forward_effects import JointEffect
+from sim_gap.better_model.native_drives import DRIVE, LONGEST_STEP_S, motors_of, put_drive
+from sim_gap.better_model.urdf import URDF, urdf_of
 from sim_gap.better_model.with_effects import compiled_copy, spec_of, with_effects
-from sim_gap.model.load import SimModel
+from sim_gap.better_model.xml_comment import xml_comment
+from sim_gap.model.load import SimModel, urdf_behind
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
 
@@ -59,53 +62,53 @@ def written(
     for joint in spec.joints:
         _set_joint(joint, corrected.model, spec.compiler.degree)
     add_to(spec, coupled_motors(sim, estimate, chosen))
-    gains = _gains(sim, estimate, chosen)
-    driven = {actuator.target for actuator in spec.actuators}
-    for actuator in spec.actuators:
-        actuator.gear = [gains.get(actuator.target, 1.0) * actuator.gear[0], *actuator.gear[1:]]
+    motors, drives = motors_of(spec), _drives(sim, estimate, chosen)
+    for joint, drive in drives.items():
+        if joint in motors:
+            put_drive(motors[joint], drive)
+    if any("actuator.delay" in drive and joint in motors for joint, drive in drives.items()):
+        spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
     spec.option.gravity = corrected.model.opt.gravity
     spec.compile()
-    left = [t for t in corrected.not_held if t.effect != "actuator.gain" or sim.arm.names[t.place] not in driven]
+    left = [t for t in corrected.not_held if t.effect not in DRIVE or sim.arm.names[t.place] not in motors]
     lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
     lines += [f"{name}: its link as fitted cannot exist; the file has one that can" for name in corrected.changed]
     lines += [f"{law} {joint}: a torque without a known cause" for law, joint, _ in laws]
     module = module_path(Path(name)).name
     comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""
-    effects = [] if estimate is None else joint_effects(sim, estimate, left, corrected.held)
-    effects += [(GEARED, joint, {"gain": gain}) for joint, gain in gains.items() if joint in driven]
+    effects = [] if estimate is None else joint_effects(sim, estimate, corrected.not_held, corrected.held)
     effects += laws
     source = module_text(sim, effects, name) if effects else ""
     return Written(comment + spec.to_xml(), source, spec, lines, effects)
 
 
 def write_model(sim: SimModel, estimate: Estimate | None, path: Path, laws: Sequence[JointEffect] = ()) -> list[str]:
-    """Write the model with the effects as MJCF, and beside it a module for those that MJCF cannot hold, and for laws.
+    """Write the model with the effects as MJCF, or as URDF if the path ends so, and beside it a module for the rest.
 
-    Returns a line per effect that MJCF cannot hold; the file lists them in a comment. Raises BadInput if the nominal
-    model did not come from a file or a file cannot be written.
+    The module has the effects that MJCF cannot hold, and laws. Returns a line per effect that the file cannot hold; it
+    lists them in a comment. Raises BadInput if the nominal model did not come from a file or a file cannot be written.
     """
     files = written(sim, estimate, path.name, laws=laws)
+    text, lines = files.xml, files.lines
+    if path.suffix == URDF:
+        text, lines = urdf_of(files.spec.compile(), urdf_behind(sim.path), lines)
     try:
-        path.write_text(files.xml, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
         if files.module:
             module_path(path).write_text(files.module, encoding="utf-8")
     except OSError as error:
         raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
-    return files.lines
+    return lines
 
 
-def xml_comment(lines: list[str]) -> str:
-    """Lines as an XML comment; two hyphens, which would end it, are parted."""
-    text = "\n  ".join(lines)
-    while "--" in text:
-        text = text.replace("--", "- -")
-    return f"<!-- {text}\n-->\n"
-
-
-def _gains(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term]) -> dict[str, float]:
-    """Motor torque per torque command, by joint name."""
-    gains = [term for term in terms if term.effect == "actuator.gain"]
-    return {sim.arm.names[t.place]: estimate.parameters(t)["gain"].value for t in gains if estimate is not None}
+def _drives(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term]) -> dict[str, dict[str, float]]:
+    """What was found of the drives, joint → effect → value."""
+    out: dict[str, dict[str, float]] = {}
+    for term in terms:
+        if estimate is not None and term.effect in DRIVE:
+            value = estimate.parameters(term)[DRIVE[term.effect]].value
+            out.setdefault(sim.arm.names[term.place], {})[term.effect] = value
+    return out
 
 
 def _line(sim: SimModel, estimate: Estimate, term: Term) -> str:

@@ -9,6 +9,14 @@
         mujoco.mj_step(model, data)
         q, tau = effects.read(model, data)       # readings of position and torque sensors
 
+Many arms at once, in a simulator that takes no callback (MuJoCo Warp, MJX, mjlab): before each step give every world
+
+    dry, lost = effects.resistance(q, v, carried, driven)    # (worlds, n) each
+
+`dry` as its `dof_frictionloss` and subtract `lost` from its `qfrc_applied`; `carried` is the sum of passive, applied,
+actuator and constraint forces of the last step less armature · acceleration, `driven` is applied and actuator force
+less `carried`.
+
 How far a simulation with these effects strays from a recording (rad, RMS per joint):
 
     stray = roll_out(model, effects, t, position, motor_torque)
@@ -40,8 +48,6 @@ CREEPING = 0.01
 """Speed below which the direction of a motion is not defined [rad/s]."""
 GRADUAL = (0.25, 0.75, 1.25, 1.75)
 """Half widths of the plays of a hysteresis that sets in gradually, as shares of its width."""
-GEARED = "actuator.gain in the model's gear"
-"""A drive's gain that the model's actuators have; a torque that is applied past them needs it too."""
 HORIZON_S, WINDOWS, STEP_S = 0.5, 40, 0.002
 """Length of a forward simulation from a recorded state, number of them over a recording, largest time step."""
 AROUND_S = 0.06
@@ -91,32 +97,47 @@ class Effects:
 
     def passive(self, model: Any, data: Any) -> None:
         """MuJoCo's passive-force callback: the ripple torque now, and the level of dry friction for the next step."""
-        speed, carried = data.qvel[self.dofs], self.carried(model, data)
-        fade = np.exp(-((speed / self.values("friction.stribeck", "velocity", 1.0)) ** 2))
-        level = self.coulomb + self.values("friction.stribeck", "breakaway") * fade
-        level = level + self.values("friction.load", "coefficient") * np.abs(carried)
+        position, speed, carried = data.qpos[self.places], data.qvel[self.dofs], self.carried(model, data)
         driven = data.qfrc_applied[self.dofs] + data.qfrc_actuator[self.dofs] - carried
-        heading = np.where(np.abs(speed) < RESTING, np.sign(driven), np.sign(speed))
-        level = level * (1.0 + self.values("friction.asymmetric", "ratio") * heading)
-        model.dof_frictionloss[self.dofs] = np.maximum(level, 0.0)
-        angle = self.values("transmission.ripple", "cycles") * data.qpos[self.places]
-        ripple = np.sin(angle + self.values("transmission.ripple", "phase"))
-        lost = self.values("transmission.ripple", "amplitude") * ripple + self.values("torque.offset", "lost")
-        data.qfrc_passive[self.dofs] -= lost + self.lawful(data, carried)
+        level, lost = self.resistance(position, speed, carried, driven, float(data.time))
+        model.dof_frictionloss[self.dofs] = level
+        data.qfrc_passive[self.dofs] -= lost
 
-    def lawful(self, data: Any, carried: Array) -> Array:
-        """Torque that the laws take now, (n,)."""
-        angle, speed, out = data.qpos[self.places], data.qvel[self.dofs], np.zeros(len(self.joints))
-        time = np.full(len(out), data.time)
-        quantities = dict(zip(LAWS, (angle, speed, carried, time, self.temperature), strict=True))
+    def resistance(
+        self, position: Array, speed: Array, carried: Array, driven: Array, time: float = 0.0, xp: Any = np
+    ) -> tuple[Array, Array]:
+        """Dry friction, for `dof_frictionloss`, and torque that is lost besides [N·m], (…, n) each.
+
+        Of any number of arms at once, without callback or state: arrays (…, n) of the joints' position and speed, of
+        the torque that their links carry, and of what drives them beyond it. `xp` is the library of the arrays: numpy,
+        or jax.numpy within a function that is compiled.
+        """
+        fade = xp.exp(-((speed / self.values("friction.stribeck", "velocity", 1.0)) ** 2))
+        level = self.coulomb + self.values("friction.stribeck", "breakaway") * fade
+        level = level + self.values("friction.load", "coefficient") * xp.abs(carried)
+        heading = xp.where(xp.abs(speed) < RESTING, xp.sign(driven), xp.sign(speed))
+        level = level * (1.0 + self.values("friction.asymmetric", "ratio") * heading)
+        angle = self.values("transmission.ripple", "cycles") * position
+        ripple = xp.sin(angle + self.values("transmission.ripple", "phase"))
+        lost = self.values("transmission.ripple", "amplitude") * ripple + self.values("torque.offset", "lost")
+        return xp.maximum(level, 0.0), lost + self._lawful(position, speed, carried, time, xp)
+
+    def _lawful(self, position: Array, speed: Array, carried: Array, time: float, xp: Any) -> Any:
+        """Torque that the laws take now, (…, n)."""
+        everywhere = xp.zeros_like(speed)
+        temperature = None if self.temperature is None else self.temperature + everywhere
+        quantities = dict(zip(LAWS, (position, speed, carried, time + everywhere, temperature), strict=True))
+        out = 0.0
         for name, joint, law in self._effects:
             value = quantities.get(name)
             if value is None:
                 continue
             k = self.joints.index(joint)
             amount = law["directed"] and name in ("law.velocity", "law.load")
-            torque = np.interp(abs(value[k]) if amount else value[k], law["at"], law["torque"])
-            out[k] += torque * (np.clip(speed[k] / CREEPING, -1.0, 1.0) if law["directed"] else 1.0)
+            at, torque = np.array(law["at"]), np.array(law["torque"])
+            taken = xp.interp(xp.abs(value[..., k]) if amount else value[..., k], at, torque)
+            taken = taken * xp.clip(speed[..., k] / CREEPING, -1.0, 1.0) if law["directed"] else taken
+            out = out + taken[..., None] * np.eye(len(self.joints))[k]
         return out
 
     def carried(self, model: Any, data: Any) -> Array:
@@ -127,7 +148,10 @@ class Effects:
     # ---- the drives
 
     def made(self, command: Array, time: float) -> Array:
-        """Torque of the drives with `command` from now on: delayed, lagging, clipped, scaled."""
+        """Torque of the drives with `command` from now on: delayed, lagging, clipped, scaled.
+
+        The model's own motors have all that in the file: their `ctrl` is the command as it is.
+        """
         self._commands.append((time, np.array(command, float)))
         due = _past(self._commands, time, self.values("actuator.delay", "time"), held=True)
         before = self._commands[-2][0] if len(self._commands) > 1 else time
@@ -147,7 +171,7 @@ class Effects:
         if source == "sensor":
             drift = self.values("torque.drift", "rate") * t[:, None] + self.values("torque.offset", "offset")
             return np.asarray((torque - drift) / self.values("torque.gain", "gain", 1.0))
-        return np.asarray(torque * self.values("actuator.gain", "gain", 1.0) * self.values(GEARED, "gain", 1.0))
+        return np.asarray(torque * self.values("actuator.gain", "gain", 1.0))
 
     # ---- the sensors
 

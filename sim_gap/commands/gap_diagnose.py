@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from rich.status import Status
 
     from sim_gap.attribution.diagnosis import Diagnosis
-    from sim_gap.closed_loop.identify import Identified
 
 
 def diagnose(
@@ -62,9 +61,7 @@ def diagnose(
     ] = None,
     out_actuators: Annotated[
         Path | None,
-        typer.Option(
-            help="Write actuator entries for Isaac Lab and mjlab here (.py); only if there is no torque channel."
-        ),
+        typer.Option(help="Write actuator entries for Isaac Lab and mjlab here (.py)."),
     ] = None,
     physics_step: Annotated[
         float, typer.Option(help="Step of the training simulation in which --out-actuators counts delays [s].")
@@ -72,7 +69,8 @@ def diagnose(
     out_model: Annotated[
         Path | None,
         typer.Option(
-            help="Write the corrected model here (MJCF), and beside it a module for effects MJCF cannot hold."
+            help="Write the corrected model here (MJCF, or URDF if the name ends so), and beside it a module for "
+            "effects that MJCF cannot hold."
         ),
     ] = None,
 ) -> None:
@@ -86,6 +84,7 @@ def diagnose(
     from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
+    from sim_gap.commands.gap_tables import show
 
     console = PlainConsole()
     paths = [*train, *(heldout or [])]
@@ -124,7 +123,7 @@ def diagnose(
             console.print(f"{name}: {recording.warning}", style="yellow")
     for finding in answer.checks:
         console.print(finding.sentence(), style="yellow")
-    _show(answer, console)
+    show(answer, console)
     if report is not None:
         from sim_gap.report.page import write_report
 
@@ -135,9 +134,7 @@ def diagnose(
     if samples:
         _write_samples(answer, samples, out_samples, console)
     if out_actuators is not None:
-        from sim_gap.closed_loop.training.actuators import write_actuators
-
-        write_actuators(_positions_of(answer, "--out-actuators"), out_actuators, physics_step)
+        _write_actuators(answer, out_actuators, physics_step)
         console.print(f"actuator entries for Isaac Lab and mjlab: {out_actuators}")
     write_json(json, answer.to_json())
 
@@ -149,31 +146,40 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
         console.print(stage)
 
 
-def _positions_of(answer: "Diagnosis", option: str) -> "Identified":
-    """The fit of positions; raises BadInput if the diagnosis is of torques."""
-    from armlink.errors import BadInput
-    from sim_gap.closed_loop.identify import Identified
+def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
+    from sim_gap.better_model.motor_entries import write_motor_entries
+    from sim_gap.closed_loop.training.actuators import write_actuators
 
-    if not isinstance(answer.internals, Identified):
-        raise BadInput(f"{option}: written where no recording has a torque channel (q_cmd and q): leave it out")
-    return answer.internals
+    if answer.unit == "rad":
+        write_actuators(answer.internals, path, step)
+    else:
+        write_motor_entries(answer.internals.model, answer.internals.estimate, path, step)
 
 
 def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
+    from sim_gap.better_model.samples import drawn_parameters, write_rows
     from sim_gap.closed_loop.training.posterior import write_samples
 
     target = path or Path("samples.csv")
-    write_samples(_positions_of(answer, "--samples"), count, target)
+    if answer.unit == "rad":
+        write_samples(answer.internals, count, target)
+    elif answer.internals.estimate is None:
+        console.print("no draws of parameters: there is no gap that any would explain", style="yellow")
+        return
+    else:
+        write_rows(drawn_parameters(answer.internals.estimate, answer.names, count), target)
     console.print(f"{count} draws of all parameters: {target}")
 
 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
+    kind = "URDF" if path.suffix == ".urdf" else "MJCF"
     if answer.unit == "rad":
         from sim_gap.closed_loop.training.posterior import batch_path, write_exported
 
+        with_actuators = " with its position actuators" if kind == "MJCF" else ""
         for line in write_exported(answer.internals, path):
-            console.print(f"not in MJCF: {line}", style="yellow")
-        console.print(f"corrected model with its position actuators: {path}")
+            console.print(f"not in {kind}: {line}", style="yellow")
+        console.print(f"corrected model{with_actuators}: {path}")
         if batch_path(path).is_file():
             console.print(f"the same without PID actuators, for MuJoCo Warp: {batch_path(path)}")
         return
@@ -186,31 +192,6 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     )
     console.print(f"corrected model: {path}")
     for line in missing:
-        console.print(f"not in MJCF: {line}", style="yellow")
-    if missing:
+        console.print(f"not in {kind}: {line}", style="yellow")
+    if missing and module_path(path).is_file():
         console.print(f"{module_path(path)} applies these effects in a MuJoCo simulation")
-
-
-def _show(answer: "Diagnosis", console: "Console") -> None:
-    """Print verdict, causes and gap as tables."""
-    from rich.table import Column, Table
-
-    from sim_gap.report.effect_text import sentence
-
-    console.print(sentence(answer), style="bold")
-    if answer.causes:
-        effect = Column("effect", no_wrap=True)
-        headers = "joints", "RMS before", "after", "confidence", "confounded with"
-        table = Table(effect, *headers, title="causes, on held-out data")
-        for cause in answer.causes:
-            joints = f"all {len(answer.names)}" if cause.joints == answer.names else ", ".join(cause.joints)
-            numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
-            table.add_row(cause.effect, joints, *numbers, ", ".join(cause.confounded_with))
-        console.print(table)
-    table = Table("joint", "noise floor", "before", "after", title=f"gap on {answer.heldout_is}, RMS in {answer.unit}")
-    for j, name in enumerate(answer.names):
-        numbers = answer.noise_floor[j], answer.heldout_before[j], answer.heldout_after[j]
-        table.add_row(name, *(f"{value:.3g}" for value in numbers))
-    console.print(table)
-    for note in answer.notes:
-        console.print(note, style="yellow")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from armlink.errors import BadInput
-from armlink.model_file import compile_spec, read_model
+from armlink.model_file import compile_spec, is_urdf, read_model
 from sim_gap.model.arm_joints import arm_hinges, hinges_of
 from sim_gap.model.from_arm import is_arm_file, nominal_model
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
@@ -85,6 +85,12 @@ def read_spec(path: Path) -> Any:
     if not path.is_file():
         raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
     return read_model(path).spec
+
+
+def urdf_behind(path: Path | None) -> Path | None:
+    """The URDF file that a model was read from, also by an arm file; None if it is of another kind."""
+    source = nominal_model(path) if path is not None and is_arm_file(path) else path
+    return source if isinstance(source, Path) and is_urdf(source) else None
 
 
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:

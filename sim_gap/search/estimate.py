@@ -1,5 +1,6 @@
 """The final fit of the selected terms: coefficients, covariance, reported parameters, predictions."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -162,14 +163,48 @@ class Estimate:
         at = self.normal.at[term]
         return bool(np.all(np.abs(self.of(term)) <= self._quantile * np.sqrt(np.diag(self.covariance)[at])))
 
+    @property
+    def _freedom(self) -> int:
+        """Degrees of freedom of the covariance: blocks of time less one."""
+        return max(int(self.store.data.blocks.max()), 1)
+
     @cached_property
     def _quantile(self) -> float:
         """Half of a 95 % interval in standard deviations."""
-        blocks = int(self.store.data.blocks.max()) + 1
-        return float(stdtrit(max(blocks - 1, 1), 0.975))
+        return float(stdtrit(self._freedom, 0.975))
 
     def parameters(self, term: Term) -> dict[str, Value]:
         """Reported parameters with 95 % intervals."""
+        reported, start, chosen = self._reported(term)
+        centre, steps = reported(start), 1e-5 * np.maximum(np.abs(start), 1e-3)
+        slopes = [
+            (reported(start + d) - reported(start - d)) / (2 * s) for s, d in zip(steps, np.diag(steps), strict=True)
+        ]
+        jacobian = np.stack(slopes, axis=1)
+        spread = np.sqrt(np.maximum(np.diag(jacobian @ self.covariance[np.ix_(chosen, chosen)] @ jacobian.T), 0.0))
+        half = spread * self._quantile
+        return {
+            name: Value(float(c), float(c - h), float(c + h), unit)
+            for (name, unit), c, h in zip(term.form.reported, centre, half, strict=True)
+        }
+
+    def draws(self, terms: Sequence[Term], count: int, seed: int) -> list[dict[Term, dict[str, float]]]:
+        """Parameters of these terms drawn from their joint distribution, Student's t as their intervals are."""
+        random, freedom = np.random.default_rng(seed), self._freedom
+        errors = random.multivariate_normal(np.zeros(len(self.covariance)), self.covariance, count, method="eigh")
+        errors *= np.sqrt(freedom / random.chisquare(freedom, (count, 1)))
+        forms = {term: self._reported(term) for term in terms}
+        names = {term: [name for name, _ in term.form.reported] for term in terms}
+        return [
+            {
+                term: dict(zip(names[term], reported(start + error[chosen]).tolist(), strict=True))
+                for term, (reported, start, chosen) in forms.items()
+            }
+            for error in errors
+        ]
+
+    def _reported(self, term: Term) -> tuple[Callable[[Array], Array], Array, list[int]]:
+        """The reported parameters as a function of what they follow from, its fitted value, its place in the fit."""
         effect = term.form
         beneath = {other.effect: other for other in self.terms if other.key in term.beneath}
         shaped, free = self._shaped, term.free
@@ -187,18 +222,7 @@ class Estimate:
             return np.asarray(effect.parameters_of(z[:own], shape, under), float)
 
         size = () if free is None else (term.shape[free],)
-        start = np.concatenate([self.of(term), *(self.of(other) for other in beneath.values()), size])
-        centre, steps = evaluate(start), 1e-5 * np.maximum(np.abs(start), 1e-3)
-        slopes = [
-            (evaluate(start + d) - evaluate(start - d)) / (2 * s) for s, d in zip(steps, np.diag(steps), strict=True)
-        ]
-        jacobian = np.stack(slopes, axis=1)
-        spread = np.sqrt(np.maximum(np.diag(jacobian @ self.covariance[np.ix_(chosen, chosen)] @ jacobian.T), 0.0))
-        half = spread * self._quantile
-        return {
-            name: Value(float(c), float(c - h), float(c + h), unit)
-            for (name, unit), c, h in zip(effect.reported, centre, half, strict=True)
-        }
+        return evaluate, np.concatenate([self.of(term), *(self.of(other) for other in beneath.values()), size]), chosen
 
     def predict(
         self, data: ResidualSet, store: ColumnStore | None = None, terms: tuple[Term, ...] | None = None

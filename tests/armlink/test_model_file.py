@@ -105,3 +105,28 @@ def test_what_mujoco_warns_of_is_logged_and_no_file_appears(tmp_path, monkeypatc
         assert compile_model(whole).njnt == 1
     assert "empty prefix" in caplog.text
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+NUMBERS = """<mujoco><worldbody><body name="arm" pos="0 0 {pos}">
+<inertial mass="1" pos="0 0 {centre}" diaginertia="1 1 1"/>
+<joint name="hinge" armature="{armature}" range="-1 {range}"/>
+<geom size="0.1" pos="{geom} 0 0"/></body></worldbody></mujoco>"""
+SOUND = {"pos": "0", "centre": "0", "armature": "0", "range": "1", "geom": "0"}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "of"),
+    [
+        ("pos", "inf", "body 'arm': position"),
+        ("armature", "inf", "joint 'hinge': armature"),
+        ("geom", "inf", "a shape of body 'arm': position"),
+        *((key, "nan", "a number is NaN") for key in ("pos", "centre", "range", "geom")),
+    ],
+)
+def test_numbers_that_are_none_are_refused_by_name(tmp_path, key, value, of):
+    """MuJoCo takes them; a centre of mass that is NaN it replaces by that of the shapes."""
+    (tmp_path / "arm.xml").write_text(NUMBERS.format(**SOUND))
+    assert compile_model(tmp_path / "arm.xml").njnt == 1
+    (tmp_path / "arm.xml").write_text(NUMBERS.format(**SOUND | {key: value}))
+    with pytest.raises(BadInput, match=f"arm.xml: {of}"):
+        compile_model(tmp_path / "arm.xml")

@@ -30,6 +30,8 @@ HEAD_SECONDS = 10.0
 """A connection that has not sent a complete request head within this time is cut [s]."""
 WRITE_BUFFER = 32 * 1024
 """Bytes buffered for one client; an item of the stream is about 2 kB."""
+ENDLESS = ("/api/stream",)
+"""Routes whose answer does not end: nothing that is sent after such a request is ever read."""
 _UCRED = struct.Struct("3i")
 
 _log = logging.getLogger(__name__)
@@ -103,6 +105,12 @@ class BoundedProtocol(H11Protocol):
         """As uvicorn's, with a deadline for the rest of the head."""
         super().data_received(data)
         self._mind_the_clock()
+
+    def handle_events(self) -> None:
+        """As uvicorn's, but whoever sends more after asking for what never ends is cut, and does not wait for ever."""
+        super().handle_events()
+        if not self._awaits_head() and self.scope["path"] in ENDLESS and self.conn.trailing_data[0].strip(b"\r\n"):
+            self.cut()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop the deadlines."""

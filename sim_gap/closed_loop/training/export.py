@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.with_effects import mujoco_quaternion, possible, spec_of, split
 from sim_gap.closed_loop.columns import shared_effects, turns
 from sim_gap.closed_loop.fit import Fit, improve
@@ -36,8 +37,6 @@ BATCHED = frozenset(NATIVE) - {"controller.slew", "controller.integral"}
 STICKS = {"solref_friction": [0.01, 1.0], "solimp_friction": [0.999, 0.9999, 0.001, 0.5, 2.0]}
 """Solver parameters with which a joint under friction rests; with MuJoCo's usual ones it creeps to where no friction is
 needed, within a tenth of a second on a small arm."""
-LEAST_DELAY_S = 0.001
-MOST_SAMPLES = 1000
 POSITION_INPUT = 1
 """MuJoCo's code of an actuator whose only input is a position."""
 
@@ -94,7 +93,7 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
     for k, turn in enumerate(turns(sim.arm.gravity)):
         gravity += float(native.point.get(f"tilt.angle_{k + 1}", np.zeros(1))[0]) * turn
     spec.option.gravity = gravity
-    spec.option.timestep = min(float(spec.option.timestep), 0.002)
+    spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
     spec.option.integrator = _implicit()
     spec.compile()
     note = "".join(f"\n  {line}" for line in left)
@@ -161,10 +160,7 @@ def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compi
         made.forcelimited, made.forcerange = 1, [-limit, limit]
     if control is not None:
         made.ctrllimited, made.ctrlrange = 1, control
-    delay = float(fit.point["delay"][j])
-    if delay >= LEAST_DELAY_S:
-        made.delay = delay
-        made.nsample = min(MOST_SAMPLES, int(np.ceil(delay / 0.002)) + 2)
+    put_delay(made, float(fit.point["delay"][j]))
 
 
 def _link_changes(search: Search, fit: Fit) -> dict[int, Array]:

@@ -1,54 +1,43 @@
 """Files for training: the corrected model, and draws of all parameters from what the recordings leave open."""
 
-import json
 from pathlib import Path
 
-import numpy as np
-
 from armlink.errors import BadInput
+from sim_gap.better_model.samples import write_rows
+from sim_gap.better_model.urdf import URDF, urdf_of
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.judge import draw
 from sim_gap.closed_loop.search import effect_there
 from sim_gap.closed_loop.training.export import BATCHED, NATIVE, Exported, exported, native_fit
-
-SUFFIXES = (".csv", ".json", ".parquet")
+from sim_gap.model.load import urdf_behind
 
 
 def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> None:
     """Write draws of all fitted parameters, one row each, columns `JOINT.PARAMETER` in SI units. Raises BadInput."""
-    if path.suffix not in SUFFIXES:
-        raise BadInput(f"--out-samples {path}: expected a name that ends in {', '.join(SUFFIXES)}")
-    rows = draw(found.search, found.fit, found.spread, count, seed)
-    names = list(rows[0]) if rows else []
-    try:
-        if path.suffix == ".json":
-            path.write_text(json.dumps({"schema": "armlink.samples/1", "samples": rows}, indent=1), encoding="utf-8")
-        elif path.suffix == ".csv":
-            lines = [",".join(names), *(",".join(f"{row[name]:.9g}" for name in names) for row in rows)]
-            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        else:
-            import pyarrow as pa
-            from pyarrow.parquet import write_table
-
-            write_table(pa.table({name: np.array([row[name] for row in rows]) for name in names}), path)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+    write_rows(draw(found.search, found.fit, found.spread, count, seed), path)
 
 
 def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
-    """Write the corrected model as MJCF; a line per effect that it leaves out. Raises BadInput.
+    """Write the corrected model as MJCF, or as URDF if the path ends so; a line per effect that it leaves out.
 
-    If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without.
+    If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without. URDF has no
+    actuators: theirs are the entries of `--out-actuators`. Raises BadInput.
     """
+    import mujoco
+
     if found.export is None:
         raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+    text, lines = found.export.xml, found.export.lines
+    if path.suffix == URDF:
+        text, told = urdf_of(mujoco.MjModel.from_xml_string(text), urdf_behind(found.sim.path), lines)
+        lines = tuple(told)
     try:
-        path.write_text(found.export.xml, encoding="utf-8")
-        if (other := batched(found)) is not None:
+        path.write_text(text, encoding="utf-8")
+        if path.suffix != URDF and (other := batched(found)) is not None:
             batch_path(path).write_text(other.xml, encoding="utf-8")
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
-    return found.export.lines
+    return lines
 
 
 def batched(found: Identified) -> Exported | None:

@@ -173,3 +173,33 @@ def _astray(module, model, recording, passive: bool) -> float:
     finally:
         mujoco.set_mjcb_passive(None)
     return float(np.sqrt(np.mean(np.square(out))))
+
+
+ALL = [
+    entry for entries in (MOTION[name] for name in ("stribeck", "load", "asymmetric", "ripple")) for entry in entries
+]
+ALL += [("law.velocity", J2, {"at": [0.0, 1.0, 3.0], "torque": [0.0, 0.4, 0.6], "directed": True})]
+ALL += [("law.position", J4, {"at": [-2.0, 2.0], "torque": [-0.3, 0.3], "directed": False})]
+
+
+def test_many_arms_at_once_resist_as_one_does_by_the_callback():
+    """By what batched simulators have: forces, and the armature and acceleration of the last step."""
+    model = plant([]).model
+    model.dof_armature[:] = 0.2
+    effects, random = Effects(model, ALL, ARM.joint_names), np.random.default_rng(5)
+    alone, forces = [], []
+    for _ in range(64):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = random.normal(0.0, 0.8, model.nq), random.normal(0.0, 0.5, model.nv)
+        data.qfrc_applied[:] = random.normal(0.0, 30.0, model.nv)
+        mujoco.mj_forward(model, data)
+        made = data.qfrc_applied + data.qfrc_actuator
+        carried = made + data.qfrc_passive + data.qfrc_constraint - model.dof_armature * data.qacc
+        forces.append([each[effects.dofs] for each in (data.qpos, data.qvel, carried, made - carried)])
+        passive = data.qfrc_passive.copy()
+        effects.passive(model, data)
+        alone.append([model.dof_frictionloss[effects.dofs], (passive - data.qfrc_passive)[effects.dofs]])
+    together = effects.resistance(*np.swapaxes(forces, 0, 1))
+    np.testing.assert_allclose(np.swapaxes(together, 0, 1), alone, rtol=1e-9, atol=1e-9)
+    assert np.ptp(together[0], axis=0).max() > 1.0
+    assert np.ptp(together[1], axis=0).max() > 1.0

@@ -1,0 +1,48 @@
+"""Gain, limit, lag and delay of drives in the motors that a model has: MuJoCo's own fields, which run in batch."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+DRIVE = {"actuator.gain": "gain", "actuator.saturation": "limit", "actuator.lag": "time", "actuator.delay": "time"}
+"""Effects that a motor holds → their parameter."""
+LEAST_DELAY_S = 0.001
+MOST_SAMPLES, LEAST_STEP_S = 1000, 0.0005
+"""A delay is kept by commands, one per step of the simulation: so many at most, and enough for steps this short [s]."""
+LONGEST_STEP_S = 0.002
+"""Step of a simulation whose actuators have delays, at most [s]."""
+
+
+def motors_of(spec: Any) -> dict[str, Any]:
+    """The actuators of a `mujoco.MjSpec` that make a torque in proportion to their control, by joint name."""
+    import mujoco
+
+    plain = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE)
+    return {
+        each.target: each
+        for each in spec.actuators
+        if each.trntype == mujoco.mjtTrn.mjTRN_JOINT and (each.dyntype, each.gaintype, each.biastype) == plain
+    }
+
+
+def put_drive(motor: Any, found: Mapping[str, float]) -> None:
+    """Give a motor what was found of its drive, effect → value: N·m, s, or the ratio of torque to command."""
+    import mujoco
+
+    gear = np.array(motor.gear)
+    if (limit := found.get("actuator.saturation")) is not None:
+        most = limit / abs(gear[0])
+        known = motor.forcerange[1] if motor.forcerange[0] < motor.forcerange[1] else np.inf
+        motor.forcelimited, motor.forcerange = 1, [-min(most, known), min(most, known)]
+    if (lag := found.get("actuator.lag", 0.0)) > 0.0:
+        motor.dyntype, motor.dynprm[0] = mujoco.mjtDyn.mjDYN_FILTEREXACT, lag
+    put_delay(motor, found.get("actuator.delay", 0.0))
+    motor.gear = [gear[0] * found.get("actuator.gain", 1.0), *gear[1:]]
+
+
+def put_delay(actuator: Any, delay: float) -> None:
+    """Let an actuator follow its control so much later [s]; less than a millisecond is none."""
+    if delay >= LEAST_DELAY_S:
+        actuator.delay = delay
+        actuator.nsample = min(MOST_SAMPLES, int(np.ceil(delay / LEAST_STEP_S)) + 2)
