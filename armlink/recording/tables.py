@@ -83,6 +83,7 @@ def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) 
             schema = file.schema_arrow
             require_width(schema.names, str(path))
             require_size(8 * file.metadata.num_columns * file.metadata.num_rows, str(path))
+            _require_each_once(schema.names, path, "")
             apart = columns_of_lists(file)
             header = _renamed(list(apart), columns, path)
             wanted = {column: apart[name] for column, name in zip(header, apart, strict=True) if is_channel(column)}
@@ -286,10 +287,10 @@ def _require_header(path: Path) -> None:
         raise BadInput(f"{path}: its header row has more than {_MOST_HEADER // 1024} kB, expected names of columns")
 
 
-def _require_each_once(header: Sequence[str], path: Path) -> None:
+def _require_each_once(header: Sequence[str], path: Path, where: str = " in the header row") -> None:
     twins = sorted(column for column in set(header) if column and header.count(column) > 1)
     if twins:
-        raise BadInput(f"{path}: column {twins[0]!r} occurs twice in the header row")
+        raise BadInput(f"{path}: column {twins[0]!r} occurs twice{where}")
 
 
 def _unnamed_apart(header: Sequence[str]) -> list[str]:

@@ -13,6 +13,7 @@ from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval, undecided_s
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
 from sim_gap.closed_loop.training.bands import SHARE
+from sim_gap.closed_loop.training.limits import described
 from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
@@ -225,6 +226,8 @@ def _notes(found: Identified) -> list[str]:
             "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
             + (", as part of the controller" if found.search.open_controller else "")
         )
+    if limits := described(found.spread.limits, names):
+        out.append(f"limits that the training motion does not reach: {limits}")
     out += _beyond(found)
     if found.export is not None and found.export.lines:
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")

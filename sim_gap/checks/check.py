@@ -10,21 +10,23 @@ from dataclasses import replace
 from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.clock import even_times, find_dropped, without_repeats
+from sim_gap.checks.clock import even_times, find_dropped, find_time_unit, without_repeats
 from sim_gap.checks.finding import Finding
+from sim_gap.checks.held_positions import without_held
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
+from sim_gap.checks.jumps import find_jumps, find_seam, unwrapped
 from sim_gap.checks.mapping import SURE, find_changed_order, find_mapping
-from sim_gap.checks.position_rows import find_jumps, unwrapped, without_held
-from sim_gap.checks.rigid_fit import Motion, as_mounted, beside_slow_torques, fit_rigid, motion_of
+from sim_gap.checks.mounting import as_mounted
+from sim_gap.checks.rigid_fit import Motion, beside_slow_torques, fit_rigid, motion_of
+from sim_gap.checks.small_zero import find_small_zero
 from sim_gap.checks.torque_source import (
-    find_absent,
     find_delay,
     find_gain_command,
     find_same,
-    find_scale,
     find_source,
     find_unsigned,
 )
+from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import TRIM_S, Signals, prepare
@@ -55,7 +57,7 @@ def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections
 ) -> tuple[Recording, list[Finding]]:
     """Check and correct one recording. Raises BadInput for a finding that is not certain."""
-    for finding in find_counts(recording, stated):
+    for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, wrapped = unwrapped(recording)
     for finding in find_jumps(recording, stated):
@@ -90,6 +92,8 @@ def check_recording(
     for finding in find_beyond_range(arm, recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, velocity = sound_velocity(recording, stated)
+    for finding in find_seam(recording, stated):
+        raise BadInput(f"{label}: {finding.sentence()}")
     return recording, [*found, *velocity]
 
 
@@ -108,7 +112,11 @@ def _mapping(
     rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
     delay, fall = find_delay(mounted, motion, rate, stated)
     if not delay or fall <= SURE + sum(finding.fall for finding in mapping):
-        return mapping or find_changed_order(arm, motion, stated, mounted)
+        return (
+            mapping
+            or find_changed_order(arm, motion, stated, mounted)
+            or find_small_zero(mounted, motion, stated, follows)
+        )
     in_time = prepare(_corrected(recording, delay[0], s.label), arm, s.label)
     return [*delay, *find_mapping(arm, motion_of(in_time, motion.channel), stated, follows)]
 
@@ -118,7 +126,11 @@ def _source(
 ) -> list[Finding]:
     """Findings on the channel's scale and on what it is a reading of."""
     fit = beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
-    scale = find_scale(arm, fit, motion, stated) or find_absent(arm, fit, motion, stated)
+    scale = (
+        find_joint_scale(mounted, motion, stated)
+        or find_scale(arm, fit, motion, stated)
+        or find_absent(arm, fit, motion, stated)
+    )
     return [*scale, *find_source(fit, s, motion, stated)]
 
 

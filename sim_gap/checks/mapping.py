@@ -15,18 +15,18 @@ from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.hypotheses import Hypothesis, hypotheses
+from sim_gap.checks.mounting import as_loaded, as_mounted
 from sim_gap.checks.rigid_fit import (
     FEW,
     STRONG_SHARE,
     Motion,
     RigidFit,
-    as_loaded,
-    as_mounted,
     fit_model,
     fit_models,
     fit_rigid,
     rows_of,
 )
+from sim_gap.checks.torque_unit import find_absent
 from sim_gap.model.rigid_body import RigidArm
 
 SURE = 0.3
@@ -108,11 +108,12 @@ def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections, mount
     if float(fit_model(model, motion).cost.sum()) - least < CHANGED:
         return []
     for half, rows in halves.items():
-        for found in find_mapping(arm, rows_of(motion, rows), stated):
-            if found.finding == "order" and found.fall > CHANGED:
-                option = f"give both halves as recordings of their own, this one with {found.option}"
-                evidence = f"in the {half} half of the recording alone {found.evidence}"
-                return [replace(found, evidence=evidence, option=option, corrected=False)]
+        part = rows_of(motion, rows)
+        orders = [each for each in find_mapping(arm, part, stated) if each.finding == "order" and each.fall > CHANGED]
+        for found in orders or find_absent(arm, fit_model(model[rows], part), part, stated):
+            option = f"give both halves as recordings of their own, this one with {found.option}"
+            evidence = f"in the {half} half of the recording alone {found.evidence}"
+            return [replace(found, evidence=evidence, option=option, corrected=False)]
     return []
 
 

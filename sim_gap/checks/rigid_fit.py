@@ -27,12 +27,6 @@ MOVING_LEAST = 0.1
 """Share of rows in motion from which a motor's torque at rest is left out."""
 FLOOR = 0.02
 """Share of a reading's variance below which what is left does not count: noise, and effects of every arm."""
-MOUNTED = 0.1
-"""Share of the readings' variance that may be left (geometric mean) for gravity along another axis to count."""
-UPSIDE_DOWN = 0.98
-"""Cosine from which gravity is nearly opposite: then a turned sign of all torques is as good, and far more common."""
-TOOL_REACH = 0.4
-"""Farthest centre of mass of a tool from the last joint, as a share of the arm's length."""
 STRONG_SHARE, STRONG_CORRELATION = 0.2, 0.8
 """A joint is strong if the model's own part is this share of the reading, and correlates with it so."""
 
@@ -143,56 +137,6 @@ def beside_slow_torques(arm: RigidArm, motion: Motion, fit: RigidFit) -> RigidFi
         columns = np.stack([direction[:, j], *own, np.ones_like(time), time, time**2], axis=1)
         friction[j] = np.linalg.lstsq(columns, motion.reading[:, j], rcond=None)[0][0]
     return replace(fit, friction=friction)
-
-
-def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
-    """The arm with gravity along the axis that fits best, if that is better than the nominal one.
-
-    A tilted base is an effect of the arm, which the diagnosis finds; no fault of the data must be seen in it.
-    """
-    still = np.zeros_like(motion.q)
-    weightless = arm.torque(motion.q, motion.v, motion.a, np.zeros(3)) + arm.spring_torque(motion.q)
-    columns = np.stack([arm.torque(motion.q, still, still, axis) for axis in np.eye(3)], axis=-1)
-    weight = 1.0 / (motion.reading.std(0) + 1e-9)
-    left = ((motion.reading - weightless) * weight).ravel()
-    gravity = np.linalg.lstsq((columns * weight[:, None]).reshape(-1, 3), left, rcond=None)[0]
-    size, nominal = float(np.linalg.norm(gravity)), float(np.linalg.norm(arm.gravity))
-    if size < 1e-6 or nominal < 1e-6:
-        return arm
-    turned = replace(arm, gravity=gravity * nominal / size)
-    found, plain = fit_rigid(turned, motion).cost, fit_rigid(arm, motion).cost
-    opposite = fit_rigid(arm, replace(motion, reading=-motion.reading)).cost
-    upside_down = float(gravity @ arm.gravity) < -UPSIDE_DOWN * size * nominal
-    if found.sum() > plain.sum() or found.mean() > np.log(MOUNTED + FLOOR):
-        return arm
-    return arm if upside_down and opposite.sum() < found.sum() + 0.3 else turned
-
-
-def as_loaded(arm: RigidArm, motion: Motion) -> RigidArm:
-    """The arm with the body at its last link that fits best, if it explains the readings and may exist.
-
-    A tool that outweighs a slim last link turns the direction of its mass moment: alone, that looks as if the joint's
-    zero were off. A zero that is off needs a moment without a mass.
-    """
-    direction, tip = motion.direction, arm.n - 1
-    columns = arm.link_regressor(arm.motion(motion.q, motion.v, motion.a), tip)[:, :, :4]
-    left = motion.reading - arm.carried(motion.q, motion.v, motion.a)
-    wide, sides = [], []
-    for j in range(arm.n):  # friction, rotor and offset of each joint are its own
-        own = np.stack([direction[:, j], motion.v[:, j], motion.a[:, j], np.ones(len(left))], axis=1)
-        both = np.column_stack([columns[:, j], left[:, j]])
-        rest = (both - own @ np.linalg.lstsq(own, both, rcond=None)[0]) / (motion.reading[:, j].std() + 1e-9)
-        wide.append(rest[:, :4])
-        sides.append(rest[:, 4])
-    body = np.linalg.lstsq(np.concatenate(wide), np.concatenate(sides), rcond=None)[0]
-    reach = float(np.linalg.norm(arm.offset[1:], axis=1).sum())
-    if body[0] <= 0.0 or float(np.linalg.norm(body[1:])) > TOOL_REACH * max(reach, 1e-9) * body[0]:
-        return arm
-    inertial = arm.inertial.copy()
-    inertial[tip, :4] += body
-    loaded = arm.with_inertial(inertial)
-    found, plain = fit_rigid(loaded, motion).cost, fit_rigid(arm, motion).cost
-    return loaded if found.sum() < plain.sum() and found.mean() < np.log(MOUNTED + FLOOR) else arm
 
 
 def _joints(grams: Array, unsigned: NDArray[np.bool_]) -> Array:

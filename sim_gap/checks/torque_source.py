@@ -1,4 +1,4 @@
-"""Scale, sign of rectified readings and source of a torque channel, and its time against the positions'."""
+"""Sign of rectified readings and source of a torque channel, and its time against the positions'."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,16 +9,10 @@ from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
-from sim_gap.checks.rigid_fit import FEW, FLOOR, STRONG_CORRELATION, Motion, RigidFit, fit_model
+from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, RigidFit, fit_model
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import Signals
 
-SCALE = 0.42, 2.4
-"""Median coefficient of the model's torque, weighted by that torque, outside which a channel is in another unit; with
-loads and wrong torque constants it stays between 0.65 and 1.9 on real arms."""
-TELLING = 0.3
-"""Share of the model's torque (root sum of squares) that the joints must have which tell its unit: a slim wrist alone,
-on which something else pulls, tells nothing of the others."""
 GEAR_FRICTION = 0.13
 """Friction over torque (root sum of squares over the joints that move) from which a channel is a motor's: link sensors
 of two real arms show 0.04 to 0.07, motors of four others 0.26 to 0.6."""
@@ -34,57 +28,8 @@ REPEATS, APART = 0.5, 0.12
 LAWFUL, STEPS = 0.3, 50
 """Least share of the variance of a command's steps that a law of gains explains (half on OpenArm, where positions,
 velocities and targets are rounded on the bus); least number of such steps."""
-ABSENT, HELD = 3.0, 0.2
-"""The model's torque is absent from a joint's reading if its own part is this multiple of all that is read, and comes
-back with a coefficient below this; on recordings of real arms the first stays below 1.2."""
 UNRELATED = 0.4
 """Correlation with the model's torque below which a reading that never changes its sign does not follow it."""
-
-
-def find_scale(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:
-    """A channel in another unit: the model's torque comes back with a coefficient that no arm has.
-
-    One strong joint alone may carry a load: others that follow the model are asked too, a unit is that of all.
-    """
-    strong = fit.strong & (fit.correlation > 0.0)
-    if strong.sum() == 1:
-        strong |= fit.correlation > STRONG_CORRELATION
-    own = fit.own_share * fit.spread
-    few = np.linalg.norm(own[strong]) < TELLING * np.linalg.norm(own)
-    if stated.states("units", f"{motion.channel}_1") or not strong.any() or few:
-        return []
-    scale = _weighted_median(fit.scale[strong], (fit.own_share * fit.spread)[strong])
-    if SCALE[0] < scale < SCALE[1]:
-        return []
-    joints = ", ".join(f"{arm.names[j]} {fit.scale[j]:.3g}" for j in np.flatnonzero(strong))
-    evidence = f"reads the model's torque times {joints}: amperes, or another unit?"
-    option = f"--units {motion.channel}=A:K (N·m/A at the joint, or one each: K1;K2;…), or {motion.channel}=N·m"
-    return [Finding("scale", motion.channel, "all", evidence, option, False)]
-
-
-def find_absent(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:
-    """Joints whose link-side sensor should read several times all that it does: the column of another joint.
-
-    A column that varies with another joint's motion may fit as well as the joint's own, by a spring or a rotor that no
-    arm has, so that nothing is gained by an exchange. A motor is not judged: its gear's friction may hold the load.
-    """
-    if motion.channel != "tau" or stated.states("units", f"{motion.channel}_1") or stated.order or stated.joints:
-        return []
-    found = []
-    for j in np.flatnonzero((fit.own_share > ABSENT) & (fit.scale < HELD)).tolist():
-        evidence = (
-            f"varies by {fit.spread[j]:.2g} N·m, while the model's torque varies by {fit.own_share[j]:.0f} times as "
-            "much and is not in it: another joint's column?"
-        )
-        option = f"--map {motion.channel}_{j + 1}=COLUMN, or --units {motion.channel}=N·m if it is right"
-        found.append(Finding("order", motion.channel, arm.names[j], evidence, option, False))
-    return found
-
-
-def _weighted_median(values: Array, weights: Array) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:

@@ -107,7 +107,8 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     scores: dict[str, float] = {}
     for kind, parts in kinds.items():
         progress(f"controller: {kind}")
-        fits[kind] = improve(few.data, _from_grid(few, parts), search.scales, 5)
+        needed = () if own.complete else ("kp", "viscous", *parts)
+        fits[kind] = improve(few.data, _as_excluded(few, _from_grid(few, parts), needed), search.scales, 5)
         scores[kind] = float(few.score(fits[kind]).sum()) + PRICE * search.data.joints * len(parts)
     kind = min(scores, key=lambda name: scores[name])
     kept = {"controller.stiffness"} | {
@@ -125,6 +126,14 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
             point[name] = fits[kind].point[name]
         found = replace(found, nominal=point, open_controller=True)
     return found, replace(fits[kind], rms=None), kind
+
+
+def _as_excluded(search: Search, fit: Fit, needed: Sequence[str]) -> Fit:
+    """The fit with parameters of excluded effects as the model has them, apart from those `needed`."""
+    own = [name for effect in search.excluded & EFFECTS.keys() for name in EFFECTS[effect].parameters]
+    held = [name for name in own if name not in needed]
+    active = tuple(tuple(name for name in each if name not in held) for each in fit.active)
+    return replace(fit.with_values(**{name: search.nominal[name].copy() for name in held}), active=active, rms=None)
 
 
 def _from_grid(search: Search, parts: Sequence[str]) -> Fit:

@@ -19,6 +19,7 @@ from sim_gap.closed_loop.search import Search, taken_out
 from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit
+from sim_gap.closed_loop.training.limits import unreached
 from sim_gap.closed_loop.windows import Windows, thinned, windows_of
 from sim_gap.model.load import SimModel
 
@@ -95,7 +96,7 @@ def identify(
     found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
-    spread = covariance(search, fit)
+    spread = replace(covariance(search, fit), limits=unreached(search, fit))
     return Identified(
         sim=sim,
         search=search,

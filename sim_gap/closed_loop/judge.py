@@ -11,6 +11,7 @@ from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, evaluate, improve, jacobia
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
 from sim_gap.closed_loop.rivals import rivals_of
 from sim_gap.closed_loop.search import Group, Search, effect_there, taken_out
+from sim_gap.closed_loop.training.limits import Unreached, draw_limits
 from sim_gap.closed_loop.windows import Windows
 
 SYSTEMATIC = 0.02
@@ -162,11 +163,13 @@ def undecided_scale(fit: Fit, spread: "Covariance") -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of the fitted parameters in their own coordinates (`fit.moved`)."""
+    """What the recordings leave open: covariance of the fitted parameters in their own coordinates (`fit.moved`), and
+    the limits that no recording reaches."""
 
     names: list[tuple[int, str]]
     """Joint (−1: whole arm) and name."""
     matrix: Array
+    limits: tuple[Unreached, ...] = ()
 
 
 def covariance(search: Search, fit: Fit) -> Covariance:
@@ -209,12 +212,17 @@ def interval(search: Search, fit: Fit, spread: Covariance, joint: int, name: str
 
 
 def draw(search: Search, fit: Fit, spread: Covariance, count: int, seed: int = 0) -> list[dict[str, float]]:
-    """Draws of all fitted parameters from their joint distribution, within their bounds: `joint.name` → value."""
+    """Draws of all fitted parameters from their joint distribution, within their bounds, and of the limits that no
+    recording reaches: `joint.name` → value."""
     random = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(spread.matrix)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     steps = random.standard_normal((count, len(values))) @ root.T
-    return [_sample(search, fit, spread.names, row) for row in steps]
+    rows = [_sample(search, fit, spread.names, row) for row in steps]
+    for each, drawn in zip(spread.limits, draw_limits(spread.limits, count, random), strict=True):
+        for row, value in zip(rows, drawn, strict=True):
+            row[f"{search.data.arm.names[each.joint]}.{each.name}"] = float(value)
+    return rows
 
 
 def _sample(search: Search, fit: Fit, names: Sequence[tuple[int, str]], steps: Array) -> dict[str, float]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from sim_gap.closed_loop.columns import shared_effects
@@ -22,6 +23,8 @@ LEVELS = {
 }
 """Levels at which a limit or an integral part is tried: in units of the command's highest speed, of the joint's own
 torque, of the gain per second."""
+BETWEEN = 6
+"""Levels that are tried between those beside the best."""
 LEAST_FALL = 0.025
 """Least relative fall of a joint's RMS by an effect."""
 Group = tuple[str, tuple[int, ...]]
@@ -82,15 +85,28 @@ def with_effect(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
 def level_of(search: Search, fit: Fit, name: str) -> Array:
     """The best of some levels of a limit or an integral part at every joint, (J,): a limit that is never reached has no
     slope to follow, and one that is always reached leads nowhere; an integral part that is next to none holds the
-    torque at the start and does nothing else."""
+    torque at the start and does nothing else.
+
+    Others between the best and those beside it are tried after: a joint that a limit lets stray from its course strays
+    elsewhere with a level some tenths off.
+    """
     if name == "ki":
-        levels = [share * fit.point["kp"] for share in LEVELS[name]]
+        size, most = fit.point["kp"], np.full(search.data.joints, np.inf)
     else:
-        peak = np.abs(search.data.speed).max(axis=(0, 2)) if name == "slew" else search.scales.of(name)
-        levels = [np.minimum(fit.point[name], share * peak) for share in LEVELS[name]]
+        size = np.abs(search.data.speed).max(axis=(0, 2)) if name == "slew" else search.scales.of(name)
+        most = fit.point[name]
+    own = np.array(LEVELS[name])
+    levels = np.minimum(np.array([own[0] ** 2 / own[1], *own, own[-1] ** 2 / own[-2]])[:, None] * size, most)
+    best, joints = 1 + _best_level(search, fit, name, levels[1:-1]), np.arange(search.data.joints)
+    below, above = (levels[best + step, joints] for step in (-1, 1))
+    between = np.vstack([levels[best, joints], np.geomspace(below, above, BETWEEN + 2)[1:-1]])
+    return np.asarray(between[_best_level(search, fit, name, between), joints])
+
+
+def _best_level(search: Search, fit: Fit, name: str, levels: Array) -> NDArray[np.intp]:
+    """Number of the level of a parameter, of (L, J), that leaves least at each joint, (J,)."""
     gaps = residuals(search.data, batch([{**fit.point, name: level} for level in levels]))
-    best = np.einsum("ptjw,ptjw->pj", gaps, gaps).argmin(axis=0)
-    return np.asarray(np.stack(levels)[best, np.arange(search.data.joints)])
+    return np.asarray(np.einsum("ptjw,ptjw->pj", gaps, gaps).argmin(axis=0))
 
 
 def start_of(search: Search, name: str, joint: int) -> float:

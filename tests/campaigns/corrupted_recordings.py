@@ -129,8 +129,8 @@ def main() -> int:
             model = asked.realdata / folder / "sim.xml"
             answer = diagnose(str(model), [spoiled])
             causes = [f"{cause.effect} {cause.confidence:.2f}" for cause in answer.causes]
-            explained += answer.verdict == "explained"
             if not any(cause.effect in EFFECTS.get(kind, ()) for cause in answer.causes):
+                explained += answer.verdict == "explained"
                 worse = worse_by(mujoco.MjModel.from_xml_path(str(model)), recording, spoiled)
                 unseen[kind] += worse <= AS_WELL
                 text = f"NOTHING, {'cannot be told' if worse <= AS_WELL else 'MISSED'}: fits worse by {worse:.3f}; "

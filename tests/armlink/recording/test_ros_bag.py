@@ -150,6 +150,27 @@ def test_a_broken_bag_is_one_line(tmp_path):
         load_recording(tmp_path)
 
 
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_bag_without_its_index_is_read_from_its_files(tmp_path, storage):
+    """As a recorder that was killed leaves it: one file, or several of one recording."""
+    kind = "sensor_msgs/msg/JointState"
+    samples = [(k * 10**7, states("ba", [0.1 * k, 1.0], [5.0, -k])) for k in range(20)]
+    whole = tmp_path / "whole"
+    write(whole, [("/joint_states", kind, samples)], storage)
+    (whole / "metadata.yaml").unlink()
+    split = tmp_path / "split"
+    split.mkdir()
+    for number, part in enumerate((samples[:8], samples[8:])):
+        write(tmp_path / f"part_{number}", [("/joint_states", kind, part)], storage)
+        (file,) = (each for each in (tmp_path / f"part_{number}").iterdir() if each.name != "metadata.yaml")
+        file.rename(split / f"split_{number}{file.suffix}")
+    for folder in (whole, split):
+        loaded = load_recording(folder)
+        assert loaded.names == ("b", "a")
+        np.testing.assert_allclose(loaded.position[:, 0], 0.1 * np.arange(20))
+        np.testing.assert_allclose(loaded.torque[:, 1], -np.arange(20.0))
+
+
 def test_a_topic_that_is_no_text_is_left_out(tmp_path):
     """The index of a bag is a file of its own, YAML; `.nan` there is a number, and equals nothing."""
     samples = [(k * 10**7, states("ba", [0.1 * k, 1.0])) for k in range(1, 5)]

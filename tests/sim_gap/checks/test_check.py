@@ -8,7 +8,7 @@ import pytest
 from wrong_arms import THREE, Wrong, model, motion, record
 
 from armlink.errors import BadInput
-from armlink.recording.corrections import AS_IT_IS, parse_corrections
+from armlink.recording.corrections import AS_IT_IS, TIME_UNITS, parse_corrections
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording, take_joints
 from sim_gap.attribution.diagnose import diagnose
@@ -327,3 +327,55 @@ def test_torques_exchanged_midway_are_refused(arm, motor):
     exchanged[motor.t.size // 2 :] = exchanged[motor.t.size // 2 :][:, [0, 2, 1]]
     with pytest.raises(BadInput, match=r"second half of the recording alone .* --map tau_motor_2=tau_motor_3"):
         check(arm, replace(motor, motor_torque=exchanged, velocity=None))
+
+
+def test_a_link_torque_that_another_column_holds_midway_is_refused():
+    """An exchange explains nothing more where the other joint's torque may be a spring's or a rotor's of this one."""
+    made = replace(record(model(), REAL, seconds=30.0, rate=100.0), motor_torque=None)
+    torque = made.torque.copy()
+    torque[made.t.size // 2 :, 0] = 0.05 * made.position[made.t.size // 2 :, 0]
+    with pytest.raises(BadInput, match=r"tau of joint_1: in the second half of the recording alone .* is not in it"):
+        check(load_model(model()).arm, replace(made, torque=torque))
+
+
+@pytest.mark.parametrize(("joint", "constant"), [(0, 12.0), (1, 0.2), (1, 15.0), (2, 0.1)])
+def test_amperes_of_one_joint_are_asked_about(arm, motor, joint, constant):
+    torque = motor.motor_torque.copy()
+    torque[:, joint] /= constant
+    column = f"tau_motor_{joint + 1}"
+    with pytest.raises(BadInput, match=rf"unlike the other joints.*--units {column}=A:K") as error:
+        check(arm, replace(motor, motor_torque=torque))
+    assert f"{column}=N·m" in str(error.value)
+    assert check(arm, replace(motor, motor_torque=torque), parse_corrections(units=[f"{column}=N·m"]))[1] == []
+    assert check(arm, motor, parse_corrections(units=[f"{column}=N·m"]))[1] == []
+
+
+@pytest.mark.parametrize("payload", [0.0, 1.0, 4.0])
+def test_a_load_that_counts_many_times_at_a_slim_wrist_is_no_unit(arm, payload):
+    carried = replace(record(model(), replace(REAL, payload=payload), seconds=30.0, rate=100.0), torque=None)
+    assert check(arm, carried)[1] == []
+
+
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+def test_times_in_a_smaller_unit_are_asked_about(arm, motor, unit):
+    fine = replace(motor, t=motor.t / TIME_UNITS[unit])
+    with pytest.raises(BadInput, match=rf"travel .* --units t={unit}, or t=s if it is right"):
+        check(arm, fine)
+    in_seconds = parse_corrections(units=[f"t={unit}"])
+    assert check(arm, in_seconds.apply(fine, "r"), in_seconds)[1] == []
+
+
+@pytest.mark.parametrize(("joint", "angle"), [(1, 0.25), (1, -0.3)])
+def test_a_zero_that_is_off_by_tenths_of_a_radian_is_asked_about(arm, motor, joint, angle):
+    position = motor.position.copy()
+    position[:, joint] += angle
+    with pytest.raises(BadInput, match=r"may have its zero off by about .* or q_2=0 if it is right"):
+        check(arm, replace(motor, position=position, velocity=None))
+    stated = parse_corrections(zero=["q_2=0"])
+    assert check(arm, replace(motor, position=position, velocity=None), stated)[1] == []
+
+
+@pytest.mark.parametrize("moved", [{1: (0.03, 0.0, 0.02)}, {0: (0.0, 0.03, 0.03)}, {2: (0.04, 0.04, 0.0)}])
+def test_a_mass_that_is_elsewhere_is_no_zero(arm, moved):
+    made = replace(record(model(), replace(REAL, moved=moved), seconds=30.0, rate=100.0), torque=None)
+    assert check(arm, made)[1] == []

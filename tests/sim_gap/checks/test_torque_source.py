@@ -12,7 +12,8 @@ from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
 from sim_gap.checks.rigid_fit import Motion, RigidFit, fit_rigid
-from sim_gap.checks.torque_source import find_absent, find_delay, find_gain_command, find_same, find_scale, find_source
+from sim_gap.checks.torque_source import find_delay, find_gain_command, find_same, find_source
+from sim_gap.checks.torque_unit import find_absent, find_scale
 from sim_gap.model.load import load_model
 
 RATE, LATE = 25.0, 0.4

@@ -101,6 +101,9 @@ def test_samples_scatter_about_the_fit(answer, tmp_path: Path) -> None:
     assert len(rows) == 200
     assert gains.std() > 0.0
     assert abs(np.median(gains) - answer.internals.fit.point["kp"][0]) < gains.std()
+    (note,) = [note for note in answer.notes if note.startswith("limits that the training motion does not reach")]
+    least = float(note.split("torque at least shoulder ")[1].split(",")[0])
+    assert 0.8 * least < min(row["shoulder.limit"] for row in rows) < 1.3 * least
     write_samples(answer.internals, 3, tmp_path / "draws.csv")
     assert len((tmp_path / "draws.csv").read_text().splitlines()) == 4
     with pytest.raises(BadInput, match=r"\.csv, \.json, \.parquet"):

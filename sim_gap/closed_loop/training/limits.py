@@ -1,0 +1,91 @@
+"""Limits that no recording reaches: what the training motion leaves open of them.
+
+A limit of the torque or of the command's speed that was never reached is not absent: it lies above what was asked for.
+Its distribution is that of a prior, log-uniform from there up, weighted by what each level costs the fit of the
+training motion; motion that asks for no more is as it was, and motion that asks for more is less sure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.fit import Fit, batch, evaluate, residuals, root_mean_squares
+from sim_gap.closed_loop.search import Search
+
+HEADROOM = 10.0
+"""Ratio of the highest level of the prior to the least that the training motion admits: recordings use between a tenth
+and all of what a drive can do."""
+LEVELS = np.geomspace(0.1, 100.0, 61)
+"""Levels at which a limit is tried, in units of the joint's RMS torque or of the command's highest speed."""
+COSTS = 2.0
+"""Loss of the score from which a level contradicts the training motion: 95 % of the likelihood of one parameter."""
+LIMITS = {"limit": "actuator.saturation", "slew": "controller.slew"}
+"""Parameter that is a limit → its effect."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unreached:
+    """A limit of one joint that the training motion does not show."""
+
+    joint: int
+    name: str
+    levels: Array
+    """Where it may lie, rising by a common factor (L,)."""
+    weights: Array
+    """Probability of each (L,)."""
+    least: float
+    """Lowest level that the training motion admits."""
+
+
+def unreached(search: Search, fit: Fit) -> tuple[Unreached, ...]:
+    """The limits that neither the model states nor the fit has, where some level of them is admitted."""
+    out: list[Unreached] = []
+    for name, effect in LIMITS.items():
+        open_at = np.isinf(fit.point[name]) & (effect not in search.excluded)
+        if open_at.any():
+            size = np.abs(search.data.speed).max(axis=(0, 2)) if name == "slew" else search.scales.of(name)
+            levels = LEVELS[:, None] * size
+            lost = _losses(search, fit, name, levels)
+            found = [_admitted(j, name, levels[:, j], lost[:, j]) for j in np.flatnonzero(open_at).tolist()]
+            out += [each for each in found if each is not None]
+    return tuple(out)
+
+
+def _losses(search: Search, fit: Fit, name: str, levels: Array) -> Array:
+    """Loss of each joint's score with a limit at each level, all else as it is, (L, J)."""
+    left = residuals(search.data, batch([{**fit.point, name: level} for level in levels]))
+    base = search.score(evaluate(search.data, fit))
+    each = root_mean_squares(search.data, left)
+    return np.stack([search.score(Fit(fit.point, fit.active, rms=rms)) - base for rms in each])
+
+
+def _admitted(joint: int, name: str, levels: Array, lost: Array) -> Unreached | None:
+    """The levels up to HEADROOM times the least from which on none costs much; None if even the highest does."""
+    costly = np.flatnonzero(lost >= COSTS)
+    first = int(costly[-1]) + 1 if costly.size else 0
+    if first >= len(levels):
+        return None
+    taken = levels <= HEADROOM * levels[first] * (1.0 + 1e-9)
+    weights = np.where(taken, np.exp(-np.clip(lost, -50.0, 50.0)), 0.0)
+    return Unreached(joint, name, levels, weights / weights.sum(), float(levels[first]))
+
+
+def draw_limits(limits: Sequence[Unreached], count: int, random: np.random.Generator) -> list[Array]:
+    """Draws of each limit, (count,): levels by their weights, spread evenly over the factor between two."""
+    out = []
+    for each in limits:
+        ratio = float(each.levels[1] / each.levels[0])
+        at = random.choice(each.levels, size=count, p=each.weights)
+        out.append(np.asarray(at * ratio ** random.uniform(-0.5, 0.5, count)))
+    return out
+
+
+def described(limits: Sequence[Unreached], names: Sequence[str]) -> str:
+    """The limits and their least values in words; nothing if there is none."""
+    told = []
+    for name, what, unit in (("limit", "torque", "N·m"), ("slew", "speed of the command", "rad/s")):
+        if least := [f"{names[each.joint]} {each.least:.3g}" for each in limits if each.name == name]:
+            told.append(f"{what} at least {', '.join(least)} {unit}")
+    return "; ".join(told)

@@ -1,0 +1,77 @@
+"""A limit that no training motion reaches is drawn from there up: motion that asks for more is less sure, no other."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from servo_arm import model_text, record
+
+from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
+from sim_gap.closed_loop.fit import Fit, improve
+from sim_gap.closed_loop.judge import covariance, draw
+from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.training import limits
+from sim_gap.closed_loop.training.bands import band
+from sim_gap.closed_loop.windows import windows_of
+from sim_gap.model.load import load_model
+
+GAIN, FASTER = 15.0, 2.0
+TEXT = model_text(kp=GAIN, friction=0.2)
+FOUND = ("kp", "coulomb", "viscous")
+
+
+def of(text: str) -> tuple[Search, Fit]:
+    """Search and fit of a training recording of the arm without limits."""
+    sim = load_model(mujoco.MjModel.from_xml_string(text))
+    data = windows_of(sim.arm, [record(TEXT, 1, 28.0)], ["run"])
+    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
+    return search, improve(data, Fit(search.nominal, (FOUND, FOUND)), search.scales)
+
+
+@pytest.fixture(scope="module")
+def arm() -> tuple[Search, Fit]:
+    return of(TEXT)
+
+
+def test_the_least_limit_is_what_the_training_motion_asks_for(arm) -> None:
+    search, fit = arm
+    torque = np.abs(GAIN * (search.data.command - search.data.recorded))[search.data.warm :].max(axis=(0, 2))
+    found = {(each.joint, each.name): each.least for each in limits.unreached(search, fit)}
+    assert found.keys() == {(j, name) for j in (0, 1) for name in ("limit", "slew")}
+    for j in (0, 1):
+        assert 0.8 < found[j, "limit"] / torque[j] < 1.15
+
+
+def test_draws_go_from_there_to_ten_times_as_much(arm) -> None:
+    search, fit = arm
+    spread = replace(covariance(search, fit), limits=limits.unreached(search, fit))
+    rows = draw(search, fit, spread, 2000)
+    least = next(x.least for x in spread.limits if (x.joint, x.name) == (1, "limit"))
+    drawn = np.log10(np.array([row["elbow.limit"] for row in rows]) / least)
+    assert -0.15 < drawn.min() < 0.05
+    assert 0.95 < drawn.max() < 1.1
+    assert np.median(drawn) == pytest.approx(0.5, abs=0.06)
+    bare = draw(search, fit, replace(spread, limits=()), 3)
+    assert bare[0].items() <= draw(search, fit, spread, 3)[0].items()
+
+
+def test_a_limit_that_is_stated_fitted_or_left_out_is_not_drawn(arm) -> None:
+    search, fit = arm
+    stated, own = of(TEXT.replace('kp="15.0"/>', 'kp="15.0" forcerange="-20 20"/>', 1))
+    assert {(x.joint, x.name) for x in limits.unreached(stated, own)} == {(1, "limit"), (0, "slew"), (1, "slew")}
+    fitted = fit.with_values(slew=np.array([np.inf, 3.0]))
+    left_out = replace(search, excluded=frozenset({"actuator.saturation"}))
+    assert {(x.joint, x.name) for x in limits.unreached(left_out, fitted)} == {(0, "slew")}
+
+
+def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> None:
+    search, fit = arm
+    spread = replace(covariance(search, fit), limits=limits.unreached(search, fit))
+    data = search.data
+    faster = windows_of(data.arm, [record(TEXT, 2, 28.0)], ["other"], data.dt)
+    faster = replace(faster, command=FASTER * faster.command, measured=FASTER * faster.measured)
+    for heldout, widened in ((data, False), (faster, True)):
+        without, within = (band(search, fit, replace(spread, limits=x), heldout).width for x in ((), spread.limits))
+        assert ((within > 1.5 * without) == widened).all()
+        assert widened or (within < 1.1 * without).all()
