@@ -15,7 +15,7 @@ from sim_gap.better_model.native_drives import DRIVE, LONGEST_STEP_S, motors_of,
 from sim_gap.better_model.urdf import URDF, urdf_of
 from sim_gap.better_model.with_effects import compiled_copy, spec_of, with_effects
 from sim_gap.better_model.xml_comment import xml_comment
-from sim_gap.model.load import SimModel, urdf_behind
+from sim_gap.model.load import SimModel, linear_part, urdf_behind
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term
 
@@ -130,8 +130,8 @@ def _set_joint(joint: Any, model: Any, degrees: bool) -> None:
     """Give a joint of a file what the compiled one has; angles in the file's unit."""
     dof, adr = model.jnt_dofadr[joint.id], model.jnt_qposadr[joint.id]
     joint.frictionloss, joint.armature = float(model.dof_frictionloss[dof]), float(model.dof_armature[dof])
-    joint.damping[0] = float(np.reshape(model.dof_damping, (model.nv, -1))[dof, 0])
-    joint.stiffness[0] = float(np.reshape(model.jnt_stiffness, (model.njnt, -1))[joint.id, 0])
+    joint.damping[0] = float(linear_part(model.dof_damping, model.nv)[dof])
+    joint.stiffness[0] = float(linear_part(model.jnt_stiffness, model.njnt)[joint.id])
     unit = float(np.degrees(1.0)) if degrees and model.jnt_type[joint.id] == HINGE else 1.0
     joint.springref, zero = unit * float(model.qpos_spring[adr]), unit * float(model.qpos0[adr])
     if not np.isclose(zero, joint.ref, rtol=1e-9, atol=1e-12):

@@ -124,15 +124,17 @@ class Effects:
 
     def _lawful(self, position: Array, speed: Array, carried: Array, time: float, xp: Any) -> Any:
         """Torque that the laws take now, (…, n)."""
+        laws = [(name, self.joints.index(joint), law) for name, joint, law in self._effects if name in LAWS]
+        if not laws:
+            return 0.0
         everywhere = xp.zeros_like(speed)
         temperature = None if self.temperature is None else self.temperature + everywhere
         quantities = dict(zip(LAWS, (position, speed, carried, time + everywhere, temperature), strict=True))
         out = 0.0
-        for name, joint, law in self._effects:
-            value = quantities.get(name)
+        for name, k, law in laws:
+            value = quantities[name]
             if value is None:
                 continue
-            k = self.joints.index(joint)
             amount = law["directed"] and name in ("law.velocity", "law.load")
             at, torque = np.array(law["at"]), np.array(law["torque"])
             taken = xp.interp(xp.abs(value[..., k]) if amount else value[..., k], at, torque)

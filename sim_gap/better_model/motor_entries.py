@@ -7,7 +7,7 @@ import numpy as np
 
 from sim_gap.better_model.actuator_entries import MOTOR, Row, steps_of, write_entries
 from sim_gap.better_model.with_effects import with_effects
-from sim_gap.model.load import SimModel
+from sim_gap.model.load import SimModel, linear_part
 from sim_gap.search.estimate import Estimate, Value
 
 ABOUT = "Controllers are the asset's own: these recordings say what torques do."
@@ -22,10 +22,9 @@ def write_motor_entries(sim: SimModel, estimate: Estimate | None, path: Path, st
     Friction, damping and armature are those of the corrected model. A gain of the drive is mjlab's `gear`; Isaac Lab
     has no field for it. What acts in one recording alone is left out.
     """
-    terms = [] if estimate is None else [term for term in estimate.terms if not term.bound]
     found: dict[tuple[str, int], dict[str, Value]] = {}
     if estimate is not None:
-        found = {term.key: estimate.parameters(term) for term in terms}
+        found = {term.key: estimate.parameters(term) for term in estimate.terms if not term.bound}
     model = with_effects(sim, estimate).model
     rows = {name: _entry(model, sim, j, found, step) for j, name in enumerate(sim.arm.names)}
     left = [
@@ -46,7 +45,7 @@ def _entry(model: Any, sim: SimModel, j: int, found: dict[tuple[str, int], dict[
         "gain": None if gain is None else gain.value,
         "armature": float(model.dof_armature[dof]),
         "friction": float(model.dof_frictionloss[dof]),
-        "viscous": float(np.reshape(model.dof_damping, (model.nv, -1))[dof, 0]),
+        "viscous": float(linear_part(model.dof_damping, model.nv)[dof]),
         "limit": None if limit is None else limit.value,
         **steps_of(np.zeros(2) if delay is None else np.array([delay.low, delay.high]), step),
     }

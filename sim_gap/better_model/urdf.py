@@ -10,7 +10,9 @@ import numpy as np
 from armlink.errors import BadInput
 from gcomp.arm.model_xml import parse_xml
 from gcomp.arrays import Array
+from sim_gap.better_model.with_effects import body_parameters, split
 from sim_gap.better_model.xml_comment import xml_comment
+from sim_gap.model.load import linear_part
 
 URDF = ".urdf"
 KINDS = {2: "prismatic", 3: "revolute"}
@@ -38,7 +40,7 @@ def _left_out(model: Any) -> list[str]:
     lines = []
     fields = (
         ("armature", model.dof_armature, "kg·m²"),
-        ("stiffness", _first(model.jnt_stiffness, model.njnt), "N·m/rad"),
+        ("stiffness", linear_part(model.jnt_stiffness, model.njnt), "N·m/rad"),
     )
     for key, values, unit in fields:
         at = model.jnt_dofadr if key == "armature" else range(model.njnt)
@@ -65,9 +67,7 @@ def _changed(model: Any, source: Path) -> ET.Element:
     joints = {model.joint(joint).name: joint for joint in range(model.njnt)}
     for link in root.iter("link"):
         if (body := bodies.get(link.get("name", ""))) is not None and model.body_mass[body] > 0.0:
-            axes = _matrix(model.body_iquat[body])
-            inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
-            _put_inertial(link, float(model.body_mass[body]), model.body_ipos[body], inertia)
+            _put_inertial(link, *split(body_parameters(model, body, np.zeros(3), np.eye(3))))
     for joint in root.iter("joint"):
         if (number := joints.get(joint.get("name", ""))) is not None:
             _put_dynamics(joint, model, number)
@@ -157,21 +157,8 @@ def _put_dynamics(joint: ET.Element, model: Any, number: int) -> None:
     for old in joint.findall("dynamics"):
         joint.remove(old)
     dof = int(model.jnt_dofadr[number])
-    damping, friction = float(_first(model.dof_damping, model.nv)[dof]), float(model.dof_frictionloss[dof])
+    damping, friction = float(linear_part(model.dof_damping, model.nv)[dof]), float(model.dof_frictionloss[dof])
     ET.SubElement(joint, "dynamics", damping=_number(damping), friction=_number(friction))
-
-
-def _first(values: Array, count: int) -> Array:
-    """The linear coefficient of every joint, whatever polynomial the field may hold, (count,)."""
-    return np.asarray(np.reshape(values, (count, -1))[:, 0])
-
-
-def _matrix(quaternion: Array) -> Array:
-    import mujoco
-
-    out = np.empty(9)
-    mujoco.mju_quat2Mat(out, quaternion)
-    return out.reshape(3, 3)
 
 
 def _angles(turn: Array) -> Array:

@@ -12,7 +12,7 @@ from gcomp.arrays import Array
 from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
 from sim_gap.effects.base import tilted
 from sim_gap.effects.inertials import mounted, pseudo_inertia
-from sim_gap.model.load import SimModel, read_spec
+from sim_gap.model.load import SimModel, linear_part, read_spec
 from sim_gap.model.rigid_body import inertial_of
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.search.about import inertial_change
@@ -105,7 +105,7 @@ def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> boo
     exist (a gripper taken away); whether the result is what was wanted."""
     joint = joints[link]
     body, anchor = int(model.jnt_bodyid[joint]), model.jnt_pos[joint]
-    total = _parameters(model, body, anchor, np.eye(3)) + added
+    total = body_parameters(model, body, anchor, np.eye(3)) + added
     if not exists(total):
         fixed = _fixed_to(model, body, joints)
         whole = total + sum((_seen_from(model, other, body, anchor) for other in fixed), np.zeros(10))
@@ -133,7 +133,7 @@ def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
     return out
 
 
-def _parameters(model: Any, body: int, origin: Array, turn: Array) -> Array:
+def body_parameters(model: Any, body: int, origin: Array, turn: Array) -> Array:
     """Ten parameters of a body about a point of its frame, in a frame turned by `turn`."""
     import mujoco
 
@@ -153,7 +153,7 @@ def _seen_from(model: Any, other: int, body: int, anchor: Array) -> Array:
     up, own = data.xmat[body].reshape(3, 3), data.xmat[other].reshape(3, 3)
     turn = up.T @ own
     place = up.T @ (data.xpos[other] - data.xpos[body]) - anchor
-    return _parameters(model, other, -turn.T @ place, turn)
+    return body_parameters(model, other, -turn.T @ place, turn)
 
 
 def mujoco_quaternion(out: Array, axes: Array) -> None:
@@ -216,7 +216,7 @@ def _move_zero(model: Any, joint: int, offset: float) -> None:
     model.qpos0[adr] -= offset
     if model.jnt_limited[joint]:
         model.jnt_range[joint] -= offset
-    if np.reshape(model.jnt_stiffness, (model.njnt, -1))[joint, 0]:
+    if linear_part(model.jnt_stiffness, model.njnt)[joint]:
         model.qpos_spring[adr] -= offset
 
 
@@ -230,13 +230,13 @@ def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
         "actuator.rotor_inertia": "dof_armature",
     }
     if effect in terms:
-        values = np.reshape(getattr(model, terms[effect]), (model.nv, -1))
-        values[dof, 0] = max(values[dof, 0] + c[0], 0.0) if added else max(values[dof, 0], c[0])
+        values = linear_part(getattr(model, terms[effect]), model.nv)
+        values[dof] = max(values[dof] + c[0], 0.0) if added else max(values[dof], c[0])
     else:
-        stiffness = np.reshape(model.jnt_stiffness, (model.njnt, -1))
-        total = stiffness[joint, 0] + c[0]
-        model.qpos_spring[adr] = (stiffness[joint, 0] * model.qpos_spring[adr] - c[1]) / total
-        stiffness[joint, 0] = total
+        stiffness = linear_part(model.jnt_stiffness, model.njnt)
+        total = stiffness[joint] + c[0]
+        model.qpos_spring[adr] = (stiffness[joint] * model.qpos_spring[adr] - c[1]) / total
+        stiffness[joint] = total
 
 
 def possible(principal: Array) -> Array:

@@ -55,6 +55,10 @@ class Search:
         mean = (fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0)
         return np.asarray(0.5 * self.samples * np.log(mean + self.floor**2))
 
+    def size_of(self, name: str) -> Array:
+        """What levels of a limit are counted in, (J,): the command's highest speed, or the usual size of it."""
+        return np.abs(self.data.speed).max(axis=(0, 2)) if name == "slew" else self.scales.of(name)
+
     @property
     def samples(self) -> Array:
         """Independent samples of each joint, (J,)."""
@@ -93,7 +97,7 @@ def level_of(search: Search, fit: Fit, name: str) -> Array:
     if name == "ki":
         size, most = fit.point["kp"], np.full(search.data.joints, np.inf)
     else:
-        size = np.abs(search.data.speed).max(axis=(0, 2)) if name == "slew" else search.scales.of(name)
+        size = search.size_of(name)
         most = fit.point[name]
     own = np.array(LEVELS[name])
     levels = np.minimum(np.array([own[0] ** 2 / own[1], *own, own[-1] ** 2 / own[-2]])[:, None] * size, most)

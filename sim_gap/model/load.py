@@ -9,6 +9,7 @@ import numpy as np
 
 from armlink.errors import BadInput
 from armlink.model_file import compile_spec, is_urdf, read_model
+from gcomp.arrays import Array
 from sim_gap.model.arm_joints import arm_hinges, hinges_of
 from sim_gap.model.from_arm import is_arm_file, nominal_model
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
@@ -93,6 +94,11 @@ def urdf_behind(path: Path | None) -> Path | None:
     return source if isinstance(source, Path) and is_urdf(source) else None
 
 
+def linear_part(values: Array, count: int) -> Array:
+    """View of the linear coefficients (count,) of a MuJoCo field that may hold polynomials, such as `dof_damping`."""
+    return np.reshape(values, (count, -1))[:, 0]
+
+
 def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
     """The chain of the MuJoCo joints `joints` (hinges, base to tip) of a compiled model.
 
@@ -136,9 +142,9 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
         inertial=inertial,
         gravity=model.opt.gravity.copy(),
         armature=model.dof_armature[dof].copy(),
-        damping=np.reshape(model.dof_damping, (model.nv, -1))[dof, 0].copy(),
+        damping=linear_part(model.dof_damping, model.nv)[dof],
         frictionloss=model.dof_frictionloss[dof].copy(),
-        stiffness=np.reshape(model.jnt_stiffness, (model.njnt, -1))[list(joints), 0].copy(),
+        stiffness=linear_part(model.jnt_stiffness, model.njnt)[list(joints)],
         rest=model.qpos_spring[adr].copy(),
         tendons=tendons_of(model, joints),
     )

@@ -20,10 +20,10 @@ def without_held(recording: Recording) -> tuple[Recording, list[Finding]]:
     share = float(same.sum()) / max(float(fast_rows(recording.position).sum()), 1.0)
     if share < HELD:
         return recording, []
-    velocity = recording.velocity
+    velocity, known = recording.velocity, np.repeat(~same[:, None], recording.n, axis=1)
     if velocity is not None and np.mean(_repeats(velocity)[same]) > 0.5:
-        velocity = _filled(recording.t, velocity, ~same)
-    position = _filled(recording.t, recording.position, ~same)
+        velocity = filled(recording.t, velocity, known)
+    position = filled(recording.t, recording.position, known)
     evidence = f"repeats in {share:.0%} of the rows in motion while torques change: read less often; filled in between"
     found = Finding("duplicate", "q", "all", evidence, "record at the rate at which positions are read", True)
     return replace(recording, position=position, velocity=velocity), [found]
@@ -34,6 +34,8 @@ def _repeats(values: Array) -> NDArray[np.bool_]:
     return np.concatenate([[False], np.all(values[1:] == values[:-1], axis=1)])
 
 
-def _filled(t: Array, values: Array, known: NDArray[np.bool_]) -> Array:
-    """Values (K, n), between the rows that are known along straight lines."""
-    return np.column_stack([np.interp(t, t[known], column[known]) for column in values.T])
+def filled(t: Array, values: Array, known: NDArray[np.bool_]) -> Array:
+    """Values (K, n), along straight lines between those that are `known` (K, n); columns without any are 0."""
+    return np.column_stack(
+        [np.interp(t, t[k], x[k]) if k.any() else np.zeros_like(t) for k, x in zip(known.T, values.T, strict=True)]
+    )

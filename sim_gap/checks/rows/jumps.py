@@ -10,6 +10,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.rigid_fit import TURNING
+from sim_gap.checks.rows.held_positions import filled
 
 JUMP, TIMES = 0.05, 8.0
 """Step from row to row from which a position jumps [rad], and its speed over what is usual at the joint."""
@@ -87,7 +88,7 @@ def find_seam(recording: Recording, stated: Corrections) -> list[Finding]:
     if "t" in stated.clock or recording.velocity is None or recording.t.size < 10 * NEAR:
         return []
     t, time = recording.t, np.diff(recording.t)[:, None]
-    q, v = _filled(t, recording.position), _filled(t, recording.velocity)
+    q, v = (filled(t, values, np.isfinite(values)) for values in (recording.position, recording.velocity))
     allowed = 0.5 * time * np.abs(np.diff(v, axis=0))
     beyond = np.maximum(np.abs(np.diff(q, axis=0) - 0.5 * time * (v[1:] + v[:-1])) - allowed, 0.0)
     slope = (v[2:] - v[:-2]) / (t[2:] - t[:-2])[:, None]
@@ -111,11 +112,3 @@ def _over_the_rest(size: Array) -> Array:
     far = np.abs(np.arange(len(size))[:, None] - size.argmax(axis=0)) > NEAR
     rest = np.where(far, size, 0.0).max(axis=0)
     return np.where(rest > 1e-9, size / np.maximum(rest, 1e-9), 0.0)
-
-
-def _filled(t: Array, values: Array) -> Array:
-    """Values (K, n) with readings that are missing in between along straight lines; columns without any are 0."""
-    there = np.isfinite(values)
-    return np.column_stack(
-        [np.interp(t, t[k], x[k]) if k.any() else np.zeros_like(t) for k, x in zip(there.T, values.T, strict=True)]
-    )

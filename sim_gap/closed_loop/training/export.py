@@ -8,7 +8,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
-from sim_gap.better_model.with_effects import mujoco_quaternion, possible, spec_of, split
+from sim_gap.better_model.with_effects import body_parameters, mujoco_quaternion, possible, spec_of, split
 from sim_gap.closed_loop.columns import shared_effects, turns
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
@@ -186,14 +186,10 @@ def _link_changes(search: Search, fit: Fit) -> dict[int, Array]:
 
 def _set_body(spec: Any, compiled: Any, joint: int, change: Array) -> None:
     """Add a change of inertial parameters to the body that a joint moves."""
-    import mujoco
 
     index = int(compiled.jnt_bodyid[joint])
-    anchor, spin = compiled.jnt_pos[joint], np.zeros(9)
-    mujoco.mju_quat2Mat(spin, compiled.body_iquat[index])
-    axes = spin.reshape(3, 3)
-    inertia = axes @ np.diag(compiled.body_inertia[index]) @ axes.T
-    total = inertial_of(float(compiled.body_mass[index]), compiled.body_ipos[index] - anchor, inertia) + change
+    anchor = compiled.jnt_pos[joint]
+    total = body_parameters(compiled, index, anchor, np.eye(3)) + change
     mass, centre, about = split(total)
     values, turned = np.linalg.eigh(about)
     turned[:, 2] *= np.sign(np.linalg.det(turned))

@@ -45,8 +45,7 @@ def unreached(search: Search, fit: Fit) -> tuple[Unreached, ...]:
     for name, effect in LIMITS.items():
         open_at = np.isinf(fit.point[name]) & (effect not in search.excluded)
         if open_at.any():
-            size = np.abs(search.data.speed).max(axis=(0, 2)) if name == "slew" else search.scales.of(name)
-            levels = LEVELS[:, None] * size
+            levels = LEVELS[:, None] * search.size_of(name)
             lost = _losses(search, fit, name, levels)
             found = [_admitted(j, name, levels[:, j], lost[:, j]) for j in np.flatnonzero(open_at).tolist()]
             out += [each for each in found if each is not None]
