@@ -92,6 +92,14 @@ class _Scorer:
         noisy = np.array([by_row or layout.beyond(joint) > 0 for joint in range(layout.n)])
         return np.where(noisy, out, whole)
 
+    def taken(self, terms: Sequence[Term]) -> Array:
+        """RMS of what these terms make of the whole fit at each joint, (n,)."""
+        out = np.zeros(self.heldout.layout.n)
+        for row, values in self.estimate.predict(self.heldout, terms=tuple(terms)).items():
+            valid = self.heldout.valid[row]
+            out[row[1]] = max(out[row[1]], float(np.sqrt(np.mean(values[valid] ** 2))) if valid.any() else 0.0)
+        return out
+
     def missed(self, terms: Sequence[Term]) -> float:
         """Largest increase of a joint's RMS without these terms, the others fitted again [N·m]."""
         rest = [term for term in self.estimate.terms if term not in terms]
@@ -162,8 +170,11 @@ def relevant_terms(
     small = set[int]()
 
     def rise(gone: set[int]) -> Array:
+        """What is lost without the effect there; or what it takes in its place, if a later cause takes that too."""
         lost = [term for term in step.terms if term.place in gone]
-        return scorer.falls([term for term in estimate.terms if term not in lost], lost, by_row)
+        kept = [[term for term in terms if term not in lost] for terms in (estimate.terms, [*step.below, *step.terms])]
+        last, first = (scorer.falls(terms, lost, by_row) for terms in kept)
+        return np.maximum(last, np.minimum(first, scorer.taken(lost)))
 
     for place in sorted(places, key=lambda place: float(np.max(rise({place}) / least))):
         if np.all(rise({*small, place}) < least):

@@ -279,6 +279,7 @@ def roll_out(
             squares += np.mean(stray**2, axis=0)
     finally:
         mujoco.set_mjcb_passive(None)
+        model.dof_frictionloss[effects.dofs] = effects.coulomb
     return np.asarray(np.sqrt(squares / len(starts)))
 
 

@@ -1,12 +1,15 @@
 """Effects that act on each other: columns are evaluated about the estimate, and large angles are exact."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from wrong_arms import THREE, Wrong, model, record
 
+from armlink.model_file import compile_model
+from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.effects.base import angles_of, tilted
 from sim_gap.effects.inertials import moved, of_pseudo_inertia, point, point_slopes, pseudo_inertia
@@ -165,3 +168,26 @@ def test_a_light_payload_is_not_taken_for_mass_moments_of_all_links():
     assert answer.verdict == "explained"
     assert answer.causes[0].effect == "link.payload"
     assert answer.causes[0].parameters["arm"]["mass"].value == pytest.approx(0.4, rel=0.03)
+
+
+def test_two_causes_that_replace_one_another_are_not_both_called_minor():
+    """At a shoulder whose load keeps its sign and size, Coulomb and load-dependent friction do the same."""
+    arm = compile_model(Path(__file__).parents[2] / "models" / "ur10e.urdf")
+    coulomb, load = np.array([8.0, 7.0, 5.0, 1.5, 1.2, 0.8]), np.array([0.0, 0.06, 0.0, 0.0, 0.0, 0.0])
+    viscous, recordings = np.array([6.0, 5.0, 4.0, 1.0, 0.8, 0.5]), []
+    for seed in (901, 902):
+        random, t, data = np.random.default_rng(seed), np.arange(0.0, 40.0, 1 / 125), mujoco.MjData(arm)
+        waves = random.uniform((0.1, 0.05, 0.0), (0.45, 0.35, 6.0), (arm.nv, 3, 3))
+        q = np.stack([sum(a * np.sin(2 * np.pi * f * t + p) for a, f, p in joint) for joint in waves], axis=1)
+        v = np.gradient(q, t, axis=0)
+        a, torque = np.gradient(v, t, axis=0), np.zeros_like(q)
+        for k in range(len(t)):
+            data.qpos[:], data.qvel[:], data.qacc[:] = q[k], v[k], a[k]
+            mujoco.mj_inverse(arm, data)
+            torque[k] = data.qfrc_inverse
+        torque += (coulomb + load * np.abs(torque)) * np.tanh(v / 0.005) + viscous * v
+        motor = torque + random.normal(0.0, 0.15, torque.shape)
+        recordings.append(Recording(t=t, position=q, motor_torque=motor))
+    answer = diagnose(arm, recordings[:1], recordings[1:])
+    dry = [cause for cause in answer.causes if cause.effect in ("friction.coulomb", "friction.load")]
+    assert "shoulder_lift_joint" in {joint for cause in dry for joint in cause.joints}
