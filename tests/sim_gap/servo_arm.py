@@ -1,5 +1,6 @@
 """A two-joint arm with position servos in MuJoCo, as a stand-in for a real one; its recordings have no torque."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -10,20 +11,27 @@ from armlink.recording.recording import Recording
 JOINTS = ("shoulder", "elbow")
 
 
-def model_text(kp: float, friction: float, damping: float = 0.8) -> str:
-    """MJCF of the arm: gravity about both joints, gains in N·m/rad."""
+def model_text(kp: float, friction: float, damping: float = 0.8, limits: Sequence[float] = ()) -> str:
+    """MJCF of the arm: gravity about both joints, gains in N·m/rad, limits of the servos' torque in N·m."""
+    limited = [f' forcerange="{-x} {x}"' for x in limits] or ["", ""]
     sticks = 'solreffriction="0.01 1" solimpfriction="0.999 0.9999 0.001 0.5 2"'
     joint = f'axis="0 1 0" damping="{damping}" frictionloss="{friction}" armature="0.02" {sticks}'
     return f"""<mujoco model="servo_arm"><option timestep="0.002" integrator="implicitfast"/><worldbody>
 <body name="upper"><joint name="shoulder" {joint}/><inertial pos="0.1 0 0" mass="0.6" diaginertia="2e-3 2e-3 2e-3"/>
 <body name="fore" pos="0.2 0 0"><joint name="elbow" {joint}/>
 <inertial pos="0.08 0 0" mass="0.3" diaginertia="1e-3 1e-3 1e-3"/></body></body></worldbody><actuator>
-<position name="shoulder" joint="shoulder" kp="{kp}"/><position name="elbow" joint="elbow" kp="{kp}"/>
+<position name="shoulder" joint="shoulder" kp="{kp}"{limited[0]}/>
+<position name="elbow" joint="elbow" kp="{kp}"{limited[1]}/>
 </actuator></mujoco>"""
 
 
-def record(text: str, seed: int, seconds: float, rate: float = 50.0) -> Recording:
-    """Positions read with 12 bits, and the commands held from row to row: sines with rests between."""
+def record(
+    text: str, seed: int, seconds: float, rate: float = 50.0, *, wide: float = 1.0, fast: float = 1.0
+) -> Recording:
+    """Positions read with 12 bits, and the commands held from row to row: sines with rests between.
+
+    `wide` and `fast` are the way and the frequencies of the motion over the usual ones.
+    """
     random = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
@@ -31,7 +39,7 @@ def record(text: str, seed: int, seconds: float, rate: float = 50.0) -> Recordin
     waves = random.uniform(0.15, 0.9, (3, 2))
     phase = random.uniform(0.0, 6.0, (3, 2))
     moving = 6.0 * np.floor(t / 7.0) + np.minimum(t % 7.0, 6.0)  # a second of rest after six
-    command = 0.3 * np.sin(2 * np.pi * waves * moving[:, None, None] + phase).sum(1)
+    command = 0.3 * wide * np.sin(2 * np.pi * fast * waves * moving[:, None, None] + phase).sum(1)
     data.qpos[:] = command[0]
     q, steps = np.empty_like(command), round(1.0 / rate / model.opt.timestep)
     for k, row in enumerate(command):

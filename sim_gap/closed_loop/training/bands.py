@@ -2,9 +2,11 @@
 
 The band of a joint at each instant joins the spread of simulations with draws of all parameters and the spread of what
 a fit leaves of recordings that it has not seen: one after the other is left out of the training ones. It is scaled so
-that it holds its share of those.
+that it holds its share of those. Of a limit that no training motion reaches nothing is known but where it may not lie,
+so that the band goes about the simulations with every limit that the training motion admits, whatever it is.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +17,7 @@ from sim_gap.closed_loop.fit import Fit, batch, improve, residuals, root_mean_sq
 from sim_gap.closed_loop.judge import Covariance, draw, joint_rms
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.simulate import simulate
+from sim_gap.closed_loop.training.limits import LIMITS, Unreached
 from sim_gap.closed_loop.windows import Windows, of_windows
 
 SHARE = 0.9
@@ -23,6 +26,8 @@ FOLDS, STEPS = 3, 3
 """Parts of a single recording of which each is left out of a fit, and the steps of such a fit."""
 DRAWS = 40
 """Simulations with drawn parameters."""
+ABOVE = (1.0, 1.1, 1.3, 2.0, 4.0)
+"""Limits about which the band goes, over the least that the training motion admits; without a limit too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,25 +37,39 @@ class Band:
     holds: Array
     """Share of the held-out samples within it."""
     width: Array
-    """RMS of half of it on held-out motion [rad]."""
+    """RMS of half of its width on held-out motion [rad]."""
     unexplained: Array
     """Standard deviation of what no parameter explains [rad]: noise to add to the draws."""
 
 
 def band(search: Search, fit: Fit, spread: Covariance, heldout: Windows) -> Band:
     """The band that follows from the training windows of `search`, judged on the held-out ones."""
-    data, points = search.data, drawn(search, fit, spread)
+    data, points = search.data, drawn(search, fit, replace(spread, limits=()))
     left, groups = left_of_others(search, fit)
     each = root_mean_squares(data, left)
     unexplained = joint_rms(data, each)
     size = np.sqrt(_variance(data, points) + unexplained[:, None] ** 2)
     factor = np.array([_quantile(left[:, j], size[:, j], data.weight[:, j]) for j in range(data.joints)])
-    other = residuals(heldout, batch([fit.point]))[0]
     wider = _uncertainty(np.stack([(each[:, groups == g] ** 2).mean(1) for g in np.unique(groups)]))
+    about = simulate(heldout, batch([fit.point, *_with_limits(fit, spread.limits)]))
     half = (wider * factor)[:, None] * np.sqrt(_variance(heldout, points) + unexplained[:, None] ** 2)
+    low, high = about.min(0) - half, about.max(0) + half
     counts = np.maximum(heldout.weight.sum((0, 2)), 1.0)
-    holds = ((np.abs(other) <= half) * heldout.weight).sum((0, 2)) / counts
-    return Band(holds, np.sqrt((half**2 * heldout.weight).sum((0, 2)) / counts), wider * unexplained)
+    within = (low <= heldout.measured) & (heldout.measured <= high)
+    width = 0.5 * np.sqrt(((high - low) ** 2 * heldout.weight).sum((0, 2)) / counts)
+    return Band((within * heldout.weight).sum((0, 2)) / counts, width, wider * unexplained)
+
+
+def _with_limits(fit: Fit, limits: Sequence[Unreached]) -> list[dict[str, Array]]:
+    """The fit's point with each kind of limit at levels from the least that is admitted at every joint."""
+    out = []
+    for name in LIMITS:
+        least = {each.joint: each.least for each in limits if each.name == name}
+        for factor in ABOVE if least else ():
+            values = fit.point[name].copy()
+            values[list(least)] = factor * np.array(list(least.values()))
+            out.append({**fit.point, name: values})
+    return out
 
 
 def _uncertainty(squares: Array) -> Array:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, residuals, root_mean_squares
@@ -19,6 +20,8 @@ HEADROOM = 10.0
 and all of what a drive can do."""
 LEVELS = np.geomspace(0.1, 100.0, 61)
 """Levels at which a limit is tried, in units of the joint's RMS torque or of the command's highest speed."""
+FINER = np.geomspace(1.0, LEVELS[1] / LEVELS[0], 9)[1:-1]
+"""Levels between two of those, over the lower one: where the least one is looked for."""
 COSTS = 2.0
 """Loss of the score from which a level contradicts the training motion: 95 % of the likelihood of one parameter."""
 LIMITS = {"limit": "actuator.saturation", "slew": "controller.slew"}
@@ -44,12 +47,26 @@ def unreached(search: Search, fit: Fit) -> tuple[Unreached, ...]:
     out: list[Unreached] = []
     for name, effect in LIMITS.items():
         open_at = np.isinf(fit.point[name]) & (effect not in search.excluded)
-        if open_at.any():
-            levels = LEVELS[:, None] * search.size_of(name)
-            lost = _losses(search, fit, name, levels)
-            found = [_admitted(j, name, levels[:, j], lost[:, j]) for j in np.flatnonzero(open_at).tolist()]
-            out += [each for each in found if each is not None]
+        if not open_at.any():
+            continue
+        levels = LEVELS[:, None] * search.size_of(name)
+        lost = _losses(search, fit, name, levels)
+        first = _first_admitted(lost)
+        between = levels[np.maximum(first - 1, 0), np.arange(len(first))] * FINER[:, None]
+        finer = _first_admitted(_losses(search, fit, name, between))
+        for j in np.flatnonzero(open_at & (first < len(levels))).tolist():
+            near = first[j] > 0 and finer[j] < len(FINER)
+            least = between[finer[j], j] if near else levels[first[j], j]
+            taken = (np.arange(len(levels)) >= first[j]) & (levels[:, j] <= HEADROOM * least)
+            weights = np.where(taken, np.exp(-np.clip(lost[:, j], -50.0, 50.0)), 0.0)
+            out.append(Unreached(j, name, levels[:, j], weights / weights.sum(), float(least)))
     return tuple(out)
+
+
+def _first_admitted(lost: Array) -> NDArray[np.intp]:
+    """Index of the first level from which on none costs much, (J,); their number where the highest does."""
+    costly = lost >= COSTS
+    return np.where(costly.any(0), len(lost) - np.argmax(costly[::-1], axis=0), 0)
 
 
 def _losses(search: Search, fit: Fit, name: str, levels: Array) -> Array:
@@ -58,17 +75,6 @@ def _losses(search: Search, fit: Fit, name: str, levels: Array) -> Array:
     base = search.score(evaluate(search.data, fit))
     each = root_mean_squares(search.data, left)
     return np.stack([search.score(Fit(fit.point, fit.active, rms=rms)) - base for rms in each])
-
-
-def _admitted(joint: int, name: str, levels: Array, lost: Array) -> Unreached | None:
-    """The levels up to HEADROOM times the least from which on none costs much; None if even the highest does."""
-    costly = np.flatnonzero(lost >= COSTS)
-    first = int(costly[-1]) + 1 if costly.size else 0
-    if first >= len(levels):
-        return None
-    taken = levels <= HEADROOM * levels[first] * (1.0 + 1e-9)
-    weights = np.where(taken, np.exp(-np.clip(lost, -50.0, 50.0)), 0.0)
-    return Unreached(joint, name, levels, weights / weights.sum(), float(levels[first]))
 
 
 def draw_limits(limits: Sequence[Unreached], count: int, random: np.random.Generator) -> list[Array]:

@@ -40,7 +40,16 @@ def test_the_least_limit_is_what_the_training_motion_asks_for(arm) -> None:
     found = {(each.joint, each.name): each.least for each in limits.unreached(search, fit)}
     assert found.keys() == {(j, name) for j in (0, 1) for name in ("limit", "slew")}
     for j in (0, 1):
-        assert 0.8 < found[j, "limit"] / torque[j] < 1.15
+        assert 0.8 < found[j, "limit"] / torque[j] < 1.05
+
+
+def test_the_least_limit_is_where_the_score_falls_by_what_contradicts_it(arm) -> None:
+    search, fit = arm
+    for each in limits.unreached(search, fit):
+        lost = limits._losses(search, fit, each.name, np.array([[0.98], [1.0]]) * each.least * np.ones(2))[
+            :, each.joint
+        ]
+        assert lost[1] < limits.COSTS < lost[0]
 
 
 def test_draws_go_from_there_to_ten_times_as_much(arm) -> None:
@@ -75,3 +84,16 @@ def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> Non
         without, within = (band(search, fit, replace(spread, limits=x), heldout).width for x in ((), spread.limits))
         assert ((within > 1.5 * without) == widened).all()
         assert widened or (within < 1.1 * without).all()
+
+
+@pytest.mark.parametrize("over", [1.1, 1.6, np.inf])
+def test_the_band_holds_motion_beyond_the_training_whatever_the_limit_is(arm, over) -> None:
+    search, fit = arm
+    data = search.data
+    torque = np.abs(GAIN * (data.command - data.recorded)).max(axis=(0, 2))
+    real = model_text(kp=GAIN, friction=0.2, limits=over * torque if np.isfinite(over) else ())
+    other = windows_of(data.arm, [record(real, 3, 28.0, wide=1.5, fast=1.7)], ["other"], data.dt)
+    spread = covariance(search, fit)
+    known, open_ = (band(search, fit, replace(spread, limits=x), other) for x in ((), limits.unreached(search, fit)))
+    assert (open_.holds > 0.85).all()
+    assert np.isinf(over) or (known.holds < 0.8).any()
