@@ -15,6 +15,7 @@ from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.position_only import _beyond, _verdict
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
+from sim_gap.closed_loop.training.bands import band
 from sim_gap.closed_loop.training.posterior import batch_path, batched, write_exported, write_samples
 from sim_gap.closed_loop.training.replay import replay_rms
 from sim_gap.report.page import write_report
@@ -142,7 +143,10 @@ def test_the_band_holds_its_share_of_other_motion(answer) -> None:
     told = answer.to_json()["band"]
     assert told["share"] == 0.9
     assert all(0.8 < share <= 0.98 for share in told["holds"])
-    assert all(0.0 < width < 0.2 * gap for width, gap in zip(told["half_width"], answer.heldout_before, strict=True))
+    found = answer.internals
+    known = band(found.search, found.fit, replace(found.spread, limits=()), found.heldout)
+    assert ((known.width > 0.0) & (known.width < 0.03 * answer.heldout_before)).all()
+    assert all(1.0 < width / own < 25.0 for width, own in zip(told["half_width"], known.width, strict=True))
 
 
 def test_report_shows_every_joint(answer, tmp_path: Path) -> None:
