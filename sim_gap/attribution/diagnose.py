@@ -25,6 +25,7 @@ from sim_gap.attribution.verdict import is_quiet, is_within
 from sim_gap.checks.check import check_recordings
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joints import match_joints
+from sim_gap.checks.one_way import unchecked_note
 from sim_gap.checks.position_command import check_position_only, is_position_only
 from sim_gap.effects.registry import library_without
 from sim_gap.model.arm_joints import hinges_between
@@ -134,7 +135,8 @@ def diagnose(
         made = answer(Internals(sim, fit, judge, estimate, tuple(heldout), estimate), found, minor, heldout_is)
     compensated += missing_in_readings(estimate, (fit, judge))
     told = tuple(each.sentence() for each in compensated)
-    return replace(made, checks=findings, notes=(*made.notes, *told), friction_compensation=tuple(compensated))
+    aside = (*told, *unchecked_note(recordings))
+    return replace(made, checks=findings, notes=(*made.notes, *aside), friction_compensation=tuple(compensated))
 
 
 def _placed(estimate: Estimate, heldout: ResidualSet) -> ResidualSet:

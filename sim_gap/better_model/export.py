@@ -86,7 +86,8 @@ def write_model(sim: SimModel, estimate: Estimate | None, path: Path, laws: Sequ
     """Write the model with the effects as MJCF, or as URDF if the path ends so, and beside it a module for the rest.
 
     The module has the effects that MJCF cannot hold, and laws. Returns a line per effect that the file cannot hold; it
-    lists them in a comment. Raises BadInput if the nominal model did not come from a file or a file cannot be written.
+    lists them in a comment. A module of an earlier model of that name is removed if there is none now. Raises BadInput
+    if the nominal model did not come from a file or a file cannot be written.
     """
     files = written(sim, estimate, path.name, laws=laws)
     text, lines = files.xml, files.lines
@@ -94,8 +95,11 @@ def write_model(sim: SimModel, estimate: Estimate | None, path: Path, laws: Sequ
         text, lines = urdf_of(files.spec.compile(), urdf_behind(sim.path), lines)
     try:
         path.write_text(text, encoding="utf-8")
+        module = module_path(path)
         if files.module:
-            module_path(path).write_text(files.module, encoding="utf-8")
+            module.write_text(files.module, encoding="utf-8")
+        else:
+            module.unlink(missing_ok=True)
     except OSError as error:
         raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
     return lines

@@ -14,6 +14,7 @@ from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_changed_order, find_mapping
 from sim_gap.checks.mounting import as_mounted
+from sim_gap.checks.one_way import goes_one_way
 from sim_gap.checks.rigid_fit import Motion, beside_slow_torques, fit_rigid, motion_of
 from sim_gap.checks.rows.clock import even_times, find_dropped, find_time_unit, without_repeats
 from sim_gap.checks.rows.held_positions import without_held
@@ -26,7 +27,7 @@ from sim_gap.checks.torque_source import (
     find_source,
     find_unsigned,
 )
-from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_scale
+from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import TRIM_S, Signals, prepare
@@ -107,6 +108,8 @@ def _mapping(
     arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
 ) -> list[Finding]:
     """Findings on clock, order, sign, zero and angle unit, in the order in which they are corrected."""
+    if goes_one_way(recording):
+        return []
     follows = follows_position(recording)
     mapping = find_mapping(arm, motion, stated, follows, mounted)
     rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
@@ -122,14 +125,15 @@ def _mapping(
 
 
 def _source(
-    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, _: Recording, stated: Corrections
+    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
 ) -> list[Finding]:
     """Findings on the channel's scale and on what it is a reading of."""
     fit = beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
     scale = (
         find_joint_scale(mounted, motion, stated)
         or find_scale(arm, fit, motion, stated)
-        or find_absent(arm, fit, motion, stated)
+        or find_outgrown(arm, mounted, motion, stated)
+        or ([] if goes_one_way(recording) else find_absent(arm, fit, motion, stated))
     )
     return [*scale, *find_source(fit, s, motion, stated)]
 

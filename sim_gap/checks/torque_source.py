@@ -9,7 +9,8 @@ from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
-from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, RigidFit, fit_model
+from sim_gap.checks.mapping import FITS
+from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, RigidFit, changed, fit_model
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import Signals
 
@@ -30,22 +31,30 @@ LAWFUL, STEPS = 0.3, 50
 velocities and targets are rounded on the bus); least number of such steps."""
 UNRELATED = 0.4
 """Correlation with the model's torque below which a reading that never changes its sign does not follow it."""
+LITTLE, BETTER = 0.45, 0.4
+"""Share of such a reading that model, friction and rotor explain, below which it may be unsigned, and the fall of the
+cost with the model's sign from which it is; sound ones of real arms, a sensor with an offset, are at 0.51 and more."""
 
 
 def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
     """Readings that are never negative although the model's torque changes its sign."""
     model = arm.carried(motion.q, motion.v, motion.a)
+    plain_fit = fit_model(model, motion)
+    signed_fit = fit_model(model, changed(motion, reading=np.abs(motion.reading) * np.sign(model)))
+    falls = plain_fit.cost - signed_fit.cost
     found = []
     for j in range(arm.n):
-        y, m = motion.reading[:, j], model[:, j]
+        y, m, explained = motion.reading[:, j], model[:, j], plain_fit.explained[j]
         if stated.states("sign", f"{motion.channel}_{j + 1}") or y.std() < 1e-9:
             continue
         both_ways = min(np.mean(motion.v[:, j] > 0.05), np.mean(motion.v[:, j] < -0.05)) > 0.1
         never = min(np.mean(y > 0.02 * y.std()), np.mean(y < -0.02 * y.std())) < 0.005
         crosses = min(np.mean(m > 0.0), np.mean(m < 0.0)) > 0.1
+        if not (never and crosses and both_ways):
+            continue
         folded, plain = (abs(np.corrcoef(np.abs(y), x)[0, 1]) for x in (np.abs(m), m))
-        unrelated = motion.channel != "tau" and plain < UNRELATED  # friction of a motor changes its sign too
-        if never and crosses and both_ways and (folded > max(plain + 0.2, 0.6) or unrelated):
+        unrelated = motion.channel != "tau" and plain < UNRELATED and explained < FITS
+        if folded > max(plain + 0.2, 0.6) or unrelated or (explained < LITTLE and falls[j] > BETTER):
             evidence = f"never changes its sign, though the model's torque does; it follows its amount ({folded:.2f})"
             option = f"record signed torque, or --sign {motion.channel}_{j + 1}=1 if it is right"
             found.append(Finding("unsigned", motion.channel, arm.names[j], evidence, option, False))

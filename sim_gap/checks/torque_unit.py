@@ -23,6 +23,9 @@ STUCK = 1e6
 JOINTS = 0.2, 2.4
 """Coefficient of a joint that follows the model, the load at the tip in it, outside which it has a unit of its own; on
 real arms and parts of their recordings, and on simulated arms, it stays between 0.33 and 1.6."""
+ALONE = 0.15
+"""Share of the model's torque in a reading (standard deviations) below which it is friction alone; on real and
+simulated arms such a joint reads at most 0.65 of what those nearer the base do, the first joint left aside."""
 SLIM = 0.03
 """Least share of the largest model torque (standard deviations) that a joint's must have for its coefficient to tell a
 unit: at a slim wrist a tool, a hose or a spring may be more."""
@@ -77,6 +80,22 @@ def find_joint_scale(arm: RigidArm, motion: Motion, stated: Corrections) -> list
         option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
         found.append(Finding("scale", motion.channel, arm.names[j], evidence, option, False))
     return found if len(found) <= np.count_nonzero(follows & ~odd) else []
+
+
+def find_outgrown(arm: RigidArm, mounted: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
+    """Joints with friction alone that read more than any joint between them and the base does: in a smaller unit."""
+    spread, model = motion.reading.std(0), mounted.carried(motion.q, motion.v, motion.a).std(0)
+    found = []
+    for j in range(1, arm.n):
+        column, largest = f"{motion.channel}_{j + 1}", float(max(spread[:j].max(), model.max()))
+        if model[j] < ALONE * spread[j] and spread[j] > largest and not stated.states("units", column):
+            evidence = (
+                f"varies by {spread[j]:.3g} N·m, of which the model's torque is {model[j] / spread[j]:.0%}; no joint "
+                f"nearer the base has more than {largest:.3g} N·m: milliamperes, or another unit?"
+            )
+            option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
+            found.append(Finding("scale", motion.channel, arm.names[j], evidence, option, False))
+    return found
 
 
 def find_absent(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:

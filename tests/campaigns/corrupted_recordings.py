@@ -17,7 +17,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from corruptions import CORRUPTIONS, torque_channel
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
 from armlink.errors import BadInput
@@ -33,6 +33,8 @@ GOAL = 0.98
 AS_WELL = 0.05
 """Most by which the model may fit a spoiled recording worse, logarithm of RMS, for it to fit as well: masses that are
 off by a few per cent do as much."""
+GAINS = 0.4, 2.5
+"""Coefficients of the model's torque that loads and wrong torque constants make of it."""
 EFFECTS = {
     "small skew": ("timing.delay", "actuator.delay", "actuator.lag"),
     "small zero": ("position.offset",),
@@ -62,10 +64,10 @@ def as_recorded(realdata: Path):
 
 
 def left_by_mujoco(model: mujoco.MjModel, recording: Recording) -> np.ndarray:
-    """What the nominal model leaves of each joint's torque at best, (K, n) [N·m], 25 rows a second.
+    """What the nominal model leaves of each joint's torque at best, over what it varies by, (K, n), 25 rows a second.
 
     MuJoCo's inverse dynamics along the smoothed positions, with a gain, an offset, friction and a rotor of each joint
-    that are fitted: gains not negative, nor friction and rotors where a motor feels them.
+    that are fitted: gains such as arms have, friction and rotors not negative where a motor feels them.
     """
     t = np.arange(recording.t[0], recording.t[-1], 0.01)
     q, y = (
@@ -86,7 +88,11 @@ def left_by_mujoco(model: mujoco.MjModel, recording: Recording) -> np.ndarray:
         own = [np.tanh(v[rows, j] / 0.01), v[rows, j], a[rows, j]]
         both = own if recording.motor_torque is not None else [*own, *(-x for x in own)]
         columns = np.column_stack([torque[:, j], *both, np.ones(len(rows)), -np.ones(len(rows))])
-        left[:, j] = y[rows, j] - columns @ nnls(columns, y[rows, j])[0]
+        least, most = np.zeros(columns.shape[1]), np.full(columns.shape[1], np.inf)
+        least[0], most[0] = GAINS
+        size = np.maximum(np.abs(columns).max(0), 1e-9)
+        found = lsq_linear(columns / size, y[rows, j], (least * size, most * size)).x
+        left[:, j] = (y[rows, j] - columns / size @ found) / max(float(y[rows, j].std()), 1e-9)
     return left
 
 
@@ -95,7 +101,7 @@ def worse_by(model: mujoco.MjModel, sound: Recording, spoiled: Recording) -> flo
 
     def size(recording: Recording) -> float:
         left = left_by_mujoco(model, recording)
-        return float(np.mean(np.log(np.sqrt(np.mean(left**2, axis=0)) + 1e-6)))
+        return float(np.mean(np.log(np.sqrt(np.mean(left**2, axis=0)) + 1e-3)))
 
     return size(spoiled) - size(sound)
 

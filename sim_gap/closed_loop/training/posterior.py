@@ -20,8 +20,9 @@ def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> N
 def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
     """Write the corrected model as MJCF, or as URDF if the path ends so; a line per effect that it leaves out.
 
-    If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without. URDF has no
-    actuators: theirs are the entries of `--out-actuators`. Raises BadInput.
+    If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without; that of an
+    earlier model is removed if it does not. URDF has no actuators: theirs are the entries of `--out-actuators`. Raises
+    BadInput.
     """
     import mujoco
 
@@ -35,6 +36,8 @@ def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
         path.write_text(text, encoding="utf-8")
         if path.suffix != URDF and (other := batched(found)) is not None:
             batch_path(path).write_text(other.xml, encoding="utf-8")
+        else:
+            batch_path(path).unlink(missing_ok=True)
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
     return lines

@@ -32,7 +32,10 @@ def test_the_written_model_has_no_gap_any_more(tmp_path, name):
         for s in (1, 2)
     )
     answer = diagnose(tmp_path / "arm.xml", [train], [other])
+    earlier = tmp_path / "closed_effects.py"
+    earlier.write_text("# of an earlier model")
     assert write_model(nominal, answer.internals.estimate, tmp_path / "closed.xml") == []
+    assert not earlier.exists()
     closed = diagnose(tmp_path / "closed.xml", [other], [train])
     assert closed.verdict == "no_gap"
     assert np.all(closed.heldout_before < 0.1 * answer.heldout_before.max() + 0.02)

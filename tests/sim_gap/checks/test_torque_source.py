@@ -12,8 +12,8 @@ from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
 from sim_gap.checks.rigid_fit import Motion, RigidFit, fit_rigid
-from sim_gap.checks.torque_source import find_delay, find_gain_command, find_same, find_source
-from sim_gap.checks.torque_unit import find_absent, find_scale
+from sim_gap.checks.torque_source import find_delay, find_gain_command, find_same, find_source, find_unsigned
+from sim_gap.checks.torque_unit import find_absent, find_outgrown, find_scale
 from sim_gap.model.load import load_model
 
 RATE, LATE = 25.0, 0.4
@@ -87,6 +87,32 @@ def test_a_link_sensor_without_the_models_torque_is_asked_about(column: int):
         assert all(each.joint == arm.names[column] and not each.corrected for each in found)
     sound = Motion(q, v, a, read + small[:, None], "tau")
     assert not find_absent(arm, fit_rigid(arm, sound), sound, AS_IT_IS)
+
+
+@pytest.mark.parametrize(
+    ("unsigned", "noise", "count"), [(True, 0.7, 1), (True, 0.0, 1), (False, 0.7, 0), (False, 0.0, 0)]
+)
+def test_an_unsigned_reading_is_found_beside_noise_and_one_with_an_offset_is_not(unsigned, noise, count):
+    """Noise of 0.7 of the torque: the amounts hardly go together (correlation 0.5), the signed torques do."""
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    _, q, v, a = motion(3, 60.0, RATE, seed=3)
+    read = arm.torque(q, v, a)
+    joint = int(np.argmin(np.abs(read.mean(0) / read.std(0))))
+    own = read[:, joint] + noise * read[:, joint].std() * np.random.default_rng(4).normal(size=len(q))
+    read[:, joint] = np.abs(own) + 1e-3 if unsigned else own - own.min() + 0.1
+    found = find_unsigned(arm, Motion(q, v, a, read, "tau"), AS_IT_IS)
+    assert [each.joint for each in found] == [arm.names[joint]] * count
+
+
+@pytest.mark.parametrize(("friction", "count"), [(1.0, 0), (8.0, 0), (300.0, 1)])
+def test_a_joint_of_friction_alone_that_reads_more_than_those_before_it_is_asked_about(friction: float, count: int):
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    _, q, v, a = motion(3, 60.0, RATE, seed=3)
+    read = arm.torque(q, v, a) + friction * np.sign(v) * [0.0, 0.0, 1.0]
+    found = find_outgrown(arm, arm, Motion(q, v, a, read, "tau_motor"), AS_IT_IS)
+    assert [each.joint for each in found] == ["joint_3"] * count
+    stated = parse_corrections(units=["tau_motor_3=N·m"])
+    assert not find_outgrown(arm, arm, Motion(q, v, a, read, "tau_motor"), stated)
 
 
 def of_motors(kp: float) -> Recording:

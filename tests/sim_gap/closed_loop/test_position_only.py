@@ -73,6 +73,7 @@ def test_joints_that_go_further_than_in_training_are_noted() -> None:
 
 
 def test_the_written_model_moves_like_the_arm(answer, tmp_path: Path) -> None:
+    batch_path(tmp_path / "closed.xml").write_text("<mujoco/>")  # of an earlier model
     write_exported(answer.internals, tmp_path / "closed.xml")
     closed = mujoco.MjModel.from_xml_path(str(tmp_path / "closed.xml"))
     other = [record(REAL, 3, 14.0)]
