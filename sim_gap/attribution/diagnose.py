@@ -19,7 +19,7 @@ from sim_gap.attribution.bodies import CLEARLY, body_of, groups_of, lacking, mou
 from sim_gap.attribution.causes import causes, founded_ones
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.friction_compensation import held_in_commands, missing_in_readings
-from sim_gap.attribution.position_only import diagnose_positions
+from sim_gap.attribution.positions.answer import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_quiet, is_within
 from sim_gap.checks.check import check_recordings
@@ -79,7 +79,7 @@ def diagnose(
         tip: body of the model that the recorded arm ends in, where it has several arms.
         progress: gets the stage that begins; used where no recording has a torque channel.
 
-    Without a torque channel in any recording, `q_cmd` and `q` are explained instead (`position_only`).
+    Without a torque channel in any recording, `q_cmd` and `q` are explained instead (`positions`).
 
     Raises BadInput if the recordings cannot be used with the model.
     """

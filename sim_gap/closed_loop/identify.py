@@ -18,7 +18,7 @@ from sim_gap.closed_loop.judge import Covariance, Stage, covariance, groups_of, 
 from sim_gap.closed_loop.search import Search, taken_out
 from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
-from sim_gap.closed_loop.training.export import Exported, exported, native_fit
+from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
 from sim_gap.closed_loop.training.limits import unreached
 from sim_gap.closed_loop.windows import Windows, thinned, windows_of
 from sim_gap.model.load import SimModel
@@ -54,9 +54,13 @@ class Identified:
     """The nominal model's gap beside what small errors make of it; None if the controller had to be found."""
     native: Fit
     export: Exported | None
-    """None if the model did not come from a file."""
+    """The model to be used alone; None if the model did not come from a file."""
+    beside: Exported | None
+    """The model to be used with a module; None if a module would have nothing to do."""
     recordings: tuple[Recording, ...]
     """Held-out recordings."""
+    gains: tuple[float, ...]
+    """The controller's gains in each of them over those in the first training recording."""
 
 
 def identify(
@@ -115,7 +119,9 @@ def identify(
         sound=split,
         native=native,
         export=exported(sim, search, fit, native) if sim.path is not None else None,
+        beside=with_module(sim, search, fit) if sim.path is not None else None,
         recordings=tuple(heldout),
+        gains=tuple(scale[len(train) :]),
     )
 
 

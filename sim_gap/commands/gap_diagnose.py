@@ -174,7 +174,8 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     kind = "URDF" if path.suffix == ".urdf" else "MJCF"
     if answer.unit == "rad":
-        from sim_gap.closed_loop.training.posterior import batch_path, write_exported
+        from sim_gap.better_model.effects_module import module_path
+        from sim_gap.closed_loop.training.posterior import batch_path, module_model, write_exported
 
         with_actuators = " with its position actuators" if kind == "MJCF" else ""
         for line in write_exported(answer.internals, path):
@@ -182,6 +183,8 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
         console.print(f"corrected model{with_actuators}: {path}")
         if batch_path(path).is_file():
             console.print(f"the same without PID actuators, for MuJoCo Warp: {batch_path(path)}")
+        if module_model(path).is_file():
+            console.print(f"with friction that {module_path(path)} applies: {module_model(path)}")
         return
     from sim_gap.attribution.residual_laws import as_effects
     from sim_gap.better_model.effects_module import module_path

@@ -10,7 +10,7 @@ from armlink.recording.recording import Recording
 from calib.report.page import ReportTable, Section, paragraph
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.closed_loop.identify import Identified
-from sim_gap.closed_loop.training.replay import replay
+from sim_gap.closed_loop.training.replay import Simulated, replay, simulated
 from sim_gap.report.effect_text import WORDS, advice, sentence
 from sim_gap.report.figures import BELOW_TITLE, BLUE, GREY, ORANGE
 
@@ -50,16 +50,15 @@ def position_sections(answer: Diagnosis) -> list[Section]:
 
 def motion_figure(found: Identified) -> Any:
     """One row a joint: measured, nominal and corrected motion; None if the model did not come from a file."""
-    import mujoco
-
     if found.export is None:
         return None
-    recording, names = _shortened(found.recordings[0]), found.sim.arm.names
-    corrected = mujoco.MjModel.from_xml_string(found.export.xml)
-    t, after, measured = replay(corrected, found.sim.joints, recording)
+    recording, names, gain = _shortened(found.recordings[0]), found.sim.arm.names, found.gains[0]
+    corrected = simulated(found.sim, found.beside or found.export)
+    t, after, measured = replay(corrected.with_gain(gain), recording)
     lines = [("command", recording.position_command[: len(t)], GREY), ("measured", measured, "black")]  # type: ignore[index]
     if found.nominal_has_controller:
-        lines.append(("nominal model", replay(found.sim.mujoco_model, found.sim.joints, recording)[1], ORANGE))
+        nominal = Simulated(found.sim.mujoco_model, found.sim.joints).with_gain(gain)
+        lines.append(("nominal model", replay(nominal, recording)[1], ORANGE))
     lines.append(("corrected model", after, BLUE))
     figure = make_subplots(rows=len(names), cols=1, shared_xaxes=True, subplot_titles=list(names))
     every = max(1, len(t) // POINTS)

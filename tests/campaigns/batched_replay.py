@@ -22,7 +22,7 @@ from sim_gap.attribution.diagnose import diagnose
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.judge import draw
 from sim_gap.closed_loop.training.posterior import batched
-from sim_gap.closed_loop.training.replay import OPENING_S, _actuator, replay
+from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, _actuator, replay
 
 AGREE = 0.05
 """Largest difference of the RMS gap to the measured position between both simulators, over all joints."""
@@ -111,7 +111,7 @@ def main() -> None:
     assert found.export is not None
     model = mujoco.MjModel.from_xml_string((batched(found) or found.export).xml)
     recording = found.recordings[0]
-    t, ours, measured = replay(model, found.sim.joints, recording)
+    t, ours, measured = replay(Simulated(model, found.sim.joints), recording)
     rows = int(np.searchsorted(t, t[0] + given.seconds))
     started = time.process_time()
     theirs = warp_replay(model, list(found.sim.joints), recording, rows)

@@ -23,7 +23,7 @@ import numpy as np
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.closed_loop.training.replay import replay_rms
+from sim_gap.closed_loop.training.replay import Simulated, replay_rms
 from sim_gap.model.load import load_model
 
 WINDOW_S, STEP_S = 6.0, 0.004
@@ -119,8 +119,11 @@ def main() -> int:
     middle = time.process_time()
     theirs = fitted_by_peer(given.sim, train, given.windows)
     ended = time.process_time()
-    gaps = {"nominal": replay_rms(nominal.mujoco_model, joints, heldout)}
-    gaps |= {"diagnosis": replay_rms(ours, joints, heldout), "mujoco.sysid": replay_rms(theirs, joints, heldout)}
+    gaps = {"nominal": replay_rms(Simulated(nominal.mujoco_model, joints), heldout)}
+    gaps |= {
+        name: replay_rms(Simulated(model, joints), heldout)
+        for name, model in (("diagnosis", ours), ("mujoco.sysid", theirs))
+    }
     whole = {name: float(np.sqrt(np.mean(gap**2))) for name, gap in gaps.items()}
     for name, gap in gaps.items():
         print(f"{name:13s} {' '.join(f'{x:.4f}' for x in gap)} rad, all joints {whole[name]:.4f}")

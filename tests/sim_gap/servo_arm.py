@@ -26,11 +26,12 @@ def model_text(kp: float, friction: float, damping: float = 0.8, limits: Sequenc
 
 
 def record(
-    text: str, seed: int, seconds: float, rate: float = 50.0, *, wide: float = 1.0, fast: float = 1.0
+    text: str, seed: int, seconds: float, rate: float = 50.0, *, wide: float = 1.0, fast: float = 1.0, load: float = 0.0
 ) -> Recording:
     """Positions read with 12 bits, and the commands held from row to row: sines with rests between.
 
-    `wide` and `fast` are the way and the frequencies of the motion over the usual ones.
+    `wide` and `fast` are the way and the frequencies of the motion over the usual ones, `load` the friction of the
+    gears over the torque that the links carry.
     """
     random = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(text)
@@ -40,15 +41,24 @@ def record(
     phase = random.uniform(0.0, 6.0, (3, 2))
     moving = 6.0 * np.floor(t / 7.0) + np.minimum(t % 7.0, 6.0)  # a second of rest after six
     command = 0.3 * wide * np.sin(2 * np.pi * fast * waves * moving[:, None, None] + phase).sum(1)
-    data.qpos[:] = command[0]
+    data.qpos[:], dry = command[0], model.dof_frictionloss.copy()
     q, steps = np.empty_like(command), round(1.0 / rate / model.opt.timestep)
     for k, row in enumerate(command):
         q[k] = data.qpos
         data.ctrl[:] = row
         for _ in range(steps):
+            if load:
+                model.dof_frictionloss[:] = dry + load * np.abs(_carried(model, data))
             mujoco.mj_step(model, data)
     count = 2 * np.pi / 4096
     return Recording(t=t, position=np.rint(q / count) * count, position_command=command, names=JOINTS)
+
+
+def _carried(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Torque of the links in the last step: their inertia times acceleration, and gravity and velocity terms."""
+    whole = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, whole)
+    return (whole - np.diag(model.dof_armature)) @ data.qacc + data.qfrc_bias
 
 
 def written(folder: Path, text: str) -> Path:

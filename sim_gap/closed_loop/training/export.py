@@ -1,4 +1,8 @@
-"""The corrected model as MJCF with native position actuators: gains, delay, limits, friction, inertials, gravity."""
+"""The corrected model as MJCF with native position actuators: gains, delay, limits, friction, inertials, gravity.
+
+Friction for which MJCF has no field is left out of the model that is to be used alone; beside another model a module
+applies it.
+"""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -7,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.with_effects import body_parameters, mujoco_quaternion, possible, spec_of, split
 from sim_gap.closed_loop.columns import shared_effects, turns
@@ -34,6 +39,8 @@ NATIVE = {
 """Effects that a field of MJCF holds."""
 BATCHED = frozenset(NATIVE) - {"controller.slew", "controller.integral"}
 """Effects that MuJoCo Warp can run too: it has no PID actuator, which slew limit and integral part need."""
+IN_MODULE = "friction.stribeck", "friction.load", "friction.asymmetric"
+"""Effects that the module beside a model applies."""
 STICKS = {"solref_friction": [0.01, 1.0], "solimp_friction": [0.999, 0.9999, 0.001, 0.5, 2.0]}
 """Solver parameters with which a joint under friction rests; with MuJoCo's usual ones it creeps to where no friction is
 needed, within a tenth of a second on a small arm."""
@@ -47,6 +54,8 @@ class Exported:
 
     xml: str
     lines: tuple[str, ...]
+    effects: tuple[JointEffect, ...] = ()
+    """Those that a module applies beside it."""
 
 
 def native_fit(search: Search, fit: Fit, held: Collection[str] = NATIVE) -> Fit:
@@ -61,7 +70,8 @@ def native_fit(search: Search, fit: Fit, held: Collection[str] = NATIVE) -> Fit:
     for effect in _shared_beside(search, fit, held):
         bare = taken_out(search, bare, (effect, ()))
     bare = bare.with_values(kd=np.zeros(search.data.joints), feed=np.zeros(search.data.joints))
-    dry = fit.point["stribeck"] + fit.point["load"] * search.data.load.mean(axis=(0, 2))
+    loaded = fit.point["load"] * search.data.load.mean(axis=(0, 2))
+    dry = fit.point["stribeck"] * ("friction.stribeck" not in held) + loaded * ("friction.load" not in held)
     bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
     wanted = [(*own, *(n for n in ("coulomb", "viscous") if n not in own)) for own in bare.active]
     changed = (bare.active, bare.shared) != (fit.active, fit.shared)
@@ -101,6 +111,24 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
         f"<!-- Left out, MJCF has no field for them (the rest was fitted without them):{note}\n-->\n" if left else ""
     )
     return Exported(comment + spec.to_xml(), tuple(left))
+
+
+def with_module(sim: SimModel, search: Search, fit: Fit) -> Exported | None:
+    """MJCF that is to be used with a module for friction that MJCF cannot hold; None if there is no such friction."""
+    held = {*NATIVE, *IN_MODULE}
+    if not any(effect_there(fit, effect, j) for effect in IN_MODULE for j in range(sim.n)):
+        return None
+    found = native_fit(search, fit, held)
+    effects: list[JointEffect] = []
+    for effect in IN_MODULE:
+        own = EFFECTS[effect]
+        for j in range(sim.n):
+            if effect_there(found, effect, j):
+                names = zip(own.reported, own.parameters, strict=True)
+                values = {called: float(found.point[name][j]) for called, name in names}
+                effects.append((effect, sim.arm.names[j], values))
+    made = exported(sim, search, fit, found, held)
+    return replace(made, effects=tuple(effects))
 
 
 def _shared_beside(search: Search, fit: Fit, held: Collection[str]) -> list[str]:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from armlink.errors import BadInput
+from sim_gap.better_model.effects_module import module_path, module_text
 from sim_gap.better_model.samples import write_rows
 from sim_gap.better_model.urdf import URDF, urdf_of
 from sim_gap.closed_loop.identify import Identified
@@ -20,26 +21,35 @@ def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> N
 def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
     """Write the corrected model as MJCF, or as URDF if the path ends so; a line per effect that it leaves out.
 
-    If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without; that of an
-    earlier model is removed if it does not. URDF has no actuators: theirs are the entries of `--out-actuators`. Raises
-    BadInput.
+    If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without. If it leaves out
+    friction that a module can apply, `NAME_effects.py` is that module, for the model `NAME_effects.xml`. Those of an
+    earlier model are removed where there are none now. URDF has no actuators: theirs are the entries of
+    `--out-actuators`. Raises BadInput.
     """
     import mujoco
 
     if found.export is None:
         raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
     text, lines = found.export.xml, found.export.lines
+    beside: dict[Path, str | None] = {}
     if path.suffix == URDF:
         text, told = urdf_of(mujoco.MjModel.from_xml_string(text), urdf_behind(found.sim.path), lines)
         lines = tuple(told)
+    else:
+        model, module, other = module_model(path), module_path(path), batched(found)
+        beside |= {batch_path(path): None if other is None else other.xml, model: None, module: None}
+        if found.beside is not None:
+            beside[model] = found.beside.xml
+            beside[module] = module_text(found.sim, found.beside.effects, model.name)
     try:
         path.write_text(text, encoding="utf-8")
-        if path.suffix != URDF and (other := batched(found)) is not None:
-            batch_path(path).write_text(other.xml, encoding="utf-8")
-        else:
-            batch_path(path).unlink(missing_ok=True)
+        for file, content in beside.items():
+            if content is None:
+                file.unlink(missing_ok=True)
+            else:
+                file.write_text(content, encoding="utf-8")
     except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+        raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
     return lines
 
 
@@ -55,3 +65,8 @@ def batched(found: Identified) -> Exported | None:
 def batch_path(path: Path) -> Path:
     """File of the model without PID actuators beside that of the corrected model."""
     return path.with_name(f"{path.stem}_batch{path.suffix}")
+
+
+def module_model(path: Path) -> Path:
+    """File of the model that the module beside the corrected model belongs to."""
+    return path.with_name(f"{path.stem}_effects.xml")

@@ -1,12 +1,17 @@
 """Free-running simulation of a MuJoCo model with its own actuators along recorded commands."""
 
 from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
+from sim_gap.better_model.forward_effects import Effects
+from sim_gap.closed_loop.training.export import Exported
+from sim_gap.model.load import SimModel
 
 OPENING_S = 1.0
 """Time at the start that is not judged [s]."""
@@ -14,42 +19,79 @@ LONGEST_S = 60.0
 """Longest part of a recording that is replayed [s]."""
 
 
-def replay(model: Any, joints: Sequence[int], recording: Recording) -> tuple[Array, Array, Array]:
+@dataclass(frozen=True)
+class Simulated:
+    """What is replayed: a compiled model, its joints, and the module's effects on it, if any."""
+
+    model: Any
+    joints: tuple[int, ...]
+    effects: Effects | None = None
+
+    def with_gain(self, gain: float) -> "Simulated":
+        """The same with the gains of the joints' position actuators times `gain`."""
+        if gain == 1.0:
+            return self
+        model = copy(self.model)
+        drive = [_actuator(model, joint) for joint in self.joints]
+        model.actuator_gainprm[drive, 0] *= gain  # of a PID actuator the integral part
+        model.actuator_biasprm[drive, 1] *= gain
+        return replace(self, model=model)
+
+
+def simulated(sim: SimModel, made: Exported) -> Simulated:
+    """A written model with what its module applies."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(made.xml)
+    return Simulated(model, tuple(sim.joints), Effects(model, made.effects, sim.arm.names) if made.effects else None)
+
+
+def replay(arm: Simulated, recording: Recording) -> tuple[Array, Array, Array]:
     """Times (K,), simulated and measured positions (K, n) of one recording while it is commanded.
 
     The model starts at the measured position at rest; each joint's actuator gets the command held from row to row.
     """
     import mujoco
 
+    model, joints = arm.model, list(arm.joints)
     given = recording.position_command
     assert given is not None
     rows = _commanded(recording)
     data = mujoco.MjData(model)
-    adr = model.jnt_qposadr[list(joints)]
+    adr = model.jnt_qposadr[joints]
     data.qpos[adr] = recording.position[0]
     drive = [_actuator(model, joint) for joint in joints]
     dt = float(model.opt.timestep)
     times, out = recording.t[:rows], np.empty((rows, len(joints)))
     at = 0
-    for k in range(int((times[-1] - times[0]) / dt) + 1):
-        now = times[0] + k * dt
-        while at + 1 < rows and times[at + 1] <= now + 1e-9:
-            out[at + 1] = data.qpos[adr]
-            at += 1
-        data.ctrl[drive] = given[at]
-        mujoco.mj_step(model, data)
+    mujoco.set_mjcb_passive(None if arm.effects is None else arm.effects.passive)
+    try:
+        for k in range(int((times[-1] - times[0]) / dt) + 1):
+            now = times[0] + k * dt
+            while at + 1 < rows and times[at + 1] <= now + 1e-9:
+                out[at + 1] = data.qpos[adr]
+                at += 1
+            data.ctrl[drive] = given[at]
+            mujoco.mj_step(model, data)
+    finally:
+        mujoco.set_mjcb_passive(None)
+        if arm.effects is not None:
+            model.dof_frictionloss[arm.effects.dofs] = arm.effects.coulomb
     out[0], out[at + 1 :] = recording.position[0], data.qpos[adr]
     return times, out, recording.position[:rows]
 
 
-def replay_rms(model: Any, joints: Sequence[int], recordings: Sequence[Recording]) -> Array:
-    """RMS of simulated minus measured positions over recordings [rad], (n,); NaN if none is commanded long enough."""
-    total, count = np.zeros(len(joints)), np.zeros(len(joints))
-    for recording in recordings:
+def replay_rms(arm: Simulated, recordings: Sequence[Recording], gains: Sequence[float] = ()) -> Array:
+    """RMS of simulated minus measured positions over recordings [rad], (n,); NaN if none is commanded long enough.
+
+    `gains` are those of the controller in each recording over the model's, by default 1.
+    """
+    total, count = np.zeros(len(arm.joints)), np.zeros(len(arm.joints))
+    for recording, gain in zip(recordings, gains or [1.0] * len(recordings), strict=True):
         if recording.t[_commanded(recording) - 1] - recording.t[0] < 2.0 * OPENING_S:
             continue
-        t, simulated, measured = replay(model, joints, recording)
-        gap = (simulated - measured)[t >= t[0] + OPENING_S]
+        t, positions, measured = replay(arm.with_gain(gain), recording)
+        gap = (positions - measured)[t >= t[0] + OPENING_S]
         total += np.nansum(gap**2, axis=0)
         count += np.isfinite(gap).sum(0)
     return np.asarray(np.sqrt(total / np.where(count > 0, count, np.nan)))

@@ -8,7 +8,8 @@ import pytest
 from sim_gap.attribution import notes, rollout
 from sim_gap.attribution.causes import ordered
 from sim_gap.attribution.diagnosis import Rollout
-from sim_gap.attribution.position_only import _running_free, _where
+from sim_gap.attribution.positions.answer import _where
+from sim_gap.attribution.positions.notes import running_free
 from sim_gap.attribution.residual_laws import ResidualLaw, _Candidate
 from sim_gap.attribution.rollout import RollOuts
 from sim_gap.attribution.steadiness import steadiness
@@ -148,7 +149,7 @@ def test_a_written_model_that_runs_away_from_the_fit_is_said() -> None:
         margin=np.array([0.001, 0.05]),
         sim=SimpleNamespace(arm=SimpleNamespace(names=("a", "b"))),
     )
-    (note,) = _running_free(found, Rollout(6.0, np.full(2, np.nan), np.array([0.05, 0.2]), closed_loop=True))
+    (note,) = running_free(found, Rollout(6.0, np.full(2, np.nan), np.array([0.05, 0.2]), closed_loop=True))
     assert note.endswith("is further off: b 0.2 rad (the fit 0.01)")
-    assert _running_free(found, Rollout(6.0, np.full(2, np.nan), np.array([0.05, 0.14]), closed_loop=True)) == []
-    assert _running_free(found, None) == []
+    assert running_free(found, Rollout(6.0, np.full(2, np.nan), np.array([0.05, 0.14]), closed_loop=True)) == []
+    assert running_free(found, None) == []

@@ -7,7 +7,7 @@ from armlink.recording.files import load_recording
 from sim_gap.blind.servo.effects import OF_THE_ARM, OF_THE_SERVO
 from sim_gap.blind.servo.make import Recipe, make_cases, recipes
 from sim_gap.blind.servo.score import score_positions
-from sim_gap.closed_loop.training.replay import replay_rms
+from sim_gap.closed_loop.training.replay import Simulated, replay_rms
 
 
 def test_every_effect_comes_in_turn() -> None:
@@ -33,7 +33,7 @@ def test_the_arm_without_an_effect_moves_as_its_model_does_in_mujoco(tmp_path) -
         recording = load_recording(folder / "heldout.csv")
         assert recording.torque is None
         moved = np.sqrt(np.mean((recording.position - recording.position_command) ** 2, axis=0))
-        rms[case] = replay_rms(model, range(model.njnt), [recording]) / moved
+        rms[case] = replay_rms(Simulated(model, tuple(range(model.njnt))), [recording]) / moved
     label = json.loads((tmp_path / "labels" / "case_0001.json").read_text())
     assert label["effects"][0]["effect"] == "controller.stiffness"
     assert rms["case_0000"].max() < 0.1

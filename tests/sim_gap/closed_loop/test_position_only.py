@@ -12,12 +12,13 @@ from servo_arm import model_text, record, written
 
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.attribution.position_only import _beyond, _verdict
+from sim_gap.attribution.positions.answer import _verdict
+from sim_gap.attribution.positions.notes import _beyond
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
 from sim_gap.closed_loop.training.bands import band
 from sim_gap.closed_loop.training.posterior import batch_path, batched, write_exported, write_samples
-from sim_gap.closed_loop.training.replay import replay_rms
+from sim_gap.closed_loop.training.replay import Simulated, replay_rms
 from sim_gap.report.page import write_report
 
 REAL = model_text(kp=15.0, friction=0.25)
@@ -77,8 +78,8 @@ def test_the_written_model_moves_like_the_arm(answer, tmp_path: Path) -> None:
     write_exported(answer.internals, tmp_path / "closed.xml")
     closed = mujoco.MjModel.from_xml_path(str(tmp_path / "closed.xml"))
     other = [record(REAL, 3, 14.0)]
-    before = replay_rms(mujoco.MjModel.from_xml_string(model_text(kp=120.0, friction=0.0)), (0, 1), other)
-    assert (replay_rms(closed, (0, 1), other) < 0.3 * before).all()
+    before = replay_rms(Simulated(mujoco.MjModel.from_xml_string(model_text(kp=120.0, friction=0.0)), (0, 1)), other)
+    assert (replay_rms(Simulated(closed, (0, 1)), other) < 0.3 * before).all()
     assert answer.to_json()["rollout"]["closed_loop"] is True
     assert batched(answer.internals) is None
     assert not batch_path(tmp_path / "closed.xml").exists()

@@ -1,4 +1,4 @@
-"""The answer from recordings without a torque channel: causes, verdict and notes in radians."""
+"""The answer from recordings without a torque channel: causes, verdict and roll-out in radians."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -7,14 +7,13 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout, Signs, Verdict
+from sim_gap.attribution.positions.notes import notes, running_free
 from sim_gap.checks.finding import Finding
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
-from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval, undecided_scale
+from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
-from sim_gap.closed_loop.training.bands import SHARE
-from sim_gap.closed_loop.training.limits import described
-from sim_gap.closed_loop.training.replay import replay_rms
+from sim_gap.closed_loop.training.replay import Simulated, replay_rms, simulated
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
@@ -25,8 +24,6 @@ STRUCTURE = 2.0
 """Remaining gap, in margins, from which an unknown controller may not be of the kind that was fitted."""
 ALMOST = 0.75
 """Highest confidence that positions alone give: it is not calibrated on sealed cases, as that from torques is."""
-FAR = 3.0
-"""So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
 SEPARATE = {
     "controller.stiffness": "hold a known load with the joint, or record the motor's current",
     "controller.dead_zone": "measure the play by hand with the servo holding, or read the motor's encoder",
@@ -74,7 +71,7 @@ def diagnose_positions(
         margin=found.margin,
         heldout_is=heldout_is,
         rollout=rollout,
-        notes=(*_notes(found), *_running_free(found, rollout)),
+        notes=(*notes(found), *running_free(found, rollout)),
         checks=tuple(checks),
         band=found.band,
         unit="rad",
@@ -197,65 +194,13 @@ def _where(found: Identified) -> tuple[Location, ...]:
 
 
 def _rollout(found: Identified) -> Rollout | None:
-    """Free-running replay of the nominal model and of the file that is exported."""
-    import mujoco
-
+    """Free-running replay of the nominal model and of what is exported, with its module if it has one."""
     if found.export is None:
         return None
-    corrected = mujoco.MjModel.from_xml_string(found.export.xml)
-    after = replay_rms(corrected, found.sim.joints, found.recordings)
+    after = replay_rms(simulated(found.sim, found.beside or found.export), found.recordings, found.gains)
     before = after * np.nan
     if found.nominal_has_controller:
-        before = replay_rms(found.sim.mujoco_model, found.sim.joints, found.recordings)
+        nominal = Simulated(found.sim.mujoco_model, found.sim.joints)
+        before = replay_rms(nominal, found.recordings, found.gains)
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
     return Rollout(longest, before, after, closed_loop=True)
-
-
-def _notes(found: Identified) -> list[str]:
-    names = found.sim.arm.names
-    kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
-    out = [f"no torque channel: controller ({kind}) and effects follow from q_cmd and q; the gap is in rad"]
-    if loose := undecided_scale(found.fit, found.spread):
-        listed = ", ".join(names[j] for j in loose)
-        out.append(
-            f"{listed}: position alone shows ratios of gain, friction and inertia here, their common scale rests on "
-            "the model's inertia: hold a known load or record the current"
-        )
-    if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
-        out.append(
-            "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
-            + (", as part of the controller" if found.search.open_controller else "")
-        )
-    if limits := described(found.spread.limits, names):
-        out.append(f"limits that the training motion does not reach: {limits}")
-    out += _beyond(found)
-    if found.export is not None and found.export.lines:
-        out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}")
-    return out
-
-
-def _running_free(found: Identified, rollout: Rollout | None) -> list[str]:
-    """A note of the joints at which the file that is written leaves much more of the gap than the fit."""
-    if rollout is None:
-        return []
-    left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
-    far = [
-        f"{found.sim.arm.names[j]} {left[j]:.3g} rad (the fit {found.heldout_after[j]:.3g})"
-        for j in np.flatnonzero(left > FAR * least)
-    ]
-    told = "the corrected model in MuJoCo, running free along the held-out commands, is further off"
-    return [f"{told}: {', '.join(far)}"] if far else []
-
-
-def _beyond(found: Identified) -> list[str]:
-    """A note of the joints that leave the range of the training recordings more often than a band may miss."""
-    out = []
-    for j, name in enumerate(found.sim.arm.names):
-        fitted, other = (d.measured[:, j][d.weight[:, j] > 0.0] for d in (found.search.data, found.heldout))
-        if not (fitted.size and other.size):
-            continue
-        outside = float(np.mean((other < fitted.min()) | (other > fitted.max())))
-        if outside > 1.0 - SHARE:
-            out.append(f"{name}: {outside:.0%} of the held-out motion")
-    told = "outside the range of the training recordings, where bands may be too narrow"
-    return [f"{told}: {', '.join(out)}"] if out else []

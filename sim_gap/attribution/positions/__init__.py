@@ -1,0 +1,1 @@
+"""The answer from recordings without a torque channel, in radians."""

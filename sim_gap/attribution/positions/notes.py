@@ -1,0 +1,69 @@
+"""Notes of an answer from positions alone: what they leave open, and where the exported model is further off."""
+
+import numpy as np
+
+from sim_gap.attribution.diagnosis import Rollout
+from sim_gap.closed_loop.identify import Identified
+from sim_gap.closed_loop.judge import undecided_scale
+from sim_gap.closed_loop.training.bands import SHARE
+from sim_gap.closed_loop.training.export import Exported
+from sim_gap.closed_loop.training.limits import described
+
+FAR = 3.0
+"""So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
+
+
+def notes(found: Identified) -> list[str]:
+    """What to know of the controller, of limits that were not reached, and of what the exported model leaves out."""
+    names = found.sim.arm.names
+    kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
+    out = [f"no torque channel: controller ({kind}) and effects follow from q_cmd and q; the gap is in rad"]
+    if loose := undecided_scale(found.fit, found.spread):
+        listed = ", ".join(names[j] for j in loose)
+        out.append(
+            f"{listed}: position alone shows ratios of gain, friction and inertia here, their common scale rests on "
+            "the model's inertia: hold a known load or record the current"
+        )
+    if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
+        out.append(
+            "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
+            + (", as part of the controller" if found.search.open_controller else "")
+        )
+    if limits := described(found.spread.limits, names):
+        out.append(f"limits that the training motion does not reach: {limits}")
+    out += _beyond(found)
+    if found.export is not None and found.export.lines:
+        module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
+        out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}{module}")
+    return out
+
+
+def _in_module(beside: Exported) -> str:
+    return ", ".join(f"{effect} {joint}" for effect, joint, _ in beside.effects)
+
+
+def running_free(found: Identified, rollout: Rollout | None) -> list[str]:
+    """A note of the joints at which the file that is written leaves much more of the gap than the fit."""
+    if rollout is None:
+        return []
+    left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
+    far = [
+        f"{found.sim.arm.names[j]} {left[j]:.3g} rad (the fit {found.heldout_after[j]:.3g})"
+        for j in np.flatnonzero(left > FAR * least)
+    ]
+    told = "the corrected model in MuJoCo, running free along the held-out commands, is further off"
+    return [f"{told}: {', '.join(far)}"] if far else []
+
+
+def _beyond(found: Identified) -> list[str]:
+    """A note of the joints that leave the range of the training recordings more often than a band may miss."""
+    out = []
+    for j, name in enumerate(found.sim.arm.names):
+        fitted, other = (d.measured[:, j][d.weight[:, j] > 0.0] for d in (found.search.data, found.heldout))
+        if not (fitted.size and other.size):
+            continue
+        outside = float(np.mean((other < fitted.min()) | (other > fitted.max())))
+        if outside > 1.0 - SHARE:
+            out.append(f"{name}: {outside:.0%} of the held-out motion")
+    told = "outside the range of the training recordings, where bands may be too narrow"
+    return [f"{told}: {', '.join(out)}"] if out else []

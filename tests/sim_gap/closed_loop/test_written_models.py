@@ -1,0 +1,95 @@
+"""What is written for training moves as the arm does: with its module, and with the gain of each recording."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import mujoco
+import numpy as np
+import pytest
+from servo_arm import model_text, record, written
+
+from sim_gap.better_model.effects_module import module_text
+from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
+from sim_gap.closed_loop.fit import Fit, improve
+from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.training.export import IN_MODULE, Exported, exported, native_fit, with_module
+from sim_gap.closed_loop.training.replay import Simulated, replay, replay_rms, simulated
+from sim_gap.closed_loop.windows import windows_of
+from sim_gap.model.load import SimModel, load_model
+
+GAIN, LOAD = 15.0, 0.4
+TEXT = model_text(kp=GAIN, friction=0.05)
+OTHER = record(TEXT, 3, 21.0, load=LOAD)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> tuple[SimModel, Search, Fit]:
+    """An arm whose gears rub under load, and the fit that knows it."""
+    sim = load_model(written(tmp_path_factory.mktemp("arm"), TEXT))
+    data = windows_of(sim.arm, [record(TEXT, seed, 28.0, load=LOAD) for seed in (1, 2)], ["one", "two"])
+    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
+    known = ("kp", "coulomb", "viscous", "load")
+    return sim, search, improve(data, Fit(search.nominal, (known, known)), search.scales)
+
+
+def loaded(sim: SimModel, beside: Exported) -> Simulated:
+    """The model with the module as a stranger gets it: from their texts."""
+    module = ModuleType("closed_effects")
+    exec(module_text(sim, beside.effects, "closed_effects.xml"), module.__dict__)
+    assert module.MODEL == "closed_effects.xml"
+    model = mujoco.MjModel.from_xml_string(beside.xml)
+    return Simulated(model, sim.joints, module.Effects(model))
+
+
+def test_the_module_holds_friction_under_load_that_the_model_alone_cannot(made) -> None:
+    sim, search, fit = made
+    assert fit.point["load"] == pytest.approx([LOAD, LOAD], rel=0.15)
+    beside, alone = with_module(sim, search, fit), exported(sim, search, fit, native_fit(search, fit))
+    assert alone.lines == ("friction.load elbow", "friction.load shoulder")
+    assert beside.lines == ()
+    assert [(effect, joint) for effect, joint, _ in beside.effects] == [
+        ("friction.load", "shoulder"),
+        ("friction.load", "elbow"),
+    ]
+    with_it, without = (
+        replay_rms(each, [OTHER]) for each in (loaded(sim, beside), simulated(sim, replace(beside, effects=())))
+    )
+    left_alone = replay_rms(simulated(sim, alone), [OTHER])
+    assert (with_it < 0.7 * left_alone).all()
+    assert (with_it < 0.3 * without).all()
+    assert (with_it < 2.0 * np.pi / 4096.0).all()  # a count of the arm's encoders
+
+
+def test_the_replay_leaves_the_model_and_mujoco_as_they_were(made) -> None:
+    arm = loaded(made[0], with_module(*made))
+    friction = arm.model.dof_frictionloss.copy()
+    replay(arm, OTHER)
+    np.testing.assert_array_equal(arm.model.dof_frictionloss, friction)
+    assert mujoco.get_mjcb_passive() is None
+
+
+def test_a_fit_without_such_friction_needs_no_module(made) -> None:
+    sim, search, fit = made
+    bare = replace(fit.with_values(load=np.zeros(2)), active=(("kp", "coulomb", "viscous"),) * 2)
+    assert with_module(sim, search, bare) is None
+    assert set(IN_MODULE) == {"friction.stribeck", "friction.load", "friction.asymmetric"}
+
+
+@pytest.mark.parametrize("kind", ["position", "pid"])
+def test_a_recording_with_another_gain_is_replayed_with_that_gain(tmp_path: Path, kind: str) -> None:
+    """Against a model whose actuators have that gain from the start."""
+
+    def arm(kp: float) -> Simulated:
+        spec = mujoco.MjSpec.from_string(model_text(kp=kp, friction=0.2))
+        for actuator in spec.actuators:
+            if kind == "pid":
+                actuator.set_to_pid(kp=kp, kv=0.3, ki=0.5 * kp, slewmax=2.0, ctrlspec=1)
+        return Simulated(spec.compile(), (0, 1))
+
+    low = arm(GAIN)
+    np.testing.assert_allclose(replay(low.with_gain(4.0), OTHER)[1], replay(arm(4.0 * GAIN), OTHER)[1], atol=1e-9)
+    assert np.abs(replay(low, OTHER)[1] - replay(low.with_gain(4.0), OTHER)[1]).max() > 0.05
+    apart = replay_rms(low, [OTHER, OTHER], [1.0, 4.0]) ** 2
+    both = replay_rms(low, [OTHER]) ** 2 + replay_rms(low.with_gain(4.0), [OTHER]) ** 2
+    np.testing.assert_allclose(2.0 * apart, both)
