@@ -42,7 +42,7 @@ LABELS = {
 def cause_figure(answer: Diagnosis, cause: Cause) -> Any:
     """Residual less all other causes, and this cause's share, on the row where it is largest; None without one."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
-    terms = tuple(term for term in estimate.terms if _is_of(term, cause, answer.names))
+    terms = tuple(term for term in estimate.terms if is_of(term, cause, answer.names))
     own, all_of_them = (_sums(data, estimate, some) for some in (terms, estimate.terms))
     sizes = {row: root_mean_square(own[row][data.valid[row]]) for row in data.rows if data.valid[row].sum() > 10}
     if not sizes or max(sizes.values()) == 0.0:
@@ -78,7 +78,8 @@ def abscissa(data: ResidualSet, joint: int, quantity: str) -> Array:
     return stacked(data, names[quantity])[:, joint]
 
 
-def _is_of(term: Term, cause: Cause, names: tuple[str, ...]) -> bool:
+def is_of(term: Term, cause: Cause, names: tuple[str, ...]) -> bool:
+    """Whether a term is a part of a cause at joints of these names."""
     return term.effect == cause.effect and ("arm" in cause.parameters or names[term.place] in cause.joints)
 
 

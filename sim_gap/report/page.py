@@ -11,6 +11,7 @@ from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
 from sim_gap.report.law_figure import law_figure
+from sim_gap.report.over_time import torque_over_time
 from sim_gap.report.position_page import position_sections
 
 
@@ -20,7 +21,7 @@ def sections(answer: Diagnosis) -> list[Section]:
         return position_sections(answer)
     out = [_verdict(answer), _gap(answer)]
     if answer.internals is not None:
-        out += [*_causes(answer), *_laws(answer), *_residuals(answer)]
+        out += [*_over_time(answer), *_causes(answer), *_laws(answer), *_residuals(answer)]
     return out
 
 
@@ -96,6 +97,21 @@ def _gap(answer: Diagnosis) -> Section:
     if answer.rollout is not None:
         figures.append(rollout_bars(answer.names, answer.rollout))
     return Section("Gap before and after", paragraph(text), figures, [ReportTable(header, rows)])
+
+
+def _over_time(answer: Diagnosis) -> list[Section]:
+    """Measured, nominal and corrected torque of every joint."""
+    layout, out = answer.internals.heldout.layout, []
+    for channel in filter(None, (layout.sensor, layout.motor)):
+        nominal = "by the nominal model" if channel == layout.against_model else "by the torque sensor's readings"
+        text = (
+            f"The {CHANNEL_WORDS[channel]} of every joint along held-out data, as measured, {nominal}, and with the "
+            "causes added. Click a name to hide or show it; “without” leaves one effect out."
+        )
+        figure = torque_over_time(answer, channel)
+        if figure is not None:
+            out.append(Section(f"Every joint over time: {CHANNEL_WORDS[channel]}", paragraph(text), [figure]))
+    return out
 
 
 def _causes(answer: Diagnosis) -> list[Section]:

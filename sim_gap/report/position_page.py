@@ -1,22 +1,17 @@
 """Report of a position-only diagnosis: causes, gap in radians, real, nominal and corrected motion of every joint."""
 
+from collections.abc import Sequence
 from html import escape
 from typing import Any
 
-import numpy as np
-from plotly.subplots import make_subplots
-
-from armlink.recording.recording import Recording
 from calib.report.page import ReportTable, Section, paragraph
+from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.closed_loop.identify import Identified
-from sim_gap.closed_loop.training.replay import Simulated, replay, simulated
+from sim_gap.closed_loop.training.replay import Simulated, less, replay, simulated
 from sim_gap.report.effect_text import WORDS, advice, sentence
-from sim_gap.report.figures import BELOW_TITLE, BLUE, GREY, ORANGE
-
-SHOWN_S = 15.0
-"""Length of the motion that is shown [s]."""
-POINTS = 750
+from sim_gap.report.figures import BLUE, GREY, ORANGE
+from sim_gap.report.over_time import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, without
 
 
 def position_sections(answer: Diagnosis) -> list[Section]:
@@ -38,52 +33,39 @@ def position_sections(answer: Diagnosis) -> list[Section]:
     ]
     table = ReportTable(("joint", "noise floor", "before", "after"), gap, f"RMS in rad on {answer.heldout_is}.")
     out = [Section("Verdict and causes", html, (), [causes, parameters]), Section("Gap", "", (), [table])]
-    figure = motion_figure(answer.internals) if isinstance(answer.internals, Identified) else None
+    figure = motion_figure(answer.internals, answer.causes) if isinstance(answer.internals, Identified) else None
     if figure is not None:
         text = (
             "The command, the measured motion, and simulations that run free along the command, on held-out data. "
-            "Click a name to hide or show it."
+            "Click a name to hide or show it; “without” leaves one effect out of the corrected model."
         )
         out.append(Section("Motion of every joint", paragraph(text), [figure]))
     return out
 
 
-def motion_figure(found: Identified) -> Any:
-    """One row a joint: measured, nominal and corrected motion; None if the model did not come from a file."""
+def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
+    """One row a joint: measured, nominal and corrected motion, and without each cause; None without a model's file."""
     if found.export is None:
         return None
-    recording, names, gain = _shortened(found.recordings[0]), found.sim.arm.names, found.gains[0]
-    corrected = simulated(found.sim, found.beside or found.export)
-    t, after, measured = replay(corrected.with_gain(gain), recording)
-    lines = [("command", recording.position_command[: len(t)], GREY), ("measured", measured, "black")]  # type: ignore[index]
+    recording, names, gain = found.recordings[0], found.sim.arm.names, found.gains[0]
+
+    def moved(arm: Simulated) -> tuple[Array, Array, Array]:
+        return replay(arm.with_gain(gain), recording, SHOWN_S)
+
+    made = found.beside or found.export
+    t, after, measured = moved(simulated(found.sim, made))
+    assert recording.position_command is not None
+    lines: list[Line] = [
+        ("command", recording.position_command[: len(t)], GREY, True),
+        ("measured", measured, "black", True),
+    ]
     if found.nominal_has_controller:
-        nominal = Simulated(found.sim.mujoco_model, found.sim.joints).with_gain(gain)
-        lines.append(("nominal model", replay(nominal, recording)[1], ORANGE))
-    lines.append(("corrected model", after, BLUE))
-    figure = make_subplots(rows=len(names), cols=1, shared_xaxes=True, subplot_titles=list(names))
-    every = max(1, len(t) // POINTS)
-    for label, values, colour in lines:
-        for j in range(len(names)):
-            figure.add_scatter(
-                x=(t - t[0])[::every].round(3),
-                y=np.asarray(values)[::every, j].round(5),
-                name=label,
-                legendgroup=label,
-                showlegend=j == 0,
-                line={"color": colour, "width": 1.4},
-                row=j + 1,
-                col=1,
-            )
-    figure.update_yaxes(title="rad")
-    figure.update_xaxes(title="time [s]", row=len(names), col=1)
-    figure.update_layout(height=120 + 190 * len(names), legend=BELOW_TITLE)
-    return figure
-
-
-def _shortened(recording: Recording) -> Recording:
-    from armlink.recording.recording import slice_rows
-
-    return slice_rows(recording, recording.t <= recording.t[0] + SHOWN_S)
+        lines.append(("nominal model", moved(Simulated(found.sim.mujoco_model, found.sim.joints))[1], ORANGE, True))
+    lines.append(("corrected model", after, BLUE, True))
+    left_out = list(dict.fromkeys(cause.effect for cause in causes))[:MOST_LEFT_OUT]
+    groups = [[stage.group for stage in found.stages if stage.group[0].partition("@")[0] == e] for e in left_out]
+    lines += without(left_out, [moved(less(found.sim, found.search, made, own))[1] for own in groups])
+    return lines_over_time(t - t[0], names, lines, "rad")
 
 
 def _cause_row(cause: Cause) -> list[str]:

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from armlink.recording.recording import Recording
-from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout, Signs, Verdict
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.positions.notes import notes, running_free
 from sim_gap.checks.finding import Finding
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
-from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, interval
+from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, groups_of, interval
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
-from sim_gap.closed_loop.training.replay import Simulated, replay_rms, simulated
+from sim_gap.closed_loop.training.replay import SHORT_S, Simulated, less, replay_rms, simulated
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
@@ -49,13 +49,14 @@ def diagnose_positions(
     progress("replaying the corrected model")
     share = _left(found)
     made = [_cause(found, stage, share) for stage in found.stages]
-    causes = [c for c, stage in zip(made, found.stages, strict=True) if _matters(found, stage)]
+    taken = [(c, stage) for c, stage in zip(made, found.stages, strict=True) if _matters(found, stage)]
+    causes = [c for c, _ in taken]
     minor = [c for c in made if c not in causes]
     verdict = _verdict(found, causes, share)
     if verdict == "no_gap":
-        causes, minor = [], [*causes, *minor]
+        taken, causes, minor = [], [], [*causes, *minor]
     capped = [_hint(cause) for cause in causes] if verdict == "unexplained" else causes
-    rollout = _rollout(found)
+    rollout = _rollout(found, taken)
     return Diagnosis(
         verdict=verdict,
         names=sim.arm.names,
@@ -193,14 +194,25 @@ def _where(found: Identified) -> tuple[Location, ...]:
     return tuple(sorted(rows, key=lambda row: -row.rms))
 
 
-def _rollout(found: Identified) -> Rollout | None:
-    """Free-running replay of the nominal model and of what is exported, with its module if it has one."""
+def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout | None:
+    """Free-running replay of the nominal model, of what is exported, with its module if it has one, and of each cause
+    alone and left out; those whose absence costs most first."""
     if found.export is None:
         return None
-    after = replay_rms(simulated(found.sim, found.beside or found.export), found.recordings, found.gains)
+    made, groups = found.beside or found.export, groups_of(found.fit, found.search)
+    after = replay_rms(simulated(found.sim, made), found.recordings, found.gains)
     before = after * np.nan
     if found.nominal_has_controller:
         nominal = Simulated(found.sim.mujoco_model, found.sim.joints)
         before = replay_rms(nominal, found.recordings, found.gains)
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
-    return Rollout(longest, before, after, closed_loop=True)
+    effects = []
+    for cause, stage in taken:
+        others = [group for group in groups if group != stage.group]
+        alone, without = (
+            replay_rms(less(found.sim, found.search, made, some), found.recordings, found.gains, SHORT_S)
+            for some in (others, [stage.group])
+        )
+        effects.append(EffectRollout(cause.effect, cause.joints, alone, without))
+    effects.sort(key=lambda each: -float(np.nanmax(each.without)))
+    return Rollout(longest, before, after, tuple(effects), closed_loop=True)

@@ -54,6 +54,8 @@ class Exported:
 
     xml: str
     lines: tuple[str, ...]
+    fit: Fit
+    """Parameters that it was written with."""
     effects: tuple[JointEffect, ...] = ()
     """Those that a module applies beside it."""
 
@@ -110,7 +112,7 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
     comment = (
         f"<!-- Left out, MJCF has no field for them (the rest was fitted without them):{note}\n-->\n" if left else ""
     )
-    return Exported(comment + spec.to_xml(), tuple(left))
+    return Exported(comment + spec.to_xml(), tuple(left), native)
 
 
 def with_module(sim: SimModel, search: Search, fit: Fit) -> Exported | None:
@@ -118,16 +120,20 @@ def with_module(sim: SimModel, search: Search, fit: Fit) -> Exported | None:
     held = {*NATIVE, *IN_MODULE}
     if not any(effect_there(fit, effect, j) for effect in IN_MODULE for j in range(sim.n)):
         return None
-    found = native_fit(search, fit, held)
+    return beside(sim, search, native_fit(search, fit, held))
+
+
+def beside(sim: SimModel, search: Search, fit: Fit) -> Exported:
+    """MJCF of a fit as it is and the effects that a module applies beside it."""
     effects: list[JointEffect] = []
     for effect in IN_MODULE:
         own = EFFECTS[effect]
         for j in range(sim.n):
-            if effect_there(found, effect, j):
-                names = zip(own.reported, own.parameters, strict=True)
-                values = {called: float(found.point[name][j]) for called, name in names}
+            if effect_there(fit, effect, j):
+                pairs = zip(own.reported, own.parameters, strict=True)
+                values = {called: float(fit.point[name][j]) for called, name in pairs}
                 effects.append((effect, sim.arm.names[j], values))
-    made = exported(sim, search, fit, found, held)
+    made = exported(sim, search, fit, fit, {*NATIVE, *IN_MODULE})
     return replace(made, effects=tuple(effects))
 
 

@@ -10,13 +10,14 @@ import numpy as np
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.better_model.forward_effects import Effects
-from sim_gap.closed_loop.training.export import Exported
+from sim_gap.closed_loop.search import Group, Search, taken_out
+from sim_gap.closed_loop.training.export import Exported, beside
 from sim_gap.model.load import SimModel
 
 OPENING_S = 1.0
 """Time at the start that is not judged [s]."""
-LONGEST_S = 60.0
-"""Longest part of a recording that is replayed [s]."""
+LONGEST_S, SHORT_S = 60.0, 15.0
+"""Longest part of a recording that is replayed [s], and that is for an effect alone or left out."""
 
 
 @dataclass(frozen=True)
@@ -46,17 +47,26 @@ def simulated(sim: SimModel, made: Exported) -> Simulated:
     return Simulated(model, tuple(sim.joints), Effects(model, made.effects, sim.arm.names) if made.effects else None)
 
 
-def replay(arm: Simulated, recording: Recording) -> tuple[Array, Array, Array]:
+def less(sim: SimModel, search: Search, made: Exported, groups: Sequence[Group]) -> Simulated:
+    """What was written less some effects, the others as they are."""
+    fit = made.fit
+    for group in groups:
+        fit = taken_out(search, fit, group)
+    return simulated(sim, beside(sim, search, fit))
+
+
+def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> tuple[Array, Array, Array]:
     """Times (K,), simulated and measured positions (K, n) of one recording while it is commanded.
 
-    The model starts at the measured position at rest; each joint's actuator gets the command held from row to row.
+    The model starts at the measured position at rest; each joint's actuator gets the command held from row to row, for
+    at most `longest` [s].
     """
     import mujoco
 
     model, joints = arm.model, list(arm.joints)
     given = recording.position_command
     assert given is not None
-    rows = _commanded(recording)
+    rows = _commanded(recording, longest)
     data = mujoco.MjData(model)
     adr = model.jnt_qposadr[joints]
     data.qpos[adr] = recording.position[0]
@@ -81,26 +91,28 @@ def replay(arm: Simulated, recording: Recording) -> tuple[Array, Array, Array]:
     return times, out, recording.position[:rows]
 
 
-def replay_rms(arm: Simulated, recordings: Sequence[Recording], gains: Sequence[float] = ()) -> Array:
+def replay_rms(
+    arm: Simulated, recordings: Sequence[Recording], gains: Sequence[float] = (), longest: float = LONGEST_S
+) -> Array:
     """RMS of simulated minus measured positions over recordings [rad], (n,); NaN if none is commanded long enough.
 
     `gains` are those of the controller in each recording over the model's, by default 1.
     """
     total, count = np.zeros(len(arm.joints)), np.zeros(len(arm.joints))
     for recording, gain in zip(recordings, gains or [1.0] * len(recordings), strict=True):
-        if recording.t[_commanded(recording) - 1] - recording.t[0] < 2.0 * OPENING_S:
+        if recording.t[_commanded(recording, longest) - 1] - recording.t[0] < 2.0 * OPENING_S:
             continue
-        t, positions, measured = replay(arm.with_gain(gain), recording)
+        t, positions, measured = replay(arm.with_gain(gain), recording, longest)
         gap = (positions - measured)[t >= t[0] + OPENING_S]
         total += np.nansum(gap**2, axis=0)
         count += np.isfinite(gap).sum(0)
     return np.asarray(np.sqrt(total / np.where(count > 0, count, np.nan)))
 
 
-def _commanded(recording: Recording) -> int:
-    """Number of rows from the first that are commanded, at most `LONGEST_S`."""
+def _commanded(recording: Recording, longest: float) -> int:
+    """Number of rows from the first that are commanded, of at most `longest` [s]."""
     assert recording.position_command is not None
-    missing = ~np.isfinite(recording.position_command).all(axis=1) | (recording.t > recording.t[0] + LONGEST_S)
+    missing = ~np.isfinite(recording.position_command).all(axis=1) | (recording.t > recording.t[0] + longest)
     return int(np.argmax(missing)) if missing.any() else len(recording.t)
 
 

@@ -306,7 +306,7 @@ def test_friction_that_a_simulator_cannot_hold_is_added_to_coulombs(monkeypatch)
 def test_the_opening_of_a_replay_is_not_judged(monkeypatch) -> None:
     t = 5.0 + np.arange(0.0, 4.0, 0.1)
     simulated, measured = np.where(t < 5.95, 7.0, 0.5)[:, None], np.zeros((len(t), 1))
-    monkeypatch.setattr(replays, "replay", lambda arm, recording: (t, simulated, measured))
+    monkeypatch.setattr(replays, "replay", lambda arm, recording, longest: (t, simulated, measured))
     recording = Recording(t=t, position=measured, position_command=measured)
     assert replays.replay_rms(replays.Simulated(None, (0,)), [recording]) == pytest.approx([0.5])
 

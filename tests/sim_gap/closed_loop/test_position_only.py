@@ -20,6 +20,7 @@ from sim_gap.closed_loop.training.bands import band
 from sim_gap.closed_loop.training.posterior import batch_path, batched, write_exported, write_samples
 from sim_gap.closed_loop.training.replay import Simulated, replay_rms
 from sim_gap.report.page import write_report
+from sim_gap.report.position_page import motion_figure
 
 REAL = model_text(kp=15.0, friction=0.25)
 
@@ -149,6 +150,29 @@ def test_the_band_holds_its_share_of_other_motion(answer) -> None:
     known = band(found.search, found.fit, replace(found.spread, limits=()), found.heldout)
     assert ((known.width > 0.0) & (known.width < 0.03 * answer.heldout_before)).all()
     assert all(1.0 < width / own < 25.0 for width, own in zip(told["half_width"], known.width, strict=True))
+
+
+def test_each_cause_is_replayed_alone_and_left_out(answer) -> None:
+    effects = {each["effect"]: each for each in answer.to_json()["rollout"]["effects"]}
+    assert effects.keys() == {"controller.stiffness", "friction.coulomb"}
+    after, before = answer.rollout.after, answer.rollout.before
+    for each in effects.values():
+        assert (np.array(each["without"]) > 1.5 * after).all()
+    assert (np.array(effects["controller.stiffness"]["alone"]) < before).all()
+    worst = [max(each["without"]) for each in answer.to_json()["rollout"]["effects"]]
+    assert worst == sorted(worst, reverse=True)
+
+
+def test_the_picture_of_the_motion_can_leave_each_cause_out(answer) -> None:
+    figure = motion_figure(answer.internals, answer.causes)
+    lines = {trace.name: trace for trace in figure.data if trace.yaxis == "y"}
+    shown = [name for name, trace in lines.items() if trace.visible is True]
+    assert shown == ["command", "measured", "nominal model", "corrected model"]
+    hidden = {name for name, trace in lines.items() if trace.visible == "legendonly"}
+    assert hidden == {"without controller.stiffness", "without friction.coulomb"}
+    measured = np.array(lines["measured"].y)
+    left = {name: np.std(np.array(trace.y) - measured) for name, trace in lines.items()}
+    assert all(left[name] > 1.5 * left["corrected model"] for name in hidden)
 
 
 def test_report_shows_every_joint(answer, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from sim_gap.attribution.diagnose import diagnose
 from sim_gap.report import page
 from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.figures import residual_panels
+from sim_gap.report.over_time import torque_over_time
 from sim_gap.report.page import sections
 
 WRONG = Wrong(coulomb=np.array([0.0, 0.8, 0.0]), spring=np.array([0.0, 0.0, 2.0]))
@@ -38,6 +39,24 @@ def test_every_cause_has_its_figure_and_lies_in_the_middle_of_what_it_explains(a
         assert np.std(left.y - explained.y) < 0.1 * np.std(left.y)
     (section,) = [s for s in sections(answer) if s.title == "The causes one by one"]
     assert len(section.figures) == 2
+
+
+def test_every_joint_is_shown_over_time_as_measured_nominal_and_corrected_and_without_each_cause(answer):
+    figure = torque_over_time(answer, "tau_motor")
+    lines = {(trace.name, trace.yaxis): trace for trace in figure.data}
+    names = {name for name, _ in lines}
+    assert names == {"measured", "nominal", "corrected", "without friction.coulomb", "without transmission.spring"}
+    assert len(lines) == 3 * len(names)
+    shown = {trace.name for trace in figure.data if trace.visible is True}
+    assert shown == {"measured", "nominal", "corrected"}
+    measured, nominal, corrected, less = (
+        np.array(lines[name, "y2"].y) for name in ("measured", "nominal", "corrected", "without friction.coulomb")
+    )
+    assert np.std(corrected - measured) < 0.2 * np.std(nominal - measured)
+    assert np.median(np.abs(corrected - less)) == pytest.approx(0.8, rel=0.1)
+    assert lines["measured", "y2"].x[-1] == pytest.approx(15.0, abs=0.2)
+    titles = [section.title for section in sections(answer)]
+    assert "Every joint over time: motor torque" in titles
 
 
 def test_it_begins_with_what_to_do_and_its_headings_are_words(answer):
