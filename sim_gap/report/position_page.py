@@ -8,6 +8,7 @@ from calib.report.page import ReportTable, Section, paragraph
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.closed_loop.identify import Identified
+from sim_gap.closed_loop.training.export import WRITTEN
 from sim_gap.closed_loop.training.replay import Simulated, less, replay, simulated
 from sim_gap.report.effect_text import WORDS, advice, sentence
 from sim_gap.report.figures import BLUE, GREY, ORANGE
@@ -62,7 +63,7 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
     if found.nominal_has_controller:
         lines.append(("nominal model", moved(Simulated(found.sim.mujoco_model, found.sim.joints))[1], ORANGE, True))
     lines.append(("corrected model", after, BLUE, True))
-    left_out = list(dict.fromkeys(cause.effect for cause in causes))[:MOST_LEFT_OUT]
+    left_out = list(dict.fromkeys(cause.effect for cause in causes if cause.effect in WRITTEN))[:MOST_LEFT_OUT]
     groups = [[stage.group for stage in found.stages if stage.group[0].partition("@")[0] == e] for e in left_out]
     lines += without(left_out, [moved(less(found.sim, found.search, made, own))[1] for own in groups])
     return lines_over_time(t - t[0], names, lines, "rad")

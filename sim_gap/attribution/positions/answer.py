@@ -13,6 +13,7 @@ from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
 from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, groups_of, interval
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
+from sim_gap.closed_loop.training.export import WRITTEN
 from sim_gap.closed_loop.training.replay import SHORT_S, Simulated, less, replay_rms, simulated
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
@@ -196,7 +197,7 @@ def _where(found: Identified) -> tuple[Location, ...]:
 
 def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout | None:
     """Free-running replay of the nominal model, of what is exported, with its module if it has one, and of each cause
-    alone and left out; those whose absence costs most first."""
+    that is in it alone and left out; those whose absence costs most first."""
     if found.export is None:
         return None
     made, groups = found.beside or found.export, groups_of(found.fit, found.search)
@@ -208,6 +209,8 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
     effects = []
     for cause, stage in taken:
+        if cause.effect not in WRITTEN:
+            continue
         others = [group for group in groups if group != stage.group]
         alone, without = (
             replay_rms(less(found.sim, found.search, made, some), found.recordings, found.gains, SHORT_S)

@@ -41,6 +41,8 @@ BATCHED = frozenset(NATIVE) - {"controller.slew", "controller.integral"}
 """Effects that MuJoCo Warp can run too: it has no PID actuator, which slew limit and integral part need."""
 IN_MODULE = "friction.stribeck", "friction.load", "friction.asymmetric"
 """Effects that the module beside a model applies."""
+WRITTEN = frozenset({*NATIVE, *IN_MODULE})
+"""Effects of a model with its module."""
 STICKS = {"solref_friction": [0.01, 1.0], "solimp_friction": [0.999, 0.9999, 0.001, 0.5, 2.0]}
 """Solver parameters with which a joint under friction rests; with MuJoCo's usual ones it creeps to where no friction is
 needed, within a tenth of a second on a small arm."""
@@ -117,10 +119,9 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
 
 def with_module(sim: SimModel, search: Search, fit: Fit) -> Exported | None:
     """MJCF that is to be used with a module for friction that MJCF cannot hold; None if there is no such friction."""
-    held = {*NATIVE, *IN_MODULE}
     if not any(effect_there(fit, effect, j) for effect in IN_MODULE for j in range(sim.n)):
         return None
-    return beside(sim, search, native_fit(search, fit, held))
+    return beside(sim, search, native_fit(search, fit, WRITTEN))
 
 
 def beside(sim: SimModel, search: Search, fit: Fit) -> Exported:
@@ -133,7 +134,7 @@ def beside(sim: SimModel, search: Search, fit: Fit) -> Exported:
                 pairs = zip(own.reported, own.parameters, strict=True)
                 values = {called: float(fit.point[name][j]) for called, name in pairs}
                 effects.append((effect, sim.arm.names[j], values))
-    made = exported(sim, search, fit, fit, {*NATIVE, *IN_MODULE})
+    made = exported(sim, search, fit, fit, WRITTEN)
     return replace(made, effects=tuple(effects))
 
 
