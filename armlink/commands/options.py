@@ -16,7 +16,9 @@ Columns = Annotated[
 Joints = Annotated[str, typer.Option(help="Joints of the recordings to take, base to tip: a,b,c.")]
 Units = Annotated[
     list[str] | None,
-    typer.Option(help="Unit of a channel: q=deg, q=counts:4096, tau_motor=A:12.5 (N·m/A), t=ms."),
+    typer.Option(
+        help="Unit of a channel: q=deg, q=counts:4096, q=percent:110 (degrees at 100), tau_motor=A:12.5 (N·m/A), t=ms."
+    ),
 ]
 Sign = Annotated[list[str] | None, typer.Option(help="Sign of a channel or column: tau_3=-1.")]
 Zero = Annotated[list[str] | None, typer.Option(help="Angle to add to a position: q_2=1.5708 [rad].")]

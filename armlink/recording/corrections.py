@@ -4,7 +4,7 @@ Each is an option of `armlink gap diagnose` in text form, so that what a check r
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -64,7 +64,7 @@ class Corrections:
             _scale(channels, column, (factor,), source, "--sign")
         units = {column: factors for column, factors in self.units.items() if column != "t"}
         for column, factors in units.items():
-            _scale(channels, column, factors, source, "--units")
+            _scale(channels, column, factors, source, "--units", beside=units)
         for column, angle in self.zero.items():
             channel, joints = _place(channels, column, source, "--zero")
             channels[channel][:, joints] += angle
@@ -99,7 +99,8 @@ def parse_corrections(
     """Read the options of a command, each `COLUMN=VALUE`, several separated by commas.
 
     `units` takes `q=deg`, `tau_motor=mN·m`, `tau_motor=A:K` or `tau_motor=A:K1;K2;…` (torque constants at the joint
-    [N·m/A]) and `q=counts:N` (counts a turn). Raises BadInput for anything else.
+    [N·m/A]), `q=counts:N` (counts a turn) and `q=percent:D` (100 is an angle of D degrees, as LeRobot's normalised
+    ranges have it); a unit of one joint goes before that of its channel. Raises BadInput for anything else.
     """
     if effort not in ("", "motor", "link"):
         raise BadInput(f"--effort-is {effort}: expected motor or link")
@@ -148,18 +149,21 @@ def _number(option: str, column: str, text: str) -> float:
 def _factors(column: str, text: str) -> tuple[float, ...]:
     """Factors into SI from the name of a unit."""
     unit, _, values = text.partition(":")
-    if values and unit in ("A", "counts"):
+    angle = _channel(column) in _ANGLES
+    if values and (unit == "A" or (unit in ("counts", "percent") and angle)):
         numbers = tuple(_number("--units", column, value) for value in values.split(";"))
         if any(number == 0.0 for number in numbers):
             raise BadInput(f"--units {column}={text}: expected numbers other than 0")
+        if unit == "percent":
+            return tuple(math.radians(number) / 100.0 for number in numbers)
         return tuple(2.0 * math.pi / number for number in numbers) if unit == "counts" else numbers
     if column == "t":
         if unit not in TIME_UNITS or values:
             raise BadInput(f"--units t={text}: expected {', '.join(TIME_UNITS)}")
         return (TIME_UNITS[unit],)
-    known = ANGLE_UNITS if _channel(column) in _ANGLES else TORQUE_UNITS if _channel(column) in _TORQUES else {}
+    known = ANGLE_UNITS if angle else TORQUE_UNITS if _channel(column) in _TORQUES else {}
     if unit not in known or values:
-        others = "counts:N" if known is ANGLE_UNITS else "A:N·m-per-A"
+        others = "counts:N or percent:DEGREES" if known is ANGLE_UNITS else "A:N·m-per-A"
         raise BadInput(
             f"--units {column}={text}: expected {', '.join(known) or 'a position or torque column'}, {others}"
         )
@@ -182,12 +186,23 @@ def _place(channels: Mapping[str, Array], column: str, source: str, option: str)
     return place[0], [place[1] - 1]
 
 
-def _scale(channels: dict[str, Array], column: str, factors: Sequence[float], source: str, option: str) -> None:
+def _scale(
+    channels: dict[str, Array],
+    column: str,
+    factors: Sequence[float],
+    source: str,
+    option: str,
+    beside: Collection[str] = (),
+) -> None:
+    """Multiply a column, or the columns of a channel that are not among those `beside` it."""
     channel, joints = _place(channels, column, source, option)
     width = channels[channel][:, joints].shape[1]
     if len(factors) not in (1, width):
         raise BadInput(f"{option} {column}: {len(factors)} values for {width} joints of {source}")
-    channels[channel][:, joints] *= np.asarray(factors)
+    values = np.broadcast_to(np.asarray(factors), width)
+    if column == channel:
+        values = np.where([f"{channel}_{j + 1}" in beside for j in range(width)], 1.0, values)
+    channels[channel][:, joints] *= values
 
 
 def _shifted(t: Array, values: Array, shift: float) -> Array:

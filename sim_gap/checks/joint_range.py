@@ -9,6 +9,10 @@ from sim_gap.model.rigid_body import RigidArm
 
 BEYOND = 0.2
 """Distance beyond the end of its range from which a joint is not there [rad]; zeros and soft limits differ by less."""
+FULL = 100.5
+"""Largest position in per cent of a range, with a half for rounding."""
+CLOSED = 0.25
+"""A range begins near zero if its lower end is no further below than this share of the upper one is above."""
 FAR = 20.0
 """Range of a position [rad] from which whole numbers alone are counts, and a servo's turns are likely degrees."""
 
@@ -50,6 +54,23 @@ def _degrees(recording: Recording) -> str:
     return "--units q=deg" + "".join(f",{name}=deg" for name, values in beside if values is not None)
 
 
+def _percent(arm: RigidArm, recording: Recording) -> str:
+    """Option for positions in per cent of each joint's range, if they may be: as LeRobot records them by default.
+
+    −100 to 100 about the middle of a range; a gripper, whose range begins near zero, from 0 at its closed end.
+    """
+    if not np.isfinite(arm.range).all() or np.nanmax(np.abs(recording.position)) > FULL:
+        return ""
+    low, high = arm.range.T
+    one_sided = low > -CLOSED * high
+    angles = ";".join(f"{x:.4g}" for x in np.degrees(np.where(one_sided, high - low, 0.5 * (high - low))))
+    channels = ["q", *(["q_cmd"] if recording.position_command is not None else [])]
+    units = ",".join(f"{channel}=percent:{angles}" for channel in channels)
+    ends = [f"{channel}_{j + 1}={low[j]:.4g}" for channel in channels for j in np.flatnonzero(one_sided)]
+    zero = f" --zero {','.join(ends)}" if ends else ""
+    return f'or per cent of the ranges, as LeRobot records them unless use_degrees is set: --units "{units}"{zero}, '
+
+
 def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) -> list[Finding]:
     """Joints that leave the model's range, unless the user stated sign, zero, unit or order of their positions."""
     found = []
@@ -67,6 +88,6 @@ def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) 
             f"--zero {column}=ANGLE, --sign {column}=-1 or --map, or --zero {column}=0 if the model's range is wrong"
         )
         if most - least > 2.0 * np.pi:
-            option = f"{_degrees(recording)}, {option}"
+            option = f"{_degrees(recording)}, {_percent(arm, recording)}{option}"
         found.append(Finding("zero", "q", arm.names[j], evidence, option, False))
     return found
