@@ -14,6 +14,7 @@ from gcomp.arrays import Array
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.with_effects import body_parameters, mujoco_quaternion, possible, spec_of, split
+from sim_gap.better_model.xml_comment import xml_comment
 from sim_gap.closed_loop.columns import shared_effects, turns
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
@@ -110,10 +111,8 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
     spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
     spec.option.integrator = _implicit()
     spec.compile()
-    note = "".join(f"\n  {line}" for line in left)
-    comment = (
-        f"<!-- Left out, MJCF has no field for them (the rest was fitted without them):{note}\n-->\n" if left else ""
-    )
+    head = "Left out, MJCF has no field for them (the rest was fitted without them):"
+    comment = xml_comment([head, *left]) if left else ""
     return Exported(comment + spec.to_xml(), tuple(left), native)
 
 

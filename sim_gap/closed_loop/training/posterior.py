@@ -6,6 +6,7 @@ from armlink.errors import BadInput
 from sim_gap.better_model.effects_module import module_path, module_text
 from sim_gap.better_model.samples import write_rows
 from sim_gap.better_model.urdf import URDF, urdf_of
+from sim_gap.better_model.xml_comment import xml_comment
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.judge import draw
 from sim_gap.closed_loop.search import effect_there
@@ -31,19 +32,12 @@ def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
     if found.export is None:
         raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
     text, lines = found.export.xml, found.export.lines
-    beside: dict[Path, str | None] = {}
     if path.suffix == URDF:
         text, told = urdf_of(mujoco.MjModel.from_xml_string(text), urdf_behind(found.sim.path), lines)
         lines = tuple(told)
-    else:
-        model, module, other = module_model(path), module_path(path), batched(found)
-        beside |= {batch_path(path): None if other is None else other.xml, model: None, module: None}
-        if found.beside is not None:
-            beside[model] = found.beside.xml
-            beside[module] = module_text(found.sim, found.beside.effects, model.name)
     try:
         path.write_text(text, encoding="utf-8")
-        for file, content in beside.items():
+        for file, content in ({} if path.suffix == URDF else _beside(found, path)).items():
             if content is None:
                 file.unlink(missing_ok=True)
             else:
@@ -51,6 +45,17 @@ def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
     except OSError as error:
         raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
     return lines
+
+
+def _beside(found: Identified, path: Path) -> dict[Path, str | None]:
+    """Text of each file that may stand beside the corrected model; None for those that must not."""
+    model, module, other, made = module_model(path), module_path(path), batched(found), found.beside
+    out: dict[Path, str | None] = {batch_path(path): None if other is None else other.xml, model: None, module: None}
+    if made is not None:
+        told = [f"{effect} {joint}" for effect, joint, _ in made.effects]
+        out[model] = xml_comment([f"To be used with {module.name}, which applies:", *told]) + made.xml
+        out[module] = module_text(found.sim, made.effects, model.name)
+    return out
 
 
 def batched(found: Identified) -> Exported | None:

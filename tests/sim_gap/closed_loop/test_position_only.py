@@ -17,6 +17,7 @@ from sim_gap.attribution.positions.notes import _beyond
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
 from sim_gap.closed_loop.training.bands import band
+from sim_gap.closed_loop.training.export import with_module
 from sim_gap.closed_loop.training.posterior import batch_path, batched, write_exported, write_samples
 from sim_gap.closed_loop.training.replay import Simulated, replay_rms
 from sim_gap.report.page import write_report
@@ -96,6 +97,22 @@ def test_a_model_with_a_slew_limit_is_written_without_pid_too(answer, tmp_path: 
     model = mujoco.MjModel.from_xml_string(other.xml)
     assert not (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_PID).any()
     assert abs(model.actuator_gainprm[0, 0] - found.native.point["kp"][0]) < 0.1 * found.native.point["kp"][0]
+
+
+def test_a_module_is_written_with_its_model_and_removed_with_it(answer, tmp_path: Path) -> None:
+    found = answer.internals
+    rubs = found.fit.with_values(load=np.array([0.3, 0.0]))
+    rubs = replace(rubs, active=((*rubs.active[0], "load"), rubs.active[1]))
+    beside = with_module(found.sim, found.search, rubs)
+    write_exported(replace(found, beside=beside), tmp_path / "closed.xml")
+    text = (tmp_path / "closed_effects.xml").read_text()
+    assert text.startswith("<!-- To be used with closed_effects.py, which applies:\n  friction.load shoulder\n-->")
+    mujoco.MjModel.from_xml_string(text)
+    made: dict = {}
+    exec((tmp_path / "closed_effects.py").read_text(), made)
+    assert (made["MODEL"], made["EFFECTS"]) == ("closed_effects.xml", beside.effects)
+    write_exported(found, tmp_path / "closed.xml")
+    assert [path.name for path in tmp_path.iterdir()] == ["closed.xml"]
 
 
 def test_samples_scatter_about_the_fit(answer, tmp_path: Path) -> None:
