@@ -109,13 +109,17 @@ class _Joints:
         carried = mass - np.minimum(0.5 * lost, mass)
         return carried, carried + lost + free * self.stiff
 
-    def grip(self, load: Array, effective: Array, v: Array | None = None) -> Array:
-        """Change of the velocity in a step up to which friction holds [rad/s]; without a velocity as if at any."""
+    def grip(self, load: Array, effective: Array, v: Array | None = None, before: Array | None = None) -> Array:
+        """Change of the velocity in a step up to which friction holds [rad/s]; without a velocity as if at any.
+
+        Its level is that at the velocity `before` the step, its direction that of the velocity `v` without it: what
+        rests is held by all of its breakaway friction.
+        """
         hold = self.of("coulomb")
         if "load" in self.active:
             hold = hold + self.of("load") * load
-        if v is not None and "stribeck" in self.active:
-            hold = hold + self.of("stribeck") * np.exp(-((v / self.of("stribeck_velocity", 0.1)) ** 2))
+        if before is not None and "stribeck" in self.active:
+            hold = hold + self.of("stribeck") * np.exp(-((before / self.of("stribeck_velocity", 0.1)) ** 2))
         if v is not None and "asymmetry" in self.active:
             hold = hold * (1.0 + self.of("asymmetry") * np.sign(v))
         return np.asarray(hold * self.data.dt / effective)
@@ -174,12 +178,13 @@ def _run(joints: _Joints) -> Array:
         torque += rest
         if "spring" in active:
             torque -= of("spring") * q
+        before = v.copy() if moving else None
         v *= carried
         torque *= step
         v += torque
         v /= effective
         if held or moving:
-            grip = joints.grip(data.load[k], effective, v)
+            grip = joints.grip(data.load[k], effective, v, before)
         v -= _within(v, grip)
         q += step * v
     return out

@@ -26,12 +26,21 @@ def model_text(kp: float, friction: float, damping: float = 0.8, limits: Sequenc
 
 
 def record(
-    text: str, seed: int, seconds: float, rate: float = 50.0, *, wide: float = 1.0, fast: float = 1.0, load: float = 0.0
+    text: str,
+    seed: int,
+    seconds: float,
+    rate: float = 50.0,
+    *,
+    wide: float = 1.0,
+    fast: float = 1.0,
+    load: float = 0.0,
+    breakaway: tuple[float, float] = (0.0, 1.0),
 ) -> Recording:
     """Positions read with 12 bits, and the commands held from row to row: sines with rests between.
 
     `wide` and `fast` are the way and the frequencies of the motion over the usual ones, `load` the friction of the
-    gears over the torque that the links carry.
+    gears over the torque that the links carry, `breakaway` that at rest besides [N·m] and the velocity over which it
+    fades [rad/s].
     """
     random = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(text)
@@ -47,8 +56,9 @@ def record(
         q[k] = data.qpos
         data.ctrl[:] = row
         for _ in range(steps):
-            if load:
-                model.dof_frictionloss[:] = dry + load * np.abs(_carried(model, data))
+            if load or breakaway[0]:
+                fades = breakaway[0] * np.exp(-((data.qvel / breakaway[1]) ** 2))
+                model.dof_frictionloss[:] = dry + fades + load * np.abs(_carried(model, data))
             mujoco.mj_step(model, data)
     count = 2 * np.pi / 4096
     return Recording(t=t, position=np.rint(q / count) * count, position_command=command, names=JOINTS)

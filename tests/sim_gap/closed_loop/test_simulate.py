@@ -1,5 +1,6 @@
 import mujoco
 import numpy as np
+import pytest
 from servo_arm import model_text, record
 
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point
@@ -20,6 +21,9 @@ def _windows(text: str = TEXT):
     return data, nominal_point(data, nominal_controller(sim))
 
 
+FADING = "stribeck", "stribeck_velocity"
+
+
 def test_agrees_with_mujoco_on_a_servo_with_friction() -> None:
     data, point = _windows()
     found = evaluate(data, Fit(point, ((), ())))
@@ -37,6 +41,28 @@ def test_the_step_shows_neither_as_a_lead_nor_as_inertia() -> None:
     apart = np.sqrt(np.mean((slow - fast) ** 2, axis=(0, 1, 3)))
     way = 0.5 * coarse.dt * np.sqrt(np.mean(coarse.v**2, axis=(0, 2)))
     assert (apart < 0.1 * way).all()
+
+
+@pytest.mark.parametrize(
+    ("rotor", "breakaway"),
+    [
+        (0.02, (0.4, 0.1)),
+        (0.002, (0.4, 0.1)),
+        (0.02, (0.4, 0.02)),
+        (0.02, (0.15, 0.05)),
+        (0.002, (0.15, 0.05)),
+    ],
+)
+def test_agrees_with_mujoco_on_friction_that_fades_with_the_velocity(rotor: float, breakaway) -> None:
+    """A joint at rest is held by all of it, also a light one that would be fast within a step."""
+    text = model_text(kp=15.0, friction=0.1).replace('armature="0.02"', f'armature="{rotor}"')
+    sim = load_model(mujoco.MjModel.from_xml_string(text))
+    data = windows_of(sim.arm, [record(text, 1, 21.0, breakaway=breakaway)], ["run"])
+    point = nominal_point(data, nominal_controller(sim))
+    known = {name: np.full(2, value) for name, value in zip(FADING, breakaway, strict=True)}
+    left, without = (joint_rms(data, evaluate(data, Fit({**point, **more}, ((), ()))).rms) for more in (known, {}))
+    assert (left < 0.0021).all()
+    assert (left < 0.6 * without).all()
 
 
 def test_another_gain_shows() -> None:
