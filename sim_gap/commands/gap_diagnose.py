@@ -183,7 +183,7 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
         console.print(f"corrected model{with_actuators}: {path}")
         if batch_path(path).is_file():
             console.print(f"the same without PID actuators, for MuJoCo Warp: {batch_path(path)}")
-        if module_model(path).is_file():
+        if kind == "MJCF" and module_model(path).is_file():
             console.print(f"with friction that {module_path(path)} applies: {module_model(path)}")
         return
     from sim_gap.attribution.residual_laws import as_effects

@@ -38,7 +38,7 @@ def lines_over_time(t: Array, names: Sequence[str], lines: Sequence[Line], unit:
     )
     every = max(1, len(t) // POINTS)
     for label, values, colour, shown in lines:
-        for j in range(len(names)):
+        for j in range(rows):
             figure.add_scatter(
                 x=t[::every].round(3),
                 y=np.asarray(values)[::every, j].round(5),
@@ -51,8 +51,8 @@ def lines_over_time(t: Array, names: Sequence[str], lines: Sequence[Line], unit:
                 col=1,
             )
     figure.update_yaxes(title=unit)
-    figure.update_xaxes(title="time [s]", row=len(names), col=1)
-    figure.update_layout(height=120 + 190 * len(names), legend=BELOW_TITLE)
+    figure.update_xaxes(title="time [s]", row=rows, col=1)
+    figure.update_layout(height=120 + 190 * rows, legend=BELOW_TITLE)
     return figure
 
 

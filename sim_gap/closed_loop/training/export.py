@@ -120,21 +120,20 @@ def with_module(sim: SimModel, search: Search, fit: Fit) -> Exported | None:
     """MJCF that is to be used with a module for friction that MJCF cannot hold; None if there is no such friction."""
     if not any(effect_there(fit, effect, j) for effect in IN_MODULE for j in range(sim.n)):
         return None
-    return beside(sim, search, native_fit(search, fit, WRITTEN))
+    return written_with_module(sim, search, fit, native_fit(search, fit, WRITTEN))
 
 
-def beside(sim: SimModel, search: Search, fit: Fit) -> Exported:
-    """MJCF of a fit as it is and the effects that a module applies beside it."""
+def written_with_module(sim: SimModel, search: Search, fit: Fit, native: Fit) -> Exported:
+    """MJCF of a native fit, with the effects that a module applies beside it and those of the whole fit left out."""
     effects: list[JointEffect] = []
     for effect in IN_MODULE:
         own = EFFECTS[effect]
         for j in range(sim.n):
-            if effect_there(fit, effect, j):
+            if effect_there(native, effect, j):
                 pairs = zip(own.reported, own.parameters, strict=True)
-                values = {called: float(fit.point[name][j]) for called, name in pairs}
+                values = {called: float(native.point[name][j]) for called, name in pairs}
                 effects.append((effect, sim.arm.names[j], values))
-    made = exported(sim, search, fit, fit, WRITTEN)
-    return replace(made, effects=tuple(effects))
+    return replace(exported(sim, search, fit, native, WRITTEN), effects=tuple(effects))
 
 
 def _shared_beside(search: Search, fit: Fit, held: Collection[str]) -> list[str]:

@@ -11,7 +11,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.closed_loop.search import Group, Search, taken_out
-from sim_gap.closed_loop.training.export import Exported, beside
+from sim_gap.closed_loop.training.export import Exported, written_with_module
 from sim_gap.model.load import SimModel
 
 OPENING_S = 1.0
@@ -52,7 +52,7 @@ def less(sim: SimModel, search: Search, made: Exported, groups: Sequence[Group])
     fit = made.fit
     for group in groups:
         fit = taken_out(search, fit, group)
-    return simulated(sim, beside(sim, search, fit))
+    return simulated(sim, written_with_module(sim, search, fit, fit))
 
 
 def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> tuple[Array, Array, Array]:

@@ -61,6 +61,14 @@ def test_the_module_holds_friction_under_load_that_the_model_alone_cannot(made) 
     assert (with_it < 2.0 * np.pi / 4096.0).all()  # a count of the arm's encoders
 
 
+def test_the_model_with_a_module_says_what_neither_holds(made) -> None:
+    sim, search, fit = made
+    fed = replace(fit.with_values(feed=np.array([0.2, 0.0])), active=((*fit.active[0], "feed"), fit.active[1]))
+    beside = with_module(sim, search, fed)
+    assert beside.lines == ("controller.feed_forward shoulder",)
+    assert "controller.feed_forward shoulder" in beside.xml
+
+
 def test_the_replay_leaves_the_model_and_mujoco_as_they_were(made) -> None:
     arm = loaded(made[0], with_module(*made))
     friction = arm.model.dof_frictionloss.copy()
