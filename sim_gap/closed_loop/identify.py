@@ -19,6 +19,7 @@ from sim_gap.closed_loop.search import Search, taken_out
 from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
+from sim_gap.closed_loop.training.left_out import between_recordings, left_out
 from sim_gap.closed_loop.training.limits import unreached
 from sim_gap.closed_loop.windows import Windows, thinned, windows_of
 from sim_gap.model.load import SimModel
@@ -44,6 +45,9 @@ class Identified:
     nominal_has_controller: bool
     stages: tuple[Stage, ...]
     spread: Covariance
+    """What is not known of the parameters: within recordings and from one to the next."""
+    within: Covariance
+    """What is not known within recordings alone: by it an effect is told from none."""
     band: Band
     train_before: Array
     train_after: Array
@@ -100,7 +104,8 @@ def identify(
     found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
-    spread = replace(covariance(search, fit), limits=unreached(search, fit))
+    within, others = replace(covariance(search, fit), limits=unreached(search, fit)), left_out(search, fit)
+    spread = between_recordings(search, within, others)
     return Identified(
         sim=sim,
         search=search,
@@ -110,7 +115,8 @@ def identify(
         nominal_has_controller=own.complete,
         stages=found,
         spread=spread,
-        band=band(search, fit, spread, judged),
+        within=within,
+        band=band(search, fit, spread, others, judged),
         train_before=rms_on(fitted, before),
         train_after=rms_on(fitted, fit),
         heldout_before=rms_on(judged, before),

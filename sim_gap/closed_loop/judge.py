@@ -190,13 +190,16 @@ def covariance(search: Search, fit: Fit) -> Covariance:
     inverse = np.linalg.inv(bread * scale * scale[:, None] + prior) * scale * scale[:, None]
     meat = scores.T @ scores
     matrix = inverse @ meat @ inverse * count / max(count - size / max(search.data.joints, 1), 1.0)
-    own = np.array([1.0 if name in LOGARITHMIC else abs(_coordinate(search, fit, j, name)) for j, name in names])
+    own = np.array([1.0 if name in LOGARITHMIC else abs(coordinate(search, fit, j, name)) for j, name in names])
     return Covariance(names, matrix + np.diag((SYSTEMATIC * own) ** 2))
 
 
-def _coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:
+def coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:
+    """A parameter's value in its own coordinate, in which `fit.moved` steps."""
     if joint < 0:
         return float(fit.point[name][0])
+    if name in LOGARITHMIC:
+        return float(np.log(fit.point[name][joint]))
     return float(fit.point[name][joint]) / float(search.scales.of(name)[joint])
 
 

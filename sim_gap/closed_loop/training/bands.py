@@ -10,20 +10,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.fit import Fit, batch, improve, residuals, root_mean_squares
+from sim_gap.closed_loop.fit import Fit, batch, root_mean_squares
 from sim_gap.closed_loop.judge import Covariance, draw, joint_rms
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.simulate import simulate
+from sim_gap.closed_loop.training.left_out import LeftOut, gaps_left_out
 from sim_gap.closed_loop.training.limits import LIMITS, Unreached
-from sim_gap.closed_loop.windows import Windows, of_windows
+from sim_gap.closed_loop.windows import Windows
 
 SHARE = 0.9
 """Share of the motion that a band should hold."""
-FOLDS, STEPS = 3, 3
-"""Parts of a single recording of which each is left out of a fit, and the steps of such a fit."""
 DRAWS = 40
 """Simulations with drawn parameters."""
 ABOVE = (1.0, 1.1, 1.3, 2.0, 4.0)
@@ -42,10 +40,10 @@ class Band:
     """Standard deviation of what no parameter explains [rad]: noise to add to the draws."""
 
 
-def band(search: Search, fit: Fit, spread: Covariance, heldout: Windows) -> Band:
+def band(search: Search, fit: Fit, spread: Covariance, others: LeftOut, heldout: Windows) -> Band:
     """The band that follows from the training windows of `search`, judged on the held-out ones."""
     data, points = search.data, drawn(search, fit, replace(spread, limits=()))
-    left, groups = left_of_others(search, fit)
+    left, groups = gaps_left_out(search, others), others.groups
     each = root_mean_squares(data, left)
     unexplained = joint_rms(data, each)
     size = np.sqrt(_variance(data, points) + unexplained[:, None] ** 2)
@@ -78,21 +76,6 @@ def _uncertainty(squares: Array) -> Array:
         return np.ones(squares.shape[1])
     error = squares.std(axis=0, ddof=1) / np.sqrt(len(squares))
     return np.asarray(np.sqrt(1.0 + error / np.maximum(squares.mean(0), 1e-300)))
-
-
-def left_of_others(search: Search, fit: Fit) -> tuple[Array, NDArray[np.intp]]:
-    """What is left of each training window by a fit to the other recordings, of thirds if there is one, (To, J, W), and
-    the number of its recording or third (W,)."""
-    data = search.data
-    groups = data.recording
-    if len(np.unique(groups)) == 1:
-        groups = np.arange(data.count) * FOLDS // data.count
-    out = np.zeros_like(data.measured)
-    for group in np.unique(groups):
-        own, others = np.flatnonzero(groups == group), np.flatnonzero(groups != group)
-        alone = improve(of_windows(data, others), replace(fit, rms=None), search.scales, STEPS) if len(others) else fit
-        out[..., own] = residuals(of_windows(data, own), batch([alone.point]))[0]
-    return out, groups
 
 
 def drawn(search: Search, fit: Fit, spread: Covariance, count: int = DRAWS) -> list[dict[str, Array]]:

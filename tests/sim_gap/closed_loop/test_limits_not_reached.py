@@ -13,6 +13,7 @@ from sim_gap.closed_loop.judge import covariance, draw
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.training import limits
 from sim_gap.closed_loop.training.bands import band
+from sim_gap.closed_loop.training.left_out import left_out
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
 
@@ -80,8 +81,11 @@ def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> Non
     data = search.data
     faster = windows_of(data.arm, [record(TEXT, 2, 28.0)], ["other"], data.dt)
     faster = replace(faster, command=FASTER * faster.command, measured=FASTER * faster.measured)
+    others = left_out(search, fit)
     for heldout, widened in ((data, False), (faster, True)):
-        without, within = (band(search, fit, replace(spread, limits=x), heldout).width for x in ((), spread.limits))
+        without, within = (
+            band(search, fit, replace(spread, limits=x), others, heldout).width for x in ((), spread.limits)
+        )
         assert ((within > 1.5 * without) == widened).all()
         assert widened or (within < 1.1 * without).all()
 
@@ -94,6 +98,9 @@ def test_the_band_holds_motion_beyond_the_training_whatever_the_limit_is(arm, ov
     real = model_text(kp=GAIN, friction=0.2, limits=over * torque if np.isfinite(over) else ())
     other = windows_of(data.arm, [record(real, 3, 28.0, wide=1.5, fast=1.7)], ["other"], data.dt)
     spread = covariance(search, fit)
-    known, open_ = (band(search, fit, replace(spread, limits=x), other) for x in ((), limits.unreached(search, fit)))
+    others = left_out(search, fit)
+    known, open_ = (
+        band(search, fit, replace(spread, limits=x), others, other) for x in ((), limits.unreached(search, fit))
+    )
     assert (open_.holds > 0.85).all()
     assert np.isinf(over) or (known.holds < 0.8).any()

@@ -149,8 +149,8 @@ def test_what_nothing_can_show_is_left_out(gravity: float, off: bool, frozen: se
 def test_a_coefficient_of_the_whole_arm_is_one_and_a_joints_is_in_its_own_scale() -> None:
     fit = SimpleNamespace(point={"tilt.x": np.array([0.03]), "coulomb": np.array([0.5, 0.8])})
     search = SimpleNamespace(scales=SimpleNamespace(of=lambda name: np.array([0.1, 0.2])))
-    assert judge._coordinate(search, fit, -1, "tilt.x") == 0.03
-    assert judge._coordinate(search, fit, 1, "coulomb") == pytest.approx(4.0)
+    assert judge.coordinate(search, fit, -1, "tilt.x") == 0.03
+    assert judge.coordinate(search, fit, 1, "coulomb") == pytest.approx(4.0)
 
 
 def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -> None:

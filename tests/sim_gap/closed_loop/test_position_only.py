@@ -18,6 +18,7 @@ from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
 from sim_gap.closed_loop.training.bands import band
 from sim_gap.closed_loop.training.export import with_module
+from sim_gap.closed_loop.training.left_out import left_out
 from sim_gap.closed_loop.training.posterior import batch_path, batched, write_exported, write_samples
 from sim_gap.closed_loop.training.replay import Simulated, replay_rms
 from sim_gap.report.page import write_report
@@ -164,7 +165,8 @@ def test_the_band_holds_its_share_of_other_motion(answer) -> None:
     assert told["share"] == 0.9
     assert all(0.8 < share <= 0.98 for share in told["holds"])
     found = answer.internals
-    known = band(found.search, found.fit, replace(found.spread, limits=()), found.heldout)
+    others = left_out(found.search, found.fit)
+    known = band(found.search, found.fit, replace(found.spread, limits=()), others, found.heldout)
     assert ((known.width > 0.0) & (known.width < 0.03 * answer.heldout_before)).all()
     assert all(1.0 < width / own < 25.0 for width, own in zip(told["half_width"], known.width, strict=True))
 
