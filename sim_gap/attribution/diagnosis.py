@@ -73,6 +73,11 @@ class Rollout:
     """Those whose absence costs most first."""
     closed_loop: bool = False
 
+    @property
+    def worse(self) -> bool:
+        """Whether the corrected model is further off over all joints; not where the nominal one cannot run."""
+        return bool(np.mean(self.after**2) > np.mean(self.before**2))
+
 
 @dataclass(frozen=True)
 class EffectRollout:

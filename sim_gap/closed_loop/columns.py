@@ -11,6 +11,11 @@ from sim_gap.model.rigid_body import RigidArm
 
 UNIT = {"mass": "kg", "x": "kg·m", "y": "kg·m", "z": "kg·m", "angle": "rad", "angle_1": "rad", "angle_2": "rad"}
 
+REACH = 0.1
+"""Length beyond the last joint [m]; a model does not tell how long the last link is."""
+LARGEST_TURN = 0.35
+"""Largest error of a zero or of the base's tilt [rad]: torques are linear in it no further."""
+
 
 def shared_effects(arm: RigidArm) -> dict[str, tuple[str, ...]]:
     """Effects with one set of coefficients for the whole arm → names of their columns."""
@@ -42,7 +47,21 @@ def with_columns(data: Windows) -> Windows:
         if np.abs(rows).max() > 1e-9:
             spread = rows.reshape(len(few), count, n).transpose(0, 2, 1)
             columns[name] = _filled(spread, few, steps)
-    return replace(data, columns=columns)
+    return replace(data, columns=columns, ranges={name: _range(arm, name) for name in columns})
+
+
+def _range(arm: RigidArm, name: str) -> tuple[float, float]:
+    """Lowest and highest coefficient of a column that an arm can have; wide, but on the arm's own scale.
+
+    Without them a mass moment of some hundred times the arm's own can stand against a spring as stiff: both cancel
+    along the recorded motion, and the simulation breaks loose along any other.
+    """
+    total, length = arm.inertial[:, 0].sum(), np.linalg.norm(arm.offset, axis=1).sum() + REACH
+    if UNIT[name.partition(".")[2]] == "rad":
+        return -LARGEST_TURN, LARGEST_TURN
+    if name == "payload.mass":
+        return -float(arm.inertial[-1, 0]), float(total)
+    return -float(total * length), float(total * length)
 
 
 def _of_an_angle(arm: RigidArm, q: Array, v: Array, a: Array, joint: int) -> Array:

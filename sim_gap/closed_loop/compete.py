@@ -117,4 +117,5 @@ def _shared_round(search: Search, fit: Fit, whole: dict[str, tuple[str, ...]], b
     fall = before - search.score(trial)
     if fall.sum() < PRICE * len(names) or (fall / search.samples).max() < LEAST_FALL:
         return None
-    return trial
+    at_an_end = any(float(trial.point[name][0]) in search.data.ranges[name] for name in names)
+    return None if at_an_end else trial

@@ -66,26 +66,28 @@ def jacobian(
 ) -> tuple[Array, list[Array]]:
     """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the coordinates of `moved`."""
     width = max((len(each) for each in names), default=0)
+    steps = [[_difference(name, fit.point[name][j], scales, j) for name in own] for j, own in enumerate(names)]
     points = [dict(fit.point)]
     for k in range(width):
         point = {name: values.copy() for name, values in fit.point.items()}
         for j, own in enumerate(names):
             if k < len(own):
-                point[own[k]][j] = moved(own[k], fit.point[own[k]][j], _difference(own[k]), scales, j)
+                point[own[k]][j] = moved(own[k], fit.point[own[k]][j], steps[j][k], scales, j)
         points.append(point)
     points += [{**fit.point, name: fit.point[name] + DIFFERENCE} for name in shared]
     all_residuals = residuals(data, batch(points))
     now, out = all_residuals[0], []
-    for j, own in enumerate(names):
-        steps = [_difference(name) for name in own]
-        columns = [(all_residuals[1 + k][:, j] - now[:, j]) / step for k, step in enumerate(steps)]
+    for j in range(len(names)):
+        columns = [(all_residuals[1 + k][:, j] - now[:, j]) / step for k, step in enumerate(steps[j])]
         columns += [(all_residuals[1 + width + s][:, j] - now[:, j]) / DIFFERENCE for s in range(len(shared))]
         out.append(np.stack(columns) if columns else np.zeros((0, *now[:, j].shape)))
     return now, out
 
 
-def _difference(name: str) -> float:
-    return 0.01 if name in LOGARITHMIC else DIFFERENCE
+def _difference(name: str, value: float, scales: Scales, joint: int) -> float:
+    """Step of a finite difference in the coordinate of `moved`, away from the highest value where that is near."""
+    step = 0.01 if name in LOGARITHMIC else DIFFERENCE
+    return -step if moved(name, value, step, scales, joint) >= PARAMETERS[name].high else step
 
 
 def moved(name: str, value: float, step: float, scales: Scales, joint: int) -> float:
@@ -112,7 +114,7 @@ def improve(data: Windows, fit: Fit, scales: Scales, iterations: int = 6) -> Fit
         if not any(busy):
             break
         now, slopes = jacobian(data, fit, scales, names, fit.shared)
-        trials = [_stepped(fit, names, now, slopes, damping, scales) for damping in DAMPINGS]
+        trials = [_stepped(data, fit, names, now, slopes, damping, scales) for damping in DAMPINGS]
         left = residuals(data, batch(trials))
         costs = np.einsum("ptjw,ptjw->pj", left, left)
         best = np.full(data.joints, int(costs.sum(1).argmin())) if fit.shared else costs.argmin(0)
@@ -148,7 +150,13 @@ def _improved_part(data: Windows, fit: Fit, scales: Scales, iterations: int, joi
 
 
 def _stepped(
-    fit: Fit, names: Sequence[Sequence[str]], now: Array, slopes: list[Array], damping: float, scales: Scales
+    data: Windows,
+    fit: Fit,
+    names: Sequence[Sequence[str]],
+    now: Array,
+    slopes: list[Array],
+    damping: float,
+    scales: Scales,
 ) -> dict[str, Array]:
     """The point after one damped Gauss-Newton step."""
     point = {name: values.copy() for name, values in fit.point.items()}
@@ -157,7 +165,7 @@ def _stepped(
         for name, size in zip(own, step, strict=True):
             point[name][j] = moved(name, float(point[name][j]), float(size), scales, j)
     for name, size in zip(fit.shared, common, strict=True):
-        point[name] = point[name] + float(size)
+        point[name] = np.clip(point[name] + float(size), *data.ranges[name])
     return point
 
 

@@ -82,7 +82,9 @@ class Windows:
     """Smoothed recorded motion, for the columns of link effects."""
     arm: RigidArm
     columns: dict[str, Array] = field(default_factory=dict)
-    """Torque per unit of a parameter of the links or the arm [N·m], made by `columns_of`."""
+    """Torque per unit of a parameter of the links or the arm [N·m], made by `with_columns`."""
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Lowest and highest coefficient of each column."""
 
     @property
     def joints(self) -> int:
@@ -121,7 +123,16 @@ def windows_of(
     }
     scale = np.array([*scales] or [1.0] * len(recordings), float)[number_of]
     return Windows(
-        dt=dt, stride=stride, warm=warm, period=period, arm=arm, recording=number_of, scale=scale, columns={}, **stacked
+        dt=dt,
+        stride=stride,
+        warm=warm,
+        period=period,
+        arm=arm,
+        recording=number_of,
+        scale=scale,
+        columns={},
+        ranges={},
+        **stacked,
     )
 
 
