@@ -14,13 +14,14 @@ from sim_gap.closed_loop.columns import shared_effects, with_columns
 from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
-from sim_gap.closed_loop.judge import Covariance, Stage, covariance, groups_of, rms_on, stages
+from sim_gap.closed_loop.judge import Stage, groups_of, rms_on, stages
 from sim_gap.closed_loop.search import Search, taken_out
 from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
-from sim_gap.closed_loop.training.left_out import between_recordings, left_out
+from sim_gap.closed_loop.training.left_out import left_out
 from sim_gap.closed_loop.training.limits import unreached
+from sim_gap.closed_loop.training.spread import Covariance, covariance, covariance_within
 from sim_gap.closed_loop.windows import Windows, thinned, windows_of
 from sim_gap.model.load import SimModel
 
@@ -104,8 +105,7 @@ def identify(
     found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
-    within, others = replace(covariance(search, fit), limits=unreached(search, fit)), left_out(search, fit)
-    spread = between_recordings(search, within, others)
+    spread = replace(covariance(search, fit), limits=unreached(search, fit))
     return Identified(
         sim=sim,
         search=search,
@@ -115,8 +115,8 @@ def identify(
         nominal_has_controller=own.complete,
         stages=found,
         spread=spread,
-        within=within,
-        band=band(search, fit, spread, others, judged),
+        within=covariance_within(search, fit),
+        band=band(search, fit, spread, left_out(search, fit), judged),
         train_before=rms_on(fitted, before),
         train_after=rms_on(fitted, fit),
         heldout_before=rms_on(judged, before),

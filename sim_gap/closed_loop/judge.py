@@ -1,25 +1,20 @@
-"""What each effect is worth: its interval, and what it lowers on held-out data."""
+"""What each effect is worth: what it lowers on held-out data."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.columns import UNIT, shared_effects
-from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, evaluate, improve, jacobian, moved
-from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS
+from sim_gap.closed_loop.columns import shared_effects
+from sim_gap.closed_loop.fit import Fit, evaluate, improve
+from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.rivals import rivals_of
 from sim_gap.closed_loop.search import Group, Search, effect_there, taken_out
-from sim_gap.closed_loop.training.limits import Unreached, draw_limits
 from sim_gap.closed_loop.windows import Windows
 
-SYSTEMATIC = 0.02
-"""Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
 LEAST_SHRINK = 0.05
 """Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
-LOOSE = 0.35
-"""Relative standard deviation of a gain from which its scale is not decided."""
 
 
 def groups_of(fit: Fit, search: Search) -> list[Group]:
@@ -153,88 +148,3 @@ def _worth(search: Search, current: Fit, trial: Fit, margin: Array) -> float:
     assert trial.rms is not None
     fall = joint_rms(search.data, current.rms) - joint_rms(search.data, trial.rms)
     return float((fall / margin).max())
-
-
-def undecided_scale(fit: Fit, spread: "Covariance") -> list[int]:
-    """Joints of which only ratios of gain, friction and inertia can be told."""
-    places = {j: spread.names.index((j, "kp")) for j, own in enumerate(fit.active) if "kp" in own}
-    return [j for j, at in places.items() if float(spread.matrix[at, at]) > LOOSE**2]
-
-
-@dataclass(frozen=True, eq=False)
-class Covariance:
-    """What the recordings leave open: covariance of the fitted parameters in their own coordinates (`fit.moved`), and
-    the limits that no recording reaches."""
-
-    names: list[tuple[int, str]]
-    """Joint (−1: whole arm) and name."""
-    matrix: Array
-    limits: tuple[Unreached, ...] = ()
-
-
-def covariance(search: Search, fit: Fit) -> Covariance:
-    """Sandwich covariance over the windows, which holds for residuals that are correlated within each."""
-    now, slopes = jacobian(search.data, fit, search.scales, fit.active, fit.shared)
-    names = [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
-    starts = np.concatenate([[0], np.cumsum([len(own) for own in fit.active])]).astype(int)
-    size, count = len(names), search.data.count
-    bread, scores = np.zeros((size, size)), np.zeros((count, size))
-    for j, x in enumerate(slopes):
-        r = now[:, j]
-        weight = 1.0 / max(float((r**2).sum()), 1e-300)
-        index = np.concatenate([np.arange(starts[j], starts[j + 1]), np.arange(starts[-1], size)]).astype(int)
-        bread[np.ix_(index, index)] += weight * np.einsum("atw,btw->ab", x, x)
-        scores[:, index] += weight * np.einsum("atw,tw->wa", x, r)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
-    prior = np.diag([1e-4] * size)  # a parameter that nothing shows keeps a finite spread
-    inverse = np.linalg.inv(bread * scale * scale[:, None] + prior) * scale * scale[:, None]
-    meat = scores.T @ scores
-    matrix = inverse @ meat @ inverse * count / max(count - size / max(search.data.joints, 1), 1.0)
-    own = np.array([1.0 if name in LOGARITHMIC else abs(coordinate(search, fit, j, name)) for j, name in names])
-    return Covariance(names, matrix + np.diag((SYSTEMATIC * own) ** 2))
-
-
-def coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:
-    """A parameter's value in its own coordinate, in which `fit.moved` steps."""
-    if joint < 0:
-        return float(fit.point[name][0])
-    if name in LOGARITHMIC:
-        return float(np.log(fit.point[name][joint]))
-    return float(fit.point[name][joint]) / float(search.scales.of(name)[joint])
-
-
-def interval(search: Search, fit: Fit, spread: Covariance, joint: int, name: str) -> tuple[float, float, float, str]:
-    """Value, ends of its 95 % interval, and unit."""
-    half = 2.0 * float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
-    if joint < 0:
-        value = float(fit.point[name][0])
-        return value, value - half, value + half, UNIT[name.partition(".")[2]]
-    value = float(fit.point[name][joint])
-    low, high = (moved(name, value, sign * half, search.scales, joint) for sign in (-1.0, 1.0))
-    return value, low, high, PARAMETERS[name].unit
-
-
-def draw(search: Search, fit: Fit, spread: Covariance, count: int, seed: int = 0) -> list[dict[str, float]]:
-    """Draws of all fitted parameters from their joint distribution, within their bounds, and of the limits that no
-    recording reaches: `joint.name` → value."""
-    random = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(spread.matrix)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    steps = random.standard_normal((count, len(values))) @ root.T
-    rows = [_sample(search, fit, spread.names, row) for row in steps]
-    for each, drawn in zip(spread.limits, draw_limits(spread.limits, count, random), strict=True):
-        for row, value in zip(rows, drawn, strict=True):
-            row[f"{search.data.arm.names[each.joint]}.{each.name}"] = float(value)
-    return rows
-
-
-def _sample(search: Search, fit: Fit, names: Sequence[tuple[int, str]], steps: Array) -> dict[str, float]:
-    out: dict[str, float] = {}
-    labels: Mapping[int, str] = dict(enumerate(search.data.arm.names))
-    for (joint, name), step in zip(names, steps, strict=True):
-        if joint < 0:
-            out[name] = float(fit.point[name][0] + step)
-        else:
-            value = moved(name, float(fit.point[name][joint]), float(step), search.scales, joint)
-            out[f"{labels[joint]}.{name}"] = value
-    return out

@@ -7,6 +7,12 @@ import mujoco
 import numpy as np
 
 from armlink.recording.recording import Recording
+from sim_gap.closed_loop.columns import with_columns
+from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
+from sim_gap.closed_loop.fit import Fit, improve
+from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.windows import windows_of
+from sim_gap.model.load import load_model
 
 JOINTS = ("shoulder", "elbow")
 
@@ -76,3 +82,25 @@ def written(folder: Path, text: str) -> Path:
     path = folder / "sim.xml"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def fitted(*friction: float, weightless: bool = False) -> tuple[Search, Fit]:
+    """A fit of gain, friction and damping to one recording of the arm with each friction [N·m].
+
+    Without weight, neither gravity nor what inertia there is shows the scale of a torque.
+    """
+    changes = {"<option ": '<option gravity="0 0 0" ', 'mass="0.6"': 'mass="0.006"', 'mass="0.3"': 'mass="0.003"'}
+    changes |= {"2e-3": "2e-5", "1e-3 1e-3 1e-3": "1e-5 1e-5 1e-5", 'armature="0.02"': 'armature="0.0002"'}
+
+    def text(dry: float) -> str:
+        made = model_text(kp=15.0, friction=dry)
+        for old, new in changes.items() if weightless else ():
+            made = made.replace(old, new)
+        return made
+
+    sim = load_model(mujoco.MjModel.from_xml_string(text(0.2)))
+    made = [record(text(x), seed, 21.0) for seed, x in enumerate(friction, start=1)]
+    data = with_columns(windows_of(sim.arm, made, [f"run {k}" for k in range(len(made))]))
+    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
+    names = ("kp", "coulomb", "viscous")
+    return search, improve(data, Fit(search.nominal, (names, names)), search.scales)

@@ -10,11 +10,12 @@ from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout,
 from sim_gap.attribution.positions.notes import notes, running_free
 from sim_gap.checks.finding import Finding
 from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
-from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, groups_of, interval
+from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, groups_of
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
 from sim_gap.closed_loop.training.export import WRITTEN
 from sim_gap.closed_loop.training.replay import SHORT_S, Simulated, less, replay_rms, simulated
+from sim_gap.closed_loop.training.spread import interval
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
@@ -56,8 +57,10 @@ def diagnose_positions(
     verdict = _verdict(found, causes, share)
     if verdict == "no_gap":
         taken, causes, minor = [], [], [*causes, *minor]
-    capped = [_hint(cause) for cause in causes] if verdict == "unexplained" else causes
     rollout = _rollout(found, taken)
+    if verdict != "no_gap" and rollout is not None and rollout.worse:
+        verdict = "unexplained"
+    capped = [_hint(cause) for cause in causes] if verdict == "unexplained" else causes
     return Diagnosis(
         verdict=verdict,
         names=sim.arm.names,

@@ -4,10 +4,10 @@ import numpy as np
 
 from sim_gap.attribution.diagnosis import Rollout
 from sim_gap.closed_loop.identify import Identified
-from sim_gap.closed_loop.judge import undecided_scale
 from sim_gap.closed_loop.training.bands import SHARE
 from sim_gap.closed_loop.training.export import Exported
 from sim_gap.closed_loop.training.limits import described
+from sim_gap.closed_loop.training.spread import undecided_scale
 
 FAR = 3.0
 """So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
@@ -43,16 +43,24 @@ def _in_module(beside: Exported) -> str:
 
 
 def running_free(found: Identified, rollout: Rollout | None) -> list[str]:
-    """A note of the joints at which the file that is written leaves much more of the gap than the fit."""
+    """Notes of a file that is written and leaves more than the nominal model, and of the joints at which it leaves much
+    more of the gap than the fit."""
     if rollout is None:
         return []
+    out = []
+    if rollout.worse:
+        before, after = (float(np.sqrt(np.mean(x**2))) for x in (rollout.before, rollout.after))
+        out.append(
+            f"running free, the corrected model leaves more ({after:.3g} rad) than the nominal one ({before:.3g} rad): "
+            "it is nothing to train with; give recordings of other motion"
+        )
     left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
     far = [
         f"{found.sim.arm.names[j]} {left[j]:.3g} rad (the fit {found.heldout_after[j]:.3g})"
         for j in np.flatnonzero(left > FAR * least)
     ]
     told = "the corrected model in MuJoCo, running free along the held-out commands, is further off"
-    return [f"{told}: {', '.join(far)}"] if far else []
+    return [*out, f"{told}: {', '.join(far)}"] if far else out
 
 
 def _beyond(found: Identified) -> list[str]:

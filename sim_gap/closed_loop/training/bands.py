@@ -1,29 +1,28 @@
 """Bands of closed-loop motion: what parameters that are not known, and what no parameter explains, leave open.
 
-The band of a joint at each instant joins the spread of simulations with draws of all parameters and the spread of what
+The band of a joint at each instant joins the spread that the covariance of all parameters brings and the spread of what
 a fit leaves of recordings that it has not seen: one after the other is left out of the training ones. It is scaled so
 that it holds its share of those. Of a limit that no training motion reaches nothing is known but where it may not lie,
 so that the band goes about the simulations with every limit that the training motion admits, whatever it is.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.fit import Fit, batch, root_mean_squares
-from sim_gap.closed_loop.judge import Covariance, draw, joint_rms
+from sim_gap.closed_loop.fit import Fit, batch, jacobian, root_mean_squares
+from sim_gap.closed_loop.judge import joint_rms
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.training.left_out import LeftOut, gaps_left_out
 from sim_gap.closed_loop.training.limits import LIMITS, Unreached
+from sim_gap.closed_loop.training.spread import Covariance
 from sim_gap.closed_loop.windows import Windows
 
 SHARE = 0.9
 """Share of the motion that a band should hold."""
-DRAWS = 40
-"""Simulations with drawn parameters."""
 ABOVE = (1.0, 1.1, 1.3, 2.0, 4.0)
 """Limits about which the band goes, over the least that the training motion admits; without a limit too."""
 
@@ -42,15 +41,15 @@ class Band:
 
 def band(search: Search, fit: Fit, spread: Covariance, others: LeftOut, heldout: Windows) -> Band:
     """The band that follows from the training windows of `search`, judged on the held-out ones."""
-    data, points = search.data, drawn(search, fit, replace(spread, limits=()))
+    data = search.data
     left, groups = gaps_left_out(search, others), others.groups
     each = root_mean_squares(data, left)
     unexplained = joint_rms(data, each)
-    size = np.sqrt(_variance(data, points) + unexplained[:, None] ** 2)
+    size = np.sqrt(_variance(search, fit, spread, data) + unexplained[:, None] ** 2)
     factor = np.array([_quantile(left[:, j], size[:, j], data.weight[:, j]) for j in range(data.joints)])
     wider = _uncertainty(np.stack([(each[:, groups == g] ** 2).mean(1) for g in np.unique(groups)]))
     about = simulate(heldout, batch([fit.point, *_with_limits(fit, spread.limits)]))
-    half = (wider * factor)[:, None] * np.sqrt(_variance(heldout, points) + unexplained[:, None] ** 2)
+    half = (wider * factor)[:, None] * np.sqrt(_variance(search, fit, spread, heldout) + unexplained[:, None] ** 2)
     low, high = about.min(0) - half, about.max(0) + half
     counts = np.maximum(heldout.weight.sum((0, 2)), 1.0)
     within = (low <= heldout.measured) & (heldout.measured <= high)
@@ -78,25 +77,15 @@ def _uncertainty(squares: Array) -> Array:
     return np.asarray(np.sqrt(1.0 + error / np.maximum(squares.mean(0), 1e-300)))
 
 
-def drawn(search: Search, fit: Fit, spread: Covariance, count: int = DRAWS) -> list[dict[str, Array]]:
-    """Points with parameters drawn from their joint distribution."""
-    places = {name: j for j, name in enumerate(search.data.arm.names)}
-    out = []
-    for row in draw(search, fit, spread, count):
-        point = {name: values.copy() for name, values in fit.point.items()}
-        for key, value in row.items():
-            joint, _, name = key.rpartition(".")
-            if key in fit.shared:
-                point[key][:] = value
-            else:
-                point[name][places[joint]] = value
-        out.append(point)
-    return out
+def _variance(search: Search, fit: Fit, spread: Covariance, data: Windows) -> Array:
+    """Variance of the simulated positions by what is not known of the parameters, (To, J, W) [rad²].
 
-
-def _variance(data: Windows, points: list[dict[str, Array]]) -> Array:
-    """Variance of the simulated positions over the points, (To, J, W) [rad²]."""
-    return np.asarray(simulate(data, batch(points)).var(axis=0))
+    It is linear, so that parameters of which only ratios are known leave nothing open where they move nothing.
+    """
+    active = tuple(tuple(name for j, name in spread.names if j == joint) for joint in range(data.joints))
+    _, slopes = jacobian(data, fit, search.scales, active, fit.shared)
+    each = [np.einsum("atw,ab,btw->tw", x, spread.of_joint(j), x) for j, x in enumerate(slopes)]
+    return np.stack(each, axis=1)
 
 
 def _quantile(left: Array, size: Array, weight: Array) -> float:

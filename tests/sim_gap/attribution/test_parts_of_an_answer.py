@@ -153,3 +153,16 @@ def test_a_written_model_that_runs_away_from_the_fit_is_said() -> None:
     assert note.endswith("is further off: b 0.2 rad (the fit 0.01)")
     assert running_free(found, Rollout(6.0, np.full(2, np.nan), np.array([0.05, 0.14]), closed_loop=True)) == []
     assert running_free(found, None) == []
+
+
+def test_a_written_model_that_leaves_more_than_the_nominal_one_is_said() -> None:
+    found = SimpleNamespace(
+        heldout_after=np.array([0.02, 0.01]),
+        margin=np.array([0.02, 0.02]),
+        sim=SimpleNamespace(arm=SimpleNamespace(names=("a", "b"))),
+    )
+    better = Rollout(6.0, np.array([0.05, 0.02]), np.array([0.03, 0.03]), closed_loop=True)
+    assert not better.worse
+    assert running_free(found, better) == []
+    (note,) = running_free(found, Rollout(6.0, np.array([0.03, 0.03]), np.array([0.05, 0.02]), closed_loop=True))
+    assert note.startswith("running free, the corrected model leaves more (0.0381 rad) than the nominal one (0.03 rad)")

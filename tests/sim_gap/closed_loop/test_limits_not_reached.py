@@ -9,11 +9,11 @@ from servo_arm import model_text, record
 
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
 from sim_gap.closed_loop.fit import Fit, improve
-from sim_gap.closed_loop.judge import covariance, draw
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.training import limits
 from sim_gap.closed_loop.training.bands import band
 from sim_gap.closed_loop.training.left_out import left_out
+from sim_gap.closed_loop.training.spread import covariance, draw
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
 

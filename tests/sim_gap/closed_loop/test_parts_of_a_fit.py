@@ -12,16 +12,16 @@ from armlink.recording.recording import Recording
 from sim_gap.closed_loop import judge, prune, rivals
 from sim_gap.closed_loop import search as edits
 from sim_gap.closed_loop.candidates import _explained, ranked
-from sim_gap.closed_loop.columns import with_columns
-from sim_gap.closed_loop.compete import select
+from sim_gap.closed_loop.columns import shared_effects, with_columns
+from sim_gap.closed_loop.compete import _shared_round, select
 from sim_gap.closed_loop.controller import _from_grid, nominal_controller, nominal_point, scales_of
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, jacobian
 from sim_gap.closed_loop.identify import _frozen
-from sim_gap.closed_loop.parameters import EFFECTS, Scales
+from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.closed_loop.search import PRICE, Search
 from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.tracks import held_command
-from sim_gap.closed_loop.training import actuators, export
+from sim_gap.closed_loop.training import actuators, export, spread
 from sim_gap.closed_loop.training import replay as replays
 from sim_gap.closed_loop.windows import WARM_S, Windows, windows_of
 from sim_gap.model.load import load_model
@@ -91,6 +91,33 @@ def test_a_parameters_slope_is_that_at_its_value(data: Windows) -> None:
         assert np.linalg.norm(slopes[j][0] - expected) < 0.08 * np.linalg.norm(expected)
 
 
+def test_a_parameter_at_its_highest_value_has_a_slope_too(data: Windows) -> None:
+    """Else a fit that has come there never leaves, and its interval would be nothing."""
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    one = np.ones(2)
+    point = {**nominal_point(data, nominal_controller(sim)), "load": np.full(2, PARAMETERS["load"].high)}
+    fit = Fit(point, (("load",), ("load",)))
+    _, slopes = jacobian(data, fit, Scales(one, one, 0.02 * one, 0.05 * one), fit.active)
+    assert all(np.linalg.norm(slope) > 0.0 for slope in slopes)
+
+
+def test_a_mass_moment_that_no_arm_can_have_is_not_taken() -> None:
+    """Beside a spring as stiff one of a hundred times the arm's own fits its motion, and breaks loose along another."""
+    heavier = TEXT.replace('<inertial pos="0.08 0 0" mass="0.3"', '<inertial pos="0.16 0 0" mass="0.3"')
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    data = with_columns(windows_of(sim.arm, [record(heavier, 1, 14.0)], ["run"]))
+    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
+    effect = "link.mass_moment@elbow"
+    whole = {effect: shared_effects(sim.arm)[effect]}
+    fit = evaluate(data, Fit(search.nominal, ((), ())))
+    found = _shared_round(search, fit, whole, 0.0)
+    assert found is not None
+    assert found.point["moment1.x"][0] == pytest.approx(0.3 * 0.08, rel=0.15)
+    assert max(abs(end) for end in data.ranges["moment1.x"]) < 0.5
+    narrow = replace(search, data=replace(data, ranges=dict.fromkeys(data.ranges, (-0.01, 0.01))))
+    assert _shared_round(narrow, fit, whole, 0.0) is None
+
+
 def test_a_command_that_arrives_late_moves_the_arm_as_a_later_one(data: Windows) -> None:
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
     point = nominal_point(data, nominal_controller(sim))
@@ -149,8 +176,8 @@ def test_what_nothing_can_show_is_left_out(gravity: float, off: bool, frozen: se
 def test_a_coefficient_of_the_whole_arm_is_one_and_a_joints_is_in_its_own_scale() -> None:
     fit = SimpleNamespace(point={"tilt.x": np.array([0.03]), "coulomb": np.array([0.5, 0.8])})
     search = SimpleNamespace(scales=SimpleNamespace(of=lambda name: np.array([0.1, 0.2])))
-    assert judge.coordinate(search, fit, -1, "tilt.x") == 0.03
-    assert judge.coordinate(search, fit, 1, "coulomb") == pytest.approx(4.0)
+    assert spread.coordinate(search, fit, -1, "tilt.x") == 0.03
+    assert spread.coordinate(search, fit, 1, "coulomb") == pytest.approx(4.0)
 
 
 def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -> None:
@@ -167,11 +194,13 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
     random = np.random.default_rng(3)
     x = random.normal(size=(1, 50, 400))
     residual = 0.01 * random.normal(size=(50, 1, 400))
-    monkeypatch.setattr(judge, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
-    search = SimpleNamespace(data=SimpleNamespace(count=400, joints=1), scales=None)
-    fit = SimpleNamespace(active=(("kp",),), shared=(), point={"kp": np.array([15.0])})
-    found = judge.covariance(search, fit).matrix[0, 0] - judge.SYSTEMATIC**2
-    assert found == pytest.approx(1e-4 / (x**2).sum(), rel=0.2)
+    monkeypatch.setattr(spread, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
+    data = SimpleNamespace(count=400, joints=1, recording=np.zeros(400, int))
+    search = SimpleNamespace(data=data, scales=None, samples=np.array([400.0]))
+    fit = Fit({"kp": np.array([15.0]), **{name: np.zeros(1) for name in spread.SCALED}}, (("kp",),))
+    for estimate in (spread.covariance, spread.covariance_within):
+        found = estimate(search, fit).matrix[0, 0] - spread.SYSTEMATIC**2
+        assert found == pytest.approx(1e-4 / (x**2).sum(), rel=0.2)
 
 
 def test_a_gain_is_a_logarithm_away_from_the_nominal_one() -> None:

@@ -1,0 +1,200 @@
+"""What recordings leave open of the parameters: covariance, intervals, draws.
+
+A position alone shows ratios: of gain, friction and inertia, whose common scale rests on a little inertia. Along such a
+direction the score is flat, a fit stops anywhere, and a fit without one recording stops beside it. So the parameters
+follow in one Gauss-Newton step where a group of windows is left out (the jackknife of clusters; Bell and McCaffrey,
+Survey Methodology 28, 2002), as far as the others let them. Windows are left out, and whole recordings: each motion
+shows what the model lacks in another way, and the parameters take it up.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm, t
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.columns import UNIT
+from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, jacobian, moved
+from sim_gap.closed_loop.parameters import PARAMETERS
+from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.training.limits import Unreached, draw_limits
+
+SYSTEMATIC = 0.02
+"""Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
+SCALED = ("kd", "coulomb", "viscous", "armature")
+"""What a gain is told by the ratio to."""
+STATED = 0.5
+"""Relative standard deviation of a value of SCALED that the model states and no fit has contradicted."""
+LOOSE = 0.35
+"""Relative standard deviation of a gain from which its scale is not decided."""
+WIDEST = 100.0
+"""Standard deviation of a parameter that nothing shows, in its own coordinate."""
+LEAST_FREEDOM = 2
+"""Degrees of freedom that are counted at least: two recordings alone have one, whose 95 % are 13 standard errors."""
+SHARE = 0.975
+"""Quantile of Student's distribution that the spread over recordings is widened to, as it rests on few of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Covariance of the parameters in their own coordinates (`fit.moved`), and the limits that no recording reaches."""
+
+    names: list[tuple[int, str]]
+    """Joint (−1: whole arm) and name."""
+    matrix: Array
+    limits: tuple[Unreached, ...] = ()
+
+    def of_joint(self, joint: int) -> Array:
+        """The part of one joint's own parameters and then those of the whole arm."""
+        at = [k for k, (j, _) in enumerate(self.names) if j in (joint, -1)]
+        return self.matrix[np.ix_(at, at)]
+
+
+def covariance(search: Search, fit: Fit) -> Covariance:
+    """What windows and recordings leave open of the fitted parameters and of the stated ones that a gain rests on."""
+    free = freed(fit)
+    terms = _terms(search, free)
+    known = _stated(search, fit, terms.names)
+    inverse = np.linalg.inv(terms.squares.sum(0) + np.diag(known))
+    matrix = inverse * known @ inverse + _jackknifed(terms, known, np.arange(search.data.count))
+    number = len(np.unique(search.data.recording))
+    if number > 1:
+        few = float(t.ppf(SHARE, max(number - 1, LEAST_FREEDOM)) / norm.ppf(SHARE))
+        matrix += few**2 * _jackknifed(terms, known, search.data.recording)
+    return Covariance(terms.names, matrix + _systematic(search, free, terms.names))
+
+
+def covariance_within(search: Search, fit: Fit) -> Covariance:
+    """Sandwich covariance of the fitted parameters over the windows, all else as it is: what tells an effect from none.
+
+    Directions that the windows hardly show are held.
+    """
+    terms = _terms(search, fit)
+    bread, size, count = terms.squares.sum(0), len(terms.names), search.data.count
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
+    held = np.diag([1e-4] * size)
+    inverse = np.linalg.inv(bread * scale * scale[:, None] + held) * scale * scale[:, None]
+    meat = terms.scores.T @ terms.scores
+    matrix = inverse @ meat @ inverse * count / max(count - size / max(search.data.joints, 1), 1.0)
+    return Covariance(terms.names, matrix + _systematic(search, fit, terms.names))
+
+
+def freed(fit: Fit) -> Fit:
+    """The fit with the stated values free that set the scale of a fitted gain."""
+    active = tuple(
+        (*own, *(name for name in SCALED if name not in own and fit.point[name][j] > 0.0)) if "kp" in own else own
+        for j, own in enumerate(fit.active)
+    )
+    return replace(fit, active=active)
+
+
+@dataclass(frozen=True, eq=False)
+class _Terms:
+    """Normal equations of each window, at all joints; of W windows and K parameters."""
+
+    names: list[tuple[int, str]]
+    squares: Array
+    """(W, K, K)."""
+    scores: Array
+    """(W, K)."""
+
+
+def _terms(search: Search, fit: Fit) -> _Terms:
+    now, slopes = jacobian(search.data, fit, search.scales, fit.active, fit.shared)
+    names = [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
+    starts = np.concatenate([[0], np.cumsum([len(own) for own in fit.active])]).astype(int)
+    size, count = len(names), search.data.count
+    squares, scores = np.zeros((count, size, size)), np.zeros((count, size))
+    for j, x in enumerate(slopes):
+        r = now[:, j]
+        weight = float(search.samples[j]) / max(float((r**2).sum()), 1e-300)
+        index = np.concatenate([np.arange(starts[j], starts[j + 1]), np.arange(starts[-1], size)]).astype(int)
+        squares[np.ix_(np.arange(count), index, index)] += weight * np.einsum("atw,btw->wab", x, x)
+        scores[:, index] += weight * np.einsum("atw,tw->wa", x, r)
+    return _Terms(names, squares, scores)
+
+
+def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
+    """Inverse variance of each parameter before any recording, (K,)."""
+    out = np.full(len(names), WIDEST**-2)
+    for k, (j, name) in enumerate(names):
+        if j >= 0 and name not in fit.active[j]:
+            out[k] = (float(search.scales.of(name)[j]) / (STATED * float(fit.point[name][j]))) ** 2
+    return out
+
+
+def _jackknifed(terms: _Terms, known: Array, groups: NDArray[np.intp]) -> Array:
+    """Covariance by leaving out one group of windows after the other, (K, K)."""
+    squares, scores = terms.squares.sum(0) + np.diag(known), terms.scores.sum(0)
+    labels = np.unique(groups)
+    steps = np.stack(
+        [
+            np.linalg.solve(squares - terms.squares[own].sum(0), terms.scores[own].sum(0) - scores)
+            for own in (groups == label for label in labels)
+        ]
+    )
+    apart = steps - steps.mean(0)
+    return np.asarray((len(labels) - 1) / len(labels) * apart.T @ apart)
+
+
+def _systematic(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
+    own = np.array([1.0 if name in LOGARITHMIC else abs(coordinate(search, fit, j, name)) for j, name in names])
+    return np.diag((SYSTEMATIC * own) ** 2)
+
+
+def coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:
+    """A parameter's value in its own coordinate, in which `fit.moved` steps."""
+    if joint < 0:
+        return float(fit.point[name][0])
+    if name in LOGARITHMIC:
+        return float(np.log(fit.point[name][joint]))
+    return float(fit.point[name][joint]) / float(search.scales.of(name)[joint])
+
+
+def undecided_scale(fit: Fit, spread: Covariance) -> list[int]:
+    """Joints of which only ratios of gain, friction and inertia can be told."""
+    places = {j: spread.names.index((j, "kp")) for j, own in enumerate(fit.active) if "kp" in own}
+    return [j for j, at in places.items() if float(spread.matrix[at, at]) > LOOSE**2]
+
+
+def interval(search: Search, fit: Fit, spread: Covariance, joint: int, name: str) -> tuple[float, float, float, str]:
+    """Value, ends of its 95 % interval, and unit."""
+    half = 2.0 * float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
+    if joint < 0:
+        value, (least, most) = float(fit.point[name][0]), search.data.ranges[name]
+        return value, max(value - half, least), min(value + half, most), UNIT[name.partition(".")[2]]
+    value = float(fit.point[name][joint])
+    low, high = (moved(name, value, sign * half, search.scales, joint) for sign in (-1.0, 1.0))
+    return value, low, high, PARAMETERS[name].unit
+
+
+def draw(search: Search, fit: Fit, spread: Covariance, count: int, seed: int = 0) -> list[dict[str, float]]:
+    """Draws of all parameters from their joint distribution, within their bounds, and of the limits that no recording
+    reaches: `joint.name` → value."""
+    random = np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(spread.matrix)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    steps = random.standard_normal((count, len(values))) @ root.T
+    rows = [_sample(search, fit, spread, row) for row in steps]
+    for each, drawn in zip(spread.limits, draw_limits(spread.limits, count, random), strict=True):
+        for row, value in zip(rows, drawn, strict=True):
+            row[f"{search.data.arm.names[each.joint]}.{each.name}"] = float(value)
+    return rows
+
+
+def _sample(search: Search, fit: Fit, spread: Covariance, steps: Array) -> dict[str, float]:
+    out: dict[str, float] = {}
+    labels: Mapping[int, str] = dict(enumerate(search.data.arm.names))
+    deviations = np.sqrt(np.diag(spread.matrix))
+    for (joint, name), step, deviation in zip(spread.names, steps.tolist(), deviations.tolist(), strict=True):
+        if joint < 0:
+            out[name] = float(np.clip(fit.point[name][0] + step, *search.data.ranges[name]))
+            continue
+        value, size = float(fit.point[name][joint]), float(search.scales.of(name)[joint])
+        if name in SCALED and deviation * size < value:  # such that the ratio to a gain, drawn with it, stays
+            out[f"{labels[joint]}.{name}"] = value * float(np.exp(step * size / value))
+        else:
+            out[f"{labels[joint]}.{name}"] = moved(name, value, step, search.scales, joint)
+    return out
