@@ -3,7 +3,8 @@
 The band of a joint at each instant joins the spread that the covariance of all parameters brings and the spread of what
 a fit leaves of recordings that it has not seen: one after the other is left out of the training ones. It is scaled so
 that it holds its share of those. Of a limit that no training motion reaches nothing is known but where it may not lie,
-so that the band goes about the simulations with every limit that the training motion admits, whatever it is.
+so that the band goes about the simulations with every limit that the training motion admits. About all of them it would
+hold more than its share, whichever is true: it is narrowed to what holds its share of the motion with each.
 """
 
 from collections.abc import Sequence
@@ -25,6 +26,9 @@ SHARE = 0.9
 """Share of the motion that a band should hold."""
 ABOVE = (1.0, 1.1, 1.3, 2.0, 4.0)
 """Limits about which the band goes, over the least that the training motion admits; without a limit too."""
+
+NARROWER = np.linspace(0.0, 1.0, 51)
+"""Factors on the band about several limits, of which the least is taken that holds its share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +53,12 @@ def band(search: Search, fit: Fit, spread: Covariance, others: LeftOut, heldout:
     factor = np.array([_quantile(left[:, j], size[:, j], data.weight[:, j]) for j in range(data.joints)])
     wider = _uncertainty(np.stack([(each[:, groups == g] ** 2).mean(1) for g in np.unique(groups)]))
     about = simulate(heldout, batch([fit.point, *_with_limits(fit, spread.limits)]))
-    half = (wider * factor)[:, None] * np.sqrt(_variance(search, fit, spread, heldout) + unexplained[:, None] ** 2)
+    unit = wider[:, None] * np.sqrt(_variance(search, fit, spread, heldout) + unexplained[:, None] ** 2)
+    for j in range(data.joints) if len(about) > 1 else ():
+        gaps = (left[:, j] / size[:, j])[data.weight[:, j] > 0.0]
+        shown = heldout.weight[:, j] > 0.0
+        factor[j] *= _narrower(gaps, about[:, :, j][:, shown] / unit[:, j][shown], float(factor[j]))
+    half = factor[:, None] * unit
     low, high = about.min(0) - half, about.max(0) + half
     counts = np.maximum(heldout.weight.sum((0, 2)), 1.0)
     within = (low <= heldout.measured) & (heldout.measured <= high)
@@ -67,6 +76,22 @@ def _with_limits(fit: Fit, limits: Sequence[Unreached]) -> list[dict[str, Array]
             values[list(least)] = factor * np.array(list(least.values()))
             out.append({**fit.point, name: values})
     return out
+
+
+def _narrower(gaps: Array, about: Array, factor: float) -> float:
+    """Least factor with which the band about all simulations holds SHARE of the motion, whichever of them is true.
+
+    `about` are the simulations at every instant (P, N) and `gaps` what fits leave of training motion, both in units of
+    the spread there, of which the band about a single simulation goes `factor` to either side.
+    """
+    gaps, low, high = np.sort(gaps), about.min(0), about.max(0)
+
+    def held(share: float) -> float:
+        below = np.searchsorted(gaps, high + share * factor - about, side="right")
+        outside = np.searchsorted(gaps, low - share * factor - about, side="left")
+        return float((below - outside).mean(1).min()) / len(gaps)
+
+    return next((share for share in NARROWER.tolist() if held(share) >= SHARE), 1.0)
 
 
 def _uncertainty(squares: Array) -> Array:

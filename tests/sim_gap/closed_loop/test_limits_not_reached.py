@@ -10,7 +10,7 @@ from servo_arm import model_text, record
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.search import Search
-from sim_gap.closed_loop.training import limits
+from sim_gap.closed_loop.training import bands, limits
 from sim_gap.closed_loop.training.bands import band
 from sim_gap.closed_loop.training.left_out import left_out
 from sim_gap.closed_loop.training.spread import covariance, draw
@@ -104,3 +104,12 @@ def test_the_band_holds_motion_beyond_the_training_whatever_the_limit_is(arm, ov
     )
     assert (open_.holds > 0.85).all()
     assert np.isinf(over) or (known.holds < 0.8).any()
+
+
+@pytest.mark.parametrize(("apart", "factor"), [(0.0, 1.645), (0.5, 1.446), (20.0, 1.282)])
+def test_the_band_about_two_simulations_holds_its_share_with_either(apart: float, factor: float) -> None:
+    """Gaps of a normal distribution: apart by nothing two sides count, far apart one side; between them what solves
+    F(a + f) - F(-f) = 0.9."""
+    gaps = np.random.default_rng(4).normal(size=200_000)
+    about = np.array([[0.0] * 50, [apart] * 50])
+    assert 1.645 * bands._narrower(gaps, about, 1.645) == pytest.approx(factor, abs=0.04)
