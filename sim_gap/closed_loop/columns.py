@@ -7,6 +7,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.closed_loop.tracks import MODEL_HZ
 from sim_gap.closed_loop.windows import Windows
+from sim_gap.effects.base import across
 from sim_gap.model.rigid_body import RigidArm
 
 UNIT = {"mass": "kg", "x": "kg·m", "y": "kg·m", "z": "kg·m", "angle": "rad", "angle_1": "rad", "angle_2": "rad"}
@@ -40,8 +41,8 @@ def with_columns(data: Windows) -> Windows:
         made |= {f"moment{link}.{axis}": regressor[:, :, link, 1 + k] for k, axis in enumerate("xyz")}
         made[f"zero{link}.angle"] = _of_an_angle(arm, q, v, a, link)
     still = np.zeros_like(q)
-    for k, turn in enumerate(turns(arm.gravity)):
-        made[f"tilt.angle_{k + 1}"] = arm.torque(q, still, still, turn)
+    for k, axis in enumerate(across(arm.gravity)):
+        made[f"tilt.angle_{k + 1}"] = arm.torque(q, still, still, np.cross(arm.gravity, axis))
     columns = {}
     for name, rows in made.items():
         if np.abs(rows).max() > 1e-9:
@@ -69,12 +70,6 @@ def _of_an_angle(arm: RigidArm, q: Array, v: Array, a: Array, joint: int) -> Arr
     step = np.zeros(arm.n)
     step[joint] = 1e-4
     return np.asarray((arm.torque(q + step, v, a) - arm.torque(q - step, v, a)) / 2e-4)
-
-
-def turns(gravity: Array) -> list[Array]:
-    """Change of gravity per radian about two horizontal axes, (3,) each."""
-    axes = np.linalg.svd(gravity[None, :])[2][1:]
-    return [np.cross(axis, gravity) for axis in axes]
 
 
 def _filled(values: Array, few: Array, steps: int) -> Array:

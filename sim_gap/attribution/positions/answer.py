@@ -15,7 +15,7 @@ from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
 from sim_gap.closed_loop.training.export import WRITTEN
 from sim_gap.closed_loop.training.replay import SHORT_S, Simulated, less, replay_rms, simulated
-from sim_gap.closed_loop.training.spread import interval
+from sim_gap.closed_loop.training.spread import interval, payload_centre
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
 from sim_gap.search.estimate import Value
@@ -173,6 +173,9 @@ def _parameters(found: Identified, stage: Stage) -> dict[str, dict[str, Value]]:
         columns = columns_of_effect(found, effect)
         place = effect.partition("@")[2] or "arm"
         values = {c.partition(".")[2]: Value(*interval(found.search, found.fit, found.spread, -1, c)) for c in columns}
+        if effect == "link.payload" and "mass" in values:
+            centre = {c.partition(".")[2]: Value(*payload_centre(found.fit, found.spread, c)) for c in columns[1:]}
+            values |= centre
         return {place: values}
     own = EFFECTS[effect]
     return {

@@ -15,6 +15,7 @@ from sim_gap.blind.cases.make import make_all, parse_words, withheld, write_csv
 from sim_gap.blind.cases.motion import KINDS, RATE, Limits, trajectory
 from sim_gap.blind.cases.scene import Scene
 from sim_gap.blind.cases.true_arm import sound
+from sim_gap.blind.effects.drawn import Values
 from sim_gap.blind.plant.plant import simulate
 from sim_gap.blind.plant.runs import Log
 from sim_gap.blind.servo.effects import OF_THE_ARM, OF_THE_SERVO, UNKNOWN, Change, drawn
@@ -218,7 +219,7 @@ def _write(drawing: Drawing, train: Log, held: Log, more: dict[str, Any], folder
         random = np.random.default_rng([*drawing.recipe.seed, 2000 + number])
         write_csv(folder / f"{name}.csv", recorded(drawing.runs[number], log, drawing.hz, random))
     recipe, change = drawing.recipe, drawing.change
-    effects = [] if change is None else [_truth(change)]
+    effects = [] if change is None else [_truth(change, drawing)]
     truth = {
         "schema": "armlink.blind-label/1",
         "case": recipe.name,
@@ -232,17 +233,32 @@ def _write(drawing: Drawing, train: Log, held: Log, more: dict[str, Any], folder
     )
 
 
-def _truth(change: Change) -> dict[str, Any]:
+def _truth(change: Change, drawing: Drawing) -> dict[str, Any]:
     joints = [name for name in change.parameters if name != "arm"]
     return {
         "effect": change.effect,
         "joints": joints,
-        "parameters": change.parameters,
+        "parameters": {**change.parameters, **{name: _whole(change, drawing, name) for name in joints}},
         "axis": None,
         "implied": list(change.implied),
         "undecided": change.undecided,
         "confused_with": list(change.confused_with),
     }
+
+
+def _whole(change: Change, drawing: Drawing, joint: str) -> Values:
+    """Parameters of one joint as they are answered: all of its friction and inertia, with what the model has of it."""
+    run, j = drawing.runs[0], drawing.nominal.names.index(joint)
+    damping = run.truth.viscous + (run.law.damping if drawing.recipe.known else 0.0)
+    whole = {
+        "friction.coulomb": ("torque", run.truth.coulomb),
+        "friction.viscous": ("damping", damping),
+        "actuator.rotor_inertia": ("inertia", run.truth.arm.armature),
+    }
+    if change.effect not in whole:
+        return change.parameters[joint]
+    name, values = whole[change.effect]
+    return {**change.parameters[joint], name: float(values[j])}
 
 
 def main() -> None:

@@ -15,10 +15,11 @@ from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.with_effects import body_parameters, mujoco_quaternion, possible, spec_of, split
 from sim_gap.better_model.xml_comment import xml_comment
-from sim_gap.closed_loop.columns import shared_effects, turns
+from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import Search, effect_there, taken_out, without
+from sim_gap.effects.base import tilted
 from sim_gap.model.load import SimModel
 from sim_gap.model.rigid_body import inertial_of
 
@@ -104,10 +105,8 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
         _set_actuator(spec, spec.joints[joint].name, native, j, search, compiled)
     for link, change in _link_changes(search, native).items():
         _set_body(spec, compiled, sim.joints[link], change)
-    gravity = sim.arm.gravity.copy()
-    for k, turn in enumerate(turns(sim.arm.gravity)):
-        gravity += float(native.point.get(f"tilt.angle_{k + 1}", np.zeros(1))[0]) * turn
-    spec.option.gravity = gravity
+    angles = [float(native.point.get(f"tilt.angle_{k}", np.zeros(1))[0]) for k in (1, 2)]
+    spec.option.gravity = tilted(sim.arm.gravity, np.array(angles))
     spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
     spec.option.integrator = _implicit()
     spec.compile()

@@ -19,6 +19,7 @@ from sim_gap.closed_loop.columns import UNIT
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, jacobian, moved
 from sim_gap.closed_loop.parameters import PARAMETERS
 from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.sound import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S
 from sim_gap.closed_loop.training.limits import Unreached, draw_limits
 
 SYSTEMATIC = 0.02
@@ -31,6 +32,8 @@ LOOSE = 0.35
 """Relative standard deviation of a gain from which its scale is not decided."""
 WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
+LIGHTEST = 1e-3
+"""Mass of a payload [kg] that its moment is divided by at least."""
 LEAST_FREEDOM = 2
 """Degrees of freedom that are counted at least: two recordings alone have one, whose 95 % are 13 standard errors."""
 SHARE = 0.975
@@ -63,7 +66,7 @@ def covariance(search: Search, fit: Fit) -> Covariance:
     if number > 1:
         few = float(t.ppf(SHARE, max(number - 1, LEAST_FREEDOM)) / norm.ppf(SHARE))
         matrix += few**2 * _jackknifed(terms, known, search.data.recording)
-    return Covariance(terms.names, matrix + _systematic(search, free, terms.names))
+    return Covariance(terms.names, matrix + _systematic(search, free, terms.names) + _besides(search, terms.names))
 
 
 def covariance_within(search: Search, fit: Fit) -> Covariance:
@@ -144,6 +147,14 @@ def _systematic(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> A
     return np.diag((SYSTEMATIC * own) ** 2)
 
 
+def _besides(search: Search, names: Sequence[tuple[int, str]]) -> Array:
+    """Variances by what sound arms have besides of friction and of lateness, (K, K)."""
+    friction = np.minimum(FRICTION_NM, FRICTION_SHARE * search.scales.torque)
+    sizes = {"coulomb": friction, "delay": np.full_like(friction, np.hypot(LATE_S, APART_S))}
+    own = [sizes[name][j] / search.scales.of(name)[j] if name in sizes else 0.0 for j, name in names]
+    return np.diag(np.square(own))
+
+
 def coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:
     """A parameter's value in its own coordinate, in which `fit.moved` steps."""
     if joint < 0:
@@ -168,6 +179,17 @@ def interval(search: Search, fit: Fit, spread: Covariance, joint: int, name: str
     value = float(fit.point[name][joint])
     low, high = (moved(name, value, sign * half, search.scales, joint) for sign in (-1.0, 1.0))
     return value, low, high, PARAMETERS[name].unit
+
+
+def payload_centre(fit: Fit, spread: Covariance, column: str) -> tuple[float, float, float, str]:
+    """A coordinate of a payload's centre of mass, from its mass moment: value, ends of its 95 % interval, unit."""
+    mass, moment = (float(fit.point[name][0]) for name in ("payload.mass", column))
+    divisor = float(np.copysign(max(abs(mass), LIGHTEST), mass))
+    centre, change = moment / divisor, np.zeros(len(spread.names))
+    change[spread.names.index((-1, column))] = 1.0 / divisor
+    change[spread.names.index((-1, "payload.mass"))] = -centre / divisor
+    half = 2.0 * float(np.sqrt(change @ spread.matrix @ change))
+    return centre, centre - half, centre + half, "m"
 
 
 def draw(search: Search, fit: Fit, spread: Covariance, count: int, seed: int = 0) -> list[dict[str, float]]:

@@ -24,6 +24,7 @@ from sim_gap.closed_loop.tracks import held_command
 from sim_gap.closed_loop.training import actuators, export, spread
 from sim_gap.closed_loop.training import replay as replays
 from sim_gap.closed_loop.windows import WARM_S, Windows, windows_of
+from sim_gap.effects.base import tilted
 from sim_gap.model.load import load_model
 
 TEXT = model_text(kp=15.0, friction=0.2)
@@ -99,6 +100,18 @@ def test_a_parameter_at_its_highest_value_has_a_slope_too(data: Windows) -> None
     fit = Fit(point, (("load",), ("load",)))
     _, slopes = jacobian(data, fit, Scales(one, one, 0.02 * one, 0.05 * one), fit.active)
     assert all(np.linalg.norm(slope) > 0.0 for slope in slopes)
+
+
+def test_a_tilt_turns_the_base_about_its_own_axes() -> None:
+    """As it does where a torque is recorded: about the base's x and y, if gravity is along its z."""
+    turned = tilted(np.array([0.0, 0.0, -9.81]), np.array([0.0, 0.1]))
+    real = TEXT.replace("<option ", f'<option gravity="{" ".join(map(str, turned))}" ')
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    data = with_columns(windows_of(sim.arm, [record(real, 1, 14.0)], ["run"]))
+    point = {**nominal_point(data, nominal_controller(sim)), "tilt.angle_2": np.zeros(2)}
+    assert "tilt.angle_1" not in data.columns  # both joints turn about y
+    fit = improve(data, Fit(point, ((), ()), ("tilt.angle_2",)), scales_of(data))
+    assert fit.point["tilt.angle_2"][0] == pytest.approx(0.1, rel=0.03)
 
 
 def test_a_mass_moment_that_no_arm_can_have_is_not_taken() -> None:
@@ -196,7 +209,7 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
     residual = 0.01 * random.normal(size=(50, 1, 400))
     monkeypatch.setattr(spread, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
     data = SimpleNamespace(count=400, joints=1, recording=np.zeros(400, int))
-    search = SimpleNamespace(data=data, scales=None, samples=np.array([400.0]))
+    search = SimpleNamespace(data=data, scales=Scales(*np.ones((4, 1))), samples=np.array([400.0]))
     fit = Fit({"kp": np.array([15.0]), **{name: np.zeros(1) for name in spread.SCALED}}, (("kp",),))
     for estimate in (spread.covariance, spread.covariance_within):
         found = estimate(search, fit).matrix[0, 0] - spread.SYSTEMATIC**2
