@@ -111,7 +111,7 @@ def test_a_tilt_turns_the_base_about_its_own_axes() -> None:
     point = {**nominal_point(data, nominal_controller(sim)), "tilt.angle_2": np.zeros(2)}
     assert "tilt.angle_1" not in data.columns  # both joints turn about y
     fit = improve(data, Fit(point, ((), ()), ("tilt.angle_2",)), scales_of(data))
-    assert fit.point["tilt.angle_2"][0] == pytest.approx(0.1, rel=0.03)
+    assert fit.point["tilt.angle_2"][0] == pytest.approx(0.1, rel=0.06)
 
 
 def test_a_mass_moment_that_no_arm_can_have_is_not_taken() -> None:
