@@ -75,18 +75,14 @@ def look(tmp_path: Path) -> Callable[..., Look]:
         pytest.skip("no Chromium: scripts/install-system installs it where that is allowed")
     quiet = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
     command = [chromium, *quiet.split(), "--disable-component-update", "--disable-sync", "--hide-scrollbars"]
-    command += ["--virtual-time-budget=10000", "--enable-logging=stderr"]
-
-    def run(page: Path, *options: str) -> subprocess.CompletedProcess[str]:
-        profile = tmp_path / f"profile{len(list(tmp_path.glob('profile*')))}"
-        complete = [*command, f"--user-data-dir={profile}", *options, page.resolve().as_uri()]
-        return subprocess.run(complete, capture_output=True, text=True, timeout=300, check=True)
+    command += ["--virtual-time-budget=5000", "--enable-logging=stderr"]
 
     def open_page(page: Path, width: int = 1200, height: int = 2000) -> Look:
-        picture = tmp_path / f"{page.stem}-{width}.png"
-        log = run(page, f"--window-size={width},{height}", f"--screenshot={picture}").stderr
-        document = run(page, "--dump-dom").stdout
-        return Look(picture, document, tuple(re.findall(r"CONSOLE[^\]]*\] (.*)", log)))
+        picture, profile = (tmp_path / f"{page.stem}-{width}-{height}.{kind}" for kind in ("png", "profile"))
+        options = [f"--window-size={width},{height}", f"--screenshot={picture}", "--dump-dom"]
+        complete = [*command, f"--user-data-dir={profile}", *options, page.resolve().as_uri()]
+        done = subprocess.run(complete, capture_output=True, text=True, timeout=300, check=True)
+        return Look(picture, done.stdout, tuple(re.findall(r"CONSOLE[^\]]*\] (.*)", done.stderr)))
 
     return open_page
 
