@@ -12,7 +12,7 @@ from sim_gap.closed_loop.compete import Progress
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.closed_loop.search import PRICE, Search
-from sim_gap.closed_loop.windows import Windows, thinned
+from sim_gap.closed_loop.windows import Windows, thinned_moving
 from sim_gap.model.load import SimModel
 
 STUCK = 0.0, 0.4
@@ -102,7 +102,7 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     always_on = "actuator.back_emf" in search.excluded
     if not own.complete and always_on:  # then all damping may be the servo's, which ends at a limit of its torque
         search = replace(search, nominal={**search.nominal, "kv": np.full(search.data.joints, np.inf)})
-    few = replace(search, data=thinned(search.data, FEW))
+    few = replace(search, data=thinned_moving(search.data, FEW))
     fits: dict[str, Fit] = {}
     scores: dict[str, float] = {}
     for kind, parts in kinds.items():

@@ -14,15 +14,15 @@ from sim_gap.closed_loop.columns import shared_effects, with_columns
 from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
-from sim_gap.closed_loop.judge import Stage, groups_of, rms_on, stages
-from sim_gap.closed_loop.search import Search, taken_out
+from sim_gap.closed_loop.judge import Stage, groups_of, joint_rms, rms_on, stages
+from sim_gap.closed_loop.search import Search, merged, taken_out
 from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
 from sim_gap.closed_loop.training.left_out import left_out
 from sim_gap.closed_loop.training.limits import unreached
 from sim_gap.closed_loop.training.spread import Covariance, covariance, covariance_within
-from sim_gap.closed_loop.windows import Windows, thinned, windows_of
+from sim_gap.closed_loop.windows import Windows, thinned, thinned_moving, windows_of
 from sim_gap.model.load import SimModel
 
 SEARCHED, FITTED, JUDGED = 16, 32, 48
@@ -83,13 +83,13 @@ def identify(
     """
     scale = gain_scales(gains, labels)
     progress("reading motion and model torques")
-    whole = thinned(windows_of(sim.arm, train, labels[: len(train)], scales=scale[: len(train)]), FITTED)
+    whole = thinned_moving(windows_of(sim.arm, train, labels[: len(train)], scales=scale[: len(train)]), FITTED)
     fitted = with_columns(whole)
     other = windows_of(sim.arm, heldout, labels[len(train) :], fitted.dt, scale[len(train) :])
     judged = with_columns(thinned(other, JUDGED))
     own = nominal_controller(sim)
     nominal = nominal_point(fitted, own)
-    data = thinned(fitted, SEARCHED)
+    data = thinned_moving(fitted, SEARCHED)
     scales, floor = scales_of(fitted), noise_floor(fitted)
     never = frozenset(withhold) | _frozen(sim, fitted)
     search = Search(data, scales, nominal, floor, never)
@@ -98,6 +98,8 @@ def identify(
     progress("final fit")
     search = replace(search, data=fitted)
     fit = improve(fitted, replace(fit, rms=None), scales, 6)
+    if own.complete:
+        fit = not_worse(search, fit)
     progress("each effect on held-out data")
     margin = _margin(search, fit, floor)
     split = sound(search, judged, margin) if own.complete else None
@@ -171,6 +173,19 @@ def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:
     weightless = np.linalg.norm(sim.arm.gravity) < 1e-6
     never = {"base.tilt", "position.offset"} if weightless else set[str]()
     return frozenset(never if bool((data.served < 0.5).any()) else never | {"actuator.back_emf"})
+
+
+def not_worse(search: Search, fit: Fit) -> Fit:
+    """The fit with the nominal model's own values at each joint at which they leave less of the training motion."""
+    nominal = evaluate(search.data, Fit({n: x.copy() for n, x in search.nominal.items()}, ((),) * search.data.joints))
+    if fit.shared:
+        nominal = evaluate(search.data, Fit({**fit.point, **nominal.point}, nominal.active, fit.shared))
+    assert fit.rms is not None
+    assert nominal.rms is not None
+    worse = joint_rms(search.data, fit.rms) > joint_rms(search.data, nominal.rms)
+    for j in np.flatnonzero(worse).tolist():
+        fit = merged(fit, nominal, j)
+    return evaluate(search.data, fit) if worse.any() else fit
 
 
 def noise_floor(data: Windows) -> Array:

@@ -23,6 +23,8 @@ STEP_S = 0.0051
 """Longest step of the simulation [s]; the recording's period is a multiple of the step."""
 WINDOW_S, WARM_S = 6.0, 1.5
 """Judged length of a window, and the simulated time before it that is not judged [s]."""
+MOVES = 0.5
+"""Share of a joint's highest speed of all windows that it has to have in one of those that are fitted."""
 JUDGED_HZ = 50.0
 """Highest rate at which simulated and measured positions are compared [Hz]."""
 
@@ -172,9 +174,24 @@ def _cut(arm: RigidArm, track: Track, number: int, warm: int, length: int, strid
 
 def thinned(data: Windows, count: int) -> Windows:
     """At most `count` of the windows, evenly spread over the recordings."""
+    return data if data.count <= count else of_windows(data, _even(data.count, count))
+
+
+def thinned_moving(data: Windows, count: int) -> Windows:
+    """The same, and for each joint that moves less than half as fast in these as elsewhere the window of its fastest.
+
+    Of a joint that rests in all windows anything fits: no gain, and any friction.
+    """
     if data.count <= count:
         return data
-    return of_windows(data, np.unique(np.linspace(0, data.count - 1, count).round().astype(int)))
+    chosen = _even(data.count, count)
+    speed = np.sqrt(np.mean(data.v**2, axis=0)) * (data.weight.sum(0) > 0.0)
+    rests = speed[:, chosen].max(1) < MOVES * speed.max(1)
+    return of_windows(data, np.unique([*chosen, *speed[rests].argmax(1)]))
+
+
+def _even(total: int, count: int) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, total - 1, count).round().astype(np.intp))
 
 
 def of_windows(data: Windows, chosen: NDArray[np.intp]) -> Windows:

@@ -16,14 +16,14 @@ from sim_gap.closed_loop.columns import shared_effects, with_columns
 from sim_gap.closed_loop.compete import _shared_round, select
 from sim_gap.closed_loop.controller import _from_grid, nominal_controller, nominal_point, scales_of
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, jacobian
-from sim_gap.closed_loop.identify import _frozen
+from sim_gap.closed_loop.identify import _frozen, not_worse
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.closed_loop.search import PRICE, Search
 from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.tracks import held_command
 from sim_gap.closed_loop.training import actuators, export, spread
 from sim_gap.closed_loop.training import replay as replays
-from sim_gap.closed_loop.windows import WARM_S, Windows, windows_of
+from sim_gap.closed_loop.windows import WARM_S, Windows, of_windows, thinned_moving, windows_of
 from sim_gap.effects.base import tilted
 from sim_gap.model.load import load_model
 
@@ -100,6 +100,31 @@ def test_a_parameter_at_its_highest_value_has_a_slope_too(data: Windows) -> None
     fit = Fit(point, (("load",), ("load",)))
     _, slopes = jacobian(data, fit, Scales(one, one, 0.02 * one, 0.05 * one), fit.active)
     assert all(np.linalg.norm(slope) > 0.0 for slope in slopes)
+
+
+def test_a_joint_that_moves_in_few_windows_moves_in_one_that_is_fitted(data: Windows) -> None:
+    """Of a joint that rests in all of them anything fits: no gain, and any friction."""
+    count = 40
+    many = replace(of_windows(data, np.zeros(count, int)), recording=np.arange(count))
+    still = np.ones(count)
+    still[7] = 0.0
+    speed = many.v.copy()
+    speed[:, 1] *= 0.1 * still + (1.0 - still)
+    chosen = thinned_moving(replace(many, v=speed), 4)
+    assert chosen.recording.tolist() == [0, 7, 13, 26, 39]
+    assert thinned_moving(many, 4).recording.tolist() == [0, 13, 26, 39]
+    assert thinned_moving(many, count) is many
+
+
+def test_a_joint_that_is_left_worse_than_by_the_model_keeps_the_models_values(data: Windows) -> None:
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    point = nominal_point(data, nominal_controller(sim))
+    search = Search(data, scales_of(data), point, np.full(2, 3e-4))
+    stuck = {**point, "kp": point["kp"] * [1.0, 0.1]}
+    fit = not_worse(search, evaluate(data, Fit(stuck, (("kp",), ("kp",)))))
+    np.testing.assert_array_equal(fit.point["kp"], point["kp"])
+    assert fit.active == (("kp",), ())
+    np.testing.assert_array_equal(fit.rms, evaluate(data, Fit(point, ((), ()))).rms)
 
 
 def test_a_tilt_turns_the_base_about_its_own_axes() -> None:
