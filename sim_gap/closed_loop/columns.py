@@ -14,6 +14,8 @@ UNIT = {"mass": "kg", "x": "kg·m", "y": "kg·m", "z": "kg·m", "angle": "rad", 
 
 REACH = 0.1
 """Length beyond the last joint [m]; a model does not tell how long the last link is."""
+LIGHTEST = 0.5
+"""Mass of an arm [kg] that is counted at least: models without masses are about."""
 LARGEST_TURN = 0.35
 """Largest error of a zero or of the base's tilt [rad]: torques are linear in it no further."""
 
@@ -57,7 +59,7 @@ def _range(arm: RigidArm, name: str) -> tuple[float, float]:
     Without them a mass moment of some hundred times the arm's own can stand against a spring as stiff: both cancel
     along the recorded motion, and the simulation breaks loose along any other.
     """
-    total, length = arm.inertial[:, 0].sum(), np.linalg.norm(arm.offset, axis=1).sum() + REACH
+    total, length = max(arm.inertial[:, 0].sum(), LIGHTEST), np.linalg.norm(arm.offset, axis=1).sum() + REACH
     if UNIT[name.partition(".")[2]] == "rad":
         return -LARGEST_TURN, LARGEST_TURN
     if name == "payload.mass":

@@ -26,7 +26,6 @@ SHARE = 0.9
 """Share of the motion that a band should hold."""
 ABOVE = (1.0, 1.1, 1.3, 2.0, 4.0)
 """Limits about which the band goes, over the least that the training motion admits; without a limit too."""
-
 NARROWER = np.linspace(0.0, 1.0, 51)
 """Factors on the band about several limits, of which the least is taken that holds its share."""
 
