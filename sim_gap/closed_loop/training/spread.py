@@ -19,7 +19,7 @@ from sim_gap.closed_loop.columns import UNIT
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, jacobian, moved
 from sim_gap.closed_loop.parameters import PARAMETERS
 from sim_gap.closed_loop.search import Search
-from sim_gap.closed_loop.sound import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S
+from sim_gap.closed_loop.sound import APART_S, ERROR, FRICTION_NM, FRICTION_SHARE, LATE_S
 from sim_gap.closed_loop.training.limits import Unreached, draw_limits
 
 SYSTEMATIC = 0.02
@@ -57,7 +57,7 @@ class Covariance:
 
 def covariance(search: Search, fit: Fit) -> Covariance:
     """What windows and recordings leave open of the fitted parameters and of the stated ones that a gain rests on."""
-    free = freed(fit)
+    free = freed(search, fit)
     terms = _terms(search, free)
     known = _stated(search, fit, terms.names)
     inverse = np.linalg.inv(terms.squares.sum(0) + np.diag(known))
@@ -66,7 +66,10 @@ def covariance(search: Search, fit: Fit) -> Covariance:
     if number > 1:
         few = float(t.ppf(SHARE, max(number - 1, LEAST_FREEDOM)) / norm.ppf(SHARE))
         matrix += few**2 * _jackknifed(terms, known, search.data.recording)
-    return Covariance(terms.names, matrix + _systematic(search, free, terms.names) + _besides(search, terms.names))
+    told = [k for k, (j, name) in enumerate(terms.names) if j >= 0 or name in fit.shared]
+    names = [terms.names[k] for k in told]
+    matrix = matrix[np.ix_(told, told)]
+    return Covariance(names, matrix + _systematic(search, free, names) + _besides(search, names))
 
 
 def covariance_within(search: Search, fit: Fit) -> Covariance:
@@ -84,13 +87,17 @@ def covariance_within(search: Search, fit: Fit) -> Covariance:
     return Covariance(terms.names, matrix + _systematic(search, fit, terms.names))
 
 
-def freed(fit: Fit) -> Fit:
-    """The fit with the stated values free that set the scale of a fitted gain."""
+def freed(search: Search, fit: Fit) -> Fit:
+    """The fit with the stated values free that set the scale of a fitted gain, and the mass moments of all links where
+    something of the whole arm was fitted."""
     active = tuple(
         (*own, *(name for name in SCALED if name not in own and fit.point[name][j] > 0.0)) if "kp" in own else own
         for j, own in enumerate(fit.active)
     )
-    return replace(fit, active=active)
+    others = [name for name in search.data.columns if name.startswith("moment") and name not in fit.shared]
+    shared = (*fit.shared, *others) if fit.shared else ()
+    point = {name: np.zeros(search.data.joints) for name in shared} | fit.point
+    return replace(fit, point=point, active=active, shared=shared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +129,12 @@ def _terms(search: Search, fit: Fit) -> _Terms:
 def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
     """Inverse variance of each parameter before any recording, (K,)."""
     out = np.full(len(names), WIDEST**-2)
+    moments = ERROR * np.maximum(np.linalg.norm(search.data.arm.inertial[:, 1:4], axis=1), 1e-6)
     for k, (j, name) in enumerate(names):
         if j >= 0 and name not in fit.active[j]:
             out[k] = (float(search.scales.of(name)[j]) / (STATED * float(fit.point[name][j]))) ** 2
+        elif j < 0 and name not in fit.shared:
+            out[k] = moments[int(name.removeprefix("moment").partition(".")[0])] ** -2
     return out
 
 

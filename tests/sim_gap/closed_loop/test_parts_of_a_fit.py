@@ -233,7 +233,8 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
     x = random.normal(size=(1, 50, 400))
     residual = 0.01 * random.normal(size=(50, 1, 400))
     monkeypatch.setattr(spread, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
-    data = SimpleNamespace(count=400, joints=1, recording=np.zeros(400, int))
+    arm = SimpleNamespace(inertial=np.ones((1, 10)))
+    data = SimpleNamespace(count=400, joints=1, recording=np.zeros(400, int), columns={}, arm=arm)
     search = SimpleNamespace(data=data, scales=Scales(*np.ones((4, 1))), samples=np.array([400.0]))
     fit = Fit({"kp": np.array([15.0]), **{name: np.zeros(1) for name in spread.SCALED}}, (("kp",),))
     for estimate in (spread.covariance, spread.covariance_within):

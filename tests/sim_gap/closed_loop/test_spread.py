@@ -109,3 +109,15 @@ def test_of_a_payload_the_centre_is_told_and_not_the_moment() -> None:
     assert (centre, unit) == (pytest.approx(0.2), "m")
     assert high - centre == pytest.approx(centre - low)
     assert high - centre == pytest.approx(2.0 * 0.2 * np.hypot(0.05, 0.025))
+
+
+def test_a_payload_is_no_surer_than_the_masses_of_the_model(several) -> None:
+    """An error of a per cent of the last link's own moment acts as a payload's does."""
+    search, fit = several
+    names = ("payload.mass", "payload.x", "payload.z")
+    point = {**fit.point, **{name: np.zeros(2) for name in names}}
+    found = covariance(search, replace(fit, point=point, shared=names))
+    assert [name for j, name in found.names if j < 0] == list(names)
+    own = float(np.linalg.norm(search.data.arm.inertial[-1, 1:4]))
+    at = found.names.index((-1, "payload.x"))
+    assert np.sqrt(found.matrix[at, at]) > 0.9 * spread.ERROR * own
