@@ -14,8 +14,8 @@ from sim_gap.closed_loop.columns import shared_effects, with_columns
 from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
-from sim_gap.closed_loop.judge import Stage, groups_of, joint_rms, rms_on, stages
-from sim_gap.closed_loop.search import Search, merged, taken_out
+from sim_gap.closed_loop.judge import Stage, groups_of, rms_on, stages
+from sim_gap.closed_loop.search import Search, effects_at, merged, taken_out, without
 from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
@@ -177,14 +177,13 @@ def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:
 
 def not_worse(search: Search, fit: Fit) -> Fit:
     """The fit with the nominal model's own values at each joint at which they leave less of the training motion."""
-    nominal = evaluate(search.data, Fit({n: x.copy() for n, x in search.nominal.items()}, ((),) * search.data.joints))
-    if fit.shared:
-        nominal = evaluate(search.data, Fit({**fit.point, **nominal.point}, nominal.active, fit.shared))
-    assert fit.rms is not None
-    assert nominal.rms is not None
-    worse = joint_rms(search.data, fit.rms) > joint_rms(search.data, nominal.rms)
+    bare = fit
+    for j in range(search.data.joints):
+        for effect in effects_at(fit, j):
+            bare = without(search, bare, effect, j)
+    worse = rms_on(search.data, fit) > rms_on(search.data, bare)
     for j in np.flatnonzero(worse).tolist():
-        fit = merged(fit, nominal, j)
+        fit = merged(fit, bare, j)
     return evaluate(search.data, fit) if worse.any() else fit
 
 

@@ -120,22 +120,11 @@ def windows_of(
         track = track_of(arm, recording, label, dt)
         parts += _cut(arm, track, number, warm, length, stride)
     number_of = np.array([part["recording"] for part in parts], dtype=np.intp)
-    stacked: dict[str, Array] = {
+    stacked: dict[str, Any] = {
         name: np.stack([part[name] for part in parts], axis=-1) for name in parts[0] if name != "recording"
     }
     scale = np.array([*scales] or [1.0] * len(recordings), float)[number_of]
-    return Windows(
-        dt=dt,
-        stride=stride,
-        warm=warm,
-        period=period,
-        arm=arm,
-        recording=number_of,
-        scale=scale,
-        columns={},
-        ranges={},
-        **stacked,
-    )
+    return Windows(dt=dt, stride=stride, warm=warm, period=period, arm=arm, recording=number_of, scale=scale, **stacked)
 
 
 def _cut(arm: RigidArm, track: Track, number: int, warm: int, length: int, stride: int) -> list[dict[str, Array]]:

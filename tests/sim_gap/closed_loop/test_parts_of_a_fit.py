@@ -127,6 +127,18 @@ def test_a_joint_that_is_left_worse_than_by_the_model_keeps_the_models_values(da
     np.testing.assert_array_equal(fit.rms, evaluate(data, Fit(point, ((), ()))).rms)
 
 
+def test_what_the_whole_arm_has_stays_where_a_joint_takes_the_models_values(data: Windows) -> None:
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    seen = with_columns(data)
+    point = nominal_point(seen, nominal_controller(sim))
+    search = Search(seen, scales_of(seen), point, np.full(2, 3e-4))
+    stuck = {**point, "kp": point["kp"] * [1.0, 0.1], "moment1.x": np.full(2, 0.001)}
+    fit = not_worse(search, evaluate(seen, Fit(stuck, (("kp",), ("kp",)), ("moment1.x",))))
+    np.testing.assert_array_equal(fit.point["kp"], point["kp"])
+    np.testing.assert_array_equal(fit.point["moment1.x"], [0.001, 0.001])
+    assert fit.shared == ("moment1.x",)
+
+
 def test_a_tilt_turns_the_base_about_its_own_axes() -> None:
     """As it does where a torque is recorded: about the base's x and y, if gravity is along its z."""
     turned = tilted(np.array([0.0, 0.0, -9.81]), np.array([0.0, 0.1]))
