@@ -39,6 +39,9 @@ _MOST_RATIO, _SURELY_MUCH = 200, 1 << 28
 """A file that unpacks to more than _SURELY_MUCH bytes must not be smaller than this share of them."""
 NAMES_KEY = b"armlink.names"
 """Parquet schema metadata: joint names as JSON."""
+THREADS = False
+"""Arrow's threads may abort a process that ends right after it has read (arrow issue 34314); 120 MB are read as fast
+without them."""
 
 
 def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Recording:
@@ -59,7 +62,9 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> R
     try:
         table = pa_csv.read_csv(
             pa.BufferReader(content),
-            read_options=pa_csv.ReadOptions(column_names=_unnamed_apart(header), skip_rows=layout.lines),
+            read_options=pa_csv.ReadOptions(
+                column_names=_unnamed_apart(header), skip_rows=layout.lines, use_threads=THREADS
+            ),
             parse_options=pa_csv.ParseOptions(delimiter=layout.separator),
             convert_options=pa_csv.ConvertOptions(
                 include_columns=wanted, column_types=kinds, decimal_point=layout.decimal
@@ -87,7 +92,7 @@ def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) 
             apart = columns_of_lists(file)
             header = _renamed(list(apart), columns, path)
             wanted = {column: apart[name] for column, name in zip(header, apart, strict=True) if is_channel(column)}
-            table = file.read(columns=sorted({name for name, _ in wanted.values()}))
+            table = file.read(columns=sorted({name for name, _ in wanted.values()}), use_threads=THREADS)
         taken = {
             column: table[name] if k is None else pa_compute.list_element(table[name], k)
             for column, (name, k) in wanted.items()
