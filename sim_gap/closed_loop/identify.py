@@ -15,6 +15,7 @@ from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Stage, groups_of, rms_on, stages
+from sim_gap.closed_loop.prune import typical
 from sim_gap.closed_loop.search import Search, effects_at, merged, taken_out, without
 from sim_gap.closed_loop.sound import Sound, sound
 from sim_gap.closed_loop.training.bands import Band, band
@@ -98,6 +99,7 @@ def identify(
     progress("final fit")
     search = replace(search, data=fitted)
     fit = improve(fitted, replace(fit, rms=None), scales, 6)
+    fit, others = typical(search, fit, progress)
     if own.complete:
         fit = not_worse(search, fit)
     progress("each effect on held-out data")
