@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.compete import Progress
+from sim_gap.closed_loop.choice.compete import Progress
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.closed_loop.search import PRICE, Search

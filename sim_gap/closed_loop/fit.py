@@ -15,6 +15,8 @@ DAMPINGS = (1e-6, 1e-2, 0.1, 1.0, 10.0, 100.0)
 """Levenberg-Marquardt dampings tried together in every step."""
 STILL = 1e-3
 """Relative fall of the cost below which a joint's fit ends."""
+FARTHEST = 1.5
+"""Logarithm of the largest factor of one step of a fit."""
 DIFFERENCE = 0.02
 """Step of a finite difference, in units of the size at which a parameter is tried."""
 
@@ -90,10 +92,13 @@ def _difference(name: str, value: float, scales: Scales, joint: int) -> float:
     return -step if moved(name, value, step, scales, joint) >= PARAMETERS[name].high else step
 
 
-def moved(name: str, value: float, step: float, scales: Scales, joint: int) -> float:
-    """A parameter's value after a step in its own coordinate: relative for gains, else in units of its trial size."""
+def moved(name: str, value: float, step: float, scales: Scales, joint: int, farthest: float = FARTHEST) -> float:
+    """A parameter's value after a step in its own coordinate: relative for gains, else in units of its trial size.
+
+    `farthest` is the logarithm of the largest factor on a gain.
+    """
     if name in LOGARITHMIC:
-        new = value * float(np.exp(np.clip(step, -1.5, 1.5)))
+        new = value * float(np.exp(np.clip(step, -farthest, farthest)))
     else:
         new = value + step * float(scales.of(name)[joint])
     low, high = PARAMETERS[name].low, PARAMETERS[name].high

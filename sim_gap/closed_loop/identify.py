@@ -10,14 +10,15 @@ import numpy as np
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
+from sim_gap.closed_loop.choice.compete import select_about
+from sim_gap.closed_loop.choice.doubt import settled
 from sim_gap.closed_loop.columns import shared_effects, with_columns
-from sim_gap.closed_loop.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Stage, groups_of, rms_on, stages
-from sim_gap.closed_loop.prune import typical
 from sim_gap.closed_loop.search import Search, effects_at, merged, taken_out, without
 from sim_gap.closed_loop.sound import Sound, sound
+from sim_gap.closed_loop.training.alternatives import alternatives
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
 from sim_gap.closed_loop.training.left_out import left_out
@@ -99,7 +100,7 @@ def identify(
     progress("final fit")
     search = replace(search, data=fitted)
     fit = improve(fitted, replace(fit, rms=None), scales, 6)
-    fit, others = typical(search, fit, progress)
+    fit, others = settled(search, fit, progress)
     if own.complete:
         fit = not_worse(search, fit)
     progress("each effect on held-out data")
@@ -109,7 +110,7 @@ def identify(
     found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
-    spread = replace(covariance(search, fit), limits=unreached(search, fit))
+    spread = replace(covariance(search, fit), limits=unreached(search, fit), others=alternatives(others))
     return Identified(
         sim=sim,
         search=search,

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.columns import shared_effects
+from sim_gap.closed_loop.choice.rivals import rivals_of
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.parameters import EFFECTS
-from sim_gap.closed_loop.rivals import rivals_of
-from sim_gap.closed_loop.search import Group, Search, effect_there, taken_out
+from sim_gap.closed_loop.search import Group, Search, effect_there, shared_of, taken_out
 from sim_gap.closed_loop.windows import Windows
 
 LEAST_SHRINK = 0.05
@@ -25,11 +24,6 @@ def groups_of(fit: Fit, search: Search) -> list[Group]:
         if not (search.open_controller and effect in search.kept)
     ]
     return [group for group in own if group[1]] + [(effect, ()) for effect in shared_of(fit, search)]
-
-
-def shared_of(fit: Fit, search: Search) -> list[str]:
-    """Effects of the whole arm that a fit has."""
-    return [e for e, names in shared_effects(search.data.arm).items() if set(names) & set(fit.shared)]
 
 
 def rms_on(data: Windows, fit: Fit) -> Array:

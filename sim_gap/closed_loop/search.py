@@ -159,6 +159,11 @@ def effects_at(fit: Fit, joint: int) -> list[str]:
     return [effect for effect in EFFECTS if effect_there(fit, effect, joint)]
 
 
+def shared_of(fit: Fit, search: Search) -> list[str]:
+    """Effects of the whole arm that a fit has."""
+    return [e for e, names in shared_effects(search.data.arm).items() if set(names) & set(fit.shared)]
+
+
 def only(fit: Fit, tried: dict[int, str]) -> Fit:
     """The fit with the parameters of other joints held."""
     return replace(fit, active=tuple(own if j in tried else () for j, own in enumerate(fit.active)), shared=())

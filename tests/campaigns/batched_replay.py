@@ -20,9 +20,9 @@ import numpy as np
 from armlink.recording.files import load_recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.closed_loop.identify import Identified
+from sim_gap.closed_loop.training.draws import draw
 from sim_gap.closed_loop.training.posterior import batched
 from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, _actuator, replay
-from sim_gap.closed_loop.training.spread import draw
 
 AGREE = 0.05
 """Largest difference of the RMS gap to the measured position between both simulators, over all joints."""

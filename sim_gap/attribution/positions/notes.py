@@ -18,7 +18,7 @@ def notes(found: Identified) -> list[str]:
     names = found.sim.arm.names
     kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
     out = [f"no torque channel: controller ({kind}) and effects follow from q_cmd and q; the gap is in rad"]
-    if loose := undecided_scale(found.fit, found.spread):
+    if loose := undecided_scale(found.search, found.fit, found.spread):
         listed = ", ".join(names[j] for j in loose)
         out.append(
             f"{listed}: position alone shows ratios of gain, friction and inertia here, their common scale rests on "

@@ -8,7 +8,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.better_model.actuator_entries import Row, steps_of, write_entries
 from sim_gap.closed_loop.identify import Identified
-from sim_gap.closed_loop.training.spread import draw
+from sim_gap.closed_loop.training.draws import draw
 
 DRAWS = 400
 """Draws of the parameters from which the range of a delay is taken."""

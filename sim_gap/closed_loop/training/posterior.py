@@ -9,8 +9,8 @@ from sim_gap.better_model.urdf import URDF, urdf_of
 from sim_gap.better_model.xml_comment import xml_comment
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.search import effect_there
+from sim_gap.closed_loop.training.draws import draw
 from sim_gap.closed_loop.training.export import BATCHED, NATIVE, Exported, exported, native_fit
-from sim_gap.closed_loop.training.spread import draw
 from sim_gap.model.load import urdf_behind
 
 

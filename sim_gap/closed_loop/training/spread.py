@@ -1,4 +1,4 @@
-"""What recordings leave open of the parameters: covariance, intervals, draws.
+"""What recordings leave open of the parameters: covariance and intervals.
 
 A position alone shows ratios: of gain, friction and inertia, whose common scale rests on a little inertia. Along such a
 direction the score is flat, a fit stops anywhere, and a fit without one recording stops beside it. So the parameters
@@ -7,7 +7,7 @@ Survey Methodology 28, 2002), as far as the others let them. Windows are left ou
 shows what the model lacks in another way, and the parameters take it up.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from gcomp.arrays import Array
+from sim_gap.closed_loop.choice.doubt import LEAST_FREEDOM
 from sim_gap.closed_loop.columns import UNIT
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, jacobian, moved
 from sim_gap.closed_loop.parameters import PARAMETERS
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.sound import APART_S, ERROR, FRICTION_NM, FRICTION_SHARE, LATE_S
-from sim_gap.closed_loop.training.limits import Unreached, draw_limits
+from sim_gap.closed_loop.training.alternatives import Alternative, quantiles
+from sim_gap.closed_loop.training.limits import Unreached
 
 SYSTEMATIC = 0.02
 """Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
@@ -32,22 +34,24 @@ LOOSE = 0.35
 """Relative standard deviation of a gain from which its scale is not decided."""
 WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
+ANYTHING = float(np.log(1e3))
+"""Logarithm of the factor to either side of a gain of which nothing is known."""
 LIGHTEST = 1e-3
 """Mass of a payload [kg] that its moment is divided by at least."""
-LEAST_FREEDOM = 2
-"""Degrees of freedom that are counted at least: two recordings alone have one, whose 95 % are 13 standard errors."""
 SHARE = 0.975
 """Quantile of Student's distribution that the spread over recordings is widened to, as it rests on few of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of the parameters in their own coordinates (`fit.moved`), and the limits that no recording reaches."""
+    """Covariance of the parameters in their own coordinates (`fit.moved`) about the fit and about those without an
+    effect that is in doubt, and the limits that no recording reaches."""
 
     names: list[tuple[int, str]]
     """Joint (−1: whole arm) and name."""
     matrix: Array
     limits: tuple[Unreached, ...] = ()
+    others: tuple[Alternative, ...] = ()
 
     def of_joint(self, joint: int) -> Array:
         """The part of one joint's own parameters and then those of the whole arm."""
@@ -174,20 +178,43 @@ def coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:
     return float(fit.point[name][joint]) / float(search.scales.of(name)[joint])
 
 
-def undecided_scale(fit: Fit, spread: Covariance) -> list[int]:
+def shifted(search: Search, fit: Fit, spread: Covariance, joint: int, name: str) -> tuple[Array, Array]:
+    """Where the other fits have a parameter, from where the fit has it, in its own coordinate, and their odds.
+
+    Fits that have no such effect say nothing of its size.
+    """
+    own = coordinate(search, fit, joint, name)
+    told = [
+        (coordinate(search, other.fit, joint, name) - own, other.odds)
+        for other in spread.others
+        if other.joint in (joint, -1) and name in (other.fit.active[joint] if joint >= 0 else other.fit.shared)
+    ]
+    shifts, odds = np.array(told, float).reshape(-1, 2).T
+    return shifts, odds
+
+
+def undecided_scale(search: Search, fit: Fit, spread: Covariance) -> list[int]:
     """Joints of which only ratios of gain, friction and inertia can be told."""
-    places = {j: spread.names.index((j, "kp")) for j, own in enumerate(fit.active) if "kp" in own}
-    return [j for j, at in places.items() if float(spread.matrix[at, at]) > LOOSE**2]
+    out = []
+    for j, own in enumerate(fit.active):
+        if "kp" in own:
+            shifts, odds = shifted(search, fit, spread, j, "kp")
+            within = float(spread.matrix[(at := spread.names.index((j, "kp"))), at])
+            share, mean = odds / (1.0 + odds.sum()), float(odds @ shifts) / (1.0 + float(odds.sum()))
+            if within + float(share @ shifts**2) - mean**2 > LOOSE**2:
+                out.append(j)
+    return out
 
 
 def interval(search: Search, fit: Fit, spread: Covariance, joint: int, name: str) -> tuple[float, float, float, str]:
     """Value, ends of its 95 % interval, and unit."""
-    half = 2.0 * float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
+    deviation = float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
+    below, above = quantiles(*shifted(search, fit, spread, joint, name), deviation)
     if joint < 0:
         value, (least, most) = float(fit.point[name][0]), search.data.ranges[name]
-        return value, max(value - half, least), min(value + half, most), UNIT[name.partition(".")[2]]
+        return value, max(value + below, least), min(value + above, most), UNIT[name.partition(".")[2]]
     value = float(fit.point[name][joint])
-    low, high = (moved(name, value, sign * half, search.scales, joint) for sign in (-1.0, 1.0))
+    low, high = (moved(name, value, step, search.scales, joint, ANYTHING) for step in (below, above))
     return value, low, high, PARAMETERS[name].unit
 
 
@@ -200,33 +227,3 @@ def payload_centre(fit: Fit, spread: Covariance, column: str) -> tuple[float, fl
     change[spread.names.index((-1, "payload.mass"))] = -centre / divisor
     half = 2.0 * float(np.sqrt(change @ spread.matrix @ change))
     return centre, centre - half, centre + half, "m"
-
-
-def draw(search: Search, fit: Fit, spread: Covariance, count: int, seed: int = 0) -> list[dict[str, float]]:
-    """Draws of all parameters from their joint distribution, within their bounds, and of the limits that no recording
-    reaches: `joint.name` → value."""
-    random = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(spread.matrix)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    steps = random.standard_normal((count, len(values))) @ root.T
-    rows = [_sample(search, fit, spread, row) for row in steps]
-    for each, drawn in zip(spread.limits, draw_limits(spread.limits, count, random), strict=True):
-        for row, value in zip(rows, drawn, strict=True):
-            row[f"{search.data.arm.names[each.joint]}.{each.name}"] = float(value)
-    return rows
-
-
-def _sample(search: Search, fit: Fit, spread: Covariance, steps: Array) -> dict[str, float]:
-    out: dict[str, float] = {}
-    labels: Mapping[int, str] = dict(enumerate(search.data.arm.names))
-    deviations = np.sqrt(np.diag(spread.matrix))
-    for (joint, name), step, deviation in zip(spread.names, steps.tolist(), deviations.tolist(), strict=True):
-        if joint < 0:
-            out[name] = float(np.clip(fit.point[name][0] + step, *search.data.ranges[name]))
-            continue
-        value, size = float(fit.point[name][joint]), float(search.scales.of(name)[joint])
-        if name in SCALED and deviation * size < value:  # such that the ratio to a gain, drawn with it, stays
-            out[f"{labels[joint]}.{name}"] = value * float(np.exp(step * size / value))
-        else:
-            out[f"{labels[joint]}.{name}"] = moved(name, value, step, search.scales, joint)
-    return out

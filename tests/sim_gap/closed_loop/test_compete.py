@@ -11,7 +11,7 @@ from servo_arm import model_text, record
 
 from armlink.recording.recording import Recording
 from sim_gap.closed_loop import controller, judge
-from sim_gap.closed_loop.compete import select_about
+from sim_gap.closed_loop.choice.compete import select_about
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, batch, improve
 from sim_gap.closed_loop.judge import _ordered

@@ -12,8 +12,9 @@ from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.training import bands, limits
 from sim_gap.closed_loop.training.bands import band
+from sim_gap.closed_loop.training.draws import draw
 from sim_gap.closed_loop.training.left_out import left_out
-from sim_gap.closed_loop.training.spread import covariance, draw
+from sim_gap.closed_loop.training.spread import covariance
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
 

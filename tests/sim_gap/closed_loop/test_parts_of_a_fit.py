@@ -9,11 +9,12 @@ import pytest
 from servo_arm import model_text, record
 
 from armlink.recording.recording import Recording
-from sim_gap.closed_loop import judge, prune, rivals
+from sim_gap.closed_loop import judge
 from sim_gap.closed_loop import search as edits
-from sim_gap.closed_loop.candidates import _explained, ranked
+from sim_gap.closed_loop.choice import prune, rivals
+from sim_gap.closed_loop.choice.candidates import _explained, ranked
+from sim_gap.closed_loop.choice.compete import _shared_round, select
 from sim_gap.closed_loop.columns import shared_effects, with_columns
-from sim_gap.closed_loop.compete import _shared_round, select
 from sim_gap.closed_loop.controller import _from_grid, nominal_controller, nominal_point, scales_of
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, jacobian
 from sim_gap.closed_loop.identify import _frozen, not_worse

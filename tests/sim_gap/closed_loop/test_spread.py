@@ -9,7 +9,8 @@ from servo_arm import JOINTS, fitted
 from sim_gap.closed_loop.fit import Fit, batch, residuals
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.training import spread
-from sim_gap.closed_loop.training.spread import Covariance, covariance, covariance_within, draw, interval
+from sim_gap.closed_loop.training.draws import draw
+from sim_gap.closed_loop.training.spread import Covariance, covariance, covariance_within, interval
 
 FRICTION = 0.15, 0.35
 
@@ -67,9 +68,9 @@ def test_of_an_arm_that_feels_no_weight_ratios_are_told_better_than_their_scale(
 
 
 def test_a_gain_that_may_be_half_as_large_again_has_no_scale(weightless) -> None:
-    _, fit = weightless
+    search, fit = weightless
     found = Covariance([(0, "kp"), (1, "kp")], np.diag([0.5**2, 0.2**2]))
-    assert spread.undecided_scale(fit, found) == [0]
+    assert spread.undecided_scale(search, fit, found) == [0]
 
 
 def test_draws_of_an_undecided_scale_move_the_arm_as_the_fit_does(weightless) -> None:

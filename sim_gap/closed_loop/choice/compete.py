@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_gap.closed_loop.candidates import expected_shared, ranked
+from sim_gap.closed_loop.choice.candidates import expected_shared, ranked
+from sim_gap.closed_loop.choice.prune import pruned
 from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.fit import Fit, evaluate, improve, jacobian
 from sim_gap.closed_loop.parameters import EFFECTS
-from sim_gap.closed_loop.prune import pruned
 from sim_gap.closed_loop.search import LEAST_FALL, PRICE, Search, merged, only, price, with_effect
 
 TRIES = 2

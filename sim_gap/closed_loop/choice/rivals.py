@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.candidates import expected_shared, ranked
+from sim_gap.closed_loop.choice.candidates import expected_shared, ranked
 from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.fit import Fit, improve, jacobian
 from sim_gap.closed_loop.parameters import EFFECTS

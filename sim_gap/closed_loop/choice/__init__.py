@@ -1,0 +1,1 @@
+"""Which effects the closed loop has: candidates, competition, removal, rivals, doubt."""

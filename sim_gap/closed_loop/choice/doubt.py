@@ -1,0 +1,104 @@
+"""How doubtful each effect of a fit is, and what the fit would be without it.
+
+The score is a sum over all windows, made up of those with the largest gap: an effect that takes up what the model lacks
+in one recording pays, and spoils the others. So what an effect lowers is compared from window to window and from
+recording to recording. An effect of the whole arm, such as a payload, changes gain, friction and inertia of all joints
+together; it is compared with what the joints' own effects make of it when they are chosen again without it.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.choice.compete import select
+from sim_gap.closed_loop.choice.prune import removable_at, without_each
+from sim_gap.closed_loop.columns import shared_effects
+from sim_gap.closed_loop.fit import Fit, improve
+from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.closed_loop.search import INDEPENDENT_S, PRICE, Group, Search, merged, price, shared_of, taken_out
+
+CALM = 0.5
+"""Share of a joint's RMS over all windows below which what is left of a window tells little."""
+LEAST_FREEDOM = 2
+"""Degrees of freedom that are counted at least: two recordings alone have one, whose 95 % are 13 standard errors."""
+ROUNDS = 4
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Other:
+    """Another choice: without an effect that the fit has, or with one that was taken out."""
+
+    group: Group
+    """The effect, of one joint or of the whole arm."""
+    fit: Fit
+    """Fitted again at that joint, or at all."""
+    likely: float
+    """Probability that this is the right one of both."""
+
+
+def settled(search: Search, fit: Fit, progress: Progress) -> tuple[Fit, list[Other]]:
+    """The fit without effects that pay in a recording or two and not in the others, and the other choices."""
+    dropped: list[Other] = []
+    for _ in range(ROUNDS):
+        others = list(_others(search, fit, progress))
+        better = [each for each in others if each.likely > 0.5]
+        if not better:
+            return fit, [*others, *dropped]
+        progress(f"{len(better)} effects that pay in some recordings alone")
+        taken = _best_of(better)
+        dropped += [replace(each, fit=fit, likely=1.0 - each.likely) for each in taken]
+        for each in taken:
+            fit = merged(fit, each.fit, each.group[1][0]) if each.group[1] else each.fit
+        fit = improve(search.data, fit, search.scales, 4)
+    return fit, [each for each in _others(search, fit, progress) if each.likely <= 0.5] + dropped
+
+
+def _best_of(others: list[Other]) -> list[Other]:
+    """The likeliest of the whole arm; without any, of each joint."""
+    whole = [each for each in others if not each.group[1]]
+    groups = [whole] if whole else [[o for o in others if o.group[1] == at] for at in {o.group[1] for o in others}]
+    return [max(each, key=lambda other: other.likely) for each in groups]
+
+
+def _others(search: Search, fit: Fit, progress: Progress) -> Iterator[Other]:
+    """The fit without each effect that may be taken out."""
+    for j, effect, other in without_each(search, fit, removable_at(search, fit)):
+        least = float(price(search, len(EFFECTS[effect].parameters))[j])
+        yield Other((effect, (j,)), other, _doubt(search, fit, other, (j,), least))
+    own = replace(search, excluded=search.excluded | {e.partition("@")[0] for e in shared_effects(search.data.arm)})
+    for effect in shared_of(fit, search):
+        progress(f"without {effect}")
+        other = improve(search.data, select(own, taken_out(search, fit, (effect, ()))), search.scales, 4)
+        more = PRICE * (_size(fit) - _size(other))
+        yield Other((effect, ()), other, _doubt(search, fit, other, range(search.data.joints), more))
+
+
+def _size(fit: Fit) -> int:
+    return sum(len(own) for own in fit.active) + len(fit.shared)
+
+
+def _doubt(search: Search, fit: Fit, other: Fit, joints: Iterable[int], least: float) -> float:
+    """Probability that the score would not fall by `least` over many more windows, or recordings, like these."""
+    assert fit.rms is not None
+    assert other.rms is not None
+    data, falls = search.data, np.zeros(search.data.count)
+    for j in joints:
+        count = data.weight.sum(0)[j]
+        calm = search.floor[j] ** 2 + CALM**2 * float((fit.rms[j] ** 2 * count).sum() / max(float(count.sum()), 1.0))
+        samples = count * data.stride * data.dt / INDEPENDENT_S
+        falls += 0.5 * samples * np.log((other.rms[j] ** 2 + calm) / (fit.rms[j] ** 2 + calm))
+    return max(_tail(falls, groups, least) for groups in (np.arange(data.count), data.recording))
+
+
+def _tail(falls: Array, groups: NDArray[np.intp], least: float) -> float:
+    """Probability by Student's distribution that the sum over so many groups is less; 0 for a single group."""
+    sums = np.array([falls[groups == group].sum() for group in np.unique(groups)])
+    if len(sums) < 2:
+        return 0.0
+    error = max(float(sums.std(ddof=1)) * np.sqrt(len(sums)), 1e-9)
+    return float(t.sf((float(sums.sum()) - least) / error, max(len(sums) - 1, LEAST_FREEDOM)))
