@@ -81,7 +81,7 @@ corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units
 servopeer: .venv/.dev ## Long campaign outside make test: positions alone, beside mujoco.sysid (ARGS="--sim M --train R --heldout R")
 	$(BIN)/python tests/campaigns/servo_peer.py $(ARGS)
 
-repeats: .venv/.dev ## Long campaign outside make test: positions alone, bands of motion and two recordings of one arm (ARGS="--arms 4")
+repeats: .venv/.dev ## Long campaign outside make test: positions alone, bands of motion and two recordings of one arm (ARGS="--arms 4", "--sim M --recordings R … --parts 5")
 	$(BIN)/python tests/campaigns/servo_repeats.py $(ARGS)
 
 bodies: .venv/.dev ## Long campaign outside make test: turned bases, bodies added and missing (ARGS="--tilts 40 --bodies 40")
