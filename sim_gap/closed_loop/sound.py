@@ -45,9 +45,28 @@ class Sound:
     """Whether a sound arm may have these errors, and they leave nothing that matters."""
 
 
+def errors_of(search: Search) -> list[dict[str, float]]:
+    """Standard deviation of each parameter of a sound arm in its own coordinate (`fit.moved`), of joints and links."""
+    data, nominal, scales = search.data, search.nominal, search.scales
+    friction = np.minimum(FRICTION_NM, FRICTION_SHARE * scales.torque)
+    deviation = {
+        "viscous": ERROR * nominal["viscous"],
+        "coulomb": np.hypot(ERROR * nominal["coulomb"], friction),
+        "armature": ERROR * (nominal["armature"] + data.inertia.mean((0, 2))),
+        "delay": np.full(data.joints, np.hypot(LATE_S, APART_S)),
+    }
+    own = [
+        {"kp": ERROR, **{name: float(x[j] / scales.of(name)[j]) for name, x in deviation.items() if x[j] > 0.0}}
+        for j in range(data.joints)
+    ]
+    moments = ERROR * np.linalg.norm(data.arm.inertial[:, 1:4], axis=1)
+    links = {f"moment{link}.{axis}": float(moments[link]) for link in range(data.joints) for axis in "xyz"}
+    return [*own, {name: size for name, size in links.items() if name in data.columns}]
+
+
 def sound(search: Search, heldout: Windows, margin: Array) -> Sound:
     """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
-    sizes = _sizes(search)
+    sizes = errors_of(search)
     deviations = np.array([size for each in sizes for size in each.values()])
     errors, usual = np.zeros(deviations.size), np.zeros(search.data.joints)
     usually = _correlation(sizes)
@@ -90,25 +109,6 @@ def _correlation(sizes: list[dict[str, float]]) -> Array:
     late = np.array([name == "delay" for each in sizes for name in each], float)
     share = LATE_S**2 / (LATE_S**2 + APART_S**2)
     return np.asarray(np.diag(1.0 - share * late) + share * np.outer(late, late))
-
-
-def _sizes(search: Search) -> list[dict[str, float]]:
-    """Standard deviation of each parameter in its own coordinate (`fit.moved`): of every joint, and of the links."""
-    data, nominal, scales = search.data, search.nominal, search.scales
-    friction = np.minimum(FRICTION_NM, FRICTION_SHARE * scales.torque)
-    deviation = {
-        "viscous": ERROR * nominal["viscous"],
-        "coulomb": np.hypot(ERROR * nominal["coulomb"], friction),
-        "armature": ERROR * (nominal["armature"] + data.inertia.mean((0, 2))),
-        "delay": np.full(data.joints, np.hypot(LATE_S, APART_S)),
-    }
-    own = [
-        {"kp": ERROR, **{name: float(x[j] / scales.of(name)[j]) for name, x in deviation.items() if x[j] > 0.0}}
-        for j in range(data.joints)
-    ]
-    moments = ERROR * np.linalg.norm(data.arm.inertial[:, 1:4], axis=1)
-    links = {f"moment{link}.{axis}": float(moments[link]) for link in range(data.joints) for axis in "xyz"}
-    return [*own, {name: size for name, size in links.items() if name in data.columns}]
 
 
 def _fit(search: Search, sizes: list[dict[str, float]], errors: Array) -> Fit:

@@ -7,7 +7,7 @@ Survey Methodology 28, 2002), as far as the others let them. Windows are left ou
 shows what the model lacks in another way, and the parameters take it up.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from sim_gap.closed_loop.columns import UNIT
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, jacobian, moved
 from sim_gap.closed_loop.parameters import PARAMETERS
 from sim_gap.closed_loop.search import Search
-from sim_gap.closed_loop.sound import APART_S, ERROR, FRICTION_NM, FRICTION_SHARE, LATE_S
+from sim_gap.closed_loop.sound import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
 from sim_gap.closed_loop.training.alternatives import Alternative, quantiles
 from sim_gap.closed_loop.training.limits import Unreached
 
@@ -36,6 +36,8 @@ WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
 ANYTHING = float(np.log(1e3))
 """Logarithm of the factor to either side of a gain of which nothing is known."""
+LEAST = 1e-8
+"""Standard deviation of a mass moment of a link without mass [kg·m]."""
 LIGHTEST = 1e-3
 """Mass of a payload [kg] that its moment is divided by at least."""
 SHARE = 0.975
@@ -60,20 +62,33 @@ class Covariance:
 
 
 def covariance(search: Search, fit: Fit) -> Covariance:
-    """What windows and recordings leave open of the fitted parameters and of the stated ones that a gain rests on."""
+    """What windows and recordings leave open of the fitted parameters and of the stated ones that a gain rests on.
+
+    It counts how far they would move if all that may be off in a sound arm were fitted beside them.
+    """
     free = freed(search, fit)
     terms = _terms(search, free)
     known = _stated(search, fit, terms.names)
     inverse = np.linalg.inv(terms.squares.sum(0) + np.diag(known))
-    matrix = inverse * known @ inverse + _jackknifed(terms, known, np.arange(search.data.count))
+    aside = inverse @ terms.scores.sum(0)
+    matrix = inverse * known @ inverse + np.outer(aside, aside)
+    matrix += _jackknifed(terms, known, np.arange(search.data.count))
     number = len(np.unique(search.data.recording))
     if number > 1:
         few = float(t.ppf(SHARE, max(number - 1, LEAST_FREEDOM)) / norm.ppf(SHARE))
         matrix += few**2 * _jackknifed(terms, known, search.data.recording)
-    told = [k for k, (j, name) in enumerate(terms.names) if j >= 0 or name in fit.shared]
+    told = [k for k, (j, name) in enumerate(terms.names) if _told(fit, j, name)]
     names = [terms.names[k] for k in told]
     matrix = matrix[np.ix_(told, told)]
     return Covariance(names, matrix + _systematic(search, free, names) + _besides(search, names))
+
+
+def _told(fit: Fit, joint: int, name: str) -> bool:
+    """Whether a parameter was fitted, or sets the scale of a fitted gain."""
+    if joint < 0:
+        return name in fit.shared
+    own = fit.active[joint]
+    return name in own or ("kp" in own and name in SCALED and float(fit.point[name][joint]) > 0.0)
 
 
 def covariance_within(search: Search, fit: Fit) -> Covariance:
@@ -92,16 +107,24 @@ def covariance_within(search: Search, fit: Fit) -> Covariance:
 
 
 def freed(search: Search, fit: Fit) -> Fit:
-    """The fit with the stated values free that set the scale of a fitted gain, and the mass moments of all links where
-    something of the whole arm was fitted."""
-    active = tuple(
-        (*own, *(name for name in SCALED if name not in own and fit.point[name][j] > 0.0)) if "kp" in own else own
-        for j, own in enumerate(fit.active)
-    )
+    """The fit with all free that may be off in a sound arm, with the stated values that set the scale of a fitted gain,
+    and with the mass moments of all links where something of the whole arm was fitted."""
+    open_at = (_open(search, fit, j, own) for j, own in enumerate(errors_of(search)[:-1]))
+    active = tuple((*own, *more) for own, more in zip(fit.active, open_at, strict=True))
     others = [name for name in search.data.columns if name.startswith("moment") and name not in fit.shared]
     shared = (*fit.shared, *others) if fit.shared else ()
     point = {name: np.zeros(search.data.joints) for name in shared} | fit.point
     return replace(fit, point=point, active=active, shared=shared)
+
+
+def _open(search: Search, fit: Fit, joint: int, errors: Mapping[str, float]) -> dict[str, float]:
+    """Standard deviation of each parameter of a joint that was not fitted and is not known, in its own coordinate."""
+    out = {name: size for name, size in errors.items() if name not in fit.active[joint]}
+    for name in SCALED if "kp" in fit.active[joint] else ():
+        if name not in fit.active[joint] and fit.point[name][joint] > 0.0:
+            relative = STATED * float(fit.point[name][joint] / search.scales.of(name)[joint])
+            out[name] = max(relative, out.get(name, 0.0))
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,14 +155,13 @@ def _terms(search: Search, fit: Fit) -> _Terms:
 
 def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
     """Inverse variance of each parameter before any recording, (K,)."""
-    out = np.full(len(names), WIDEST**-2)
-    moments = ERROR * np.maximum(np.linalg.norm(search.data.arm.inertial[:, 1:4], axis=1), 1e-6)
-    for k, (j, name) in enumerate(names):
-        if j >= 0 and name not in fit.active[j]:
-            out[k] = (float(search.scales.of(name)[j]) / (STATED * float(fit.point[name][j]))) ** 2
-        elif j < 0 and name not in fit.shared:
-            out[k] = moments[int(name.removeprefix("moment").partition(".")[0])] ** -2
-    return out
+    *own, moments = errors_of(search)
+    known = [_open(search, fit, j, errors) for j, errors in enumerate(own)]
+    sizes = [
+        known[j].get(name, WIDEST) if j >= 0 else WIDEST if name in fit.shared else max(moments[name], LEAST)
+        for j, name in names
+    ]
+    return np.array(sizes) ** -2.0
 
 
 def _jackknifed(terms: _Terms, known: Array, groups: NDArray[np.intp]) -> Array:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from servo_arm import JOINTS, fitted
 
-from sim_gap.closed_loop.fit import Fit, batch, residuals
+from sim_gap.closed_loop import sound
+from sim_gap.closed_loop.fit import Fit, batch, improve, residuals
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.training import spread
 from sim_gap.closed_loop.training.draws import draw
@@ -56,7 +57,10 @@ def test_the_jackknife_is_that_of_the_text_books() -> None:
     assert found[0, 0] == pytest.approx(values.var(ddof=1) / 4.0)
 
 
-def test_of_an_arm_that_feels_no_weight_ratios_are_told_better_than_their_scale(weightless) -> None:
+def test_of_an_arm_that_feels_no_weight_ratios_are_told_better_than_their_scale(weightless, monkeypatch) -> None:
+    """Where commands are in time: what is not known of that is not known of the ratio of gain and damping, a time."""
+    monkeypatch.setattr(sound, "LATE_S", 1e-6)
+    monkeypatch.setattr(sound, "APART_S", 1e-6)
     search, fit = weightless
     found = covariance(search, fit)
     for j in (0, 1):
@@ -121,4 +125,16 @@ def test_a_payload_is_no_surer_than_the_masses_of_the_model(several) -> None:
     assert [name for j, name in found.names if j < 0] == list(names)
     own = float(np.linalg.norm(search.data.arm.inertial[-1, 1:4]))
     at = found.names.index((-1, "payload.x"))
-    assert np.sqrt(found.matrix[at, at]) > 0.9 * spread.ERROR * own
+    assert np.sqrt(found.matrix[at, at]) > 0.9 * sound.ERROR * own
+
+
+def test_what_a_sound_arm_may_have_beside_an_effect_widens_its_interval(several) -> None:
+    """Friction alone is fitted to an arm whose gain is 3 % off: what the gain takes up is open."""
+    search, fit = several
+    stiffer = replace(fit, point={**fit.point, "kp": 1.03 * fit.point["kp"]}, active=(("coulomb",), ("coulomb",)))
+    some = improve(search.data, stiffer, search.scales)
+    for joint in (0, 1):
+        wide, own = (spread_of(search, some) for spread_of in (covariance, covariance_within))
+        assert deviations(wide, "coulomb")[joint] > deviations(own, "coulomb")[joint]
+        _, low, high, _ = interval(search, some, wide, joint, "coulomb")
+        assert low < float(fit.point["coulomb"][joint]) < high
