@@ -197,12 +197,16 @@ class Effects:
         """
         torque = self.carried(model, data) - self._pushed(model, data)
         give = self._give(torque)
-        return self._angle(data.qpos[self.places] + give), self._torque(torque, float(data.time))
+        return self.angle(data.qpos[self.places] + give), self._torque(torque, float(data.time))
+
+    @property
+    def rigid(self) -> bool:
+        """Whether the position sensors read the joints' own angles, whatever the torque."""
+        return not any(name in ("transmission.elasticity", "transmission.backlash") for name, _, _ in self._effects)
 
     def position(self, model: Any, data: Any) -> Array:
         """Readings of the position sensors after a step [rad], (n,)."""
-        rigid = not any(name in ("transmission.elasticity", "transmission.backlash") for name, _, _ in self._effects)
-        return self._angle(data.qpos[self.places]) if rigid else self.read(model, data)[0]
+        return self.angle(data.qpos[self.places]) if self.rigid else self.read(model, data)[0]
 
     def _pushed(self, model: Any, data: Any) -> Array:
         """Torque of stops and contacts on the links, (n,)."""
@@ -211,14 +215,14 @@ class Effects:
         push[data.efc_id[rows]] -= data.efc_force[rows]
         return np.asarray(push[self.dofs])
 
-    def _angle(self, true: Array) -> Array:
-        """The reading φ with true = gain·φ + offset + amplitude·sin(φ + phase)."""
+    def angle(self, true: Array) -> Array:
+        """The reading φ with true = gain·φ + offset + amplitude·sin(φ + phase), (…, n)."""
         straight = true - self.values("position.offset", "offset")
         gain = self.values("position.gain", "gain", 1.0)
+        amplitude, phase = (self.values("position.eccentricity", name) for name in ("amplitude", "phase"))
         reading = straight / gain
-        for _ in range(8):  # contracts by amplitude / gain each time
-            bent = np.sin(reading + self.values("position.eccentricity", "phase"))
-            reading = (straight - self.values("position.eccentricity", "amplitude") * bent) / gain
+        for _ in range(8 if amplitude.any() else 0):  # contracts by amplitude / gain each time
+            reading = (straight - amplitude * np.sin(reading + phase)) / gain
         return np.asarray(reading)
 
     def _torque(self, true: Array, time: float) -> Array:
@@ -309,14 +313,14 @@ def _window(
     data = mujoco.MjData(model)
     data.qpos[effects.places], data.qvel[effects.dofs] = state
     data.time = time
-    out = np.empty_like(reading)
+    out, speed, rigid = np.empty_like(reading), data.qvel, effects.rigid
     for k in range(len(reading)):
         data.qfrc_applied[effects.dofs] = 0.5 * (drive[k] + drive[k + 1])
         for _ in range(each):
             mujoco.mj_step(model, data)
-            np.clip(data.qvel, -WILD, WILD, out=data.qvel)
-        out[k] = effects.position(model, data) - reading[k]
-    return np.clip(out, -LOST, LOST)
+            np.minimum(np.maximum(speed, -WILD, out=speed), WILD, out=speed)
+        out[k] = data.qpos[effects.places] if rigid else effects.position(model, data)
+    return np.clip((effects.angle(out) if rigid else out) - reading, -LOST, LOST)
 
 
 def _past(history: list[tuple[float, Array]], now: float, delay: Array, *, held: bool) -> Array:
