@@ -26,6 +26,7 @@ CALM = 0.5
 LEAST_FREEDOM = 2
 """Degrees of freedom that are counted at least: two recordings alone have one, whose 95 % are 13 standard errors."""
 ROUNDS = 4
+"""Times that effects are taken out and the rest is fitted again, at most."""
 Progress = Callable[[str], None]
 
 
