@@ -244,8 +244,10 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
     """One parameter and white residuals of independent windows: σ² / Σ x², beside what is systematic."""
     random = np.random.default_rng(3)
     x = random.normal(size=(1, 50, 400))
-    residual = 0.01 * random.normal(size=(50, 1, 400))
+    noise = 0.01 * random.normal(size=(50, 400))
+    residual = (noise - x[0] * (x[0] * noise).sum() / (x**2).sum())[:, None]  # what the best value leaves
     monkeypatch.setattr(spread, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
+    monkeypatch.setattr(spread, "errors_of", lambda search: [{}, {}])
     arm = SimpleNamespace(inertial=np.ones((1, 10)))
     data = SimpleNamespace(count=400, joints=1, recording=np.zeros(400, int), columns={}, arm=arm)
     search = SimpleNamespace(data=data, scales=Scales(*np.ones((4, 1))), samples=np.array([400.0]))
