@@ -7,15 +7,7 @@ import numpy as np
 
 from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, improve, jacobian
 from sim_gap.closed_loop.parameters import EFFECTS
-from sim_gap.closed_loop.search import (
-    Search,
-    acts,
-    effects_at,
-    merged,
-    only,
-    price,
-    without,
-)
+from sim_gap.closed_loop.search import Search, acts, effects_at, merged, only, price, without
 
 DOUBTFUL = 4.0
 """Expected loss, in prices, up to which it is tried whether an effect is needed."""
