@@ -23,7 +23,7 @@ from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
 from sim_gap.closed_loop.training.left_out import left_out
 from sim_gap.closed_loop.training.limits import unreached
-from sim_gap.closed_loop.training.spread import Covariance, covariance, covariance_within
+from sim_gap.closed_loop.training.spread import Covariance, covariance, covariance_within, vague_limits
 from sim_gap.closed_loop.windows import Windows, thinned, thinned_moving, windows_of
 from sim_gap.model.load import SimModel
 
@@ -110,7 +110,8 @@ def identify(
     found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
-    spread = replace(covariance(search, fit), limits=unreached(search, fit), others=alternatives(others))
+    spread = replace(covariance(search, fit), others=alternatives(others))
+    spread = replace(spread, limits=unreached(search, fit, vague_limits(spread)))
     return Identified(
         sim=sim,
         search=search,

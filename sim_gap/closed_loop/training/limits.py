@@ -5,7 +5,7 @@ Its distribution is that of a prior, log-uniform from there up, weighted by what
 training motion; motion that asks for no more is as it was, and motion that asks for more is less sure.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,11 +42,13 @@ class Unreached:
     """Lowest level that the training motion admits."""
 
 
-def unreached(search: Search, fit: Fit) -> tuple[Unreached, ...]:
-    """The limits that neither the model states nor the fit has, where some level of them is admitted."""
+def unreached(search: Search, fit: Fit, vague: Collection[tuple[int, str]] = ()) -> tuple[Unreached, ...]:
+    """The limits that neither the model states nor the fit has, where some level of them is admitted; and of those that
+    the fit has the `vague` ones (joint, name), where no level above it costs much."""
     out: list[Unreached] = []
     for name, effect in LIMITS.items():
         open_at = np.isinf(fit.point[name]) & (effect not in search.excluded)
+        open_at |= np.array([(j, name) in vague for j in range(search.data.joints)])
         if not open_at.any():
             continue
         levels = LEVELS[:, None] * search.size_of(name)
@@ -57,6 +59,8 @@ def unreached(search: Search, fit: Fit) -> tuple[Unreached, ...]:
         for j in np.flatnonzero(open_at & (first < len(levels))).tolist():
             near = first[j] > 0 and finer[j] < len(FINER)
             least = between[finer[j], j] if near else levels[first[j], j]
+            if least > fit.point[name][j]:
+                continue
             taken = (np.arange(len(levels)) >= first[j]) & (levels[:, j] <= HEADROOM * least)
             weights = np.where(taken, np.exp(-np.clip(lost[:, j], -50.0, 50.0)), 0.0)
             out.append(Unreached(j, name, levels[:, j], weights / weights.sum(), float(least)))

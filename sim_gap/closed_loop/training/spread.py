@@ -17,12 +17,12 @@ from scipy.stats import norm, t
 from gcomp.arrays import Array
 from sim_gap.closed_loop.choice.doubt import LEAST_FREEDOM
 from sim_gap.closed_loop.columns import UNIT
-from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, jacobian, moved
+from sim_gap.closed_loop.fit import FARTHEST, LOGARITHMIC, Fit, jacobian, moved
 from sim_gap.closed_loop.parameters import PARAMETERS
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.sound import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
 from sim_gap.closed_loop.training.alternatives import Alternative, quantiles
-from sim_gap.closed_loop.training.limits import Unreached
+from sim_gap.closed_loop.training.limits import LIMITS, Unreached
 
 SYSTEMATIC = 0.02
 """Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
@@ -228,8 +228,18 @@ def undecided_scale(search: Search, fit: Fit, spread: Covariance) -> list[int]:
     return out
 
 
+def vague_limits(spread: Covariance) -> list[tuple[int, str]]:
+    """Fitted limits (joint, name) of which the motion says next to nothing where they are."""
+    deviations = np.sqrt(np.diag(spread.matrix))
+    return [at for at, size in zip(spread.names, deviations, strict=True) if at[1] in LIMITS and size > FARTHEST]
+
+
 def interval(search: Search, fit: Fit, spread: Covariance, joint: int, name: str) -> tuple[float, float, float, str]:
-    """Value, ends of its 95 % interval, and unit."""
+    """Value, ends of its 95 % interval, and unit; of a limit that no motion reaches, where it may lie."""
+    for limit in spread.limits:
+        if (limit.joint, limit.name) == (joint, name):
+            value, most = float(fit.point[name][joint]), float(limit.levels[limit.weights > 0.0].max())
+            return value, limit.least, max(most, value), PARAMETERS[name].unit
     deviation = float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
     below, above = quantiles(*shifted(search, fit, spread, joint, name), deviation)
     if joint < 0:

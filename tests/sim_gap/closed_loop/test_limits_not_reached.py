@@ -14,7 +14,7 @@ from sim_gap.closed_loop.training import bands, limits
 from sim_gap.closed_loop.training.bands import band
 from sim_gap.closed_loop.training.draws import draw
 from sim_gap.closed_loop.training.left_out import left_out
-from sim_gap.closed_loop.training.spread import covariance
+from sim_gap.closed_loop.training.spread import covariance, interval, vague_limits
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
 
@@ -114,3 +114,22 @@ def test_the_band_about_two_simulations_holds_its_share_with_either(apart: float
     gaps = np.random.default_rng(4).normal(size=200_000)
     about = np.array([[0.0] * 50, [apart] * 50])
     assert 1.645 * bands._narrower(gaps, about, 1.645) == pytest.approx(factor, abs=0.04)
+
+
+def test_a_fitted_limit_that_no_motion_reaches_lies_anywhere_above_what_was_asked_for(arm) -> None:
+    search, fit = arm
+    least = next(each.least for each in limits.unreached(search, fit) if (each.joint, each.name) == (1, "limit"))
+    far = fit.with_values(limit=np.array([np.inf, 3.0 * least]))
+    limited = replace(far, active=(FOUND, (*FOUND, "limit")))
+    spread = covariance(search, limited)
+    assert vague_limits(spread) == [(1, "limit")]
+    told = replace(spread, limits=limits.unreached(search, limited, vague_limits(spread)))
+    value, low, high, _ = interval(search, limited, told, 1, "limit")
+    assert (value, low) == (pytest.approx(3.0 * least), pytest.approx(least))
+    assert 8.0 * least < high < 12.0 * least
+    drawn = np.array([row["elbow.limit"] for row in draw(search, limited, told, 500)])
+    assert 0.7 * least < drawn.min() < 1.2 * least
+    assert 5.0 * least < drawn.max() < 13.0 * least
+    near = fit.with_values(limit=np.array([np.inf, 0.7 * least]))
+    reached = covariance(search, replace(near, active=(FOUND, (*FOUND, "limit"))))
+    assert vague_limits(reached) == []
