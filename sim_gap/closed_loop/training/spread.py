@@ -34,6 +34,8 @@ LOOSE = 0.35
 """Relative standard deviation of a gain from which its scale is not decided."""
 WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
+KEPT = 0.03
+"""Share of the information of all windows that stays where a group of them is left out."""
 ANYTHING = float(np.log(1e3))
 """Logarithm of the factor to either side of a gain of which nothing is known."""
 LEAST = 1e-8
@@ -165,8 +167,12 @@ def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array
 
 
 def _jackknifed(terms: _Terms, known: Array, groups: NDArray[np.intp]) -> Array:
-    """Covariance by leaving out one group of windows after the other, (K, K)."""
-    squares, scores = terms.squares.sum(0) + np.diag(known), terms.scores.sum(0)
+    """Covariance by leaving out one group of windows after the other, (K, K).
+
+    A share of all information stays: of a parameter that one group alone shows, such as the limit of a speed that is
+    reached in a single motion, the others say nothing, and their step is noise over nothing.
+    """
+    squares, scores = (1.0 + KEPT) * terms.squares.sum(0) + np.diag(known), terms.scores.sum(0)
     labels = np.unique(groups)
     steps = np.stack(
         [
