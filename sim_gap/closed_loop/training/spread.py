@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 from scipy.stats import norm, t
 
 from gcomp.arrays import Array
@@ -34,8 +35,10 @@ LOOSE = 0.35
 """Relative standard deviation of a gain from which its scale is not decided."""
 WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
-KEPT = 0.03
-"""Share of the information of all windows that stays where a group of them is left out."""
+ALONE = 0.03
+"""Share of the information about a direction that must be left without a group, for the step of the others to count."""
+ROUNDING = 1e-12
+"""Information that every direction has, as a share of that about a parameter by itself."""
 ANYTHING = float(np.log(1e3))
 """Logarithm of the factor to either side of a gain of which nothing is known."""
 LEAST = 1e-8
@@ -169,18 +172,20 @@ def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array
 def _jackknifed(terms: _Terms, known: Array, groups: NDArray[np.intp]) -> Array:
     """Covariance by leaving out one group of windows after the other, (K, K).
 
-    A share of all information stays: of a parameter that one group alone shows, such as the limit of a speed that is
-    reached in a single motion, the others say nothing, and their step is noise over nothing.
+    Nothing is said of a direction whose information is nearly all in one group, such as the limit of a speed that is
+    reached in a single motion: the step of the others is noise over nothing there.
     """
-    squares, scores = (1.0 + KEPT) * terms.squares.sum(0) + np.diag(known), terms.scores.sum(0)
-    labels = np.unique(groups)
-    steps = np.stack(
-        [
-            np.linalg.solve(squares - terms.squares[own].sum(0), terms.scores[own].sum(0) - scores)
-            for own in (groups == label for label in labels)
-        ]
-    )
-    apart = steps - steps.mean(0)
+    squares, scores = terms.squares.sum(0) + np.diag(known), terms.scores.sum(0)
+    scale = 1.0 / np.sqrt(np.diag(squares))
+    least = ROUNDING * np.eye(len(known))
+    whole = squares * scale * scale[:, None] + least
+    labels, steps = np.unique(groups), []
+    for own in (groups == label for label in labels):
+        others = (squares - terms.squares[own].sum(0)) * scale * scale[:, None] + least
+        told, directions = eigh(others, whole)
+        weights = np.where(told > ALONE, 1.0 / np.maximum(told, ALONE), 0.0)
+        steps.append(scale * (directions @ (weights * (directions.T @ (scale * (terms.scores[own].sum(0) - scores))))))
+    apart = np.stack(steps) - np.mean(steps, axis=0)
     return np.asarray((len(labels) - 1) / len(labels) * apart.T @ apart)
 
 
