@@ -36,7 +36,7 @@ LOOSE = 0.35
 WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
 ALONE = 0.03
-"""Share of the information about a direction that must be left without a group, for the step of the others to count."""
+"""Share of the information about a direction that the others are taken to have at least, without a group."""
 ROUNDING = 1e-12
 """Information that every direction has, as a share of that about a parameter by itself."""
 ANYTHING = float(np.log(1e3))
@@ -172,8 +172,8 @@ def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array
 def _jackknifed(terms: _Terms, known: Array, groups: NDArray[np.intp]) -> Array:
     """Covariance by leaving out one group of windows after the other, (K, K).
 
-    Nothing is said of a direction whose information is nearly all in one group, such as the limit of a speed that is
-    reached in a single motion: the step of the others is noise over nothing there.
+    Where nearly all that is known of a direction is in one group, such as the limit of a speed that is reached in a
+    single motion, the step of the others would be noise over nothing.
     """
     squares, scores = terms.squares.sum(0) + np.diag(known), terms.scores.sum(0)
     scale = 1.0 / np.sqrt(np.diag(squares))
@@ -183,8 +183,8 @@ def _jackknifed(terms: _Terms, known: Array, groups: NDArray[np.intp]) -> Array:
     for own in (groups == label for label in labels):
         others = (squares - terms.squares[own].sum(0)) * scale * scale[:, None] + least
         told, directions = eigh(others, whole)
-        weights = np.where(told > ALONE, 1.0 / np.maximum(told, ALONE), 0.0)
-        steps.append(scale * (directions @ (weights * (directions.T @ (scale * (terms.scores[own].sum(0) - scores))))))
+        step = directions.T @ (scale * (terms.scores[own].sum(0) - scores)) / np.maximum(told, ALONE)
+        steps.append(scale * (directions @ step))
     apart = np.stack(steps) - np.mean(steps, axis=0)
     return np.asarray((len(labels) - 1) / len(labels) * apart.T @ apart)
 
