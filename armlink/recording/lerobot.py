@@ -15,6 +15,7 @@ import pyarrow.parquet as pa_parquet
 from armlink.arrays import Array
 from armlink.errors import BadInput
 from armlink.recording.recording import MOST_JOINTS, Recording, require_size
+from armlink.recording.tables import THREADS
 
 STATE, ACTION = "observation.state", "action"
 _COLUMNS = ("episode_index", "timestamp", STATE, ACTION)
@@ -30,7 +31,7 @@ def load_lerobot(path: Path) -> dict[str, Recording]:
         try:
             size += 8 * (2 * len(names) + 2) * pa_parquet.read_metadata(file).num_rows
             require_size(size, str(path))
-            table = pa_parquet.read_table(file, columns=list(_COLUMNS))
+            table = pa_parquet.read_table(file, columns=list(_COLUMNS), use_threads=THREADS)
         except (pa.ArrowException, KeyError, ValueError, OSError) as error:
             raise BadInput(f"{file}: not the data of a LeRobot data set: {str(error).partition(chr(10))[0]}") from None
         missing = [column for column in _COLUMNS if column not in table.column_names]

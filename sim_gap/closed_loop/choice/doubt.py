@@ -6,7 +6,7 @@ recording to recording. An effect of the whole arm, such as a payload, changes g
 together; it is compared with what the joints' own effects make of it when they are chosen again without it.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import t
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.choice.compete import select
+from sim_gap.closed_loop.choice.compete import Progress, select
 from sim_gap.closed_loop.choice.prune import removable_at, without_each
 from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.fit import Fit, improve
@@ -27,7 +27,6 @@ LEAST_FREEDOM = 2
 """Degrees of freedom that are counted at least: two recordings alone have one, whose 95 % are 13 standard errors."""
 ROUNDS = 4
 """Times that effects are taken out and the rest is fitted again, at most."""
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
