@@ -8,6 +8,7 @@ import pyarrow.csv as pa_csv
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
+from armlink.recording.tables import THREADS
 from calib.arm.kinematics import gcomp_arm
 from gcomp.arrays import Array
 from sim_gap.experiment.excitation import Motion
@@ -57,7 +58,7 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
 def _columns(path: Path, names: list[str]) -> tuple[Array, Array]:
     """Times (K,) and columns (K, n), all finite, times increasing."""
     try:
-        table = pa_csv.read_csv(path)
+        table = pa_csv.read_csv(path, pa_csv.ReadOptions(use_threads=THREADS))
     except (pa.ArrowInvalid, OSError) as error:
         raise BadInput(f"{path}: not a readable CSV file: {str(error).splitlines()[0]}") from None
     missing = [name for name in ("t", *names) if name not in table.column_names]
