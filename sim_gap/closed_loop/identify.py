@@ -18,6 +18,7 @@ from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Stage, groups_of, rms_on, stages
 from sim_gap.closed_loop.search import Search, effects_at, merged, taken_out, without
 from sim_gap.closed_loop.sound import Sound, sound
+from sim_gap.closed_loop.surface import Mask, Surface, find_surface, touched
 from sim_gap.closed_loop.training.alternatives import alternatives
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
@@ -68,6 +69,10 @@ class Identified:
     """Held-out recordings."""
     gains: tuple[float, ...]
     """The controller's gains in each of them over those in the first training recording."""
+    surface: Surface | None
+    """What the arm presses on in some recordings; those moments are not in the windows."""
+    touched: tuple[Mask, ...]
+    """Rows of each recording at which it does, train first."""
 
 
 def identify(
@@ -85,9 +90,10 @@ def identify(
     """
     scale = gain_scales(gains, labels)
     progress("reading motion and model torques")
-    whole = thinned_moving(windows_of(sim.arm, train, labels[: len(train)], scales=scale[: len(train)]), FITTED)
-    fitted = with_columns(whole)
-    other = windows_of(sim.arm, heldout, labels[len(train) :], fitted.dt, scale[len(train) :])
+    surface = find_surface(sim.arm, [*train, *heldout])
+    whole = windows_of(sim.arm, train, labels[: len(train)], scales=scale[: len(train)], surface=surface)
+    fitted = with_columns(thinned_moving(whole, FITTED))
+    other = windows_of(sim.arm, heldout, labels[len(train) :], fitted.dt, scale[len(train) :], surface)
     judged = with_columns(thinned(other, JUDGED))
     own = nominal_controller(sim)
     nominal = nominal_point(fitted, own)
@@ -134,6 +140,8 @@ def identify(
         beside=with_module(sim, search, fit) if sim.path is not None else None,
         recordings=tuple(heldout),
         gains=tuple(scale[len(train) :]),
+        surface=surface,
+        touched=tuple(touched(surface, sim.arm, recording) for recording in (*train, *heldout)),
     )
 
 

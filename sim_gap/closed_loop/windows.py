@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
+from sim_gap.closed_loop.surface import Surface
 from sim_gap.closed_loop.tracks import Track, period_of, track_of
 from sim_gap.model.rigid_body import RigidArm
 
@@ -105,11 +106,12 @@ def windows_of(
     labels: Sequence[str],
     step: float = 0.0,
     scales: Sequence[float] = (),
+    surface: Surface | None = None,
 ) -> Windows:
     """Cut recordings into windows. Raises BadInput for one that holds no commanded position.
 
     `step` is the simulation's [s], by default a whole fraction of the recordings' period; `scales` are the controller's
-    gains in each recording relative to the first, by default 1.
+    gains in each recording relative to the first, by default 1; what touches the `surface` does not count.
     """
     period = max(period_of(recording) for recording in recordings)
     dt = step or min(period_of(r) / math.ceil(period_of(r) / STEP_S - 1e-6) for r in recordings)
@@ -118,6 +120,8 @@ def windows_of(
     parts: list[dict[str, Array]] = []
     for number, (recording, label) in enumerate(zip(recordings, labels, strict=True)):
         track = track_of(arm, recording, label, dt)
+        if surface is not None:
+            track.seen[surface.touched(arm, track.t, track.signals["q"])] = 0.0
         parts += _cut(arm, track, number, warm, length, stride)
     number_of = np.array([part["recording"] for part in parts], dtype=np.intp)
     stacked: dict[str, Any] = {

@@ -31,6 +31,13 @@ def model_text(kp: float, friction: float, damping: float = 0.8, limits: Sequenc
 </actuator></mujoco>"""
 
 
+def above_a_table(text: str, height: float) -> str:
+    """The arm above a table at this height [m], that the end of its last link touches."""
+    tip = '<geom type="sphere" size="0.001" pos="0.16 0 0" mass="0"/></body></body></worldbody>'
+    table = f'<worldbody><geom type="plane" pos="0 0 {height}" size="1 1 0.1" solref="0.01 1"/>'
+    return text.replace("</body></body></worldbody>", tip).replace("<worldbody>", table)
+
+
 def record(
     text: str,
     seed: int,

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from armlink.recording.recording import Recording
+from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.positions.notes import notes, running_free
 from sim_gap.checks.finding import Finding
@@ -14,7 +15,7 @@ from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, groups_of
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import PRICE
 from sim_gap.closed_loop.training.export import WRITTEN
-from sim_gap.closed_loop.training.replay import SHORT_S, Simulated, less, replay_rms, simulated
+from sim_gap.closed_loop.training.replay import LONGEST_S, SHORT_S, Simulated, less, replay_rms, simulated
 from sim_gap.closed_loop.training.spread import interval, payload_centre
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.where import Location
@@ -79,6 +80,7 @@ def diagnose_positions(
         notes=(*notes(found), *running_free(found, rollout)),
         checks=tuple(checks),
         band=found.band,
+        left_out=float(np.concatenate(found.touched[-len(found.recordings) :]).mean()),
         unit="rad",
         internals=found,
     )
@@ -207,21 +209,22 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
     if found.export is None:
         return None
     made, groups = found.beside or found.export, groups_of(found.fit, found.search)
-    after = replay_rms(simulated(found.sim, made), found.recordings, found.gains)
+    touched = found.touched[-len(found.recordings) :]
+
+    def gap(arm: Simulated, longest: float = LONGEST_S) -> Array:
+        return replay_rms(arm, found.recordings, found.gains, longest, touched)
+
+    after = gap(simulated(found.sim, made))
     before = after * np.nan
     if found.nominal_has_controller:
-        nominal = Simulated(found.sim.mujoco_model, found.sim.joints)
-        before = replay_rms(nominal, found.recordings, found.gains)
+        before = gap(Simulated(found.sim.mujoco_model, found.sim.joints))
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
     effects = []
     for cause, stage in taken:
         if cause.effect not in WRITTEN:
             continue
         others = [group for group in groups if group != stage.group]
-        alone, without = (
-            replay_rms(less(found.sim, found.search, made, some), found.recordings, found.gains, SHORT_S)
-            for some in (others, [stage.group])
-        )
+        alone, without = (gap(less(found.sim, found.search, made, some), SHORT_S) for some in (others, [stage.group]))
         effects.append(EffectRollout(cause.effect, cause.joints, alone, without))
     effects.sort(key=lambda each: -float(np.nanmax(each.without)))
     return Rollout(longest, before, after, tuple(effects), closed_loop=True)

@@ -31,7 +31,7 @@ def notes(found: Identified) -> list[str]:
         )
     if limits := described(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
-    out += _beyond(found)
+    out += [*_touching(found), *_beyond(found)]
     if found.export is not None and found.export.lines:
         module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}{module}")
@@ -61,6 +61,21 @@ def running_free(found: Identified, rollout: Rollout | None) -> list[str]:
     ]
     told = "the corrected model in MuJoCo, running free along the held-out commands, is further off"
     return [*out, f"{told}: {', '.join(far)}"] if far else out
+
+
+def _touching(found: Identified) -> list[str]:
+    """A note of the surface that the arm presses on, and of what is left out for it."""
+    if found.surface is None:
+        return []
+    names = found.sim.arm.names
+    joints = ", ".join(names[j] for j in found.surface.joints)
+    some = [100.0 * float(rows.mean()) for rows in found.touched if rows.any()]
+    return [
+        f"the arm presses on something below it, such as a table, in {len(some)} of {len(found.touched)} recordings: "
+        f"{joints} stop short of the command the lower {names[found.surface.link]} goes, from a height of "
+        f"{found.surface.height:.2f} m on; these moments ({min(some):.0f} to {max(some):.0f} % of such a recording) are "
+        "neither fitted nor judged: if simulated motion goes there, put a surface there into the model"
+    ]
 
 
 def _beyond(found: Identified) -> list[str]:

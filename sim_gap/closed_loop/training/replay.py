@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
@@ -92,18 +93,24 @@ def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> 
 
 
 def replay_rms(
-    arm: Simulated, recordings: Sequence[Recording], gains: Sequence[float] = (), longest: float = LONGEST_S
+    arm: Simulated,
+    recordings: Sequence[Recording],
+    gains: Sequence[float] = (),
+    longest: float = LONGEST_S,
+    apart: Sequence[NDArray[np.bool_]] = (),
 ) -> Array:
     """RMS of simulated minus measured positions over recordings [rad], (n,); NaN if none is commanded long enough.
 
-    `gains` are those of the controller in each recording over the model's, by default 1.
+    `gains` are those of the controller in each recording over the model's, by default 1; rows of each recording that
+    are set `apart` (K,) are not judged.
     """
     total, count = np.zeros(len(arm.joints)), np.zeros(len(arm.joints))
-    for recording, gain in zip(recordings, gains or [1.0] * len(recordings), strict=True):
+    each = [1.0] * len(recordings), [np.zeros(len(recording.t), bool) for recording in recordings]
+    for recording, gain, left_out in zip(recordings, gains or each[0], apart or each[1], strict=True):
         if recording.t[_commanded(recording, longest) - 1] - recording.t[0] < 2.0 * OPENING_S:
             continue
         t, positions, measured = replay(arm.with_gain(gain), recording, longest)
-        gap = (positions - measured)[t >= t[0] + OPENING_S]
+        gap = (positions - measured)[(t >= t[0] + OPENING_S) & ~left_out[: len(t)]]
         total += np.nansum(gap**2, axis=0)
         count += np.isfinite(gap).sum(0)
     return np.asarray(np.sqrt(total / np.where(count > 0, count, np.nan)))

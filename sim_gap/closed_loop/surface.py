@@ -1,0 +1,214 @@
+"""A surface that the arm presses on: joints that stop short of their commands the more, the lower the arm goes.
+
+A table under the arm carries part of the command's torque: τ_j = −(∂z/∂q_j) f, with z the height of the point that
+touches and f the force. No property of the arm does that below one height, at several joints at once, each in
+proportion to its lever ∂z/∂q_j. The point and the height are not known, and a model often has no shapes; both are found
+from the errors e = q_cmd − q, beside what controllers, friction and gravity do to them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+from scipy.optimize import least_squares
+
+from armlink.recording.recording import Recording
+from gcomp.arrays import Array
+from sim_gap.model.rigid_body import RigidArm, into
+
+LOOKED_HZ = 10.0
+"""Rate at which recordings are looked at [Hz]."""
+REST = 0.03
+"""Speed [rad/s] at which friction has turned over for the most part."""
+JOINTS = 2
+"""Least number of joints that must show a surface: at one alone, a stop looks the same."""
+SURE, ALSO = (0.6, 2.0), (0.35, 1.5)
+"""What shows it at one joint, and at the others: the share of the squared error below it that a surface takes, and the
+error that it makes over what is usual."""
+MOST = 0.3
+"""Largest share of the samples that touch: what happens more often is a property of the arm."""
+FEWEST = 20
+"""Least number of samples that touch."""
+FIRST_HEIGHTS = (0.01, 0.03, 0.1)
+"""Shares of the samples that are below the heights from which the search starts."""
+NEAR, FIRMLY = 0.12, 0.1
+"""Standard deviation of the touching point about the link's centre of mass, as a share of the arm's length, and the
+weight of that beside one sample's error."""
+PRESSED = 0.95
+"""Share of the samples that are commanded well below the surface whose heights are those of the touch."""
+RELEASE_S = 0.3
+"""Time after a touch, and half as long before it, that is left out, too: the servo has to recover [s]."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A horizontal surface that a point of one link presses on."""
+
+    link: int
+    """Index of the link in the arm."""
+    point: Array
+    """The point in the frame of the link [m], (3,)."""
+    height: float
+    """Height above the base's origin, against gravity, up to which the point is when it is pressed down [m]."""
+    joints: tuple[int, ...]
+    """Joints whose errors show it."""
+
+    def touched(self, arm: RigidArm, t: Array, q: Array) -> Mask:
+        """Times of a recording at which the arm touches or has just been released, (K,); q (K, n) [rad]."""
+        origin, up = heights(arm, q, self.link)
+        below = (origin + self.point @ up < self.height).astype(np.uint8)
+        rows = max(1, round(RELEASE_S / float(np.median(np.diff(t)))))
+        before = maximum_filter1d(below, 2 * (rows // 2) + 1)
+        after = maximum_filter1d(below, rows + 1, origin=rows // 2)
+        return np.asarray((before | after).astype(bool))
+
+
+def heights(arm: RigidArm, q: Array, link: int) -> tuple[Array, Array]:
+    """Height of a link's origin above that of the base (K,) [m]; the upward direction in the link's frame (3, K)."""
+    turns, _ = arm.motion(q, np.zeros_like(q), np.zeros_like(q))
+    chain = np.flatnonzero(arm.carries[:, link])
+    up = np.broadcast_to(-(arm.gravity / np.linalg.norm(arm.gravity))[:, None], (3, len(q)))
+    height: Array = np.zeros(len(q))
+    for j in chain:
+        height = height + arm.offset[j] @ up
+        up = into(turns[j], up)
+    return height, up
+
+
+def touched(surface: Surface | None, arm: RigidArm, recording: Recording) -> Mask:
+    """Rows of a recording at which the arm touches, (K,); none without a surface."""
+    if surface is None:
+        return np.zeros(len(recording.t), bool)
+    return surface.touched(arm, recording.t, recording.position)
+
+
+def find_surface(arm: RigidArm, recordings: Sequence[Recording]) -> Surface | None:
+    """The surface that the arm presses on in some of the recordings of commanded and measured positions, if any."""
+    if arm.n < JOINTS or np.linalg.norm(arm.gravity) < 1e-6:
+        return None
+    looked = _Looked.of(arm, recordings)
+    if len(looked.q) < 10 * FEWEST:
+        return None
+    found = [_pressed(looked, link) for link in range(arm.n) if arm.carries[:, link].sum() >= JOINTS]
+    return max((each for each in found if each is not None), key=lambda each: each[0], default=(0.0, None))[1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Looked:
+    """Positions, commands, and what is unusual of the errors between, at a low rate."""
+
+    arm: RigidArm
+    q: Array
+    command: Array
+    besides: list[Array]
+    """What controller, friction and gravity do to the error of each joint: an orthonormal basis, (K, m) each."""
+    error: Array
+    """What they leave of it over its RMS, (K, n)."""
+    usual: Array
+    """That RMS [rad], (n,)."""
+
+    @classmethod
+    def of(cls, arm: RigidArm, recordings: Sequence[Recording]) -> "_Looked":
+        positions, commands, speeds = [], [], []
+        for recording in recordings:
+            assert recording.position_command is not None
+            there = np.isfinite(recording.position_command).all(1) & np.isfinite(recording.position).all(1)
+            stride = max(1, round(1.0 / LOOKED_HZ / float(np.median(np.diff(recording.t)))))
+            rows = np.flatnonzero(there)[::stride]
+            if len(rows) < 3:
+                continue
+            positions.append(recording.position[rows])
+            commands.append(recording.position_command[rows])
+            speeds.append(np.gradient(recording.position[rows], recording.t[rows], axis=0))
+        if not positions:
+            nothing = np.empty((0, arm.n))
+            return cls(arm, nothing, nothing, [], nothing, np.empty(0))
+        q, command, v = (np.vstack(parts) for parts in (positions, commands, speeds))
+        gravity = arm.torque(q, np.zeros_like(q), np.zeros_like(q))
+        besides = []
+        for j in range(arm.n):
+            own = np.column_stack(
+                [np.ones(len(q)), _direction(v[:, j]), np.tanh(v[:, j] / REST), v[:, j], gravity[:, j]]
+            )
+            basis, size, _ = np.linalg.svd(own, full_matrices=False)
+            besides.append(basis[:, size > 1e-9 * size[0]])
+        left = np.column_stack([e - b @ (b.T @ e) for e, b in zip((command - q).T, besides, strict=True)])
+        usual = np.sqrt(np.mean(left**2, axis=0)) + 1e-6
+        return cls(arm, q, command, besides, left / usual, usual)
+
+
+def _pressed(looked: _Looked, link: int) -> tuple[float, Surface] | None:
+    """What a surface under one link takes of the squared errors, and the surface; None if it is not clearly there."""
+    arm, q, error = looked.arm, looked.q, looked.error
+    chain = np.flatnonzero(arm.carries[:, link]).tolist()
+    origin, up = heights(arm, looked.command, link)
+    levers = [_lever(arm, q, link, j) for j in chain]
+    mass, *moment = arm.inertial[link, :4]
+    centre = np.array(moment) / mass if mass > 1e-9 else np.zeros(3)
+    near = NEAR * (np.linalg.norm(arm.offset, axis=1).sum() + np.linalg.norm(centre))
+
+    def explained(x: Array) -> list[Array]:
+        """What the surface of x = (point, height) makes of the errors of the chain, by the best stiffness of each."""
+        depth = np.maximum(0.0, x[3] - origin - x[:3] @ up)
+        out = []
+        for j, (own, turned) in zip(chain, levers, strict=True):
+            push = -depth * (own + x[:3] @ turned)
+            push = push - looked.besides[j] @ (looked.besides[j].T @ push)
+            out.append(max(0.0, float(push @ error[:, j])) / max(float(push @ push), 1e-12) * push)
+        return out
+
+    def left(x: Array) -> Array:
+        rest = [error[:, j] - made for j, made in zip(chain, explained(x), strict=True)]
+        return np.concatenate([*rest, FIRMLY * np.sqrt(len(q)) * (x[:3] - centre) / near])
+
+    scale = [near, near, near, 0.3 * near]
+    starts = [np.append(centre, np.quantile(origin + centre @ up, share)) for share in FIRST_HEIGHTS]
+    best = min((least_squares(left, x, x_scale=scale, max_nfev=40) for x in starts), key=lambda each: float(each.cost))
+    x = np.asarray(best.x)
+    below = origin + x[:3] @ up < x[3]
+    if below.sum() < FEWEST or below.mean() > MOST:
+        return None
+    made = explained(x)
+    signs = {
+        j: (
+            1.0 - float(np.sum((error[below, j] - own[below]) ** 2) / np.sum(error[below, j] ** 2)),
+            float(np.quantile(np.abs(own[below]), 0.9)),
+        )
+        for j, own in zip(chain, made, strict=True)
+    }
+    shown = tuple(j for j in chain if _shows(signs[j], ALSO))
+    if len(shown) < JOINTS or not any(_shows(signs[j], SURE) for j in shown):
+        return None
+    taken = sum(float(np.sum(error[:, j] ** 2 - (error[:, j] - own) ** 2)) for j, own in zip(chain, made, strict=True))
+    return taken, Surface(link, x[:3], _reached(looked, link, x), shown)
+
+
+def _reached(looked: _Looked, link: int, x: Array) -> float:
+    """Height up to which the point x[:3] is where it is commanded to be well below x[3]."""
+    (origin, up), (other, turned) = (heights(looked.arm, angles, link) for angles in (looked.q, looked.command))
+    depth = x[3] - other - x[:3] @ turned
+    deep = depth > np.median(depth[depth > 0.0])
+    return float(np.quantile((origin + x[:3] @ up)[deep], PRESSED))
+
+
+def _shows(sign: tuple[float, float], least: tuple[float, float]) -> bool:
+    return sign[0] >= least[0] and sign[1] >= least[1]
+
+
+def _direction(v: Array) -> Array:
+    """Sign of the last motion [-1, 0, 1], (K,): friction holds a joint on the side that it came from."""
+    moves = np.where(np.abs(v) > REST, np.arange(len(v)), -1)
+    last = np.maximum.accumulate(moves)
+    return np.where(last < 0, 0.0, np.sign(v[last]))
+
+
+def _lever(arm: RigidArm, q: Array, link: int, joint: int) -> tuple[Array, Array]:
+    """Derivative of `heights` of a link with respect to one joint."""
+    step = np.zeros(arm.n)
+    step[joint] = 1e-4
+    ahead, behind = heights(arm, q + step, link), heights(arm, q - step, link)
+    return (ahead[0] - behind[0]) / 2e-4, (ahead[1] - behind[1]) / 2e-4
