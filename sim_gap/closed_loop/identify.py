@@ -24,6 +24,7 @@ from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
 from sim_gap.closed_loop.training.left_out import left_out
 from sim_gap.closed_loop.training.limits import unreached
+from sim_gap.closed_loop.training.ranges import wide_enough
 from sim_gap.closed_loop.training.spread import Covariance, covariance, covariance_within, vague_limits
 from sim_gap.closed_loop.windows import Windows, thinned, thinned_moving, windows_of
 from sim_gap.model.load import SimModel
@@ -89,6 +90,7 @@ def identify(
     `gains` are `RECORDING=VALUE`, the controller's gain in recordings that differ in it. Raises BadInput.
     """
     scale = gain_scales(gains, labels)
+    sim = wide_enough(sim, [*train, *heldout])
     progress("reading motion and model torques")
     surface = find_surface(sim.arm, [*train, *heldout])
     whole = windows_of(sim.arm, train, labels[: len(train)], scales=scale[: len(train)], surface=surface)

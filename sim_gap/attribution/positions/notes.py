@@ -7,6 +7,7 @@ from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.training.bands import SHARE
 from sim_gap.closed_loop.training.export import Exported
 from sim_gap.closed_loop.training.limits import described
+from sim_gap.closed_loop.training.ranges import widened
 from sim_gap.closed_loop.training.spread import undecided_scale
 
 FAR = 3.0
@@ -31,7 +32,7 @@ def notes(found: Identified) -> list[str]:
         )
     if limits := described(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
-    out += [*_touching(found), *_beyond(found)]
+    out += [*_touching(found), *_ranges(found), *_beyond(found)]
     if found.export is not None and found.export.lines:
         module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}{module}")
@@ -73,9 +74,20 @@ def _touching(found: Identified) -> list[str]:
     return [
         f"the arm presses on something below it, such as a table, in {len(some)} of {len(found.touched)} recordings: "
         f"{joints} stop short of the command the lower {names[found.surface.link]} goes, from a height of "
-        f"{found.surface.height:.2f} m on; these moments ({min(some):.0f} to {max(some):.0f} % of such a recording) are "
-        "neither fitted nor judged: if simulated motion goes there, put a surface there into the model"
+        f"{found.surface.height:.2f} m on; these moments ({min(some):.0f} to {max(some):.0f} % of such a recording) "
+        "are neither fitted nor judged: if simulated motion goes there, put a surface there into the model"
     ]
+
+
+def _ranges(found: Identified) -> list[str]:
+    """A note of joints that go further than the model lets them."""
+    names, own = found.sim.arm.names, found.sim.mujoco_model.jnt_range[list(found.sim.joints)]
+    out = [
+        f"{names[j]} (model {own[j, 0]:.2f} to {own[j, 1]:.2f} rad, corrected {low:.2f} to {high:.2f} rad)"
+        for j in widened(found.sim)
+        for low, high in [found.sim.arm.range[j]]
+    ]
+    return [f"goes further than the model's range, where a simulation would stop: {', '.join(out)}"] if out else []
 
 
 def _beyond(found: Identified) -> list[str]:

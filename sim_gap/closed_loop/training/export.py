@@ -19,6 +19,7 @@ from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import Search, effect_there, taken_out, without
+from sim_gap.closed_loop.training.ranges import widened, write_range
 from sim_gap.effects.base import tilted
 from sim_gap.model.load import SimModel
 from sim_gap.model.rigid_body import inertial_of
@@ -100,9 +101,13 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
         }
     )
     compiled = spec.compile()
+    unit = float(np.degrees(1.0)) if spec.compiler.degree else 1.0
+    wider = widened(sim)
     for j, joint in enumerate(sim.joints):
-        _set_joint(spec.joints[joint], native, j)
-        _set_actuator(spec, spec.joints[joint].name, native, j, search, compiled)
+        _set_joint(spec.joints[joint], native, j, unit)
+        actuator = _set_actuator(spec, spec.joints[joint].name, native, j)
+        if j in wider:
+            write_range(spec.joints[joint], actuator, sim.arm.range[j], unit)
     for link, change in _link_changes(search, native).items():
         _set_body(spec, compiled, sim.joints[link], change)
     angles = [float(native.point.get(f"tilt.angle_{k}", np.zeros(1))[0]) for k in (1, 2)]
@@ -150,14 +155,15 @@ def _implicit() -> Any:
     return mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
-def _set_joint(joint: Any, fit: Fit, j: int) -> None:
+def _set_joint(joint: Any, fit: Fit, j: int, unit: float) -> None:
+    """Give a joint of a file what the fit has; angles of joints in the file's `unit`."""
     joint.frictionloss, joint.armature = float(fit.point["coulomb"][j]), float(fit.point["armature"][j])
     joint.solref_friction, joint.solimp_friction = STICKS["solref_friction"], STICKS["solimp_friction"]
     joint.damping[0] = float(fit.point["viscous"][j] - _of_servo(fit, j))
     stiffness = float(fit.point["spring"][j])
     if stiffness > 1e-9:
         joint.stiffness[0] = stiffness
-        joint.springref = -float(fit.point["offset"][j]) / stiffness
+        joint.springref = -unit * float(fit.point["offset"][j]) / stiffness
 
 
 def _of_servo(fit: Fit, j: int) -> float:
@@ -165,7 +171,7 @@ def _of_servo(fit: Fit, j: int) -> float:
     return float(min(fit.point["kv"][j], fit.point["viscous"][j]))
 
 
-def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compiled: Any) -> None:
+def _set_actuator(spec: Any, joint: str, fit: Fit, j: int) -> Any:
     """One position actuator at a joint, in the place of those that it has."""
     import mujoco
 
@@ -193,6 +199,7 @@ def _set_actuator(spec: Any, joint: str, fit: Fit, j: int, search: Search, compi
     if control is not None:
         made.ctrllimited, made.ctrlrange = 1, control
     put_delay(made, float(fit.point["delay"][j]))
+    return made
 
 
 def _link_changes(search: Search, fit: Fit) -> dict[int, Array]:

@@ -2,18 +2,20 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 from servo_arm import model_text, record, written
 
+from sim_gap.attribution.positions.notes import _ranges
 from sim_gap.better_model.effects_module import module_text
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.training.export import IN_MODULE, Exported, exported, native_fit, with_module
+from sim_gap.closed_loop.training.ranges import wide_enough, widened
 from sim_gap.closed_loop.training.replay import Simulated, replay, replay_rms, simulated
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import SimModel, load_model
@@ -101,3 +103,38 @@ def test_a_recording_with_another_gain_is_replayed_with_that_gain(tmp_path: Path
     apart = replay_rms(low, [OTHER, OTHER], [1.0, 4.0]) ** 2
     both = replay_rms(low, [OTHER]) ** 2 + replay_rms(low.with_gain(4.0), [OTHER]) ** 2
     np.testing.assert_allclose(2.0 * apart, both)
+
+
+@pytest.mark.parametrize("compiler", ["", '<compiler angle="radian"/>'])
+def test_a_spring_is_written_in_the_angles_of_the_file(made, tmp_path: Path, compiler: str) -> None:
+    _, search, fit = made
+    sim = load_model(written(tmp_path, TEXT.replace("<option", f"{compiler}<option", 1)))
+    sprung = fit.with_values(spring=np.array([2.0, 0.0]), offset=np.array([0.6, 0.0]))
+    model = mujoco.MjModel.from_xml_string(exported(sim, search, sprung, sprung).xml)
+    assert model.jnt_stiffness.ravel()[0] == pytest.approx(2.0)
+    assert model.qpos_spring[0] == pytest.approx(-0.3)
+
+
+@pytest.mark.parametrize(("compiler", "unit"), [("", np.degrees(1.0)), ('<compiler angle="radian"/>', 1.0)])
+def test_a_joint_of_the_written_model_goes_as_far_as_the_arm(made, tmp_path: Path, compiler: str, unit: float) -> None:
+    """The shoulder left the model's range, the elbow did not."""
+    _, search, fit = made
+    shoulder, elbow = OTHER.position.T
+    text = TEXT.replace("<option", f"{compiler}<option", 1)
+    text = text.replace('name="shoulder" axis', f'name="shoulder" range="{-9 * unit} {0.2 * unit}" limited="true" axis')
+    text = text.replace('name="elbow" axis', f'name="elbow" range="{-9 * unit} {9 * unit}" limited="true" axis')
+    text = text.replace('joint="shoulder" kp', 'joint="shoulder" ctrllimited="true" ctrlrange="-9 0.2" kp')
+    sim = load_model(written(tmp_path, text))
+    wide = wide_enough(sim, [OTHER])
+    assert widened(sim) == []
+    assert widened(wide) == [0]
+    kept, free = (simulated(each, exported(each, search, fit, native_fit(search, fit))) for each in (sim, wide))
+    assert free.model.jnt_range[0] == pytest.approx([-9.0, shoulder.max() + 0.01])
+    assert free.model.jnt_range[1] == pytest.approx([-9.0, 9.0])
+    assert elbow.max() < 9.0
+    stopped, moved = (replay_rms(each, [OTHER])[0] for each in (kept, free))
+    assert moved < 0.3 * stopped
+    found = SimpleNamespace(sim=wide)
+    (note,) = _ranges(found)
+    assert "shoulder (model -9.00 to 0.20 rad" in note
+    assert "elbow" not in note
