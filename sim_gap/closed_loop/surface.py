@@ -31,7 +31,7 @@ MOST = 0.3
 """Largest share of the samples that touch: what happens more often is a property of the arm."""
 FEWEST = 20
 """Least number of samples that touch."""
-FIRST_HEIGHTS = (0.01, 0.03, 0.1)
+FIRST_HEIGHTS = (0.01, 0.03, 0.1, 0.2)
 """Shares of the samples that are below the heights from which the search starts."""
 NEAR, FIRMLY = 0.12, 0.1
 """Standard deviation of the touching point about the link's centre of mass, as a share of the arm's length, and the
@@ -93,7 +93,7 @@ def find_surface(arm: RigidArm, recordings: Sequence[Recording]) -> Surface | No
     looked = _Looked.of(arm, recordings)
     if len(looked.q) < 10 * FEWEST:
         return None
-    found = [_pressed(looked, link) for link in range(arm.n) if arm.carries[:, link].sum() >= JOINTS]
+    found = [_Under(looked, link).surface() for link in range(arm.n) if arm.carries[:, link].sum() >= JOINTS]
     return max((each for each in found if each is not None), key=lambda each: each[0], default=(0.0, None))[1]
 
 
@@ -141,58 +141,65 @@ class _Looked:
         return cls(arm, q, command, besides, left / usual, usual)
 
 
-def _pressed(looked: _Looked, link: int) -> tuple[float, Surface] | None:
-    """What a surface under one link takes of the squared errors, and the surface; None if it is not clearly there."""
-    arm, q, error = looked.arm, looked.q, looked.error
-    chain = np.flatnonzero(arm.carries[:, link]).tolist()
-    origin, up = heights(arm, looked.command, link)
-    levers = [_lever(arm, q, link, j) for j in chain]
-    mass, *moment = arm.inertial[link, :4]
-    centre = np.array(moment) / mass if mass > 1e-9 else np.zeros(3)
-    near = NEAR * (np.linalg.norm(arm.offset, axis=1).sum() + np.linalg.norm(centre))
+class _Under:
+    """What a surface under one link makes of the errors; x = (point in the link's frame, height), (4,) [m]."""
 
-    def explained(x: Array) -> list[Array]:
-        """What the surface of x = (point, height) makes of the errors of the chain, by the best stiffness of each."""
-        depth = np.maximum(0.0, x[3] - origin - x[:3] @ up)
+    def __init__(self, looked: _Looked, link: int) -> None:
+        self.looked, self.link, arm = looked, link, looked.arm
+        self.chain = np.flatnonzero(arm.carries[:, link]).tolist()
+        self.origin, self.up = heights(arm, looked.command, link)
+        self.levers = [_lever(arm, looked.q, link, j) for j in self.chain]
+        mass, *moment = arm.inertial[link, :4]
+        self.centre = np.array(moment) / mass if mass > 1e-9 else np.zeros(3)
+        self.near = NEAR * float(np.linalg.norm(arm.offset, axis=1).sum() + np.linalg.norm(self.centre))
+
+    def surface(self) -> tuple[float, Surface] | None:
+        """What a surface takes of the squared errors, and the surface; None if none is clearly there."""
+        scale = [self.near, self.near, self.near, 0.3 * self.near]
+        levels = np.quantile(self.origin + self.centre @ self.up, FIRST_HEIGHTS)
+        starts = [np.append(self.centre, level) for level in levels]
+        ends = [np.asarray(least_squares(self._left, x, x_scale=scale, max_nfev=40).x) for x in starts]
+        return max((found for x in ends if (found := self._clearly(x))), key=lambda each: each[0], default=None)
+
+    def _made(self, x: Array) -> list[Array]:
+        """Errors that the surface makes at each joint of the chain, by the best stiffness of each, (K,)."""
+        depth = np.maximum(0.0, x[3] - self.origin - x[:3] @ self.up)
         out = []
-        for j, (own, turned) in zip(chain, levers, strict=True):
+        for j, (own, turned) in zip(self.chain, self.levers, strict=True):
             push = -depth * (own + x[:3] @ turned)
-            push = push - looked.besides[j] @ (looked.besides[j].T @ push)
-            out.append(max(0.0, float(push @ error[:, j])) / max(float(push @ push), 1e-12) * push)
+            push = push - self.looked.besides[j] @ (self.looked.besides[j].T @ push)
+            stiffness = max(0.0, float(push @ self.looked.error[:, j])) / max(float(push @ push), 1e-12)
+            out.append(stiffness * push)
         return out
 
-    def left(x: Array) -> Array:
-        rest = [error[:, j] - made for j, made in zip(chain, explained(x), strict=True)]
-        return np.concatenate([*rest, FIRMLY * np.sqrt(len(q)) * (x[:3] - centre) / near])
+    def _left(self, x: Array) -> Array:
+        errors = self.looked.error
+        rest = [errors[:, j] - made for j, made in zip(self.chain, self._made(x), strict=True)]
+        return np.concatenate([*rest, FIRMLY * np.sqrt(len(errors)) * (x[:3] - self.centre) / self.near])
 
-    scale = [near, near, near, 0.3 * near]
-    starts = [np.append(centre, np.quantile(origin + centre @ up, share)) for share in FIRST_HEIGHTS]
-    best = min((least_squares(left, x, x_scale=scale, max_nfev=40) for x in starts), key=lambda each: float(each.cost))
-    x = np.asarray(best.x)
-    below = origin + x[:3] @ up < x[3]
-    if below.sum() < FEWEST or below.mean() > MOST:
-        return None
-    made = explained(x)
-    signs = {
-        j: (
-            1.0 - float(np.sum((error[below, j] - own[below]) ** 2) / np.sum(error[below, j] ** 2)),
-            float(np.quantile(np.abs(own[below]), 0.9)),
-        )
-        for j, own in zip(chain, made, strict=True)
-    }
-    shown = tuple(j for j in chain if _shows(signs[j], ALSO))
-    if len(shown) < JOINTS or not any(_shows(signs[j], SURE) for j in shown):
-        return None
-    taken = sum(float(np.sum(error[:, j] ** 2 - (error[:, j] - own) ** 2)) for j, own in zip(chain, made, strict=True))
-    return taken, Surface(link, x[:3], _reached(looked, link, x), shown)
+    def _clearly(self, x: Array) -> tuple[float, Surface] | None:
+        """The same of one x; None if it does not show at enough joints, or nowhere or everywhere."""
+        below = self.origin + x[:3] @ self.up < x[3]
+        if below.sum() < FEWEST or below.mean() > MOST:
+            return None
+        taken, signs = 0.0, {}
+        for j, made in zip(self.chain, self._made(x), strict=True):
+            error = self.looked.error[:, j]
+            falls = error**2 - (error - made) ** 2
+            taken += float(falls.sum())
+            share = float(falls[below].sum() / np.sum(error[below] ** 2))
+            signs[j] = share, float(np.quantile(np.abs(made[below]), 0.9))
+        shown = tuple(j for j in self.chain if _shows(signs[j], ALSO))
+        if len(shown) < JOINTS or not any(_shows(signs[j], SURE) for j in shown):
+            return None
+        return taken, Surface(self.link, x[:3], self._reached(x), shown)
 
-
-def _reached(looked: _Looked, link: int, x: Array) -> float:
-    """Height up to which the point x[:3] is where it is commanded to be well below x[3]."""
-    (origin, up), (other, turned) = (heights(looked.arm, angles, link) for angles in (looked.q, looked.command))
-    depth = x[3] - other - x[:3] @ turned
-    deep = depth > np.median(depth[depth > 0.0])
-    return float(np.quantile((origin + x[:3] @ up)[deep], PRESSED))
+    def _reached(self, x: Array) -> float:
+        """Height up to which the point is where it is commanded to be well below the surface."""
+        depth = x[3] - self.origin - x[:3] @ self.up
+        origin, up = heights(self.looked.arm, self.looked.q, self.link)
+        deep = depth >= np.median(depth[depth > 0.0])
+        return float(np.quantile((origin + x[:3] @ up)[deep], PRESSED))
 
 
 def _shows(sign: tuple[float, float], least: tuple[float, float]) -> bool:

@@ -24,8 +24,8 @@ STEP_S = 0.0051
 """Longest step of the simulation [s]; the recording's period is a multiple of the step."""
 WINDOW_S, WARM_S = 6.0, 1.5
 """Judged length of a window, and the simulated time before it that is not judged [s]."""
-MOVES = 0.5
-"""Share of a joint's highest speed of all windows that it has to have in one of those that are fitted."""
+MOVES, FAST = 0.5, 0.8
+"""Shares of a joint's largest RMS speed and largest speed of all windows that it has to have in one that is fitted."""
 JUDGED_HZ = 50.0
 """Highest rate at which simulated and measured positions are compared [Hz]."""
 
@@ -171,16 +171,20 @@ def thinned(data: Windows, count: int) -> Windows:
 
 
 def thinned_moving(data: Windows, count: int) -> Windows:
-    """The same, and for each joint that moves less than half as fast in these as elsewhere the window of its fastest.
+    """The same, and for each joint that moves less in these than elsewhere the windows of its most and fastest motion.
 
-    Of a joint that rests in all windows anything fits: no gain, and any friction.
+    Of a joint that rests in all windows anything fits: no gain, and any friction. Of one that is slow in all of them
+    nothing follows for fast motion.
     """
     if data.count <= count:
         return data
     chosen = _even(data.count, count)
-    speed = np.sqrt(np.mean(data.v**2, axis=0)) * (data.weight.sum(0) > 0.0)
-    rests = speed[:, chosen].max(1) < MOVES * speed.max(1)
-    return of_windows(data, np.unique([*chosen, *speed[rests].argmax(1)]))
+    counts = data.weight.sum(0) > 0.0
+    mean, most = np.sqrt(np.mean(data.v**2, axis=0)) * counts, np.abs(data.v).max(0) * counts
+    for speed, share in ((mean, MOVES), (most, FAST)):
+        rests = speed[:, chosen].max(1) < share * speed.max(1)
+        chosen = np.unique([*chosen, *speed[rests].argmax(1)])
+    return of_windows(data, chosen)
 
 
 def _even(total: int, count: int) -> NDArray[np.intp]:

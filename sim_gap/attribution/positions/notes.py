@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Rollout
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.training.bands import SHARE
@@ -9,9 +10,13 @@ from sim_gap.closed_loop.training.export import Exported
 from sim_gap.closed_loop.training.limits import described
 from sim_gap.closed_loop.training.ranges import widened
 from sim_gap.closed_loop.training.spread import undecided_scale
+from sim_gap.closed_loop.windows import Windows
 
 FAR = 3.0
 """So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
+
+AT_TIMES = 0.01
+"""Share of the held-out samples from which a note says that they are faster than any that was fitted."""
 
 
 def notes(found: Identified) -> list[str]:
@@ -32,7 +37,7 @@ def notes(found: Identified) -> list[str]:
         )
     if limits := described(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
-    out += [*_touching(found), *_ranges(found), *_beyond(found)]
+    out += [*_touching(found), *_ranges(found), *_beyond(found), *_faster(found)]
     if found.export is not None and found.export.lines:
         module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}{module}")
@@ -102,3 +107,22 @@ def _beyond(found: Identified) -> list[str]:
             out.append(f"{name}: {outside:.0%} of the held-out motion")
     told = "outside the range of the training recordings, where bands may be too narrow"
     return [f"{told}: {', '.join(out)}"] if out else []
+
+
+def _faster(found: Identified) -> list[str]:
+    """A note of the joints that are at times faster than in any training recording."""
+    out = []
+    for j, name in enumerate(found.sim.arm.names):
+        fitted, other = (_speeds(data, j) for data in (found.search.data, found.heldout))
+        if not (fitted.size and other.size):
+            continue
+        if np.mean(other > fitted.max()) > AT_TIMES:
+            out.append(f"{name} up to {other.max():.2g} rad/s (training {fitted.max():.2g})")
+    told = "held-out motion is faster than any training motion, from which nothing follows for it"
+    return [f"{told}: {', '.join(out)}: give faster motion to fit"] if out else []
+
+
+def _speeds(data: Windows, joint: int) -> Array:
+    """Amounts of a joint's velocity at the judged samples [rad/s], (K,)."""
+    speed = np.abs(data.v[data.warm :: data.stride, joint][: len(data.weight)])
+    return np.asarray(speed[data.weight[:, joint][: len(speed)] > 0.0])

@@ -31,6 +31,8 @@ SCALED = ("kd", "coulomb", "viscous", "armature")
 """What a gain is told by the ratio to."""
 STATED = 0.5
 """Relative standard deviation of a value of SCALED that the model states and no fit has contradicted."""
+ALIKE = 0.9
+"""Correlation of the errors of a value of SCALED that the model states for several joints."""
 LOOSE = 0.35
 """Relative standard deviation of a gain from which its scale is not decided."""
 WIDEST = 100.0
@@ -74,9 +76,9 @@ def covariance(search: Search, fit: Fit) -> Covariance:
     free = freed(search, fit)
     terms = _terms(search, free)
     known = _stated(search, fit, terms.names)
-    inverse = np.linalg.inv(terms.squares.sum(0) + np.diag(known))
+    inverse = np.linalg.inv(terms.squares.sum(0) + known)
     aside = inverse @ terms.scores.sum(0)
-    matrix = inverse * known @ inverse + np.outer(aside, aside)
+    matrix = inverse @ known @ inverse + np.outer(aside, aside)
     matrix += _jackknifed(terms, known, np.arange(search.data.count))
     number = len(np.unique(search.data.recording))
     if number > 1:
@@ -159,14 +161,22 @@ def _terms(search: Search, fit: Fit) -> _Terms:
 
 
 def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
-    """Inverse variance of each parameter before any recording, (K,)."""
+    """Inverse covariance of the parameters before any recording, (K, K).
+
+    What a model states of the same parameter of several joints is of one source, such as one rotor for all: it is off
+    together.
+    """
     *own, moments = errors_of(search)
     known = [_open(search, fit, j, errors) for j, errors in enumerate(own)]
-    sizes = [
-        known[j].get(name, WIDEST) if j >= 0 else WIDEST if name in fit.shared else max(moments[name], LEAST)
-        for j, name in names
-    ]
-    return np.array(sizes) ** -2.0
+    sizes = np.array(
+        [
+            known[j].get(name, WIDEST) if j >= 0 else WIDEST if name in fit.shared else max(moments[name], LEAST)
+            for j, name in names
+        ]
+    )
+    stated = [name if j >= 0 and name in SCALED and name in known[j] else str(k) for k, (j, name) in enumerate(names)]
+    together = np.equal.outer(stated, stated)
+    return np.linalg.inv(np.outer(sizes, sizes) * np.where(together, ALIKE, 0.0) + np.diag(sizes**2 * (1.0 - ALIKE)))
 
 
 def _jackknifed(terms: _Terms, known: Array, groups: NDArray[np.intp]) -> Array:
@@ -175,7 +185,7 @@ def _jackknifed(terms: _Terms, known: Array, groups: NDArray[np.intp]) -> Array:
     Where nearly all that is known of a direction is in one group, such as the limit of a speed that is reached in a
     single motion, the step of the others would be noise over nothing.
     """
-    squares, scores = terms.squares.sum(0) + np.diag(known), terms.scores.sum(0)
+    squares, scores = terms.squares.sum(0) + known, terms.scores.sum(0)
     scale = 1.0 / np.sqrt(np.diag(squares))
     least = ROUNDING * np.eye(len(known))
     whole = squares * scale * scale[:, None] + least

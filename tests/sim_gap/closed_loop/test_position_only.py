@@ -13,7 +13,7 @@ from servo_arm import model_text, record, written
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.positions.answer import _verdict
-from sim_gap.attribution.positions.notes import _beyond
+from sim_gap.attribution.positions.notes import _beyond, _faster
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
 from sim_gap.closed_loop.training.bands import band
@@ -74,6 +74,20 @@ def test_joints_that_go_further_than_in_training_are_noted() -> None:
     (note,) = _beyond(found)
     assert "shoulder: 68% of the held-out motion" in note
     assert "elbow" not in note
+
+
+def test_joints_that_go_faster_than_in_training_are_noted() -> None:
+    slow, fast = np.linspace(-0.2, 0.2, 50), np.linspace(-1.5, 1.5, 50)
+    fitted, other = (
+        SimpleNamespace(v=np.stack(columns, axis=1)[..., None], weight=np.ones((50, 2, 1)), warm=0, stride=1)
+        for columns in ((slow, fast), (fast, slow))
+    )
+    arm = SimpleNamespace(names=("shoulder", "elbow"))
+    found = SimpleNamespace(sim=SimpleNamespace(arm=arm), search=SimpleNamespace(data=fitted), heldout=other)
+    (note,) = _faster(found)
+    assert "shoulder up to 1.5 rad/s (training 0.2)" in note
+    assert "elbow" not in note
+    assert _faster(SimpleNamespace(sim=found.sim, search=found.search, heldout=fitted)) == []
 
 
 def test_the_written_model_moves_like_the_arm(answer, tmp_path: Path) -> None:
