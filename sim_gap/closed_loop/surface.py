@@ -30,7 +30,9 @@ error that it makes over what is usual."""
 MOST = 0.3
 """Largest share of the samples that touch: what happens more often is a property of the arm."""
 FEWEST = 20
-"""Least number of samples that touch."""
+"""Least number of samples that touch: two seconds. With half as many, one of sixty arms without has a surface."""
+ROWS = 200
+"""Least number of samples that are looked at."""
 FIRST_HEIGHTS = (0.01, 0.03, 0.1, 0.2)
 """Shares of the samples that are below the heights from which the search starts."""
 NEAR, FIRMLY = 0.12, 0.1
@@ -91,7 +93,7 @@ def find_surface(arm: RigidArm, recordings: Sequence[Recording]) -> Surface | No
     if arm.n < JOINTS or np.linalg.norm(arm.gravity) < 1e-6:
         return None
     looked = _Looked.of(arm, recordings)
-    if len(looked.q) < 10 * FEWEST:
+    if len(looked.q) < ROWS:
         return None
     found = [_Under(looked, link).surface() for link in range(arm.n) if arm.carries[:, link].sum() >= JOINTS]
     return max((each for each in found if each is not None), key=lambda each: each[0], default=(0.0, None))[1]

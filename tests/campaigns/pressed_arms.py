@@ -10,7 +10,7 @@ Printed are the number of cases in which a surface is found although there is no
 are found, the share of the moments of contact that is left out for it, and of the moments left out, those that are
 further than half a second from any contact. Exit status 1 if a surface is found in more than 1 % of the cases without
 one, or in less than 80 % of those in which two joints or more lift the tip, the second by a quarter of what the first
-does, and the table moves them by 0.02 to 0.5 rad: by more an arm has slipped aside.
+does, and the table moves them by 0.02 to 0.5 rad (by more an arm has slipped aside), for two seconds or more.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from sim_gap.blind.servo.make import make_cases, recipes
 from sim_gap.closed_loop.surface import find_surface
 from sim_gap.model.load import load_model
 
-FALSE, FOUND, CLEAR_RAD, LIFTS = 0.01, 0.8, (0.02, 0.5), 0.25
+FALSE, FOUND, CLEAR_RAD, LIFTS, LONG_S = 0.01, 0.8, (0.02, 0.5), 0.25, 2.0
 TIP = 1.5
 """Place of the tip in the last link, from its origin through its centre of mass."""
 
@@ -65,6 +65,7 @@ def above_a_table(path: Path, recording: Recording, share: float) -> tuple[Recor
     lifts = np.sqrt(np.mean(levers**2, axis=0))
     both = np.argsort(lifts)[-2:]
     clear = lifts[both[0]] > LIFTS * lifts[both[1]]
+    clear = clear and float(touches.mean() * np.ptp(recording.t)) > LONG_S
     clear = clear and CLEAR_RAD[0] < moved[both].min() and moved[both].max() < CLEAR_RAD[1]
     return Recording(t=recording.t, position=q, position_command=recording.position_command), touches, bool(clear)
 
