@@ -16,7 +16,7 @@ from scipy.stats import t
 from gcomp.arrays import Array
 from sim_gap.closed_loop.choice.compete import Progress, select
 from sim_gap.closed_loop.choice.prune import removable_at, without_each
-from sim_gap.closed_loop.choice.scale import ROTORS, at_another_scale
+from sim_gap.closed_loop.choice.scale import ROTORS, at_other_scales
 from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
@@ -77,22 +77,19 @@ def _others(search: Search, fit: Fit, progress: Progress) -> Iterator[Other]:
         other = improve(search.data, select(own, taken_out(search, fit, (effect, ()))), search.scales, 4)
         more = PRICE * (_size(fit) - _size(other))
         yield Other((effect, ()), other, _doubt(search, fit, other, range(search.data.joints), more))
-    yield from _at_another_scale(search, fit)
+    for other in at_other_scales(search, fit):
+        yield from _rescaled(search, fit, other)
 
 
-def _at_another_scale(search: Search, fit: Fit) -> Iterator[Other]:
-    """The fit with lighter rotors and all that goes with them; of each joint, unless something of the whole arm is
-    coupled to all."""
-    other = at_another_scale(search, fit)
-    if other is None:
-        return
-    changed = [j for j, own in enumerate(other.active) if own != fit.active[j]]
+def _rescaled(search: Search, fit: Fit, other: Fit) -> Iterator[Other]:
+    """The fit with other rotors and all that goes with them; of each joint, unless something couples all of them."""
     if fit.shared:
-        least = PRICE * (_size(fit) - _size(other))
-        yield Other((ROTORS, ()), other, _doubt(search, fit, other, range(search.data.joints), least))
+        more = PRICE * (_size(fit) - _size(other))
+        yield Other((ROTORS, ()), other, _doubt(search, fit, other, range(search.data.joints), more))
         return
-    for j in changed:
-        yield Other((ROTORS, (j,)), merged(fit, other, j), _doubt(search, fit, other, (j,), -PRICE))
+    for j, own in enumerate(other.active):
+        if own != fit.active[j]:
+            yield Other((ROTORS, (j,)), merged(fit, other, j), _doubt(search, fit, other, (j,), -PRICE))
 
 
 def _size(fit: Fit) -> int:

@@ -5,6 +5,7 @@ Where these are lighter than stated, a payload and a gain that is larger by as m
 both the score hardly changes, and a fit stays where it began.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,24 +13,25 @@ import numpy as np
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.search import Search
 
-SHARE = 0.5
-"""Scale at which a fit begins again, over its own."""
+SHARES = 0.7, 0.4
+"""Scales at which a fit begins again, over its own."""
 WITH_TORQUE = ("kp", "ki", "kd", "limit", "coulomb", "viscous", "stribeck", "back_emf", "armature", "spring", "offset")
 """Parameters that go with the scale; the others are ratios, times or velocities."""
 ITERATIONS = 12
 ROTORS = "actuator.rotor_inertia"
 
 
-def at_another_scale(search: Search, fit: Fit) -> Fit | None:
-    """The fit from a smaller scale, the rotors that the model states free; None if there are none to free."""
+def at_other_scales(search: Search, fit: Fit) -> Iterator[Fit]:
+    """The fit from each smaller scale, the rotors that the model states free; none if there are none to free."""
     if ROTORS in search.excluded:
-        return None
+        return
     stated = search.nominal["armature"] > 0.0
     free = [("kp" in own and bool(stated[j]) and "armature" not in own) for j, own in enumerate(fit.active)]
     if not any(free):
-        return None
-    part = np.where(free, SHARE, 1.0)
-    point = {name: values * part if name in WITH_TORQUE else values.copy() for name, values in fit.point.items()}
-    point |= {name: SHARE * fit.point[name] for name in fit.shared}
+        return
     active = tuple((*own, "armature") if loose else own for own, loose in zip(fit.active, free, strict=True))
-    return improve(search.data, replace(fit, point=point, active=active, rms=None), search.scales, ITERATIONS)
+    for share in SHARES:
+        part = np.where(free, share, 1.0)
+        point = {name: values * part if name in WITH_TORQUE else values.copy() for name, values in fit.point.items()}
+        point |= {name: share * fit.point[name] for name in fit.shared}
+        yield improve(search.data, replace(fit, point=point, active=active, rms=None), search.scales, ITERATIONS)
