@@ -38,6 +38,8 @@ FIRST_HEIGHTS = (0.01, 0.03, 0.1, 0.2)
 NEAR, FIRMLY = 0.12, 0.1
 """Standard deviation of the touching point about the link's centre of mass, as a share of the arm's length, and the
 weight of that beside one sample's error."""
+SHORTEST_M = 0.01
+"""Length that an arm is taken to have at least [m]: models of bare motors have none."""
 PRESSED = 0.95
 """Share of the samples that are commanded well below the surface whose heights are those of the touch."""
 RELEASE_S = 0.3
@@ -101,7 +103,7 @@ def find_surface(arm: RigidArm, recordings: Sequence[Recording]) -> Surface | No
 
 @dataclass(frozen=True, eq=False)
 class _Looked:
-    """Positions, commands, and what is unusual of the errors between, at a low rate."""
+    """Positions, commands, and what is unusual of the errors between, at a low rate, (K, n) each."""
 
     arm: RigidArm
     q: Array
@@ -110,8 +112,6 @@ class _Looked:
     """What controller, friction and gravity do to the error of each joint: an orthonormal basis, (K, m) each."""
     error: Array
     """What they leave of it over its RMS, (K, n)."""
-    usual: Array
-    """That RMS [rad], (n,)."""
 
     @classmethod
     def of(cls, arm: RigidArm, recordings: Sequence[Recording]) -> "_Looked":
@@ -128,7 +128,7 @@ class _Looked:
             speeds.append(np.gradient(recording.position[rows], recording.t[rows], axis=0))
         if not positions:
             nothing = np.empty((0, arm.n))
-            return cls(arm, nothing, nothing, [], nothing, np.empty(0))
+            return cls(arm, nothing, nothing, [], nothing)
         q, command, v = (np.vstack(parts) for parts in (positions, commands, speeds))
         gravity = arm.torque(q, np.zeros_like(q), np.zeros_like(q))
         besides = []
@@ -140,7 +140,7 @@ class _Looked:
             besides.append(basis[:, size > 1e-9 * size[0]])
         left = np.column_stack([e - b @ (b.T @ e) for e, b in zip((command - q).T, besides, strict=True)])
         usual = np.sqrt(np.mean(left**2, axis=0)) + 1e-6
-        return cls(arm, q, command, besides, left / usual, usual)
+        return cls(arm, q, command, besides, left / usual)
 
 
 class _Under:
@@ -153,7 +153,8 @@ class _Under:
         self.levers = [_lever(arm, looked.q, link, j) for j in self.chain]
         mass, *moment = arm.inertial[link, :4]
         self.centre = np.array(moment) / mass if mass > 1e-9 else np.zeros(3)
-        self.near = NEAR * float(np.linalg.norm(arm.offset, axis=1).sum() + np.linalg.norm(self.centre))
+        length = float(np.linalg.norm(arm.offset, axis=1).sum() + np.linalg.norm(self.centre))
+        self.near = NEAR * max(length, SHORTEST_M)
 
     def surface(self) -> tuple[float, Surface] | None:
         """What a surface takes of the squared errors, and the surface; None if none is clearly there."""
@@ -189,7 +190,7 @@ class _Under:
             error = self.looked.error[:, j]
             falls = error**2 - (error - made) ** 2
             taken += float(falls.sum())
-            share = float(falls[below].sum() / np.sum(error[below] ** 2))
+            share = float(falls[below].sum() / max(float(np.sum(error[below] ** 2)), 1e-12))
             signs[j] = share, float(np.quantile(np.abs(made[below]), 0.9))
         shown = tuple(j for j in self.chain if _shows(signs[j], ALSO))
         if len(shown) < JOINTS or not any(_shows(signs[j], SURE) for j in shown):

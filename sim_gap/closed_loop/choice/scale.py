@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sim_gap.closed_loop.columns import UNIT
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.search import Search
 
@@ -33,5 +34,5 @@ def at_other_scales(search: Search, fit: Fit) -> Iterator[Fit]:
     for share in SHARES:
         part = np.where(free, share, 1.0)
         point = {name: values * part if name in WITH_TORQUE else values.copy() for name, values in fit.point.items()}
-        point |= {name: share * fit.point[name] for name in fit.shared}
+        point |= {name: share * fit.point[name] for name in fit.shared if UNIT[name.partition(".")[2]] != "rad"}
         yield improve(search.data, replace(fit, point=point, active=active, rms=None), search.scales, ITERATIONS)

@@ -71,6 +71,14 @@ def test_without_gravity_or_with_one_joint_nothing_is_looked_for(pressing) -> No
     assert find_surface(SIM.arm, short) is None
 
 
+def test_an_arm_without_length_or_motion_has_none(pressing) -> None:
+    bare = replace(SIM.arm, offset=np.zeros((2, 3)), inertial=np.zeros((2, 10)))
+    assert find_surface(bare, pressing) is None
+    t = np.arange(0.0, 40.0, 0.02)
+    still = np.full((len(t), 2), 0.5)
+    assert find_surface(SIM.arm, [Recording(t=t, position=still, position_command=still)]) is None
+
+
 def test_the_moments_before_and_after_a_touch_are_left_out_too() -> None:
     surface = Surface(1, TIP, HEIGHT, (0, 1))
     t = np.arange(0.0, 4.0, 0.02)
