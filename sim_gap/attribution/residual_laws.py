@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.residuals.besides import regimes, slides
 from sim_gap.residuals.layout import Row
@@ -37,7 +37,6 @@ WARM_UPS = (6.0, 20.0, 60.0, 200.0)
 """Time constants of laws of time [s]."""
 DEVIATIONS = 2.0
 """Half the width of the band about a law, in standard deviations."""
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.closed_loop.choice.compete import select_about
 from sim_gap.closed_loop.choice.doubt import settled
 from sim_gap.closed_loop.columns import shared_effects, with_columns
@@ -18,7 +18,7 @@ from sim_gap.closed_loop.fit import Fit, evaluate, improve
 from sim_gap.closed_loop.judge import Stage, groups_of, rms_on, stages
 from sim_gap.closed_loop.search import Search, effects_at, merged, taken_out, without
 from sim_gap.closed_loop.sound import Sound, sound
-from sim_gap.closed_loop.surface import Mask, Surface, find_surface, touched
+from sim_gap.closed_loop.surface import Surface, find_surface, touched
 from sim_gap.closed_loop.training.alternatives import alternatives
 from sim_gap.closed_loop.training.bands import Band, band
 from sim_gap.closed_loop.training.export import Exported, exported, native_fit, with_module
@@ -74,6 +74,11 @@ class Identified:
     """What the arm presses on in some recordings; those moments are not in the windows."""
     touched: tuple[Mask, ...]
     """Rows of each recording at which it does, train first."""
+
+    @property
+    def heldout_touched(self) -> tuple[Mask, ...]:
+        """Rows of each held-out recording at which the arm presses on something."""
+        return self.touched[-len(self.recordings) :]
 
 
 def identify(

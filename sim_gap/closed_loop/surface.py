@@ -10,12 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import least_squares
 
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.model.rigid_body import RigidArm, into
 
 LOOKED_HZ = 10.0
@@ -42,10 +41,10 @@ SHORTEST_M = 0.01
 """Length that an arm is taken to have at least [m]: models of bare motors have none."""
 PRESSED = 0.95
 """Share of the samples that are commanded well below the surface whose heights are those of the touch."""
+ALIKE_M = 1e-6
+"""Heights that differ by less are one height [m]: an arm that rests has one position."""
 RELEASE_S = 0.3
 """Time after a touch, and half as long before it, that is left out, too: the servo has to recover [s]."""
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class Surface:
     def touched(self, arm: RigidArm, t: Array, q: Array) -> Mask:
         """Times of a recording at which the arm touches or has just been released, (K,); q (K, n) [rad]."""
         origin, up = heights(arm, q, self.link)
-        below = (origin + self.point @ up < self.height).astype(np.uint8)
+        below = (origin + self.point @ up < self.height + ALIKE_M).astype(np.uint8)
         rows = max(1, round(RELEASE_S / float(np.median(np.diff(t)))))
         before = maximum_filter1d(below, 2 * (rows // 2) + 1)
         after = maximum_filter1d(below, rows + 1, origin=rows // 2)

@@ -4,10 +4,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.residuals.channel_noise import spectrum
 from sim_gap.residuals.disturbances import calm, disturbances, far_off
 from sim_gap.residuals.layout import Row
@@ -29,8 +28,6 @@ HUMP, NEAR, FAR = 8.0, 1.3, 1.8
 SMOOTH, FEW_BINS, BROAD = 5, 6, 2.0
 """Bins over which a spectrum is averaged to look for a resonance; fewest bins on either side to judge it by; multiple
 of a line's power from which it counts before the line."""
-
-Mask = NDArray[np.bool_]
 
 
 def regimes(data: ResidualSet) -> dict[tuple[Row, str], Mask]:

@@ -7,10 +7,9 @@ that, so that such a moment says nothing of it. Its samples are left out of the 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label, maximum_filter1d
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 
 FAR = 8.0
 """A residual is far off from this many standard deviations of what usually remains (by its median)."""
@@ -24,8 +23,6 @@ LONGEST_S = 0.6
 """Longest disturbance, without the time around it [s]: what lasts is a property of the arm, or a body it took up."""
 RARE = 0.02
 """Largest share of a recording's time that is disturbed: what happens more often is a property of the arm."""
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, median_filter
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 
-Mask = NDArray[np.bool_]
 SLOWEST_HZ = 45.0
 """Rate below which a channel's single readings are no spikes: a motion of the arm may be as short."""
 LONGEST_S, LONGEST = 0.015, 3

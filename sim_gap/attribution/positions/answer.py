@@ -80,7 +80,7 @@ def diagnose_positions(
         notes=(*notes(found), *running_free(found, rollout)),
         checks=tuple(checks),
         band=found.band,
-        left_out=float(np.concatenate(found.touched[-len(found.recordings) :]).mean()),
+        left_out=float(np.concatenate(found.heldout_touched).mean()),
         unit="rad",
         internals=found,
     )
@@ -209,10 +209,9 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
     if found.export is None:
         return None
     made, groups = found.beside or found.export, groups_of(found.fit, found.search)
-    touched = found.touched[-len(found.recordings) :]
 
     def gap(arm: Simulated, longest: float = LONGEST_S) -> Array:
-        return replay_rms(arm, found.recordings, found.gains, longest, touched)
+        return replay_rms(arm, found.recordings, found.gains, longest, found.heldout_touched)
 
     after = gap(simulated(found.sim, made))
     before = after * np.nan

@@ -110,15 +110,15 @@ def _beyond(found: Identified) -> list[str]:
 
 
 def _faster(found: Identified) -> list[str]:
-    """A note of the joints that are at times faster than in any training recording."""
+    """A note of the joints that are at times faster than in what is fitted of the training."""
     out = []
     for j, name in enumerate(found.sim.arm.names):
         fitted, other = (_speeds(data, j) for data in (found.search.data, found.heldout))
         if not (fitted.size and other.size):
             continue
         if np.mean(other > fitted.max()) > AT_TIMES:
-            out.append(f"{name} up to {other.max():.2g} rad/s (training {fitted.max():.2g})")
-    told = "held-out motion is faster than any training motion, from which nothing follows for it"
+            out.append(f"{name} up to {other.max():.2g} rad/s (fitted {fitted.max():.2g})")
+    told = "held-out motion is faster than any that is fitted, from which nothing follows for it"
     return [f"{told}: {', '.join(out)}: give faster motion to fit"] if out else []
 
 

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.closed_loop.search import Group, Search, taken_out
 from sim_gap.closed_loop.training.export import Exported, written_with_module
@@ -97,7 +96,7 @@ def replay_rms(
     recordings: Sequence[Recording],
     gains: Sequence[float] = (),
     longest: float = LONGEST_S,
-    apart: Sequence[NDArray[np.bool_]] = (),
+    apart: Sequence[Mask] = (),
 ) -> Array:
     """RMS of simulated minus measured positions over recordings [rad], (n,); NaN if none is commanded long enough.
 
@@ -105,8 +104,9 @@ def replay_rms(
     are set `apart` (K,) are not judged.
     """
     total, count = np.zeros(len(arm.joints)), np.zeros(len(arm.joints))
-    each = [1.0] * len(recordings), [np.zeros(len(recording.t), bool) for recording in recordings]
-    for recording, gain, left_out in zip(recordings, gains or each[0], apart or each[1], strict=True):
+    gains = gains or [1.0] * len(recordings)
+    apart = apart or [np.zeros(len(recording.t), bool) for recording in recordings]
+    for recording, gain, left_out in zip(recordings, gains, apart, strict=True):
         if recording.t[_commanded(recording, longest) - 1] - recording.t[0] < 2.0 * OPENING_S:
             continue
         t, positions, measured = replay(arm.with_gain(gain), recording, longest)

@@ -19,14 +19,18 @@ GAIN, ROTOR = 12.0, 0.02
 REAL = model_text(kp=GAIN, friction=0.15)
 
 
-@pytest.fixture(scope="module")
-def stated_too_heavy() -> tuple[Search, Fit]:
-    """A fit of gain and friction about a model whose rotors are four times too heavy."""
-    sim = load_model(mujoco.MjModel.from_xml_string(REAL.replace(f'armature="{ROTOR}"', f'armature="{4 * ROTOR}"')))
+def fitted_with(rotor: float) -> tuple[Search, Fit]:
+    """A fit of gain and friction about a model that states such rotors [kg·m²]."""
+    sim = load_model(mujoco.MjModel.from_xml_string(REAL.replace(f'armature="{ROTOR}"', f'armature="{rotor}"')))
     data = windows_of(sim.arm, [record(REAL, seed, 24.0, fast=2.0) for seed in (1, 2)], ["one", "two"])
     search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 4e-4))
     names = ("kp", "coulomb", "viscous")
     return search, improve(data, Fit(search.nominal, (names, names)), search.scales, 12)
+
+
+@pytest.fixture(scope="module")
+def stated_too_heavy() -> tuple[Search, Fit]:
+    return fitted_with(4 * ROTOR)
 
 
 def test_rotors_that_are_stated_too_heavy_are_found(stated_too_heavy) -> None:
@@ -40,12 +44,7 @@ def test_rotors_that_are_stated_too_heavy_are_found(stated_too_heavy) -> None:
 
 
 def test_rotors_that_are_right_stay_as_stated() -> None:
-    sim = load_model(mujoco.MjModel.from_xml_string(REAL))
-    data = windows_of(sim.arm, [record(REAL, seed, 24.0, fast=2.0) for seed in (1, 2)], ["one", "two"])
-    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 4e-4))
-    names = ("kp", "coulomb", "viscous")
-    fit = improve(data, Fit(search.nominal, (names, names)), search.scales, 12)
-    found, _ = settled(search, fit, lambda stage: None)
+    found, _ = settled(*fitted_with(ROTOR), lambda stage: None)
     assert not any("armature" in own for own in found.active)
 
 

@@ -90,6 +90,13 @@ def test_the_moments_before_and_after_a_touch_are_left_out_too() -> None:
     assert not touched(None, SIM.arm, Recording(t=t, position=q)).any()
 
 
+def test_an_arm_that_lies_still_on_it_touches() -> None:
+    t = np.arange(0.0, 4.0, 0.02)
+    still = np.tile([1.2, 0.1], (len(t), 1))
+    surface = Surface(1, TIP, float(tip_height(still)[0]), (0, 1))
+    assert touched(surface, SIM.arm, Recording(t=t, position=still)).all()
+
+
 def test_what_touches_does_not_count_in_windows(pressing) -> None:
     surface = find_surface(SIM.arm, pressing)
     labels = ["one", "two"]
