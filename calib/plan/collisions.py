@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
@@ -12,7 +11,7 @@ from armlink.model_file import Beside, compile_model, read_model
 from calib.arm.sweep_section import ParkedArm, sweep_section
 from calib.plan.choices import DEPTH, POINTS
 from calib.plan.types import Sweep, SweepPlan
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 
 PARKED = "parked "
 """What the names of bodies of an arm that is parked beside this one begin with, where it has a model of its own."""
@@ -73,7 +72,7 @@ class Geometry:
         """Collisions at a pose (n,) [rad], deepest first."""
         return [contact for contact in self._contacts(pose) if contact.bodies not in self._own]
 
-    def free(self, poses: Array) -> npt.NDArray[np.bool_]:
+    def free(self, poses: Array) -> Mask:
         """Poses (K, n) [rad] without collision, as a mask (K,)."""
         return np.array([not self.contacts(pose) for pose in poses], dtype=bool)
 

@@ -35,7 +35,7 @@ class Candidates:
         """Number of combinations, C."""
         return len(self.stops)
 
-    def kept(self, which: npt.NDArray[np.bool_]) -> "Candidates":
+    def kept(self, which: Mask) -> "Candidates":
         """These combinations alone."""
         return Candidates(self.joint, self.stops[which], self.poses[which], self.lever[which])
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import Signals
 from sim_gap.residuals.residual_set import ResidualSet
@@ -194,7 +194,7 @@ def _frictions(estimate: Estimate | None, data: ResidualSet) -> list[_Friction]:
     return out
 
 
-def _friction(s: Signals, row: Row, y: Array, valid: NDArray[np.bool_], blocks: NDArray[np.intp]) -> _Friction:
+def _friction(s: Signals, row: Row, y: Array, valid: Mask, blocks: NDArray[np.intp]) -> _Friction:
     """Friction from one recording's residual `y` at its `valid` samples, beside what rigid links may leave."""
     q, v, a, direction = (s.filtered(each)[valid, row[1]] for each in (s.q, s.v, s.a, s.direction))
     x = np.stack([direction, v, np.ones_like(q), np.sin(q), np.cos(q), a], axis=1)

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import Signals
 
@@ -70,7 +69,7 @@ class RigidFit:
         return np.asarray(np.log(1.0 - np.clip(self.explained, 0.0, 1.0) + FLOOR))
 
     @property
-    def strong(self) -> NDArray[np.bool_]:
+    def strong(self) -> Mask:
         """Whether the model says much of a joint's reading, (n,)."""
         share = self.own_share * np.maximum(self.scale, 1.0)
         return np.asarray((share > STRONG_SHARE) & (np.abs(self.correlation) > STRONG_CORRELATION))
@@ -116,7 +115,7 @@ def _covariances(model: Array, motion: Motion, springs: bool) -> Array:
     return np.asarray((columns * weight) @ columns.transpose(0, 2, 1))
 
 
-def _telling(motion: Motion) -> NDArray[np.bool_]:
+def _telling(motion: Motion) -> Mask:
     """Rows that are fitted at each joint, (K, n): friction at rest takes any value, which a motor has to hold.
 
     All rows of a sensor on the link, and of a joint that hardly moves.
@@ -139,7 +138,7 @@ def beside_slow_torques(arm: RigidArm, motion: Motion, fit: RigidFit) -> RigidFi
     return replace(fit, friction=friction)
 
 
-def _joints(grams: Array, unsigned: NDArray[np.bool_]) -> Array:
+def _joints(grams: Array, unsigned: Mask) -> Array:
     """The fields of `RigidFit` of J joints from their `_covariances` (J, 6, 6), (J, 6).
 
     A sensor on the link feels no gear, and a joint at rest no friction (`unsigned`): then the sign of those columns

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 
 CREEP = 0.01
 """Speed [rad/s] below which the sign of a velocity is not defined and friction may take any value."""
@@ -79,7 +78,7 @@ class RigidArm:
         return len(self.names)
 
     @cached_property
-    def carries(self) -> NDArray[np.bool_]:
+    def carries(self) -> Mask:
         """(n, n): whether joint i carries link j."""
         carries = np.eye(self.n, dtype=bool)
         for link in range(self.n):

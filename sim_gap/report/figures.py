@@ -7,7 +7,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.attribution.diagnosis import Diagnosis, Rollout
 from sim_gap.residuals.residual_set import ResidualSet
 
@@ -99,7 +99,7 @@ def stacked(data: ResidualSet, name: str) -> Array:
     return np.concatenate([s.filtered(getattr(s, name)) for s in data.signals])
 
 
-def thinned(valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+def thinned(valid: Mask) -> NDArray[np.intp]:
     """Indices of the samples that are drawn: some hundreds of the valid ones."""
     rows = np.flatnonzero(valid)
     return rows[:: max(1, len(rows) // POINTS)]

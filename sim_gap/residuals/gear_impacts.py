@@ -4,9 +4,8 @@ No inverse form follows an impact. Its samples are left out of the comparison, a
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.residuals.preprocess import Signals
 
 BEFORE_S, AFTER_S = 0.4, 0.6
@@ -17,7 +16,7 @@ LEAST_LEFT = 0.2
 """Share of a recording that must remain."""
 
 
-def near_impacts(s: Signals, channel: str, residual: Array) -> dict[int, NDArray[np.bool_]]:
+def near_impacts(s: Signals, channel: str, residual: Array) -> dict[int, Mask]:
     """Joints whose gear hits at their torque reversals, and the samples near those, (k,) each.
 
     `residual` is that of the link-side sensor `channel`, (k, n), at the rate of the comparison.

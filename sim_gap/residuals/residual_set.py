@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.residuals.gear_impacts import near_impacts
 from sim_gap.residuals.layout import Layout, Row, layout_of
 from sim_gap.residuals.preprocess import Signals
@@ -86,9 +86,9 @@ class ResidualSet:
         return layout.compared(out)
 
     @cached_property
-    def impacts(self) -> dict[int, NDArray[np.bool_]]:
+    def impacts(self) -> dict[int, Mask]:
         """Joints whose gear hits at torque reversals, and the samples near those, (K,) each."""
-        sensor, out = self.layout.sensor, dict[int, NDArray[np.bool_]]()
+        sensor, out = self.layout.sensor, dict[int, Mask]()
         first = 0
         for s, length in zip(self.signals if sensor else (), self.lengths, strict=False):
             part = slice(first, first + length)
@@ -102,9 +102,9 @@ class ResidualSet:
         return out
 
     @cached_property
-    def valid(self) -> dict[Row, NDArray[np.bool_]]:
+    def valid(self) -> dict[Row, Mask]:
         """Samples that count: read and not interpolated, away from gear impacts, and in motion for the motor row."""
-        out: dict[Row, list[NDArray[np.bool_]]] = {row: [] for row in self.rows}
+        out: dict[Row, list[Mask]] = {row: [] for row in self.rows}
         for s in self.signals:
             moving = sliding(s)
             for channel, joint in self.rows:
@@ -217,7 +217,7 @@ def residual_sets(train: Sequence[Signals], heldout: Sequence[Signals]) -> tuple
     return ResidualSet(tuple(train), layout), ResidualSet(tuple(heldout), layout)
 
 
-def sliding(s: Signals) -> NDArray[np.bool_]:
+def sliding(s: Signals) -> Mask:
     """Samples at which each joint slides before and after, so that its friction is fully developed, (k, n).
 
     Around rest and reversals friction builds up over some distance. If a joint hardly does anything else, these samples

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 
 LONGEST_S = 2.0
 """Longest time for which a reading may repeat [s]."""
@@ -22,9 +21,7 @@ class Stuck:
     seconds: float
 
 
-def stuck_intervals(
-    time: Array, model: Array, held: NDArray[np.bool_], t: Array, reading: Array
-) -> list[tuple[float, float]]:
+def stuck_intervals(time: Array, model: Array, held: Mask, t: Array, reading: Array) -> list[tuple[float, float]]:
     """Intervals of time [s] in which a joint's reading repeats although its torque changes.
 
     `model` is the nominal torque [N·m] at `time`, (K,); `reading` holds the finite values at `t`, (k,). At zero and at

@@ -4,9 +4,8 @@ from collections.abc import Collection, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.residuals.layout import Columns, Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.about import About, Values, about
@@ -64,7 +63,7 @@ class ColumnStore:
         return self
 
     @cached_property
-    def _close(self) -> "list[tuple[ColumnStore, NDArray[np.bool_]]]":
+    def _close(self) -> "list[tuple[ColumnStore, Mask]]":
         """Stores about estimates with the same poses, gravity and gains, and the joints with the same torque, (n,)."""
         stores = [store for store in (self.nominal, self.near) if store is not None]
         found = [(store, _alike(self.about, store.about)) for store in stores]
@@ -89,7 +88,7 @@ class ColumnStore:
         return None
 
     @cached_property
-    def other_torques(self) -> NDArray[np.bool_]:
+    def other_torques(self) -> Mask:
         """Joints whose torque about the estimate is not close to the nominal model's, (n,)."""
         pairs = [(one.signals.model, one.signals.read.model) for one in self.about]
         moved = [np.sqrt(np.mean((now - nominal) ** 2, axis=0)) for now, nominal in pairs]
@@ -227,7 +226,7 @@ class ColumnStore:
         return out
 
 
-def _alike(ours: Sequence[About], theirs: Sequence[About]) -> NDArray[np.bool_] | None:
+def _alike(ours: Sequence[About], theirs: Sequence[About]) -> Mask | None:
     """Joints with torques close in two estimates, (n,); None unless angles, gravity and gains are close."""
     same = np.ones(len(ours[0].motor_gain), bool)
     for one, other in zip(ours, theirs, strict=True):

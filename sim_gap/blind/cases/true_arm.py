@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.blind.cases.arms import Arm, perturbed
 
 
@@ -74,7 +73,7 @@ class TrueArm:
         return self.arm.n
 
     @property
-    def elastic(self) -> NDArray[np.bool_]:
+    def elastic(self) -> Mask:
         """Joints with two masses (those with elasticity or backlash), (n,) of bool."""
         return np.isfinite(self.stiffness)
 

@@ -4,10 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armlink.effect_catalogue import CATALOGUE
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.blind.cases.arms import Arm
 from sim_gap.blind.cases.scene import Scene, rms
 from sim_gap.blind.cases.true_arm import TrueArm
@@ -103,9 +102,7 @@ def motor_level(scene: Scene, random: np.random.Generator) -> Array:
     return np.maximum(MOTOR_LEAST, random.uniform(*SHARES) * rms(scene.torque + scene.rotor_torque))
 
 
-def pick(
-    wanted: Array, cap: float | Array, random: np.random.Generator, allowed: NDArray[np.bool_] | None = None
-) -> int | None:
+def pick(wanted: Array, cap: float | Array, random: np.random.Generator, allowed: Mask | None = None) -> int | None:
     """A joint with a wanted magnitude that is finite and within the cap; None if there is none."""
     fit = np.isfinite(wanted) & (wanted <= cap)
     if allowed is not None:

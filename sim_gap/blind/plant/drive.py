@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.plant.friction import Bristles, padded
 
@@ -150,7 +150,7 @@ class Drives:
 class _Cells:
     """Cells (arm, joint) of a mask in row order; `within(k)` gives those of the first k arms and their number."""
 
-    def __init__(self, mask: NDArray[np.bool_]) -> None:
+    def __init__(self, mask: Mask) -> None:
         self.rows, self.columns = np.nonzero(mask)
         self.all = (self.rows, self.columns)
         self._k, self._found = -1, (self.all, len(self.rows))

@@ -1,12 +1,11 @@
 """The rows' times: jitter of receipt, rows that repeat the one before, and rows that are missing."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from armlink.recording.corrections import TIME_UNITS, Corrections
 from armlink.recording.recording import Recording, slice_rows
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.checks.finding import Finding
 
 JITTER = 0.2
@@ -149,7 +148,7 @@ def find_dropped(recording: Recording) -> list[Finding]:
     return [Finding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)]
 
 
-def fast_rows(position: Array) -> NDArray[np.bool_]:
+def fast_rows(position: Array) -> Mask:
     """Rows at which some joint travels at least three of its smallest steps a row, over ten rows, (K,)."""
     span = 5
     fast = np.zeros(len(position), bool)

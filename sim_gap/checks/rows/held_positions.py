@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.rows.clock import fast_rows
 
@@ -29,12 +28,12 @@ def without_held(recording: Recording) -> tuple[Recording, list[Finding]]:
     return replace(recording, position=position, velocity=velocity), [found]
 
 
-def _repeats(values: Array) -> NDArray[np.bool_]:
+def _repeats(values: Array) -> Mask:
     """Rows in which all columns repeat the row before, (K,)."""
     return np.concatenate([[False], np.all(values[1:] == values[:-1], axis=1)])
 
 
-def filled(t: Array, values: Array, known: NDArray[np.bool_]) -> Array:
+def filled(t: Array, values: Array, known: Mask) -> Array:
     """Values (K, n), along straight lines between those that are `known` (K, n); columns without any are 0."""
     return np.column_stack(
         [np.interp(t, t[k], x[k]) if k.any() else np.zeros_like(t) for k, x in zip(known.T, values.T, strict=True)]
