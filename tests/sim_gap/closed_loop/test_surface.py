@@ -97,6 +97,21 @@ def test_an_arm_that_lies_still_on_it_touches() -> None:
     assert touched(surface, SIM.arm, Recording(t=t, position=still)).all()
 
 
+def test_an_arm_that_always_lies_in_one_pose_on_it_is_found_and_left_out() -> None:
+    """As coarse encoders show it: however deep the command is, the position is the same to the last digit."""
+    t = np.arange(0.0, 60.0, 0.02)
+    q = np.column_stack([-0.2 + 0.4 * np.sin(0.9 * t), 0.4 * np.sin(1.3 * t + 1.0)])
+    lies, pose = t % 15.0 > 12.5, np.array([0.5, 0.2])
+    q[lies] = pose
+    lever = -np.array([0.2 * np.cos(pose[0]) + TIP[0] * np.cos(pose.sum()), TIP[0] * np.cos(pose.sum())])
+    deep = np.where(lies, 0.45 * np.abs(np.sin(2.0 * t)), 0.0)[:, None]
+    jitter = 0.004 * np.random.default_rng(1).standard_normal(q.shape)
+    recording = Recording(t=t, position=q, position_command=q - deep * lever + jitter)
+    found = find_surface(SIM.arm, [recording])
+    assert found is not None
+    assert touched(found, SIM.arm, recording)[lies].all()
+
+
 def test_what_touches_does_not_count_in_windows(pressing) -> None:
     surface = find_surface(SIM.arm, pressing)
     labels = ["one", "two"]
