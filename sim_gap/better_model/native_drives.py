@@ -1,9 +1,11 @@
 """Gain, limit, lag and delay of drives in the motors that a model has: MuJoCo's own fields, which run in batch."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from gcomp.arrays import Array
 
 DRIVE = {"actuator.gain": "gain", "actuator.saturation": "limit", "actuator.lag": "time", "actuator.delay": "time"}
 """Effects that a motor holds → their parameter."""
@@ -46,3 +48,30 @@ def put_delay(actuator: Any, delay: float) -> None:
     if delay >= LEAST_DELAY_S:
         actuator.delay = delay
         actuator.nsample = min(MOST_SAMPLES, int(np.ceil(delay / LEAST_STEP_S)) + 2)
+
+
+def hold(model: Any, data: Any, actuators: Sequence[int], commands: Array) -> None:
+    """Let actuators be as if each had been given its command (n,) for long, the joints at rest where they are.
+
+    A simulation that begins takes every earlier command for 0: with a delay, a lag or a slew limit it first drives the
+    joint there. The integral part of a PID holds what gravity and springs ask for. `data` has its positions; the
+    commands are written to `ctrl`.
+    """
+    import mujoco
+
+    mujoco.mj_forward(model, data)
+    asked_for = data.qfrc_bias - data.qfrc_passive
+    pid, lags = mujoco.mjtDyn.mjDYN_PID, (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    for i, command in zip(actuators, commands.tolist(), strict=True):
+        data.ctrl[model.actuator_ctrladr[i]] = command
+        if count := int(model.actuator_history[i, 0]):
+            mujoco.mj_initCtrlHistory(model, data, i, None, np.full((count, 1), command))
+        state = data.act[model.actuator_actadr[i] : model.actuator_actadr[i] + model.actuator_actnum[i]]
+        kind = mujoco.mjtDyn(int(model.actuator_dyntype[i]))
+        if kind in lags or (kind == pid and model.actuator_dynprm[i, 1] > 0.0):
+            state[0] = command
+        if kind == pid and (ki := model.actuator_gainprm[i, 0]) > 0.0:
+            gear, joint = model.actuator_gear[i, 0], model.actuator_trnid[i, 0]
+            error = command - gear * data.qpos[model.jnt_qposadr[joint]]
+            kp = -model.actuator_biasprm[i, 1]
+            state[-1] = (asked_for[model.jnt_dofadr[joint]] / gear - kp * error) / ki

@@ -19,10 +19,11 @@ import numpy as np
 
 from armlink.recording.files import load_recording
 from sim_gap.attribution.diagnose import diagnose
+from sim_gap.better_model.native_drives import hold
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.training.draws import draw
 from sim_gap.closed_loop.training.posterior import batched
-from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, _actuator, replay
+from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, actuator_of, replay
 
 AGREE = 0.05
 """Largest difference of the RMS gap to the measured position between both simulators, over all joints."""
@@ -37,9 +38,10 @@ def warp_replay(model: Any, joints: list[int], recording: Any, rows: int) -> np.
     data = mujoco.MjData(model)
     adr = model.jnt_qposadr[joints]
     data.qpos[adr] = recording.position[0]
-    mujoco.mj_forward(model, data)
+    drives = [actuator_of(model, joint) for joint in joints]
+    hold(model, data, drives, recording.position_command[0])
+    controls = model.actuator_ctrladr[drives]
     m, d = mjw.put_model(model), mjw.put_data(model, data)
-    drive = [_actuator(model, joint) for joint in joints]
     dt, times = float(model.opt.timestep), recording.t[:rows]
     out, at = np.empty((rows, len(joints))), 0
     ctrl = np.zeros((1, d.ctrl.shape[1]), np.float32)
@@ -50,7 +52,7 @@ def warp_replay(model: Any, joints: list[int], recording: Any, rows: int) -> np.
             while at + 1 < rows and times[at + 1] <= now + 1e-9:
                 out[at + 1] = q
                 at += 1
-        ctrl[0, drive] = recording.position_command[at]
+        ctrl[0, controls] = recording.position_command[at]
         wp.copy(d.ctrl, wp.array(ctrl, dtype=float))
         mjw.step(m, d)
     out[0], out[at + 1 :] = recording.position[0], d.qpos.numpy()[0, adr]
@@ -69,7 +71,7 @@ def batch_seconds(
     m = mjw.put_model(model, batch_sizes=dict.fromkeys(sized, worlds))
     d = mjw.make_data(model, nworld=worlds)
     dofs = [int(model.jnt_dofadr[joint]) for joint in joints]
-    drive = [_actuator(model, joint) for joint in joints]
+    drives = [actuator_of(model, joint) for joint in joints]
     values = {name: np.array(getattr(m, name).numpy()) for name in sized}
     for w, row in enumerate(rows):
         for j, joint in enumerate(names):
@@ -78,8 +80,8 @@ def batch_seconds(
                 if own[p] is not None:
                     values[field][w, dofs[j]] = own[p]
             if own["kp"] is not None:
-                values["actuator_gainprm"][w, drive[j], 0] = own["kp"]
-                values["actuator_biasprm"][w, drive[j], 1] = -own["kp"]
+                values["actuator_gainprm"][w, drives[j], 0] = own["kp"]
+                values["actuator_biasprm"][w, drives[j], 1] = -own["kp"]
     for name, x in values.items():
         getattr(m, name).assign(x)
     wp.copy(d.ctrl, wp.array(np.full(d.ctrl.shape, 0.3, np.float32), dtype=float))

@@ -10,6 +10,7 @@ import numpy as np
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
+from sim_gap.better_model.native_drives import hold
 from sim_gap.closed_loop.search import Group, Search, taken_out
 from sim_gap.closed_loop.training.export import Exported, written_with_module
 from sim_gap.model.load import SimModel
@@ -33,9 +34,9 @@ class Simulated:
         if gain == 1.0:
             return self
         model = copy(self.model)
-        drive = [_actuator(model, joint) for joint in self.joints]
-        model.actuator_gainprm[drive, 0] *= gain  # of a PID actuator the integral part
-        model.actuator_biasprm[drive, 1] *= gain
+        drives = [actuator_of(model, joint) for joint in self.joints]
+        model.actuator_gainprm[drives, 0] *= gain  # of a PID actuator the integral part
+        model.actuator_biasprm[drives, 1] *= gain
         return replace(self, model=model)
 
 
@@ -58,8 +59,8 @@ def less(sim: SimModel, search: Search, made: Exported, groups: Sequence[Group])
 def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> tuple[Array, Array, Array]:
     """Times (K,), simulated and measured positions (K, n) of one recording while it is commanded.
 
-    The model starts at the measured position at rest; each joint's actuator gets the command held from row to row, for
-    at most `longest` [s].
+    The model starts at the measured position at rest, as if the first command had been there for long; each joint's
+    actuator gets the command held from row to row, for at most `longest` [s].
     """
     import mujoco
 
@@ -70,7 +71,9 @@ def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> 
     data = mujoco.MjData(model)
     adr = model.jnt_qposadr[joints]
     data.qpos[adr] = recording.position[0]
-    drive = [_actuator(model, joint) for joint in joints]
+    drives = [actuator_of(model, joint) for joint in joints]
+    hold(model, data, drives, given[0])
+    controls = model.actuator_ctrladr[drives]
     dt = float(model.opt.timestep)
     times, out = recording.t[:rows], np.empty((rows, len(joints)))
     at = 0
@@ -81,7 +84,7 @@ def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> 
             while at + 1 < rows and times[at + 1] <= now + 1e-9:
                 out[at + 1] = data.qpos[adr]
                 at += 1
-            data.ctrl[drive] = given[at]
+            data.ctrl[controls] = given[at]
             mujoco.mj_step(model, data)
     finally:
         mujoco.set_mjcb_passive(None)
@@ -123,10 +126,9 @@ def _commanded(recording: Recording, longest: float) -> int:
     return int(np.argmax(missing)) if missing.any() else len(recording.t)
 
 
-def _actuator(model: Any, joint: int) -> int:
-    """Place in `ctrl` of the position command of the actuator that drives a joint."""
+def actuator_of(model: Any, joint: int) -> int:
+    """Number of the actuator that drives a joint."""
     import mujoco
 
     own = (model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
-    index = int(np.flatnonzero(own)[0])
-    return int(np.reshape(getattr(model, "actuator_ctrladr", np.arange(model.nu)), -1)[index])
+    return int(np.flatnonzero(own)[0])
