@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
+from sim_gap.closed_loop.tracks import in_one_order, period_of
 from sim_gap.model.rigid_body import RigidArm, into
 
 LOOKED_HZ = 10.0
@@ -114,27 +115,25 @@ class _Looked:
 
     @classmethod
     def of(cls, arm: RigidArm, recordings: Sequence[Recording]) -> "_Looked":
-        positions, commands, speeds = [], [], []
-        for recording in recordings:
+        parts: list[tuple[Array, ...]] = []
+        for recording in (recordings[number] for number in in_one_order(recordings)):
             assert recording.position_command is not None
             there = np.isfinite(recording.position_command).all(1) & np.isfinite(recording.position).all(1)
-            stride = max(1, round(1.0 / LOOKED_HZ / float(np.median(np.diff(recording.t)))))
+            stride = max(1, round(1.0 / LOOKED_HZ / period_of(recording)))
             rows = np.flatnonzero(there)[::stride]
             if len(rows) < 3:
                 continue
-            positions.append(recording.position[rows])
-            commands.append(recording.position_command[rows])
-            speeds.append(np.gradient(recording.position[rows], recording.t[rows], axis=0))
-        if not positions:
+            speed = np.gradient(recording.position[rows], recording.t[rows], axis=0)
+            direction = np.column_stack([_direction(speed[:, j]) for j in range(arm.n)])
+            parts.append((recording.position[rows], recording.position_command[rows], speed, direction))
+        if not parts:
             nothing = np.empty((0, arm.n))
             return cls(arm, nothing, nothing, [], nothing)
-        q, command, v = (np.vstack(parts) for parts in (positions, commands, speeds))
+        q, command, v, direction = (np.vstack(part) for part in zip(*parts, strict=True))
         gravity = arm.torque(q, np.zeros_like(q), np.zeros_like(q))
         besides = []
         for j in range(arm.n):
-            own = np.column_stack(
-                [np.ones(len(q)), _direction(v[:, j]), np.tanh(v[:, j] / REST), v[:, j], gravity[:, j]]
-            )
+            own = np.column_stack([np.ones(len(q)), direction[:, j], np.tanh(v[:, j] / REST), v[:, j], gravity[:, j]])
             basis, size, _ = np.linalg.svd(own, full_matrices=False)
             besides.append(basis[:, size > 1e-9 * size[0]])
         left = np.column_stack([e - b @ (b.T @ e) for e, b in zip((command - q).T, besides, strict=True)])

@@ -1,6 +1,6 @@
 """Recordings of commanded and measured positions on an even time base, with the model's torques along both."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,17 @@ class Track:
 def period_of(recording: Recording) -> float:
     """Median time from row to row [s]."""
     return float(np.median(np.diff(recording.t)))
+
+
+def in_one_order(recordings: Sequence[Recording]) -> list[int]:
+    """Numbers of recordings in an order that is the same however they were given."""
+
+    def content(number: int) -> tuple[float, ...]:
+        recording = recordings[number]
+        command = np.nansum(recording.position_command) if recording.position_command is not None else 0.0
+        return float(len(recording.t)), float(np.nansum(recording.position)), float(command)
+
+    return sorted(range(len(recordings)), key=content)
 
 
 def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Track:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.closed_loop.surface import Surface
-from sim_gap.closed_loop.tracks import Track, period_of, track_of
+from sim_gap.closed_loop.tracks import Track, in_one_order, period_of, track_of
 from sim_gap.model.rigid_body import RigidArm
 
 STEP_S = 0.0051
@@ -108,7 +108,8 @@ def windows_of(
     scales: Sequence[float] = (),
     surface: Surface | None = None,
 ) -> Windows:
-    """Cut recordings into windows. Raises BadInput for one that holds no commanded position.
+    """Cut recordings into windows, the same however they are ordered. Raises BadInput for one that holds no commanded
+    position.
 
     `step` is the simulation's [s], by default a whole fraction of the recordings' period; `scales` are the controller's
     gains in each recording relative to the first, by default 1; what touches the `surface` does not count.
@@ -118,8 +119,8 @@ def windows_of(
     stride = max(1, math.ceil(max(period, 1.0 / JUDGED_HZ) / dt - 1e-6))
     warm, length = (stride * round(s / dt / stride) for s in (WARM_S, WINDOW_S))
     parts: list[dict[str, Array]] = []
-    for number, (recording, label) in enumerate(zip(recordings, labels, strict=True)):
-        track = track_of(arm, recording, label, dt)
+    for number in in_one_order(recordings):
+        track = track_of(arm, recordings[number], labels[number], dt)
         if surface is not None:
             track.seen[surface.touched(arm, track.t, track.signals["q"])] = 0.0
         parts += _cut(arm, track, number, warm, length, stride)

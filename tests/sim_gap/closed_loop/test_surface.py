@@ -14,7 +14,7 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.positions.notes import _touching
 from sim_gap.closed_loop.surface import RELEASE_S, Surface, find_surface, touched
 from sim_gap.closed_loop.training import replay as replays
-from sim_gap.closed_loop.windows import windows_of
+from sim_gap.closed_loop.windows import thinned, windows_of
 from sim_gap.model.load import load_model
 
 HEIGHT, TIP = -0.2, np.array([0.16, 0.0, 0.0])
@@ -110,6 +110,19 @@ def test_an_arm_that_always_lies_in_one_pose_on_it_is_found_and_left_out() -> No
     found = find_surface(SIM.arm, [recording])
     assert found is not None
     assert touched(found, SIM.arm, recording)[lies].all()
+
+
+def test_surface_and_windows_do_not_depend_on_the_order_of_recordings(pressing) -> None:
+    three = [*pressing, record(REAL, 3, 30.0)]
+    one, other = (find_surface(SIM.arm, each) for each in (three, three[::-1]))
+    assert one.height == other.height
+    np.testing.assert_array_equal(one.point, other.point)
+    ahead, back = (
+        windows_of(SIM.arm, each, labels) for each, labels in ((three, ["a", "b", "c"]), (three[::-1], ["c", "b", "a"]))
+    )
+    np.testing.assert_array_equal(ahead.measured, back.measured)
+    np.testing.assert_array_equal(ahead.recording, 2 - back.recording)
+    np.testing.assert_array_equal(thinned(ahead, 5).measured, thinned(back, 5).measured)
 
 
 def test_what_touches_does_not_count_in_windows(pressing) -> None:
