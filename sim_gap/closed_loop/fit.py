@@ -6,17 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.closed_loop.coordinates import FARTHEST, LOGARITHMIC, moved, relative, with_gain
 from sim_gap.closed_loop.parameters import PARAMETERS, Scales
 from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.windows import Windows, of_joints
 
-LOGARITHMIC = ("kp", "ki", "limit", "slew", "stribeck_velocity", "gain")
 DAMPINGS = (1e-6, 1e-2, 0.1, 1.0, 10.0, 100.0)
 """Levenberg-Marquardt dampings tried together in every step."""
 STILL = 1e-3
 """Relative fall of the cost below which a joint's fit ends."""
-FARTHEST = 1.5
-"""Logarithm of the largest factor of one step of a fit."""
 DIFFERENCE = 0.02
 """Step of a finite difference, in units of the size at which a parameter is tried."""
 
@@ -39,6 +37,14 @@ class Fit:
     def with_values(self, **values: Array) -> "Fit":
         """The same with other values of some parameters."""
         return replace(self, point={**self.point, **values})
+
+
+def coordinate(fit: Fit, scales: Scales, joint: int, name: str) -> float:
+    """A fit's value of a parameter in its own coordinate; `joint` is −1 for the whole arm."""
+    value = float(fit.point[name][max(joint, 0)])
+    if joint < 0:
+        return value
+    return float(np.log(value)) if name in LOGARITHMIC else value / float(scales.of(name)[joint])
 
 
 def residuals(data: Windows, values: Mapping[str, Array]) -> Array:
@@ -66,7 +72,12 @@ def evaluate(data: Windows, fit: Fit) -> Fit:
 def jacobian(
     data: Windows, fit: Fit, scales: Scales, names: Sequence[Sequence[str]], shared: Sequence[str] = ()
 ) -> tuple[Array, list[Array]]:
-    """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the coordinates of `moved`."""
+    """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the parameters' own coordinates.
+
+    That by a gain is the difference by the gain and all that goes with it, less the derivatives by the latter: their
+    common scale changes next to nothing of the motion, and differences of each alone, which sticking and slipping
+    roughen, do not add up to that.
+    """
     width = max((len(each) for each in names), default=0)
     steps = [[_difference(name, fit.point[name][j], scales, j) for name in own] for j, own in enumerate(names)]
     points = [dict(fit.point)]
@@ -75,34 +86,26 @@ def jacobian(
         for j, own in enumerate(names):
             if k < len(own):
                 point[own[k]][j] = moved(own[k], fit.point[own[k]][j], steps[j][k], scales, j)
+                for name in with_gain(own) if own[k] == "kp" else ():
+                    point[name][j] *= np.exp(steps[j][k])
         points.append(point)
     points += [{**fit.point, name: fit.point[name] + DIFFERENCE} for name in shared]
     all_residuals = residuals(data, batch(points))
     now, out = all_residuals[0], []
-    for j in range(len(names)):
+    for j, own in enumerate(names):
         columns = [(all_residuals[1 + k][:, j] - now[:, j]) / step for k, step in enumerate(steps[j])]
+        for name in with_gain(own):
+            share = relative(name, fit.point[name][j], scales, j)
+            columns[own.index("kp")] -= share * columns[own.index(name)]
         columns += [(all_residuals[1 + width + s][:, j] - now[:, j]) / DIFFERENCE for s in range(len(shared))]
         out.append(np.stack(columns) if columns else np.zeros((0, *now[:, j].shape)))
     return now, out
 
 
 def _difference(name: str, value: float, scales: Scales, joint: int) -> float:
-    """Step of a finite difference in the coordinate of `moved`, away from the highest value where that is near."""
+    """Step of a finite difference in the parameter's own coordinate, away from the highest value where that is near."""
     step = 0.01 if name in LOGARITHMIC else DIFFERENCE
     return -step if moved(name, value, step, scales, joint) >= PARAMETERS[name].high else step
-
-
-def moved(name: str, value: float, step: float, scales: Scales, joint: int, farthest: float = FARTHEST) -> float:
-    """A parameter's value after a step in its own coordinate: relative for gains, else in units of its trial size.
-
-    `farthest` is the logarithm of the largest factor on a gain.
-    """
-    if name in LOGARITHMIC:
-        new = value * float(np.exp(np.clip(step, -farthest, farthest)))
-    else:
-        new = value + step * float(scales.of(name)[joint])
-    low, high = PARAMETERS[name].low, PARAMETERS[name].high
-    return float(np.clip(new, low, high))
 
 
 def improve(data: Windows, fit: Fit, scales: Scales, iterations: int = 6) -> Fit:
@@ -164,13 +167,27 @@ def _stepped(
     scales: Scales,
 ) -> dict[str, Array]:
     """The point after one damped Gauss-Newton step."""
+    return stepped(data, fit, scales, names, *solve(names, len(fit.shared), now, slopes, damping))
+
+
+def stepped(
+    data: Windows, fit: Fit, scales: Scales, names: Sequence[Sequence[str]], steps: Sequence[Array], common: Array
+) -> dict[str, Array]:
+    """The point after steps of each joint's own parameters and of the shared ones.
+
+    What goes with a gain is scaled as the gain is and moved by what its step is more than that: however far the scale
+    moves, ratios stay.
+    """
     point = {name: values.copy() for name, values in fit.point.items()}
-    steps, common = solve(names, len(fit.shared), now, slopes, damping)
-    for j, (own, step) in enumerate(zip(names, steps, strict=True)):
-        for name, size in zip(own, step, strict=True):
-            point[name][j] = moved(name, float(point[name][j]), float(size), scales, j)
-    for name, size in zip(fit.shared, common, strict=True):
-        point[name] = np.clip(point[name] + float(size), *data.ranges[name])
+    for j, (own, each) in enumerate(zip(names, steps, strict=True)):
+        step = dict(zip(own, each.tolist(), strict=True))
+        scale = float(np.clip(step.get("kp", 0.0), -FARTHEST, FARTHEST))
+        for name in set(with_gain(own)).difference(LOGARITHMIC):
+            step[name] += (np.exp(scale) - 1.0 - scale) * relative(name, point[name][j], scales, j)
+        for name, size in step.items():
+            point[name][j] = moved(name, float(point[name][j]), size, scales, j)
+    for name, size in zip(fit.shared, common.tolist(), strict=True):
+        point[name] = np.clip(point[name] + size, *data.ranges[name])
     return point
 
 

@@ -49,6 +49,10 @@ PARAMETERS = {
 }
 
 
+WITH_TORQUE = ("kp", "ki", "kd", "limit", "coulomb", "viscous", "stribeck", "back_emf", "armature", "spring", "offset")
+"""Parameters that go with the scale of all torques; the others are ratios, times or velocities."""
+
+
 @dataclass(frozen=True)
 class LoopEffect:
     """An effect of one joint: its parameters here, and how each is called in an answer."""

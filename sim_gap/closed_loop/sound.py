@@ -11,7 +11,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from gcomp.arrays import Array
-from sim_gap.closed_loop.fit import Fit, jacobian, moved
+from sim_gap.closed_loop.coordinates import moved
+from sim_gap.closed_loop.fit import Fit, jacobian
 from sim_gap.closed_loop.judge import rms_on
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.windows import Windows
@@ -46,7 +47,7 @@ class Sound:
 
 
 def errors_of(search: Search) -> list[dict[str, float]]:
-    """Standard deviation of each parameter of a sound arm in its own coordinate (`fit.moved`), of joints and links."""
+    """Standard deviation of each parameter of a sound arm in its own coordinate, of joints and links."""
     data, nominal, scales = search.data, search.nominal, search.scales
     friction = np.minimum(FRICTION_NM, FRICTION_SHARE * scales.torque)
     deviation = {

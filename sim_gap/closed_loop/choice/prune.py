@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_gap.closed_loop.fit import LOGARITHMIC, Fit, improve, jacobian
+from sim_gap.closed_loop.coordinates import LOGARITHMIC
+from sim_gap.closed_loop.fit import Fit, improve, jacobian
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import Search, acts, effects_at, merged, only, price, without
 

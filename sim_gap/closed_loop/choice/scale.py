@@ -12,12 +12,11 @@ import numpy as np
 
 from sim_gap.closed_loop.columns import UNIT
 from sim_gap.closed_loop.fit import Fit, improve
+from sim_gap.closed_loop.parameters import WITH_TORQUE
 from sim_gap.closed_loop.search import Search
 
 SHARES = 0.7, 0.4
 """Scales at which a fit begins again, over its own."""
-WITH_TORQUE = ("kp", "ki", "kd", "limit", "coulomb", "viscous", "stribeck", "back_emf", "armature", "spring", "offset")
-"""Parameters that go with the scale; the others are ratios, times or velocities."""
 ITERATIONS = 12
 ROTORS = "actuator.rotor_inertia"
 

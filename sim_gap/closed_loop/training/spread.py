@@ -11,18 +11,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import eigh
 from scipy.stats import norm, t
 
 from gcomp.arrays import Array
 from sim_gap.closed_loop.choice.doubt import LEAST_FREEDOM
 from sim_gap.closed_loop.columns import UNIT
-from sim_gap.closed_loop.fit import FARTHEST, LOGARITHMIC, Fit, jacobian, moved
+from sim_gap.closed_loop.coordinates import FARTHEST, moved, relative
+from sim_gap.closed_loop.fit import Fit, coordinate
 from sim_gap.closed_loop.parameters import PARAMETERS
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.sound import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
 from sim_gap.closed_loop.training.alternatives import Alternative, quantiles
+from sim_gap.closed_loop.training.jackknife import jackknifed, shortened, terms_of
 from sim_gap.closed_loop.training.limits import LIMITS, Unreached
 
 SYSTEMATIC = 0.02
@@ -37,10 +37,6 @@ LOOSE = 0.35
 """Relative standard deviation of a gain from which its scale is not decided."""
 WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
-ALONE = 0.03
-"""Share of the information about a direction that the others are taken to have at least, without a group."""
-ROUNDING = 1e-12
-"""Information that every direction has, as a share of that about a parameter by itself."""
 ANYTHING = float(np.log(1e3))
 """Logarithm of the factor to either side of a gain of which nothing is known."""
 LEAST = 1e-8
@@ -53,8 +49,8 @@ SHARE = 0.975
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of the parameters in their own coordinates (`fit.moved`) about the fit and about those without an
-    effect that is in doubt, and the limits that no recording reaches."""
+    """Covariance of the parameters in their own coordinates about the fit and about those without an effect that is in
+    doubt, and the limits that no recording reaches."""
 
     names: list[tuple[int, str]]
     """Joint (−1: whole arm) and name."""
@@ -74,16 +70,16 @@ def covariance(search: Search, fit: Fit) -> Covariance:
     It counts how far they would move if all that may be off in a sound arm were fitted beside them.
     """
     free = freed(search, fit)
-    terms = _terms(search, free)
+    terms = terms_of(search, free)
     known = _stated(search, fit, terms.names)
     inverse = np.linalg.inv(terms.squares.sum(0) + known)
-    aside = inverse @ terms.scores.sum(0)
+    aside = shortened(search, free, terms, known, -inverse @ terms.scores.sum(0), np.ones(search.data.count, bool))
     matrix = inverse @ known @ inverse + np.outer(aside, aside)
-    matrix += _jackknifed(terms, known, np.arange(search.data.count))
+    matrix += jackknifed(search, free, terms, known, np.arange(search.data.count))
     number = len(np.unique(search.data.recording))
     if number > 1:
         few = float(t.ppf(SHARE, max(number - 1, LEAST_FREEDOM)) / norm.ppf(SHARE))
-        matrix += few**2 * _jackknifed(terms, known, search.data.recording)
+        matrix += few**2 * jackknifed(search, free, terms, known, search.data.recording)
     told = [k for k, (j, name) in enumerate(terms.names) if _told(fit, j, name)]
     names = [terms.names[k] for k in told]
     matrix = matrix[np.ix_(told, told)]
@@ -103,7 +99,7 @@ def covariance_within(search: Search, fit: Fit) -> Covariance:
 
     Directions that the windows hardly show are held.
     """
-    terms = _terms(search, fit)
+    terms = terms_of(search, fit)
     bread, size, count = terms.squares.sum(0), len(terms.names), search.data.count
     scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
     held = np.diag([1e-4] * size)
@@ -134,32 +130,6 @@ def _open(search: Search, fit: Fit, joint: int, errors: Mapping[str, float]) -> 
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Terms:
-    """Normal equations of each window, at all joints; of W windows and K parameters."""
-
-    names: list[tuple[int, str]]
-    squares: Array
-    """(W, K, K)."""
-    scores: Array
-    """(W, K)."""
-
-
-def _terms(search: Search, fit: Fit) -> _Terms:
-    now, slopes = jacobian(search.data, fit, search.scales, fit.active, fit.shared)
-    names = [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
-    starts = np.concatenate([[0], np.cumsum([len(own) for own in fit.active])]).astype(int)
-    size, count = len(names), search.data.count
-    squares, scores = np.zeros((count, size, size)), np.zeros((count, size))
-    for j, x in enumerate(slopes):
-        r = now[:, j]
-        weight = float(search.samples[j]) / max(float((r**2).sum()), 1e-300)
-        index = np.concatenate([np.arange(starts[j], starts[j + 1]), np.arange(starts[-1], size)]).astype(int)
-        squares[np.ix_(np.arange(count), index, index)] += weight * np.einsum("atw,btw->wab", x, x)
-        scores[:, index] += weight * np.einsum("atw,tw->wa", x, r)
-    return _Terms(names, squares, scores)
-
-
 def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
     """Inverse covariance of the parameters before any recording, (K, K).
 
@@ -179,29 +149,12 @@ def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array
     return np.linalg.inv(np.outer(sizes, sizes) * np.where(together, ALIKE, 0.0) + np.diag(sizes**2 * (1.0 - ALIKE)))
 
 
-def _jackknifed(terms: _Terms, known: Array, groups: NDArray[np.intp]) -> Array:
-    """Covariance by leaving out one group of windows after the other, (K, K).
-
-    Where nearly all that is known of a direction is in one group, such as the limit of a speed that is reached in a
-    single motion, the step of the others would be noise over nothing.
-    """
-    squares, scores = terms.squares.sum(0) + known, terms.scores.sum(0)
-    scale = 1.0 / np.sqrt(np.diag(squares))
-    least = ROUNDING * np.eye(len(known))
-    whole = squares * scale * scale[:, None] + least
-    labels, steps = np.unique(groups), []
-    for own in (groups == label for label in labels):
-        others = (squares - terms.squares[own].sum(0)) * scale * scale[:, None] + least
-        told, directions = eigh(others, whole)
-        step = directions.T @ (scale * (terms.scores[own].sum(0) - scores)) / np.maximum(told, ALONE)
-        steps.append(scale * (directions @ step))
-    apart = np.stack(steps) - np.mean(steps, axis=0)
-    return np.asarray((len(labels) - 1) / len(labels) * apart.T @ apart)
-
-
 def _systematic(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
-    own = np.array([1.0 if name in LOGARITHMIC else abs(coordinate(search, fit, j, name)) for j, name in names])
-    return np.diag((SYSTEMATIC * own) ** 2)
+    own = [
+        coordinate(fit, search.scales, j, name) if j < 0 else relative(name, fit.point[name][j], search.scales, j)
+        for j, name in names
+    ]
+    return np.diag((SYSTEMATIC * np.array(own)) ** 2)
 
 
 def _besides(search: Search, names: Sequence[tuple[int, str]]) -> Array:
@@ -212,23 +165,14 @@ def _besides(search: Search, names: Sequence[tuple[int, str]]) -> Array:
     return np.diag(np.square(own))
 
 
-def coordinate(search: Search, fit: Fit, joint: int, name: str) -> float:
-    """A parameter's value in its own coordinate, in which `fit.moved` steps."""
-    if joint < 0:
-        return float(fit.point[name][0])
-    if name in LOGARITHMIC:
-        return float(np.log(fit.point[name][joint]))
-    return float(fit.point[name][joint]) / float(search.scales.of(name)[joint])
-
-
 def shifted(search: Search, fit: Fit, spread: Covariance, joint: int, name: str) -> tuple[Array, Array]:
     """Where the other fits have a parameter, from where the fit has it, in its own coordinate, and their odds.
 
     Fits that have no such effect say nothing of its size.
     """
-    own = coordinate(search, fit, joint, name)
+    own = coordinate(fit, search.scales, joint, name)
     told = [
-        (coordinate(search, other.fit, joint, name) - own, other.odds)
+        (coordinate(other.fit, search.scales, joint, name) - own, other.odds)
         for other in spread.others
         if other.joint in (joint, -1) and name in (other.fit.active[joint] if joint >= 0 else other.fit.shared)
     ]

@@ -16,13 +16,14 @@ from sim_gap.closed_loop.choice.candidates import _explained, ranked
 from sim_gap.closed_loop.choice.compete import _shared_round, select
 from sim_gap.closed_loop.columns import shared_effects, with_columns
 from sim_gap.closed_loop.controller import _from_grid, nominal_controller, nominal_point, scales_of
-from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, jacobian
+from sim_gap.closed_loop.coordinates import relative
+from sim_gap.closed_loop.fit import Fit, batch, coordinate, evaluate, improve, jacobian, residuals
 from sim_gap.closed_loop.identify import _frozen, not_worse
-from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
+from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, WITH_TORQUE, Scales
 from sim_gap.closed_loop.search import PRICE, Search
 from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.tracks import held_command
-from sim_gap.closed_loop.training import actuators, export, spread
+from sim_gap.closed_loop.training import actuators, export, jackknife, spread
 from sim_gap.closed_loop.training import replay as replays
 from sim_gap.closed_loop.windows import WARM_S, Windows, of_windows, thinned_moving, windows_of
 from sim_gap.effects.base import tilted
@@ -91,6 +92,20 @@ def test_a_parameters_slope_is_that_at_its_value(data: Windows) -> None:
             ends.append(simulate(data, batch([values]))[0, :, j] * data.weight[:, j])
         expected = (ends[0] - ends[1]) / 2e-4 * 0.2  # in units of the size at which it is tried
         assert np.linalg.norm(slopes[j][0] - expected) < 0.08 * np.linalg.norm(expected)
+
+
+def test_slopes_add_up_to_that_by_the_common_scale_of_all_torques(data: Windows) -> None:
+    """Sticking and slipping roughen each difference: of friction and gain alone they would add up to much more."""
+    scales, names = scales_of(data), ("kp", "coulomb", "viscous", "armature", "delay")
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    fit = Fit(nominal_point(data, nominal_controller(sim)), (names, names))
+    _, slopes = jacobian(data, fit, scales, fit.active)
+    scaled = {name: values * (np.exp(0.01) if name in WITH_TORQUE else 1.0) for name, values in fit.point.items()}
+    gaps = residuals(data, batch([fit.point, scaled]))
+    for j in range(2):
+        expected = (gaps[1] - gaps[0])[:, j] / 0.01
+        shares = [relative(name, fit.point[name][j], scales, j) if name in WITH_TORQUE else 0.0 for name in names]
+        np.testing.assert_allclose(np.tensordot(shares, slopes[j], 1), expected, atol=1e-12)
 
 
 def test_a_parameter_at_its_highest_value_has_a_slope_too(data: Windows) -> None:
@@ -227,8 +242,8 @@ def test_what_nothing_can_show_is_left_out(gravity: float, off: bool, frozen: se
 def test_a_coefficient_of_the_whole_arm_is_one_and_a_joints_is_in_its_own_scale() -> None:
     fit = SimpleNamespace(point={"tilt.x": np.array([0.03]), "coulomb": np.array([0.5, 0.8])})
     search = SimpleNamespace(scales=SimpleNamespace(of=lambda name: np.array([0.1, 0.2])))
-    assert spread.coordinate(search, fit, -1, "tilt.x") == 0.03
-    assert spread.coordinate(search, fit, 1, "coulomb") == pytest.approx(4.0)
+    assert coordinate(fit, search.scales, -1, "tilt.x") == 0.03
+    assert coordinate(fit, search.scales, 1, "coulomb") == pytest.approx(4.0)
 
 
 def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -> None:
@@ -246,7 +261,9 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
     x = random.normal(size=(1, 50, 400))
     noise = 0.01 * random.normal(size=(50, 400))
     residual = (noise - x[0] * (x[0] * noise).sum() / (x**2).sum())[:, None]  # what the best value leaves
-    monkeypatch.setattr(spread, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
+    monkeypatch.setattr(jackknife, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
+    for module in (spread, jackknife):
+        monkeypatch.setattr(module, "shortened", lambda search, free, terms, known, step, others: step)
     monkeypatch.setattr(spread, "errors_of", lambda search: [{}, {}])
     arm = SimpleNamespace(inertial=np.ones((1, 10)))
     data = SimpleNamespace(count=400, joints=1, recording=np.zeros(400, int), columns={}, arm=arm)

@@ -5,7 +5,8 @@ from servo_arm import model_text, record
 
 from sim_gap.closed_loop.choice.rivals import _like
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point
-from sim_gap.closed_loop.fit import Fit, batch, evaluate, jacobian, moved
+from sim_gap.closed_loop.coordinates import moved
+from sim_gap.closed_loop.fit import Fit, batch, evaluate, jacobian
 from sim_gap.closed_loop.judge import joint_rms
 from sim_gap.closed_loop.parameters import Scales
 from sim_gap.closed_loop.simulate import simulate
