@@ -18,7 +18,7 @@ ABOUT = "Friction of other kinds is taken into Coulomb and viscous friction."
 
 def write_actuators(found: Identified, path: Path, step: float = 0.005) -> None:
     """Write the entries for Isaac Lab and mjlab; delays are counted in `step` [s]. Raises BadInput."""
-    drawn = draw(found.search, found.fit, found.spread, DRAWS)
+    drawn = draw(found.search, found.fit, found.spread, DRAWS, reach=found.band.reach)
     rows = {name: _entry(found, j, step, drawn) for j, name in enumerate(found.sim.arm.names)}
     left = found.export.lines if found.export is not None else ()
     write_entries(rows, path, step, about=ABOUT, left=left)

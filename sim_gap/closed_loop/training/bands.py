@@ -40,6 +40,8 @@ class Band:
     """RMS of half of its width on held-out motion [rad]."""
     unexplained: Array
     """Standard deviation of what no parameter explains [rad]: noise to add to the draws."""
+    reach: Array
+    """RMS of half of its width on the training motion, about a single simulation [rad]: how far draws go."""
 
 
 def band(search: Search, fit: Fit, spread: Covariance, others: LeftOut, heldout: Windows) -> Band:
@@ -51,6 +53,7 @@ def band(search: Search, fit: Fit, spread: Covariance, others: LeftOut, heldout:
     size = np.sqrt(_variance(search, fit, spread, data) + unexplained[:, None] ** 2)
     factor = np.array([_quantile(left[:, j], size[:, j], data.weight[:, j]) for j in range(data.joints)])
     wider = _uncertainty(np.stack([(each[:, groups == g] ** 2).mean(1) for g in np.unique(groups)]))
+    reach = factor * wider * np.sqrt((size**2 * data.weight).sum((0, 2)) / np.maximum(data.weight.sum((0, 2)), 1.0))
     about = simulate(heldout, batch([fit.point, *_with_limits(fit, spread.limits)]))
     unit = wider[:, None] * np.sqrt(_variance(search, fit, spread, heldout) + unexplained[:, None] ** 2)
     for j in range(data.joints) if len(about) > 1 else ():
@@ -62,7 +65,7 @@ def band(search: Search, fit: Fit, spread: Covariance, others: LeftOut, heldout:
     counts = np.maximum(heldout.weight.sum((0, 2)), 1.0)
     within = (low <= heldout.measured) & (heldout.measured <= high)
     width = 0.5 * np.sqrt(((high - low) ** 2 * heldout.weight).sum((0, 2)) / counts)
-    return Band((within * heldout.weight).sum((0, 2)) / counts, width, wider * unexplained)
+    return Band((within * heldout.weight).sum((0, 2)) / counts, width, wider * unexplained, reach)
 
 
 def _with_limits(fit: Fit, limits: Sequence[Unreached]) -> list[dict[str, Array]]:

@@ -16,7 +16,7 @@ from sim_gap.model.load import urdf_behind
 
 def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> None:
     """Write draws of all fitted parameters, one row each, columns `JOINT.PARAMETER` in SI units. Raises BadInput."""
-    write_rows(draw(found.search, found.fit, found.spread, count, seed), path)
+    write_rows(draw(found.search, found.fit, found.spread, count, seed, found.band.reach), path)
 
 
 def write_exported(found: Identified, path: Path) -> tuple[str, ...]:

@@ -49,14 +49,6 @@ def test_recordings_that_agree_leave_the_interval_nearly_as_it_is() -> None:
         assert (deviations(wide, name) < 2.0 * deviations(own, name)).all()
 
 
-def test_the_jackknife_is_that_of_the_text_books() -> None:
-    """Of a mean of G values it is their variance over G."""
-    values = np.array([0.15, 0.35, 0.2, 0.5])
-    terms = spread._Terms([(0, "coulomb")], np.ones((4, 1, 1)), (0.3 - values)[:, None])
-    found = spread._jackknifed(terms, np.zeros(1), np.arange(4))
-    assert found[0, 0] == pytest.approx(values.var(ddof=1) / 4.0)
-
-
 def test_of_an_arm_that_feels_no_weight_ratios_are_told_better_than_their_scale(weightless, monkeypatch) -> None:
     """Where commands are in time: what is not known of that is not known of the ratio of gain and damping, a time."""
     monkeypatch.setattr(sound, "LATE_S", 1e-6)
@@ -95,6 +87,25 @@ def test_draws_of_an_undecided_scale_move_the_arm_as_the_fit_does(weightless) ->
     gaps = residuals(search.data, batch([fit.point, *points]))
     moved = np.sqrt(np.mean((gaps[1:] - gaps[0]) ** 2, axis=(1, 2, 3)))
     assert np.median(moved) < 0.001
+
+
+def test_no_draw_moves_the_arm_further_than_it_may(several) -> None:
+    """A delay known to 0.1 s at one joint alone: draws of it are shortened, and those of the other joint are not."""
+    search, fit = several
+    found = Covariance([(0, "delay"), (1, "kp")], np.diag([(0.1 / search.scales.of("delay")[0]) ** 2, 0.05**2]))
+    free, near = (draw(search, fit, found, 40, reach=reach) for reach in (None, np.array([0.01, 1.0])))
+
+    def moved(rows: list[dict[str, float]]) -> np.ndarray:
+        points = [{**fit.point, "delay": np.array([row["shoulder.delay"], fit.point["delay"][1]])} for row in rows]
+        gaps = residuals(search.data, batch([fit.point, *points]))[:, :, 0]
+        return np.sqrt(np.mean((gaps[1:] - gaps[0]) ** 2, axis=(1, 2)))
+
+    assert np.median(moved(free)) > 0.02
+    assert moved(near).max() < 0.0105
+    assert np.std([row["shoulder.delay"] for row in near]) > 0.005
+    assert [row["elbow.kp"] for row in near] == [row["elbow.kp"] for row in free]
+    for one, other, far in zip(near, free, moved(free), strict=True):
+        assert one == other if far < 0.0095 else one != other
 
 
 def test_a_value_that_the_model_states_is_open_where_a_gain_rests_on_it(weightless) -> None:
