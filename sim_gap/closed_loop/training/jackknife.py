@@ -1,26 +1,22 @@
 """The jackknife: where parameters go when a group of windows is left out, a recording or a single window.
 
-They follow in one Gauss-Newton step (Bell and McCaffrey, Survey Methodology 28, 2002), as far as the others let them
-and as far as it lowers what is left of the others: along a direction that these hardly show a step is as long as the
-prior lets it be, and motion is not linear over that.
+They follow in one Gauss-Newton step (Bell and McCaffrey, Survey Methodology 28, 2002), as far as the others let them.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from gcomp.arrays import Array, Mask
-from sim_gap.closed_loop.fit import Fit, batch, coordinate, jacobian, residuals, stepped
+from gcomp.arrays import Array
+from sim_gap.closed_loop.fit import Fit, jacobian
 from sim_gap.closed_loop.search import Search
 
 ALONE = 0.03
 """Share of the information about a direction that the others are taken to have at least, without a group."""
 ROUNDING = 1e-12
 """Information that every direction has, as a share of that about a parameter by itself."""
-SHARES = 1.0, 0.5, 0.25, 0.125, 0.0
-"""Shares of a step of which the best is taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +28,6 @@ class Terms:
     """(W, K, K)."""
     scores: Array
     """(W, K)."""
-    weights: Array
-    """Of the squares that each joint leaves, (J,)."""
 
 
 def terms_of(search: Search, fit: Fit) -> Terms:
@@ -48,20 +42,11 @@ def terms_of(search: Search, fit: Fit) -> Terms:
         index = np.concatenate([np.arange(starts[j], starts[j + 1]), np.arange(starts[-1], size)]).astype(int)
         squares[np.ix_(np.arange(count), index, index)] += weights[j] * np.einsum("atw,btw->wab", x, x)
         scores[:, index] += weights[j] * np.einsum("atw,tw->wa", x, now[:, j])
-    return Terms(names, squares, scores, weights)
+    return Terms(names, squares, scores)
 
 
-def jackknifed(search: Search, free: Fit, terms: Terms, known: Array, groups: NDArray[np.intp]) -> Array:
-    """Covariance by leaving out one group of windows after the other, (K, K); `known` is what is known beforehand."""
-    steps = [
-        shortened(search, free, terms, known, step, groups != label)
-        for label, step in zip(np.unique(groups), steps_without(terms, known, groups), strict=True)
-    ]
-    return scatter(np.stack(steps))
-
-
-def steps_without(terms: Terms, known: Array, groups: NDArray[np.intp]) -> Array:
-    """The step of the parameters without each group, (G, K).
+def jackknifed(terms: Terms, known: Array, groups: NDArray[np.intp]) -> Array:
+    """Covariance (K, K) by leaving out one group of windows after the other; `known` is what is known beforehand.
 
     Where nearly all that is known of a direction is in one group, such as the limit of a speed that is reached in a
     single motion, the step of the others would be noise over nothing.
@@ -76,38 +61,5 @@ def steps_without(terms: Terms, known: Array, groups: NDArray[np.intp]) -> Array
         told, directions = eigh(others, whole)
         step = directions.T @ (scale * (terms.scores[own].sum(0) - scores)) / np.maximum(told, ALONE)
         steps.append(scale * (directions @ step))
-    return np.stack(steps)
-
-
-def scatter(steps: Array) -> Array:
-    """Covariance (K, K) of the whole from the steps without each of G groups (G, K)."""
-    apart = steps - steps.mean(0)
+    apart = np.stack(steps) - np.mean(steps, axis=0)
     return np.asarray((len(steps) - 1) / len(steps) * apart.T @ apart)
-
-
-def shortened(search: Search, free: Fit, terms: Terms, known: Array, step: Array, others: Mask) -> Array:
-    """What the part of a step moves each parameter by that lowers most what is left of the `others` of the windows.
-
-    It is of each joint by itself, unless the whole arm shares something.
-    """
-    joints = np.array([j for j, _ in terms.names])
-    parts = [np.flatnonzero(joints == j) for j in range(search.data.joints)]
-    common = np.flatnonzero(joints < 0)
-    points = [
-        stepped(search.data, free, search.scales, free.active, [share * step[at] for at in parts], share * step[common])
-        for share in SHARES
-    ]
-    left = residuals(search.data, batch(points))[..., others]
-    cost = terms.weights * np.einsum("ptjw,ptjw->pj", left, left)
-    cost += np.square(SHARES)[:, None] * [step[at] @ known[np.ix_(at, at)] @ step[at] for at in parts]
-    if len(common):
-        rest = step @ known @ step - sum(step[at] @ known[np.ix_(at, at)] @ step[at] for at in parts)
-        cost = np.broadcast_to((cost.sum(1) + np.square(SHARES) * rest)[:, None], cost.shape)
-    best = cost.argmin(0)
-    return np.array(
-        [
-            coordinate(replace(free, point=points[best[j]]), search.scales, j, name)
-            - coordinate(free, search.scales, j, name)
-            for j, name in terms.names
-        ]
-    )

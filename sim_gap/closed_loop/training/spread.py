@@ -22,7 +22,7 @@ from sim_gap.closed_loop.parameters import PARAMETERS
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.sound import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
 from sim_gap.closed_loop.training.alternatives import Alternative, quantiles
-from sim_gap.closed_loop.training.jackknife import jackknifed, shortened, terms_of
+from sim_gap.closed_loop.training.jackknife import jackknifed, terms_of
 from sim_gap.closed_loop.training.limits import LIMITS, Unreached
 
 SYSTEMATIC = 0.02
@@ -73,13 +73,13 @@ def covariance(search: Search, fit: Fit) -> Covariance:
     terms = terms_of(search, free)
     known = _stated(search, fit, terms.names)
     inverse = np.linalg.inv(terms.squares.sum(0) + known)
-    aside = shortened(search, free, terms, known, -inverse @ terms.scores.sum(0), np.ones(search.data.count, bool))
+    aside = inverse @ terms.scores.sum(0)
     matrix = inverse @ known @ inverse + np.outer(aside, aside)
-    matrix += jackknifed(search, free, terms, known, np.arange(search.data.count))
+    matrix += jackknifed(terms, known, np.arange(search.data.count))
     number = len(np.unique(search.data.recording))
     if number > 1:
         few = float(t.ppf(SHARE, max(number - 1, LEAST_FREEDOM)) / norm.ppf(SHARE))
-        matrix += few**2 * jackknifed(search, free, terms, known, search.data.recording)
+        matrix += few**2 * jackknifed(terms, known, search.data.recording)
     told = [k for k, (j, name) in enumerate(terms.names) if _told(fit, j, name)]
     names = [terms.names[k] for k in told]
     matrix = matrix[np.ix_(told, told)]

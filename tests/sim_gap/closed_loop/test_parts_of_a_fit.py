@@ -262,8 +262,6 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
     noise = 0.01 * random.normal(size=(50, 400))
     residual = (noise - x[0] * (x[0] * noise).sum() / (x**2).sum())[:, None]  # what the best value leaves
     monkeypatch.setattr(jackknife, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
-    for module in (spread, jackknife):
-        monkeypatch.setattr(module, "shortened", lambda search, free, terms, known, step, others: step)
     monkeypatch.setattr(spread, "errors_of", lambda search: [{}, {}])
     arm = SimpleNamespace(inertial=np.ones((1, 10)))
     data = SimpleNamespace(count=400, joints=1, recording=np.zeros(400, int), columns={}, arm=arm)

@@ -11,6 +11,7 @@ from sim_gap.closed_loop.fit import Fit, batch, improve, residuals
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.training import spread
 from sim_gap.closed_loop.training.draws import draw
+from sim_gap.closed_loop.training.jackknife import Terms, jackknifed
 from sim_gap.closed_loop.training.spread import Covariance, covariance, covariance_within, interval
 
 FRICTION = 0.15, 0.35
@@ -47,6 +48,14 @@ def test_recordings_that_agree_leave_the_interval_nearly_as_it_is() -> None:
     wide, own = covariance(search, fit), covariance_within(search, fit)
     for name in ("kp", "viscous"):
         assert (deviations(wide, name) < 2.0 * deviations(own, name)).all()
+
+
+def test_the_jackknife_is_that_of_the_text_books() -> None:
+    """Of a mean of G values it is their variance over G."""
+    values = np.array([0.15, 0.35, 0.2, 0.5])
+    terms = Terms([(0, "coulomb")], np.ones((4, 1, 1)), (0.3 - values)[:, None])
+    found = jackknifed(terms, np.zeros(1), np.arange(4))
+    assert found[0, 0] == pytest.approx(values.var(ddof=1) / 4.0)
 
 
 def test_of_an_arm_that_feels_no_weight_ratios_are_told_better_than_their_scale(weightless, monkeypatch) -> None:
