@@ -76,10 +76,11 @@ def _touching(found: Identified) -> list[str]:
     names = found.sim.arm.names
     joints = ", ".join(names[j] for j in found.surface.joints)
     some = [100.0 * float(rows.mean()) for rows in found.touched if rows.any()]
+    part = " to ".join(dict.fromkeys(f"{each:.0f}" for each in (min(some), max(some))))
     return [
         f"the arm presses on something below it, such as a table, in {len(some)} of {len(found.touched)} recordings: "
         f"{joints} stop short of the command the lower {names[found.surface.link]} goes, from a height of "
-        f"{found.surface.height:.2f} m on; these moments ({min(some):.0f} to {max(some):.0f} % of such a recording) "
+        f"{found.surface.height:.2f} m on; these moments ({part} % of such a recording) "
         "are neither fitted nor judged: if simulated motion goes there, put a surface there into the model"
     ]
 

@@ -15,6 +15,7 @@ from scipy.stats import t
 
 from gcomp.arrays import Array
 from sim_gap.closed_loop.choice.compete import Progress, select
+from sim_gap.closed_loop.choice.plain import PLAINEST, plainest
 from sim_gap.closed_loop.choice.prune import removable_at, without_each
 from sim_gap.closed_loop.choice.scale import ROTORS, at_other_scales
 from sim_gap.closed_loop.columns import shared_effects
@@ -78,18 +79,21 @@ def _others(search: Search, fit: Fit, progress: Progress) -> Iterator[Other]:
         more = PRICE * (_size(fit) - _size(other))
         yield Other((effect, ()), other, _doubt(search, fit, other, range(search.data.joints), more))
     for other in at_other_scales(search, fit):
-        yield from _rescaled(search, fit, other)
+        yield from _of_each_joint(search, fit, other, ROTORS)
+    for other in plainest(search, fit):
+        yield from _of_each_joint(search, fit, other, PLAINEST)
 
 
-def _rescaled(search: Search, fit: Fit, other: Fit) -> Iterator[Other]:
-    """The fit with other rotors and all that goes with them; of each joint, unless something couples all of them."""
+def _of_each_joint(search: Search, fit: Fit, other: Fit, called: str) -> Iterator[Other]:
+    """Another fit with other effects, at each joint that it differs at; of all, if something couples them."""
     if fit.shared:
         more = PRICE * (_size(fit) - _size(other))
-        yield Other((ROTORS, ()), other, _doubt(search, fit, other, range(search.data.joints), more))
+        yield Other((called, ()), other, _doubt(search, fit, other, range(search.data.joints), more))
         return
     for j, own in enumerate(other.active):
         if own != fit.active[j]:
-            yield Other((ROTORS, (j,)), merged(fit, other, j), _doubt(search, fit, other, (j,), -PRICE))
+            more = PRICE * (len(fit.active[j]) - len(own))
+            yield Other((called, (j,)), merged(fit, other, j), _doubt(search, fit, other, (j,), more))
 
 
 def _size(fit: Fit) -> int:

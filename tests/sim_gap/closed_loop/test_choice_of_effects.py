@@ -7,6 +7,7 @@ import pytest
 from servo_arm import fitted
 
 from sim_gap.closed_loop.choice.doubt import Other, _tail, settled
+from sim_gap.closed_loop.choice.plain import plainest
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.search import PRICE, Search, effect_there, taken_out, with_effect
 from sim_gap.closed_loop.training.alternatives import alternatives, quantiles
@@ -60,6 +61,30 @@ def test_a_payload_that_the_arm_does_not_have_is_compared_with_the_joints_own_ef
     found, others = settled(search, heavy, quiet)
     assert found.shared == ()
     assert [each.likely < 0.5 for each in others if each.group == ("link.payload", ())] == [True]
+
+
+def test_the_plainest_choice_has_gain_and_friction_alone_wherever_there_is_more(several) -> None:
+    search, fit = several
+    assert not [*plainest(search, fit)]
+    more = fit.with_values(spring=np.array([0.0, 0.2]), offset=np.array([0.0, 0.3]))
+    more = replace(more, active=(("kp",), (*fit.active[1], "spring", "offset")), rms=None)
+    (plain,) = plainest(search, more)
+    assert plain.active[0] == ("kp",)
+    assert {*plain.active[1]} == {"kp", "coulomb", "viscous"}
+    assert (plain.point["spring"][1], plain.point["offset"][1]) == (0.0, 0.0)
+    np.testing.assert_allclose(plain.rms[1], fit.rms[1], rtol=0.05)
+    loaded = replace(fit.with_values(**{"payload.mass": np.full(2, 0.3)}), shared=("payload.mass",), rms=None)
+    (plain,) = plainest(search, loaded)
+    assert plain.shared == ()
+    assert plain.point["payload.mass"][0] == 0.0
+
+
+def test_the_plainest_choice_has_nothing_that_is_withheld(several) -> None:
+    search, fit = several
+    more = replace(fit, active=((*fit.active[0], "asymmetry"), fit.active[1]), rms=None)
+    (plain,) = plainest(replace(search, excluded=frozenset({"friction.viscous"})), more)
+    assert {*plain.active[0]} == {"kp", "coulomb"}
+    assert plain.point["viscous"][0] == search.nominal["viscous"][0]
 
 
 def test_the_ends_of_a_mixture_are_those_of_its_draws() -> None:
