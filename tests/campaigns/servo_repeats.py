@@ -8,7 +8,8 @@ the recordings of a real arm are dealt into parts, and each is diagnosed with th
 held-out motion is 1.7 times as fast and 1.5 times as wide as that of the training, and torque limits, which the model
 does not state, are 1.0 to 2.5 times what that asks for.
 
-Printed are, of each, the share of the held-out motion within the 90 % band, and of every two diagnoses of an arm the
+Printed are, of each, the share of the held-out motion within the 90 % band, what draws of the parameters leave of the
+training motion over what the fit leaves, in the median and of nine in ten, and of every two diagnoses of an arm the
 parameters whose values lie in each other's 95 % intervals, whose intervals overlap, and whose difference is within that
 of two such intervals, the root of the sum of their squares. Exit status 1 if the bands hold less than 85 or more than
 95 % over all joints, or less than 90 % of the differences are such.
@@ -29,8 +30,12 @@ from servo_arm import model_text, record, written
 from armlink.recording.files import load_recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
+from sim_gap.closed_loop.fit import Fit, evaluate
+from sim_gap.closed_loop.judge import joint_rms
+from sim_gap.closed_loop.training.draws import draw
 
 HELD, APART = (0.85, 0.95), 0.9
+DRAWS = 100
 
 
 def intervals(answer: Diagnosis) -> dict[tuple[str, str, str], tuple[float, float, float]]:
@@ -68,6 +73,24 @@ def recorded(asked: argparse.Namespace) -> Iterator[tuple[str, list[Diagnosis]]]
     yield asked.sim.parent.name, [diagnose(asked.sim, train, other) for train, other in pairs]
 
 
+def drawn(answer: Diagnosis) -> np.ndarray:
+    """Median and 90 % quantile of what draws leave of the training motion over what the fit leaves, (2, J)."""
+    found = answer.internals
+    data, names = found.search.data, list(found.sim.arm.names)
+    points = []
+    for row in draw(found.search, found.fit, found.spread, DRAWS, reach=found.band.reach):
+        point = {name: values.copy() for name, values in found.fit.point.items()}
+        for label, value in row.items():
+            joint, _, name = label.partition(".")
+            if joint in names:
+                point[name][names.index(joint)] = value
+            else:
+                point[label][:] = value
+        points.append(point)
+    left = np.stack([joint_rms(data, evaluate(data, Fit(point, ())).rms) for point in [found.fit.point, *points]])
+    return np.quantile(left[1:] / left[0], [0.5, 0.9], axis=0)
+
+
 def compared(one: Diagnosis, two: Diagnosis) -> Iterator[tuple[str, tuple[bool, bool], bool, bool]]:
     """Of each parameter of both: a line, which value is in the other's interval, overlap, whether it is one value."""
     first, second = intervals(one), intervals(two)
@@ -100,6 +123,14 @@ def main() -> int:
         own = [answer.band.holds for answer in answers if answer.band is not None]
         holds += own
         print(name, answers[0].verdict, "bands hold", *(np.round(each, 3) for each in own), flush=True)
+        for median, most in map(drawn, answers):
+            print(
+                "  draws leave",
+                np.round(median, 2),
+                "times as much, nine in ten at most",
+                np.round(most, 2),
+                flush=True,
+            )
     share = float(np.mean(holds))
     print(f"90 % bands hold {share:.1%} of the held-out motion")
     print(
