@@ -124,7 +124,7 @@ def main() -> None:
     pooled = [float(np.linalg.norm(gap)) for gap in gaps]
     share = abs(pooled[1] / pooled[0] - 1.0)
     print(f"RMS over all joints differs by {share:.2%}: {'within' if share < AGREE else 'NOT within'} {AGREE:.0%}")
-    drawn = draw(found.search, found.fit, found.spread, given.worlds)
+    drawn = draw(found.search, found.fit, found.spread, given.worlds, reach=found.band.reach)
     seconds, spread = batch_seconds(model, found.sim.joints, found.sim.arm.names, drawn, given.steps)
     print(f"{given.worlds} worlds with draws: {seconds * 1e3:.1f} ms of processor time a step, spread {spread:.4f} rad")
 
