@@ -98,8 +98,9 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     score clearly worse than the best. Damping is part of a controller that has to be found: of all damping, or, where
     the servo is off at times, of that while it is on.
     """
-    kinds = {"P": ()} if own.complete else KINDS
     always_on = "actuator.back_emf" in search.excluded
+    servo: tuple[str, ...] = () if own.complete or always_on else ("back_emf",)
+    kinds = {"P": ()} if own.complete else {kind: (*parts, *servo) for kind, parts in KINDS.items()}
     if not own.complete and always_on:  # then all damping may be the servo's, which ends at a limit of its torque
         search = replace(search, nominal={**search.nominal, "kv": np.full(search.data.joints, np.inf)})
     few = replace(search, data=thinned_moving(search.data, FEW))
@@ -138,11 +139,12 @@ def _as_excluded(search: Search, fit: Fit, needed: Sequence[str]) -> Fit:
 
 def _from_grid(search: Search, parts: Sequence[str]) -> Fit:
     """The best stiffness of a coarse grid at every joint, with damping and friction that go with it."""
-    data, nominal = search.data, search.nominal
-    e, v = data.command - data.recorded, data.v
+    data, nominal, on = search.data, search.nominal, search.data.served
+    e, v = on * (data.command - data.recorded), data.v
     needed = data.gravity + data.coupling + (data.inertia + nominal["armature"][:, None]) * data.a
-    feed = data.feed if "feed" in parts else np.zeros_like(data.feed)
-    size = np.sqrt(np.mean((needed - feed) ** 2, axis=(0, 2))) / np.maximum(np.sqrt(np.mean(e**2, axis=(0, 2))), 1e-6)
+    feed = on * data.feed if "feed" in parts else np.zeros_like(data.feed)
+    asked = np.sqrt(np.mean((on * needed - feed) ** 2, axis=(0, 2)))
+    size = asked / np.maximum(np.sqrt(np.mean(e**2, axis=(0, 2))), 1e-6)
     centre = np.maximum(size, search.scales.inertia * 25.0)
     points = []
     for factor, stuck in product(np.geomspace(0.02, 50.0, GRID), STUCK):
@@ -158,14 +160,15 @@ def _from_grid(search: Search, parts: Sequence[str]) -> Fit:
         for j in range(data.joints):
             rest = kp[j] * e[:, j] + feed[:, j] - needed[:, j]
             if "kd" in parts:
-                rest = rest + point["kd"][j] * (data.speed[:, j] - v[:, j])
-            columns = np.stack([np.tanh(v[:, j] / 0.02).ravel(), v[:, j].ravel()])
-            target = (rest * data.served[:, j]).ravel()
-            c = np.linalg.lstsq(columns.T, target, rcond=None)[0]
-            coulomb = max(float(c[0]), stuck * kp[j] * float(search.scales.angle[j]))
-            left = target - coulomb * columns[0]
-            viscous = float(columns[1] @ left) / max(float(columns[1] @ columns[1]), 1e-12)
+                rest = rest + point["kd"][j] * on[:, j] * (data.speed[:, j] - v[:, j])
+            columns = np.stack([np.tanh(v[:, j] / 0.02).ravel(), v[:, j].ravel(), (on * v)[:, j].ravel()])
+            columns = columns[: 3 if "back_emf" in parts else 2]
+            coulomb = float(np.linalg.lstsq(columns.T, rest.ravel(), rcond=None)[0][0])
+            coulomb = max(coulomb, stuck * kp[j] * float(search.scales.angle[j]))
+            left = rest.ravel() - coulomb * columns[0]
+            viscous, *servo = np.linalg.lstsq(columns[1:].T, left, rcond=None)[0].tolist()
             point["coulomb"][j], point["viscous"][j] = coulomb, max(viscous, 1e-3 * kp[j])
+            point["back_emf"][j] = max(*servo, 0.0) if servo else nominal["back_emf"][j]
         points.append(point)
     gaps = residuals(data, batch(points))
     costs = np.einsum("ptjw,ptjw->pj", gaps, gaps)

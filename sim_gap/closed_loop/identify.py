@@ -10,6 +10,7 @@ import numpy as np
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
+from sim_gap.closed_loop.balance import balanced
 from sim_gap.closed_loop.choice.compete import select_about
 from sim_gap.closed_loop.choice.doubt import settled
 from sim_gap.closed_loop.columns import shared_effects, with_columns
@@ -107,12 +108,13 @@ def identify(
     data = thinned_moving(fitted, SEARCHED)
     scales, floor = scales_of(fitted), noise_floor(fitted)
     never = frozenset(withhold) | _frozen(sim, fitted)
-    search = Search(data, scales, nominal, floor, never)
+    search = Search(balanced(data), scales, nominal, floor, never)
     search, fit, kind = starting_fit(search, own, progress)
-    fit = select_about(search, fit, progress)
+    search = replace(search, data=balanced(data, fit))
+    fit = select_about(search, replace(fit, rms=None), progress)
     progress("final fit")
-    search = replace(search, data=fitted)
-    fit = improve(fitted, replace(fit, rms=None), scales, 6)
+    search = replace(search, data=balanced(fitted, fit))
+    fit = improve(search.data, replace(fit, rms=None), scales, 6)
     fit, others = settled(search, fit, progress)
     if own.complete:
         fit = not_worse(search, fit)
@@ -120,7 +122,8 @@ def identify(
     margin = _margin(search, fit, floor)
     split = sound(search, judged, margin) if own.complete else None
     matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
-    found = tuple(stages(replace(search, data=data), evaluate(data, fit), judged, matters))
+    few = balanced(data, fit)
+    found = tuple(stages(replace(search, data=few), evaluate(few, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
     spread = replace(covariance(search, fit), others=alternatives(others))
@@ -135,7 +138,7 @@ def identify(
         stages=found,
         spread=spread,
         within=covariance_within(search, fit),
-        band=band(search, fit, spread, left_out(search, fit), judged),
+        band=band(replace(search, data=fitted), fit, spread, left_out(search, fit), judged),
         train_before=rms_on(fitted, before),
         train_after=rms_on(fitted, fit),
         heldout_before=rms_on(judged, before),

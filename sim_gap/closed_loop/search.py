@@ -62,7 +62,7 @@ class Search:
     @property
     def samples(self) -> Array:
         """Independent samples of each joint, (J,)."""
-        judged = self.data.weight.sum(0).sum(1) * self.data.stride * self.data.dt
+        judged = (self.data.weight > 0.0).sum((0, 2)) * self.data.stride * self.data.dt
         return np.asarray(judged / INDEPENDENT_S)
 
 

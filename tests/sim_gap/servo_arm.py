@@ -48,12 +48,13 @@ def record(
     fast: float = 1.0,
     load: float = 0.0,
     breakaway: tuple[float, float] = (0.0, 1.0),
+    released: float = np.inf,
 ) -> Recording:
     """Positions read with 12 bits, and the commands held from row to row: sines with rests between.
 
     `wide` and `fast` are the way and the frequencies of the motion over the usual ones, `load` the friction of the
     gears over the torque that the links carry, `breakaway` that at rest besides [N·m] and the velocity over which it
-    fades [rad/s].
+    fades [rad/s]. From `released` on [s] the servos are off, and there is no command.
     """
     random = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(text)
@@ -67,7 +68,9 @@ def record(
     q, steps = np.empty_like(command), round(1.0 / rate / model.opt.timestep)
     for k, row in enumerate(command):
         q[k] = data.qpos
-        data.ctrl[:] = row
+        if t[k] >= released:
+            model.actuator_gainprm[:], model.actuator_biasprm[:], command[k] = 0.0, 0.0, np.nan
+        data.ctrl[:] = np.nan_to_num(row)
         for _ in range(steps):
             if load or breakaway[0]:
                 fades = breakaway[0] * np.exp(-((data.qvel / breakaway[1]) ** 2))

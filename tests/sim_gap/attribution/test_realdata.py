@@ -104,3 +104,15 @@ def test_load_dependent_friction_of_a_hobby_servo_is_named(realdata):
     assert {"friction.load", "actuator.rotor_inertia"} <= {cause.effect for cause in answer.causes}
     assert answer.heldout_after[0] <= 1.1 * 0.073
     assert answer.heldout_after[0] < 0.5 * answer.heldout_before[0]
+
+
+def test_a_swing_with_the_servo_off_leaves_what_its_command_shows(realdata):
+    """An STS3250 with a pendulum: with the swing the held-out motion was left 2.5 to 5 times as large as without."""
+    folder = realdata / "bam_servo"
+    load = lambda name: load_recording(folder / f"sts3250_{name}.csv.gz")  # noqa: E731
+    train = [load(name) for name in ("up_and_down", "sin_time_square", "lift_and_drop")]
+    answer = diagnose(folder / "sim_sts3250.xml", train, [load("sin_sin")])
+    assert answer.heldout_after[0] < 0.009
+    assert answer.heldout_after[0] < 0.2 * answer.heldout_before[0]
+    point = answer.internals.fit.point
+    assert point["back_emf"][0] > 5.0 * point["viscous"][0]
