@@ -87,7 +87,8 @@ def scales_of(data: Windows) -> Scales:
     speed = np.sqrt(np.mean(data.v**2, axis=flat))
     inertia = data.inertia.mean(flat) + data.arm.armature
     torque = np.maximum(torque, inertia * np.sqrt(np.mean(data.a**2, axis=flat)) + 1e-6)
-    error = np.sqrt(np.mean((data.command - data.recorded) ** 2, axis=flat))
+    served = np.maximum(data.served.sum(flat), 1.0)
+    error = np.sqrt((data.served * (data.command - data.recorded) ** 2).sum(flat) / served)
     return Scales(torque, torque / np.maximum(speed, 0.05), inertia, np.maximum(error, 1e-4))
 
 
