@@ -37,7 +37,7 @@ def notes(found: Identified) -> list[str]:
         )
     if limits := described(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
-    out += [*_touching(found), *_ranges(found), *_beyond(found), *_faster(found)]
+    out += [*_touching(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
     if found.export is not None and found.export.lines:
         module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}{module}")
@@ -121,6 +121,18 @@ def _faster(found: Identified) -> list[str]:
             out.append(f"{name} up to {other.max():.2g} rad/s (fitted {fitted.max():.2g})")
     told = "held-out motion is faster than any that is fitted, from which nothing follows for it"
     return [f"{told}: {', '.join(out)}: give faster motion to fit"] if out else []
+
+
+def _released(found: Identified) -> list[str]:
+    """A note of the joints whose servo is off at times in the held-out motion and never in what is fitted."""
+    off = [1.0 - data.served.mean((0, 2)) for data in (found.search.data, found.heldout)]
+    out = [
+        f"{name} for {100.0 * off[1][j]:.0f} % of the time"
+        for j, name in enumerate(found.sim.arm.names)
+        if off[0][j] == 0.0 < off[1][j]
+    ]
+    told = "in the held-out motion the servo is off, in what is fitted never, from which nothing follows for it"
+    return [f"{told}: {', '.join(out)}: give such a swing to fit"] if out else []
 
 
 def _speeds(data: Windows, joint: int) -> Array:

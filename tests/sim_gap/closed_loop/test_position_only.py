@@ -13,7 +13,7 @@ from servo_arm import model_text, record, written
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.positions.answer import _verdict
-from sim_gap.attribution.positions.notes import _beyond, _faster
+from sim_gap.attribution.positions.notes import _beyond, _faster, _released
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
 from sim_gap.closed_loop.training.bands import band
@@ -88,6 +88,17 @@ def test_joints_that_go_faster_than_in_training_are_noted() -> None:
     assert "shoulder up to 1.5 rad/s (fitted 0.2)" in note
     assert "elbow" not in note
     assert _faster(SimpleNamespace(sim=found.sim, search=found.search, heldout=fitted)) == []
+
+
+def test_joints_that_swing_with_the_servo_off_in_the_held_out_motion_alone_are_noted() -> None:
+    fitted, other = (SimpleNamespace(served=np.ones((50, 2, 4))) for _ in range(2))
+    other.served[:, 0, 3] = 0.0
+    arm = SimpleNamespace(names=("shoulder", "elbow"))
+    found = SimpleNamespace(sim=SimpleNamespace(arm=arm), search=SimpleNamespace(data=fitted), heldout=other)
+    (note,) = _released(found)
+    assert "never, from which nothing follows for it: shoulder for 25 % of the time: give such a swing to fit" in note
+    assert _released(SimpleNamespace(sim=found.sim, search=found.search, heldout=fitted)) == []
+    assert _released(SimpleNamespace(sim=found.sim, search=SimpleNamespace(data=other), heldout=other)) == []
 
 
 def test_the_written_model_moves_like_the_arm(answer, tmp_path: Path) -> None:
