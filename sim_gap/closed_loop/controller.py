@@ -35,11 +35,14 @@ command, which may have been written before or after its row's time."""
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """Controller of the model's own position actuators, (J,) each; NaN at a joint without one."""
+    """Controller of the model's own position actuators, (J,) each; NaN gains at a joint without one."""
 
     kp: Array
     kv: Array
+    ki: Array
     limit: Array
+    slew: Array
+    delay: Array
 
     @property
     def complete(self) -> bool:
@@ -48,11 +51,12 @@ class Nominal:
 
 
 def nominal_controller(sim: SimModel) -> Nominal:
-    """Gains and force limits of the model's position actuators."""
+    """Gains, limits and delays of the model's position actuators, PID ones among them."""
     import mujoco
 
     model: Any = sim.mujoco_model
-    kp, kv, limit = np.full(sim.n, np.nan), np.zeros(sim.n), np.full(sim.n, np.inf)
+    none, unlimited = np.zeros(sim.n), np.full(sim.n, np.inf)
+    own = Nominal(np.full(sim.n, np.nan), none.copy(), none.copy(), unlimited.copy(), unlimited.copy(), none.copy())
     joints = {int(joint): j for j, joint in enumerate(sim.joints)}
     for i in range(model.nu):
         j = joints.get(int(model.actuator_trnid[i, 0]))
@@ -61,10 +65,14 @@ def nominal_controller(sim: SimModel) -> Nominal:
         if j is None or not is_joint or not affine or model.actuator_biasprm[i, 1] >= 0.0:
             continue
         gear = float(model.actuator_gear[i, 0])
-        kp[j], kv[j] = -model.actuator_biasprm[i, 1] * gear**2, -model.actuator_biasprm[i, 2] * gear**2
+        own.kp[j], own.kv[j] = -model.actuator_biasprm[i, 1] * gear**2, -model.actuator_biasprm[i, 2] * gear**2
         if model.actuator_forcelimited[i]:
-            limit[j] = float(np.abs(model.actuator_forcerange[i]).max()) * abs(gear)
-    return Nominal(kp, kv, limit)
+            own.limit[j] = float(np.abs(model.actuator_forcerange[i]).max()) * abs(gear)
+        if model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_PID:
+            own.ki[j], slew = model.actuator_gainprm[i, 0] * gear**2, float(model.actuator_dynprm[i, 1])
+            own.slew[j] = slew / abs(gear) if slew > 0.0 else np.inf
+        own.delay[j] = model.actuator_delay[i]
+    return own
 
 
 def nominal_point(data: Windows, own: Nominal) -> dict[str, Array]:
@@ -74,7 +82,8 @@ def nominal_point(data: Windows, own: Nominal) -> dict[str, Array]:
     point |= {"coulomb": arm.frictionloss.copy(), "armature": arm.armature.copy()}
     point["viscous"] = arm.damping + np.where(np.isfinite(own.kp), own.kv, 0.0)
     point["kp"] = np.where(np.isfinite(own.kp), own.kp, 1.0)
-    point["limit"], point["kv"] = own.limit.copy(), np.where(np.isfinite(own.kp), own.kv, 0.0)
+    point["kv"] = np.where(np.isfinite(own.kp), own.kv, 0.0)
+    point |= {"ki": own.ki.copy(), "limit": own.limit.copy(), "slew": own.slew.copy(), "delay": own.delay.copy()}
     point["spring"], point["offset"] = arm.stiffness.copy(), -arm.stiffness * arm.rest
     return point | {name: np.zeros(data.joints) for name in data.columns}
 

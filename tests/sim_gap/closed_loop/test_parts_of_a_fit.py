@@ -94,6 +94,28 @@ def test_a_parameters_slope_is_that_at_its_value(data: Windows) -> None:
         assert np.linalg.norm(slopes[j][0] - expected) < 0.08 * np.linalg.norm(expected)
 
 
+def test_a_models_own_pid_and_delay_are_its_controllers() -> None:
+    """Behind a gear of 2 at the elbow: torque and speed at the joint; the shoulder has a P servo."""
+    spec = mujoco.MjSpec.from_string(TEXT)
+    servo = spec.actuator("elbow")
+    servo.set_to_pid(kp=3.0, ki=2.0, kv=0.25, slewmax=8.0, ctrlspec=export.POSITION_INPUT)
+    servo.gear[0], servo.delay, servo.nsample = 2.0, 0.012, 8
+    sim = load_model(spec.compile())
+    own = nominal_controller(sim)
+    assert own.complete
+    shoulder, elbow = np.transpose([own.kp, own.kv, own.ki, own.limit, own.slew, own.delay])
+    np.testing.assert_allclose(elbow, [12.0, 1.0, 8.0, np.inf, 4.0, 0.012])
+    assert (shoulder[1:] == [0.0, 0.0, np.inf, np.inf, 0.0]).all()
+    point = nominal_point(windows_of(sim.arm, [record(TEXT, 1, 8.0)], ["run"]), own)
+    assert {name: float(point[name][1]) for name in ("kp", "ki", "slew", "delay", "kv")} == {
+        "kp": 12.0,
+        "ki": 8.0,
+        "slew": 4.0,
+        "delay": 0.012,
+        "kv": 1.0,
+    }
+
+
 def test_slopes_add_up_to_that_by_the_common_scale_of_all_torques(data: Windows) -> None:
     """Sticking and slipping roughen each difference: of friction and gain alone they would add up to much more."""
     scales, names = scales_of(data), ("kp", "coulomb", "viscous", "armature", "delay")

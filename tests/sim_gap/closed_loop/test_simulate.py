@@ -10,6 +10,7 @@ from sim_gap.closed_loop.fit import Fit, batch, evaluate, jacobian
 from sim_gap.closed_loop.judge import joint_rms
 from sim_gap.closed_loop.parameters import Scales
 from sim_gap.closed_loop.simulate import simulate
+from sim_gap.closed_loop.training.export import POSITION_INPUT
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
 
@@ -106,6 +107,24 @@ def test_damping_of_an_actuator_acts_within_its_limit() -> None:
     assert (rms < np.maximum(0.05 * moved, 2e-3)).all()
     outside = joint_rms(data, evaluate(data, Fit({**point, "kv": np.zeros(2)}, ((), ()))).rms)
     assert (outside > 3.0 * rms).any()
+
+
+def test_a_pid_with_slew_limit_and_delay_moves_as_mujocos_does() -> None:
+    spec = mujoco.MjSpec.from_string(model_text(kp=15.0, friction=0.2))
+    for servo in spec.actuators:
+        servo.set_to_pid(kp=15.0, kv=0.3, slewmax=1.0, ctrlspec=POSITION_INPUT)
+        servo.delay, servo.nsample = 0.04, 90
+    spec.compile()
+    text = spec.to_xml()
+    sim = load_model(mujoco.MjModel.from_xml_string(text))
+    data = windows_of(sim.arm, [record(text, 1, 20.0)], ["run"])
+    point = nominal_point(data, nominal_controller(sim))
+    off = {"slew": np.full(2, np.inf), "delay": np.zeros(2)}
+    own = joint_rms(data, evaluate(data, Fit(point, ((), ()))).rms)
+    for name, values in off.items():
+        without = joint_rms(data, evaluate(data, Fit({**point, name: values}, ((), ()))).rms)
+        assert (without > 3.0 * own).any(), name
+    assert (own < 0.003).all()
 
 
 def test_back_emf_damps_only_while_the_servo_is_on() -> None:
