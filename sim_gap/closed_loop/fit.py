@@ -48,7 +48,7 @@ def coordinate(fit: Fit, scales: Scales, joint: int, name: str) -> float:
 
 
 def residuals(data: Windows, values: Mapping[str, Array]) -> Array:
-    """Simulated minus measured positions, 0 where nothing was measured, (P, To, J, W)."""
+    """Simulated minus measured positions, as far as they count, (P, To, J, W)."""
     return (simulate(data, values) - data.measured) * data.weight
 
 

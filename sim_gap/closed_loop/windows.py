@@ -60,7 +60,7 @@ class Windows:
     measured: Array
     """Measured position, (To, J, W) [rad]."""
     weight: Array
-    """1 where it counts, (To, J, W)."""
+    """What a sample counts, (To, J, W): 0 where nothing was measured, else 1, or less (`balance`)."""
     start: Array
     """Position and velocity at the first step, (2, J, W)."""
     error_sum: Array
