@@ -56,8 +56,11 @@ class Search:
         return np.asarray(0.5 * self.samples * np.log(mean + self.floor**2))
 
     def size_of(self, name: str) -> Array:
-        """What levels of a limit are counted in, (J,): the command's highest speed, or the usual size of it."""
-        return np.abs(self.data.speed).max(axis=(0, 2)) if name == "slew" else self.scales.of(name)
+        """What levels of a limit are counted in, (J,): the command's highest speed, if it moves at all, or the usual
+        size of it."""
+        if name != "slew":
+            return self.scales.of(name)
+        return np.asarray(np.maximum(np.abs(self.data.speed).max(axis=(0, 2)), PARAMETERS["slew"].low))
 
     @property
     def samples(self) -> Array:

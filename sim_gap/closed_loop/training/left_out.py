@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from gcomp.arrays import Array
 from sim_gap.closed_loop.fit import Fit, batch, improve, residuals
 from sim_gap.closed_loop.search import Search
-from sim_gap.closed_loop.windows import of_windows
+from sim_gap.closed_loop.windows import Windows, of_windows
 
 FOLDS, STEPS = 3, 3
 """Parts of a single recording of which each is left out of a fit, and the steps of such a fit."""
@@ -24,11 +24,16 @@ class LeftOut:
     """The fit without each group, in their order."""
 
 
+def recordings_or_thirds(data: Windows) -> NDArray[np.intp]:
+    """Number of the group of each window, (W,): its recording, or the third of a single one."""
+    if len(np.unique(data.recording)) > 1:
+        return data.recording
+    return np.arange(data.count) * FOLDS // data.count
+
+
 def left_out(search: Search, fit: Fit) -> LeftOut:
     """A fit to all other windows for each group of them."""
-    data, groups = search.data, search.data.recording
-    if len(np.unique(groups)) == 1:
-        groups = np.arange(data.count) * FOLDS // data.count
+    data, groups = search.data, recordings_or_thirds(search.data)
     fits = []
     for group in np.unique(groups):
         others = np.flatnonzero(groups != group)

@@ -20,7 +20,7 @@ from sim_gap.closed_loop.coordinates import relative
 from sim_gap.closed_loop.fit import Fit, batch, coordinate, evaluate, improve, jacobian, residuals
 from sim_gap.closed_loop.identify import _frozen, not_worse
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, WITH_TORQUE, Scales
-from sim_gap.closed_loop.search import PRICE, Search
+from sim_gap.closed_loop.search import PRICE, Search, level_of
 from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.tracks import held_command
 from sim_gap.closed_loop.training import actuators, export, jackknife, spread
@@ -114,6 +114,17 @@ def test_a_models_own_pid_and_delay_are_its_controllers() -> None:
         "delay": 0.012,
         "kv": 1.0,
     }
+
+
+def test_a_joint_whose_command_rests_has_levels_of_a_slew_limit_all_the_same(data: Windows) -> None:
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    still = data.speed.copy()
+    still[:, 1] = 0.0
+    point = nominal_point(data, nominal_controller(sim))
+    search = Search(replace(data, speed=still), scales_of(data), point, np.full(2, 3e-4))
+    level = level_of(search, Fit(point, ((), ())), "slew")
+    assert (level >= 0.1 * PARAMETERS["slew"].low).all()
+    assert level[0] > 10.0 * level[1]
 
 
 def test_slopes_add_up_to_that_by_the_common_scale_of_all_torques(data: Windows) -> None:
@@ -278,7 +289,8 @@ def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -
 
 
 def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None:
-    """One parameter and white residuals of independent windows: σ² / Σ x², beside what is systematic."""
+    """One parameter and white residuals of independent windows: σ² / Σ x², beside what is systematic; over windows and
+    over 40 recordings, where both count."""
     random = np.random.default_rng(3)
     x = random.normal(size=(1, 50, 400))
     noise = 0.01 * random.normal(size=(50, 400))
@@ -286,12 +298,26 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
     monkeypatch.setattr(jackknife, "jacobian", lambda data, fit, scales, active, shared: (residual, [x]))
     monkeypatch.setattr(spread, "errors_of", lambda search: [{}, {}])
     arm = SimpleNamespace(inertial=np.ones((1, 10)))
-    data = SimpleNamespace(count=400, joints=1, recording=np.zeros(400, int), columns={}, arm=arm)
+    data = SimpleNamespace(count=400, joints=1, recording=np.arange(400) // 10, columns={}, arm=arm)
     search = SimpleNamespace(data=data, scales=Scales(*np.ones((4, 1))), samples=np.array([400.0]))
     fit = Fit({"kp": np.array([15.0]), **{name: np.zeros(1) for name in spread.SCALED}}, (("kp",),))
-    for estimate in (spread.covariance, spread.covariance_within):
+    for estimate, times in ((spread.covariance, 2.0), (spread.covariance_within, 1.0)):
         found = estimate(search, fit).matrix[0, 0] - spread.SYSTEMATIC**2
-        assert found == pytest.approx(1e-4 / (x**2).sum(), rel=0.2)
+        assert found == pytest.approx(times * 1e-4 / (x**2).sum(), rel=0.25)
+
+
+def test_of_one_motion_what_is_left_of_the_way_to_the_command_is_what_another_may_show(monkeypatch) -> None:
+    """A tenth of it at the first joint, nothing at the second; nothing where several recordings show it."""
+    monkeypatch.setattr(spread, "rms_on", lambda data, fit: np.array([0.002, 0.0]))
+    fit = Fit({"kp": np.array([15.0, 10.0]), "coulomb": np.array([0.3, 0.2])}, (("kp", "coulomb"), ("kp",)))
+    torque, one = np.full(2, 0.5), np.ones(2)
+    scales = Scales(torque, one, one, np.full(2, 0.02))
+    search = SimpleNamespace(data=SimpleNamespace(recording=np.zeros(6, int)), scales=scales)
+    share = 0.1 * spread.OTHERWISE
+    found = np.diag(spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp")]))
+    np.testing.assert_allclose(found, [share**2, (share * 0.3 / scales.of("coulomb")[0]) ** 2, 0.0])
+    two = SimpleNamespace(data=SimpleNamespace(recording=np.arange(6) % 2), scales=scales)
+    assert not spread._of_one_motion(two, fit, [(0, "kp")]).any()
 
 
 def test_a_gain_is_a_logarithm_away_from_the_nominal_one() -> None:
