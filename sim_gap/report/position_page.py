@@ -9,7 +9,7 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.training.export import WRITTEN
-from sim_gap.closed_loop.training.replay import Simulated, less, replay, simulated
+from sim_gap.closed_loop.training.replay import Simulated, commanded, less, replay, simulated
 from sim_gap.report.effect_text import WORDS, advice, sentence
 from sim_gap.report.figures import BLUE, GREY, ORANGE
 from sim_gap.report.over_time import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, without
@@ -45,7 +45,8 @@ def position_sections(answer: Diagnosis) -> list[Section]:
 
 
 def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
-    """One row a joint: measured, nominal and corrected motion, and without each cause; None without a model's file."""
+    """One row a joint: measured, nominal and corrected motion, and without each cause; None without a model's
+    file or without a command."""
     if found.export is None:
         return None
     recording, names, gain = found.recordings[0], found.sim.arm.names, found.gains[0]
@@ -55,9 +56,12 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
 
     made = found.beside or found.export
     t, after, measured = moved(simulated(found.sim, made))
-    assert recording.position_command is not None
+    if not len(t):
+        return None
+    command = recording.position_command
+    assert command is not None
     lines: list[Line] = [
-        ("command", recording.position_command[: len(t)], GREY, True),
+        ("command", command[commanded(recording, SHOWN_S)], GREY, True),
         ("measured", measured, "black", True),
     ]
     if found.nominal_has_controller:

@@ -220,7 +220,7 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
     effects = []
     for cause, stage in taken:
-        if cause.effect not in WRITTEN:
+        if cause.effect not in WRITTEN or np.isnan(after).all():
             continue
         others = [group for group in groups if group != stage.group]
         alone, without = (gap(less(found.sim, found.search, made, some), SHORT_S) for some in (others, [stage.group]))

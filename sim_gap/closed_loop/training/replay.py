@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from armlink.recording.recording import Recording
+from armlink.recording.recording import Recording, slice_rows
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.better_model.native_drives import hold
@@ -57,7 +57,8 @@ def less(sim: SimModel, search: Search, made: Exported, groups: Sequence[Group])
 
 
 def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> tuple[Array, Array, Array]:
-    """Times (K,), simulated and measured positions (K, n) of one recording while it is commanded.
+    """Times (K,), simulated and measured positions (K, n) of one recording from its first command to the first that
+    is missing; nothing of one without commands.
 
     The model starts at the measured position at rest, as if the first command had been there for long; each joint's
     actuator gets the command held from row to row, for at most `longest` [s].
@@ -65,9 +66,11 @@ def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> 
     import mujoco
 
     model, joints = arm.model, list(arm.joints)
-    given = recording.position_command
+    recording = slice_rows(recording, commanded(recording, longest))
+    given, rows = recording.position_command, len(recording.t)
     assert given is not None
-    rows = _commanded(recording, longest)
+    if not rows:
+        return recording.t, recording.position, recording.position
     data = mujoco.MjData(model)
     adr = model.jnt_qposadr[joints]
     data.qpos[adr] = recording.position[0]
@@ -75,7 +78,7 @@ def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> 
     hold(model, data, drives, given[0])
     controls = model.actuator_ctrladr[drives]
     dt = float(model.opt.timestep)
-    times, out = recording.t[:rows], np.empty((rows, len(joints)))
+    times, out = recording.t, np.empty((rows, len(joints)))
     at = 0
     mujoco.set_mjcb_passive(None if arm.effects is None else arm.effects.passive)
     try:
@@ -91,7 +94,7 @@ def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> 
         if arm.effects is not None:
             model.dof_frictionloss[arm.effects.dofs] = arm.effects.coulomb
     out[0], out[at + 1 :] = recording.position[0], data.qpos[adr]
-    return times, out, recording.position[:rows]
+    return times, out, recording.position
 
 
 def replay_rms(
@@ -110,20 +113,25 @@ def replay_rms(
     gains = gains or [1.0] * len(recordings)
     apart = apart or [np.zeros(len(recording.t), bool) for recording in recordings]
     for recording, gain, left_out in zip(recordings, gains, apart, strict=True):
-        if recording.t[_commanded(recording, longest) - 1] - recording.t[0] < 2.0 * OPENING_S:
+        part = commanded(recording, longest)
+        if np.diff(recording.t[part]).sum() < 2.0 * OPENING_S:
             continue
         t, positions, measured = replay(arm.with_gain(gain), recording, longest)
-        gap = (positions - measured)[(t >= t[0] + OPENING_S) & ~left_out[: len(t)]]
+        gap = (positions - measured)[(t >= t[0] + OPENING_S) & ~left_out[part]]
         total += np.nansum(gap**2, axis=0)
         count += np.isfinite(gap).sum(0)
     return np.asarray(np.sqrt(total / np.where(count > 0, count, np.nan)))
 
 
-def _commanded(recording: Recording, longest: float) -> int:
-    """Number of rows from the first that are commanded, of at most `longest` [s]."""
+def commanded(recording: Recording, longest: float = LONGEST_S) -> slice:
+    """Rows of a recording from the first at which all joints are commanded to the first at which one is not, at most
+    `longest` [s] later."""
     assert recording.position_command is not None
-    missing = ~np.isfinite(recording.position_command).all(axis=1) | (recording.t > recording.t[0] + longest)
-    return int(np.argmax(missing)) if missing.any() else len(recording.t)
+    given = np.flatnonzero(np.isfinite(recording.position_command).all(axis=1))
+    if not given.size:
+        return slice(0, 0)
+    first, last = int(given[0]), int(given[0]) + int(np.argmax(np.diff(given, append=-1) != 1))
+    return slice(first, min(last + 1, int(np.searchsorted(recording.t, recording.t[first] + longest, side="right"))))
 
 
 def actuator_of(model: Any, joint: int) -> int:

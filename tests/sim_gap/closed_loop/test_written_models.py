@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from servo_arm import model_text, record, written
 
+from armlink.recording.recording import Recording
 from sim_gap.attribution.positions.notes import _ranges
 from sim_gap.better_model.effects_module import module_text
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
@@ -16,7 +17,7 @@ from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.training.export import IN_MODULE, Exported, exported, native_fit, with_module
 from sim_gap.closed_loop.training.ranges import wide_enough, widened
-from sim_gap.closed_loop.training.replay import Simulated, replay, replay_rms, simulated
+from sim_gap.closed_loop.training.replay import Simulated, commanded, replay, replay_rms, simulated
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import SimModel, load_model
 
@@ -138,3 +139,36 @@ def test_a_joint_of_the_written_model_goes_as_far_as_the_arm(made, tmp_path: Pat
     (note,) = _ranges(found)
     assert "shoulder (model -9.00 to 0.20 rad" in note
     assert "elbow" not in note
+
+
+@pytest.mark.parametrize(
+    ("given", "longest", "expected"),
+    [
+        ([1, 1, 1, 1, 1, 1], 60.0, slice(0, 6)),
+        ([1, 1, 1, 1, 1, 1], 0.25, slice(0, 3)),
+        ([0, 0, 1, 1, 0, 1], 60.0, slice(2, 4)),
+        ([0, 0, 1, 1, 1, 1], 0.15, slice(2, 4)),
+        ([0, 0, 0, 0, 0, 1], 60.0, slice(5, 6)),
+        ([0, 0, 0, 0, 0, 0], 60.0, slice(0, 0)),
+    ],
+)
+def test_a_replay_goes_from_the_first_command_to_the_first_that_is_missing(given, longest, expected) -> None:
+    command = np.where(np.array(given, bool)[:, None], 0.1, np.nan) * np.ones(2)
+    recording = Recording(t=5.0 + 0.1 * np.arange(6), position=np.zeros((6, 2)), position_command=command)
+    assert commanded(recording, longest) == expected
+
+
+def test_a_recording_that_begins_with_the_servos_off_is_replayed_from_where_they_are_on() -> None:
+    arm = Simulated(mujoco.MjModel.from_xml_string(model_text(kp=GAIN, friction=0.1)), (0, 1))
+    late = OTHER.position_command.copy()
+    late[:40] = np.nan
+    later = replace(OTHER, position_command=late)
+    t, simulated_positions, measured = replay(arm, later)
+    assert t[0] == OTHER.t[40]
+    np.testing.assert_array_equal(measured, OTHER.position[40:])
+    whole = replay(arm, OTHER)[1][-1]
+    np.testing.assert_allclose(simulated_positions[-1], whole, atol=1e-3)
+    assert np.isfinite(replay_rms(arm, [later])).all()
+    never = replace(OTHER, position_command=np.full_like(late, np.nan))
+    assert [len(each) for each in replay(arm, never)] == [0, 0, 0]
+    assert np.isnan(replay_rms(arm, [never])).all()
