@@ -9,10 +9,21 @@ from dataclasses import replace
 import numpy as np
 
 from sim_gap.closed_loop.fit import Fit, evaluate
+from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.windows import Windows
 
 LEAST = 0.02
 """What a window counts at least, over one of the other kind."""
+
+
+def counted(search: Search, data: Windows, fit: Fit | None = None) -> Windows:
+    """The windows as a search counts them: both kinds as much, and nothing of joints that rest, of which any friction
+    holds the place."""
+    data = balanced(data, fit)
+    if not search.resting:
+        return data
+    moves = [j not in search.resting for j in range(data.joints)]
+    return replace(data, weight=data.weight * np.array(moves, float)[:, None])
 
 
 def balanced(data: Windows, fit: Fit | None = None) -> Windows:

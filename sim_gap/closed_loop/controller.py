@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.closed_loop.choice.compete import Progress
 from sim_gap.closed_loop.fit import Fit, batch, evaluate, improve, residuals
 from sim_gap.closed_loop.parameters import EFFECTS, PARAMETERS, Scales
@@ -21,6 +21,8 @@ FEW = 8
 """Windows on which controllers are compared."""
 GRID = 12
 """Stiffnesses that are tried at the start."""
+RESTS_RAD = 0.002
+"""Way of a command over all recordings below which it rests [rad]."""
 KINDS: dict[str, tuple[str, ...]] = {
     "P": ("delay",),
     "PD": ("kd", "delay"),
@@ -131,12 +133,33 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     if "feed" not in kinds[kind]:
         left_out.add("actuator.gain")
     found = replace(search, kept=frozenset(kept), excluded=search.excluded | left_out)
+    if own.complete:
+        found = replace(found, resting=frozenset(np.flatnonzero(rests(search.data)).tolist()))
+        fits[kind] = _at_rest(found, fits[kind])
     if not own.complete:
         point = dict(found.nominal)
         for name in ("kp", *kinds[kind]):
             point[name] = fits[kind].point[name]
         found = replace(found, nominal=point, open_controller=True)
     return found, replace(fits[kind], rms=None), kind
+
+
+def rests(data: Windows) -> Mask:
+    """Joints whose command rests in all windows, (J,): any controller holds them there."""
+    on = data.served > 0.5
+    ends = [find(np.where(on, data.command, fill), axis=(0, 2)) for find, fill in ((np.max, -np.inf), (np.min, np.inf))]
+    return np.asarray(ends[0] - ends[1] < RESTS_RAD)
+
+
+def _at_rest(search: Search, fit: Fit) -> Fit:
+    """The fit with the model's own values at the joints that rest."""
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for j in search.resting:
+        for name in point:
+            point[name][j] = search.nominal[name][j]
+    return replace(
+        fit, point=point, active=tuple(() if j in search.resting else own for j, own in enumerate(fit.active))
+    )
 
 
 def _as_excluded(search: Search, fit: Fit, needed: Sequence[str]) -> Fit:

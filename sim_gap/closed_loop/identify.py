@@ -10,7 +10,7 @@ import numpy as np
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
-from sim_gap.closed_loop.balance import balanced
+from sim_gap.closed_loop.balance import balanced, counted
 from sim_gap.closed_loop.choice.compete import select_about
 from sim_gap.closed_loop.choice.doubt import settled
 from sim_gap.closed_loop.columns import shared_effects, with_columns
@@ -110,10 +110,10 @@ def identify(
     never = frozenset(withhold) | _frozen(sim, fitted)
     search = Search(balanced(data), scales, nominal, floor, never)
     search, fit, kind = starting_fit(search, own, progress)
-    search = replace(search, data=balanced(data, fit))
+    search = replace(search, data=counted(search, data, fit))
     fit = select_about(search, replace(fit, rms=None), progress)
     progress("final fit")
-    search = replace(search, data=balanced(fitted, fit))
+    search = replace(search, data=counted(search, fitted, fit))
     fit = improve(search.data, replace(fit, rms=None), scales, 6)
     fit, others = settled(search, fit, progress)
     if own.complete:
@@ -122,7 +122,7 @@ def identify(
     margin = _margin(search, fit, floor)
     split = sound(search, judged, margin) if own.complete else None
     matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
-    few = balanced(data, fit)
+    few = counted(search, data, fit)
     found = tuple(stages(replace(search, data=few), evaluate(few, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)

@@ -45,6 +45,8 @@ class Search:
     """Effects that do not take part."""
     kept: frozenset[str] = frozenset({"controller.stiffness"})
     """Effects that are not taken out."""
+    resting: frozenset[int] = frozenset()
+    """Joints of which nothing is fitted."""
     open_controller: bool = False
     """Whether the nominal model has no controller, so that the fitted one is no cause of a gap."""
 

@@ -35,6 +35,11 @@ def notes(found: Identified) -> list[str]:
             "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
             + (", as part of the controller" if found.search.open_controller else "")
         )
+    if found.search.resting:
+        listed = ", ".join(names[j] for j in sorted(found.search.resting))
+        out.append(
+            f"{listed}: the command rests in all that is fitted, from which nothing follows: the model's values stay"
+        )
     if limits := described(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
     out += [*_touching(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]

@@ -25,14 +25,14 @@ def select(search: Search, fit: Fit, progress: Progress = lambda text: None) -> 
     own = [e for e in EFFECTS if e not in search.excluded]
     fit = improve(search.data, fit, search.scales)
     whole = {e: names for e, names in shared_effects(search.data.arm).items() if e.split("@")[0] not in search.excluded}
-    open_joints = set(range(search.data.joints))
+    open_joints = set(range(search.data.joints)) - search.resting
     for round_number in range(ROUNDS):
         progress(f"round {round_number + 1}: {sum(len(each) for each in fit.active) + len(fit.shared)} parameters")
         candidates = ranked(search, fit, own)
         best_own = max((each[0][0] for j, each in enumerate(candidates) if each and j in open_joints), default=0.0)
         if shared := _shared_round(search, fit, whole, best_own):
             fit = shared
-            open_joints = set(range(search.data.joints))
+            open_joints = set(range(search.data.joints)) - search.resting
             continue
         fit, changed = _own_round(search, fit, candidates, open_joints)
         open_joints &= changed

@@ -1,0 +1,54 @@
+"""A joint whose command never moves in what is fitted: nothing is known of it, and it spoils nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from servo_arm import model_text, record, written
+
+from armlink.recording.recording import Recording
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.attribution.diagnosis import Diagnosis
+
+GAIN, MODEL_GAIN = 15.0, 120.0
+
+
+@pytest.fixture(scope="module")
+def answer(tmp_path_factory) -> Diagnosis:
+    real = model_text(kp=GAIN, friction=0.15)
+    folder: Path = tmp_path_factory.mktemp("arm")
+    sim = written(folder, model_text(kp=MODEL_GAIN, friction=0.0))
+    return diagnose(sim, [still(record(real, 1, 24.0))], [record(real, 2, 18.0)])
+
+
+def still(recording: Recording) -> Recording:
+    """The elbow held where it is at first, as friction may hold it."""
+    assert recording.position_command is not None
+    command, position = recording.position_command.copy(), recording.position.copy()
+    command[:, 1], position[:, 1] = command[0, 1], position[0, 1]
+    return replace(recording, position_command=command, position=position)
+
+
+def test_its_values_are_the_models_and_a_note_says_so(answer: Diagnosis) -> None:
+    fit = answer.internals.fit
+    assert fit.active[1] == ()
+    assert fit.point["kp"][1] == MODEL_GAIN
+    assert fit.point["coulomb"][1] == 0.0
+    assert all("elbow" not in joint for cause in answer.causes for joint in cause.joints)
+    (note,) = [note for note in answer.notes if "rests" in note]
+    assert note.startswith("elbow: the command rests in all that is fitted")
+
+
+def test_the_other_joint_is_told_as_well_as_if_there_were_no_such(answer: Diagnosis) -> None:
+    fit = answer.internals.fit
+    assert fit.point["kp"][0] == pytest.approx(GAIN, rel=0.02)
+    assert fit.shared == ()
+    assert answer.heldout_after[0] < 0.03 * answer.heldout_before[0]
+    assert np.isfinite(answer.band.width).all()
+
+
+def test_the_exported_model_moves_and_the_resting_joint_as_before(answer: Diagnosis) -> None:
+    """With 36,000 N·m/rad, which held the elbow as well, it flew apart."""
+    assert answer.rollout.after[0] < 0.03 * answer.rollout.before[0]
+    assert answer.rollout.after[1] == pytest.approx(answer.rollout.before[1], rel=0.05)
