@@ -145,10 +145,10 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
 
 
 def rests(data: Windows) -> Mask:
-    """Joints whose command rests in all windows, (J,): any controller holds them there."""
+    """Joints whose command rests in all windows, (J,): any controller holds them there. One that has none swings."""
     on = data.served > 0.5
     ends = [find(np.where(on, data.command, fill), axis=(0, 2)) for find, fill in ((np.max, -np.inf), (np.min, np.inf))]
-    return np.asarray(ends[0] - ends[1] < RESTS_RAD)
+    return np.asarray(on.any(axis=(0, 2)) & (ends[0] - ends[1] < RESTS_RAD))
 
 
 def _at_rest(search: Search, fit: Fit) -> Fit:

@@ -44,11 +44,12 @@ class Unreached:
 
 def unreached(search: Search, fit: Fit, vague: Collection[tuple[int, str]] = ()) -> tuple[Unreached, ...]:
     """The limits that neither the model states nor the fit has, where some level of them is admitted; and of those that
-    the fit has the `vague` ones (joint, name), where no level above it costs much."""
+    the fit has the `vague` ones (joint, name), where no level above it costs much. Nothing of joints that rest."""
     out: list[Unreached] = []
     for name, effect in LIMITS.items():
         open_at = np.isinf(fit.point[name]) & (effect not in search.excluded)
         open_at |= np.array([(j, name) in vague for j in range(search.data.joints)])
+        open_at[list(search.resting)] = False
         if not open_at.any():
             continue
         levels = LEVELS[:, None] * search.size_of(name)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from servo_arm import model_text, record, written
@@ -10,6 +11,9 @@ from servo_arm import model_text, record, written
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
+from sim_gap.closed_loop.controller import rests
+from sim_gap.closed_loop.windows import windows_of
+from sim_gap.model.load import load_model
 
 GAIN, MODEL_GAIN = 15.0, 120.0
 
@@ -38,6 +42,21 @@ def test_its_values_are_the_models_and_a_note_says_so(answer: Diagnosis) -> None
     assert all("elbow" not in joint for cause in answer.causes for joint in cause.joints)
     (note,) = [note for note in answer.notes if "rests" in note]
     assert note.startswith("elbow: the command rests in all that is fitted")
+
+
+def test_nothing_is_said_of_limits_that_its_motion_does_not_reach(answer: Diagnosis) -> None:
+    assert {each.joint for each in answer.internals.spread.limits} == {0}
+    assert not any("does not reach" in note and "elbow" in note for note in answer.notes)
+
+
+def test_a_joint_rests_by_its_command_and_one_without_a_command_does_not() -> None:
+    text = model_text(kp=GAIN, friction=0.15)
+    whole = record(text, 1, 14.0)
+    held, loose = still(whole), still(whole)
+    loose.position_command[:, 1] = np.nan
+    arm = load_model(mujoco.MjModel.from_xml_string(text)).arm
+    for recording, expected in ((whole, False), (held, True), (loose, False)):
+        assert rests(windows_of(arm, [recording], ["run"])).tolist() == [False, expected]
 
 
 def test_the_other_joint_is_told_as_well_as_if_there_were_no_such(answer: Diagnosis) -> None:
