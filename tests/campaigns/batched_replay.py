@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 
 from armlink.recording.files import load_recording
+from armlink.recording.recording import slice_rows
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.better_model.native_drives import hold
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.training.draws import draw
 from sim_gap.closed_loop.training.posterior import batched
-from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, actuator_of, replay
+from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, actuator_of, commanded, replay
 
 AGREE = 0.05
 """Largest difference of the RMS gap to the measured position between both simulators, over all joints."""
@@ -112,7 +113,7 @@ def main() -> None:
     assert isinstance(found, Identified)
     assert found.export is not None
     model = mujoco.MjModel.from_xml_string((batched(found) or found.export).xml)
-    recording = found.recordings[0]
+    recording = slice_rows(found.recordings[0], commanded(found.recordings[0]))
     t, ours, measured = replay(Simulated(model, found.sim.joints), recording)
     rows = int(np.searchsorted(t, t[0] + given.seconds))
     started = time.process_time()

@@ -81,7 +81,7 @@ def drawn(answer: Diagnosis) -> np.ndarray:
     for row in draw(found.search, found.fit, found.spread, DRAWS, reach=found.band.reach):
         point = {name: values.copy() for name, values in found.fit.point.items()}
         for label, value in row.items():
-            joint, _, name = label.partition(".")
+            joint, _, name = label.rpartition(".")
             if joint in names:
                 point[name][names.index(joint)] = value
             else:

@@ -1,10 +1,9 @@
 """What recordings leave open of the parameters: covariance and intervals.
 
 A position alone shows ratios: of gain, friction and inertia, whose common scale rests on a little inertia. Along such a
-direction the score is flat, a fit stops anywhere, and a fit without one recording stops beside it. So the parameters
-follow in one Gauss-Newton step where a group of windows is left out (the jackknife of clusters; Bell and McCaffrey,
-Survey Methodology 28, 2002), as far as the others let them. Windows are left out, and whole recordings: each motion
-shows what the model lacks in another way, and the parameters take it up.
+direction the score is flat, a fit stops anywhere, and a fit without one recording stops beside it. So parameters are
+not fitted again but follow in one step (`jackknife`) where windows are left out, and where whole recordings are: each
+motion shows what the model lacks in another way, and the parameters take it up.
 """
 
 from collections.abc import Mapping, Sequence
