@@ -10,9 +10,10 @@ from dataclasses import replace
 from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
+from sim_gap.checks.changed_order import find_changed_order
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
-from sim_gap.checks.mapping import SURE, find_changed_order, find_mapping
+from sim_gap.checks.mapping import SURE, find_mapping
 from sim_gap.checks.mounting import as_mounted
 from sim_gap.checks.one_way import goes_one_way
 from sim_gap.checks.rigid_fit import Motion, beside_slow_torques, fit_rigid, motion_of
@@ -111,15 +112,14 @@ def _mapping(
     if goes_one_way(recording):
         return []
     follows = follows_position(recording)
-    mapping = find_mapping(arm, motion, stated, follows, mounted)
+    mapping, midway = find_mapping(arm, motion, stated, follows, mounted), find_changed_order(mounted, motion, stated)
+    gained = sum(finding.fall for finding in mapping)
+    if midway and midway[0].fall > SURE + gained:
+        return midway
     rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
     delay, fall = find_delay(mounted, motion, rate, stated)
-    if not delay or fall <= SURE + sum(finding.fall for finding in mapping):
-        return (
-            mapping
-            or find_changed_order(arm, motion, stated, mounted)
-            or find_small_zero(mounted, motion, stated, follows)
-        )
+    if not delay or fall <= SURE + gained:
+        return mapping or midway or find_small_zero(mounted, motion, stated, follows)
     in_time = prepare(_corrected(recording, delay[0], s.label), arm, s.label)
     return [*delay, *find_mapping(arm, motion_of(in_time, motion.channel), stated, follows)]
 

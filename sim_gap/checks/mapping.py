@@ -26,7 +26,6 @@ from sim_gap.checks.rigid_fit import (
     fit_rigid,
     rows_of,
 )
-from sim_gap.checks.torque_unit import find_absent
 from sim_gap.model.rigid_body import RigidArm
 
 SURE = 0.3
@@ -38,9 +37,6 @@ SCREENED = 0.3
 """Share of that fall that a hypothesis must reach on few rows."""
 ALIKE = 0.05
 """Difference of the falls below which two changes at the same joints cannot be told from each other."""
-CHANGED = 1.0
-"""Fall of the cost in one half of the rows from which its columns have an order of their own; on sound recordings no
-other order lowers it by more than 0.3 in a half, on those with two torques exchanged midway by 2.4 and more."""
 MOST_WORSE = 0.5
 """Most that the cost of any joint may rise with a hypothesis, as a share of the fall of all."""
 FITS = 0.65
@@ -95,26 +91,6 @@ def find_mapping(
         return []
     sure = sound and not any(each.others for each in taken)
     return [_finding(arm, each, fit, sure) for each in taken]
-
-
-def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections, mounted: RigidArm) -> list[Finding]:
-    """An order of the columns that one half of a motion alone has, as where recordings were put together.
-
-    Only looked for where the model explains a half far better than the whole.
-    """
-    model, middle = mounted.carried(motion.q, motion.v, motion.a), len(motion.q) // 2
-    halves = {"first": slice(None, middle), "second": slice(middle, None)}
-    least = min(float(fit_model(model[rows], rows_of(motion, rows)).cost.sum()) for rows in halves.values())
-    if float(fit_model(model, motion).cost.sum()) - least < CHANGED:
-        return []
-    for half, rows in halves.items():
-        part = rows_of(motion, rows)
-        orders = [each for each in find_mapping(arm, part, stated) if each.finding == "order" and each.fall > CHANGED]
-        for found in orders or find_absent(arm, fit_model(model[rows], part), part, stated):
-            option = f"give both halves as recordings of their own, this one with {found.option}"
-            evidence = f"in the {half} half of the recording alone {found.evidence}"
-            return [replace(found, evidence=evidence, option=option, corrected=False)]
-    return []
 
 
 def _as_an_arm(mounted: RigidArm, motion: Motion) -> RigidFit:

@@ -1,0 +1,64 @@
+"""Torque columns that change places within a recording, as where two were put together."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from armlink.recording.corrections import Corrections
+from gcomp.arrays import Array
+from sim_gap.checks.finding import Finding
+from sim_gap.checks.hypotheses import Hypothesis, hypotheses
+from sim_gap.checks.rigid_fit import FEW, Motion, changed, fit_model, fit_models, rows_of
+from sim_gap.checks.torque_unit import find_absent
+from sim_gap.model.rigid_body import RigidArm
+
+CLEAR = 0.6
+"""Fall of the cost, with an order in a part of the rows, from which it is asked about: on sound recordings of real arms
+none reaches 0.1, on those with two torques exchanged from the middle on they reach 1.2 and more."""
+UNEVEN = 1.0
+"""Fall of the cost from all rows to one half of them from which a torque may be absent from the other."""
+TRIED, LOCATED = np.linspace(0.25, 0.75, 3), np.linspace(0.05, 0.95, 37)
+"""Shares of the rows after which the order is tried to change, and those among which that place is then sought."""
+
+
+def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
+    """An order of the torque columns that the rows before or after some place alone have; `arm` is as mounted."""
+    model = arm.carried(motion.q, motion.v, motion.a)
+    orders = [h for h in hypotheses(arm, motion.channel, stated, ()) if h.kind == "order"]
+    own_orders = [h for h in orders if h.channels == (motion.channel,)]
+    tried = [(own, late, share) for own in own_orders for late in (False, True) for share in TRIED]
+    if not tried:
+        return []
+    few = rows_of(motion, slice(None, None, FEW))
+    fits = fit_models([(model[::FEW], _in_part(few, *each)) for each in tried])
+    own, late, _ = tried[int(np.argmin([fit.cost.sum() for fit in fits]))]
+    costs = [fit.cost.sum() for fit in fit_models([(model, _in_part(motion, own, late, share)) for share in LOCATED])]
+    share = float(LOCATED[np.argmin(costs)])
+    fall = float(fit_model(model, motion).cost.sum() - min(costs))
+    if fall < CLEAR:
+        return _absent_from_a_half(arm, motion, model, stated)
+    part = f"{'after' if late else 'before'} {share:.0%} of the rows"
+    evidence = f"{part} alone {own.what}: then the logarithm of what the model leaves falls by {fall:.1f}"
+    option = f"give both parts as recordings of their own, the {'later' if late else 'earlier'} with {own.option}"
+    return [Finding("order", motion.channel, arm.names[own.joints[0]], evidence, option, False, fall)]
+
+
+def _absent_from_a_half(arm: RigidArm, motion: Motion, model: Array, stated: Corrections) -> list[Finding]:
+    """Joints whose torque is absent from one half of the rows, where the model explains the other far better."""
+    whole, middle = float(fit_model(model, motion).cost.sum()), len(model) // 2
+    halves = {"first": slice(None, middle), "second": slice(middle, None)}
+    fits = {half: fit_model(model[rows], rows_of(motion, rows)) for half, rows in halves.items()}
+    if whole - min(float(fit.cost.sum()) for fit in fits.values()) < UNEVEN:
+        return []
+    for half, rows in halves.items():
+        for found in find_absent(arm, fits[half], rows_of(motion, rows), stated):
+            option = f"give both halves as recordings of their own, this one with {found.option}"
+            return [replace(found, evidence=f"in the {half} half of the rows alone {found.evidence}", option=option)]
+    return []
+
+
+def _in_part(motion: Motion, order: Hypothesis, late: bool, share: float) -> Motion:
+    """The motion with an order of its readings before, or after, a share of the rows."""
+    row = round(share * len(motion.q))
+    before, after = (motion, order.change(motion)) if late else (order.change(motion), motion)
+    return changed(motion, reading=np.concatenate([before.reading[:row], after.reading[row:]]))
