@@ -24,6 +24,9 @@ OWN_LAG = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 
 sensors read late, drives follow a command late, and positions are some milliseconds old."""
 SURE, SCREENED = 0.7, 0.3
 """Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
+SEVERAL, SURE_OF_SEVERAL = 3, 0.45
+"""Number of joints whose common delay is certain with a smaller fall; sound recordings of such arms reach 0.33, with
+which a link sensor's reading may truly be late, and those of one joint 0.45, as a motion that repeats looks alike."""
 REPEATS, APART = 0.5, 0.12
 """Share of that fall by which any other minimum of the cost must be higher that is so far away [s]."""
 LAWFUL, STEPS = 0.3, 50
@@ -116,18 +119,20 @@ def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) 
         return [], 0.0
     model = arm.carried(motion.q, motion.v, motion.a)
     start = float(fit_model(model, motion).cost.sum())
-    costs = {}
-    if start - arm.n * np.log(FLOOR) < SURE:
+    costs, sure = {}, SURE if arm.n < SEVERAL else SURE_OF_SEVERAL
+    if start - arm.n * np.log(FLOOR) < sure:
         return [], 0.0
     for rows in np.unique(np.round(np.arange(-LAG, LAG + LAG_STEP, LAG_STEP) * rate).astype(int)):
-        if abs(rows) < len(model) // 4 and start - _delayed_cost(model, motion, int(rows), FEW) > SCREENED * SURE:
+        if abs(rows) < len(model) // 4 and start - _delayed_cost(model, motion, int(rows), FEW) > SCREENED * sure:
             costs[rows / rate] = _delayed_cost(model, motion, int(rows))
     lag = min(costs, key=costs.__getitem__, default=0.0)
     fall = start - costs.get(lag, start)
     early, late = OWN_LAG[motion.channel]
-    if early <= lag <= late or abs(lag) >= LAG - 2.0 * LAG_STEP or fall < SURE or _repeats(costs, lag):
+    if early <= lag <= late or abs(lag) >= LAG - 2.0 * LAG_STEP or fall < sure or _repeats(costs, lag):
         return [], 0.0
     lag = _between_rows(model, motion, round(lag * rate)) / rate
+    if 0.0 < lag <= late:
+        return [], 0.0
     evidence = f"is {abs(lag):.2f} s {'late' if lag > 0 else 'early'} against the positions"
     option = f"--clock {motion.channel}={-lag:.3f}"
     return [Finding("clock", motion.channel, "all", evidence, option, True)], fall

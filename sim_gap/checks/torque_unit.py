@@ -1,6 +1,7 @@
 """Unit of a torque channel, or of one joint in it, and joints whose torque is absent from their column."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
@@ -23,9 +24,14 @@ STUCK = 1e6
 JOINTS = 0.2, 2.4
 """Coefficient of a joint that follows the model, the load at the tip in it, outside which it has a unit of its own; on
 real arms and parts of their recordings, and on simulated arms, it stays between 0.33 and 1.6."""
+LITTLE, EXPLAINED = 0.5, 0.9
+"""Correlation with the model's torque, beside friction and rotor, of a joint that follows it although friction hides
+it, where that torque is more than all that is read, and share of the reading that they explain together."""
 ALONE = 0.15
 """Share of the model's torque in a reading (standard deviations) below which it is friction alone; on real and
 simulated arms such a joint reads at most 0.65 of what those nearer the base do, the first joint left aside."""
+OUTGROWN = 1.5
+"""From this multiple of those on it is in another unit: coupled joints of a light arm read up to 1.1 of them."""
 SLIM = 0.03
 """Least share of the largest model torque (standard deviations) that a joint's must have for its coefficient to tell a
 unit: at a slim wrist a tool, a hose or a spring may be more."""
@@ -62,7 +68,7 @@ def find_joint_scale(arm: RigidArm, motion: Motion, stated: Corrections) -> list
     loaded = as_loaded(arm, motion)
     fit = fit_rigid(loaded, motion)
     found = []
-    follows = fit.correlation > STRONG_CORRELATION
+    follows = _follows(fit)
     odd = (fit.scale < JOINTS[0]) | (fit.scale > JOINTS[1])
     for j in np.flatnonzero(follows & odd).tolist():
         column = f"{motion.channel}_{j + 1}"
@@ -71,7 +77,7 @@ def find_joint_scale(arm: RigidArm, motion: Motion, stated: Corrections) -> list
         own = alone.own_share * alone.spread
         scales = np.array([each.scale[j] for each in (fit, alone, fit_rigid(others, motion, springs=True))])
         apart = np.all(scales < JOINTS[0]) or np.all(scales > JOINTS[1])
-        tells = alone.correlation[j] > STRONG_CORRELATION and own[j] > SLIM * own.max()
+        tells = _follows(alone)[j] and own[j] > SLIM * own.max()
         if stated.states("units", column) or not apart or not tells:
             continue
         evidence = (
@@ -82,13 +88,19 @@ def find_joint_scale(arm: RigidArm, motion: Motion, stated: Corrections) -> list
     return found if len(found) <= np.count_nonzero(follows & ~odd) else []
 
 
+def _follows(fit: RigidFit) -> NDArray[np.bool_]:
+    """Whether the model's torque is in each joint's reading, (n,)."""
+    hidden = (fit.correlation > LITTLE) & (fit.own_share > 1.0) & (fit.explained > EXPLAINED)
+    return (fit.correlation > STRONG_CORRELATION) | hidden
+
+
 def find_outgrown(arm: RigidArm, mounted: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
     """Joints with friction alone that read more than any joint between them and the base does: in a smaller unit."""
     spread, model = motion.reading.std(0), mounted.carried(motion.q, motion.v, motion.a).std(0)
     found = []
     for j in range(1, arm.n):
         column, largest = f"{motion.channel}_{j + 1}", float(max(spread[:j].max(), model.max()))
-        if model[j] < ALONE * spread[j] and spread[j] > largest and not stated.states("units", column):
+        if model[j] < ALONE * spread[j] and spread[j] > OUTGROWN * largest and not stated.states("units", column):
             evidence = (
                 f"varies by {spread[j]:.3g} N·m, of which the model's torque is {model[j] / spread[j]:.0%}; no joint "
                 f"nearer the base has more than {largest:.3g} N·m: milliamperes, or another unit?"

@@ -13,7 +13,7 @@ from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
 from sim_gap.checks.rigid_fit import Motion, RigidFit, fit_rigid
 from sim_gap.checks.torque_source import find_delay, find_gain_command, find_same, find_source, find_unsigned
-from sim_gap.checks.torque_unit import find_absent, find_outgrown, find_scale
+from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.model.load import load_model
 
 RATE, LATE = 25.0, 0.4
@@ -33,6 +33,29 @@ def test_a_late_channel_is_found():
     arm, read = late(*motion(3, 60.0, RATE, seed=3))
     (finding,), _ = find_delay(arm, read, RATE, AS_IT_IS)
     assert float(finding.option.split("=")[1]) == pytest.approx(-LATE, abs=0.02)
+
+
+@pytest.mark.parametrize(("late_s", "found"), [(0.025, 0), (0.06, 1), (-0.04, 1)])
+def test_a_motor_may_follow_late_by_some_hundredths_of_a_second_and_never_early(late_s: float, found: int):
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    t, q, v, a = motion(3, 60.0, 50.0, seed=3)
+    t, v, a = 0.5 * t, 2.0 * v, 4.0 * a
+    torque = np.stack([np.interp(t - late_s, t, column) for column in arm.torque(q, v, a).T], axis=1)
+    assert len(find_delay(arm, Motion(q, v, a, torque, "tau_motor"), 100.0, AS_IT_IS)[0]) == found
+
+
+@pytest.mark.parametrize(("factor", "found"), [(1.0, 0), (0.06, 1)])
+def test_a_unit_of_one_joint_is_found_although_friction_hides_its_torque(factor: float, found: int):
+    """The friction of the first joint is five times the model's torque, which correlates with what it leaves by 0.6."""
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    _, q, v, a = motion(3, 60.0, RATE, seed=3)
+    torque = arm.torque(q, v, a)
+    random = np.random.default_rng(1)
+    noise = 1.2 * torque[:, 0].std() * np.convolve(random.normal(size=len(q)), np.ones(9) / 3.0, "same")
+    torque[:, 0] += 5.0 * torque[:, 0].std() * np.tanh(v[:, 0] / 0.02) + noise
+    torque[:, 0] *= factor
+    read = Motion(q, v, a, torque, "tau_motor")
+    assert len(find_joint_scale(arm, read, AS_IT_IS)) == found
 
 
 def test_a_motion_that_repeats_does_not_tell_by_how_many_periods():
