@@ -24,7 +24,7 @@ OWN_LAG = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 
 sensors read late, drives follow a command late, and positions are some milliseconds old."""
 SURE, SCREENED = 0.7, 0.3
 """Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
-SEVERAL, SURE_OF_SEVERAL = 3, 0.45
+SEVERAL, SURE_OF_SEVERAL = 3, 0.4
 """Number of joints whose common delay is certain with a smaller fall; sound recordings of such arms reach 0.33, with
 which a link sensor's reading may truly be late, and those of one joint 0.45, as a motion that repeats looks alike."""
 REPEATS, APART = 0.5, 0.12
@@ -37,6 +37,10 @@ UNRELATED = 0.4
 LITTLE, BETTER = 0.45, 0.4
 """Share of such a reading that model, friction and rotor explain, below which it may be unsigned, and the fall of the
 cost with the model's sign from which it is; sound ones of real arms, a sensor with an offset, are at 0.51 and more."""
+
+TOUCHES = 0.05
+"""Lowest fiftieth of a reading that never changes its sign, over its standard deviation, below which it turns round at
+zero, as rectified readings do; sound ones of real arms, a sensor with an offset, stay above 0.2."""
 
 
 def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
@@ -57,8 +61,11 @@ def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Fi
             continue
         folded, plain = (abs(np.corrcoef(np.abs(y), x)[0, 1]) for x in (np.abs(m), m))
         unrelated = motion.channel != "tau" and plain < UNRELATED and explained < FITS
-        if folded > max(plain + 0.2, 0.6) or unrelated or (explained < LITTLE and falls[j] > BETTER):
-            evidence = f"never changes its sign, though the model's torque does; it follows its amount ({folded:.2f})"
+        touches = np.quantile(np.abs(y), 0.02) < TOUCHES * y.std()
+        follows = folded > max(plain + 0.2, 0.6)
+        if follows or touches or unrelated or (explained < LITTLE and falls[j] > BETTER):
+            how = f"it follows its amount ({folded:.2f})" if follows or not touches else "it turns round at zero"
+            evidence = f"never changes its sign, though the model's torque does; {how}"
             option = f"record signed torque, or --sign {motion.channel}_{j + 1}=1 if it is right"
             found.append(Finding("unsigned", motion.channel, arm.names[j], evidence, option, False))
     return found

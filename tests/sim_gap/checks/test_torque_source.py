@@ -127,6 +127,18 @@ def test_an_unsigned_reading_is_found_beside_noise_and_one_with_an_offset_is_not
     assert [each.joint for each in found] == [arm.names[joint]] * count
 
 
+@pytest.mark.parametrize(("raised_by", "count"), [(0.0, 1), (0.3, 0)])
+def test_an_unsigned_reading_that_does_not_follow_the_model_turns_round_at_zero(raised_by: float, count: int):
+    """The last joint's velocity, rectified, is half explained as friction, and has nothing of the model's torque."""
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    _, q, v, a = motion(3, 60.0, RATE, seed=3)
+    read = arm.torque(q, v, a)
+    own = 0.3 * np.abs(v[:, 2]) + 0.7 * v[:, 2].clip(0.0)
+    read[:, 2] = own + raised_by * own.std()
+    found = find_unsigned(arm, Motion(q, v, a, read, "tau"), AS_IT_IS)
+    assert [each.joint for each in found] == [arm.names[2]] * count
+
+
 @pytest.mark.parametrize(("friction", "count"), [(1.0, 0), (8.0, 0), (300.0, 1)])
 def test_a_joint_of_friction_alone_that_reads_more_than_those_before_it_is_asked_about(friction: float, count: int):
     arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
