@@ -28,9 +28,9 @@ from sim_gap.closed_loop.training.limits import LIMITS, Unreached
 
 SYSTEMATIC = 0.02
 """Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
-OTHERWISE = 2.0
+OTHERWISE = 6.0
 """Relative standard deviation of a parameter from one motion to the next, over what a fit leaves of the way to the
-command, as four recordings of an SO-101 show it, each fitted alone."""
+command: of 25 recordings of an SO-101, each fitted alone, 94 % of the differences are within two such intervals."""
 SCALED = ("kd", "coulomb", "viscous", "armature")
 """What a gain is told by the ratio to."""
 STATED = 0.5
