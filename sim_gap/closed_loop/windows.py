@@ -99,6 +99,11 @@ class Windows:
         """Number of windows."""
         return int(self.command.shape[2])
 
+    @property
+    def of_one_recording(self) -> bool:
+        """Whether all windows are of a single recording."""
+        return len(np.unique(self.recording)) == 1
+
 
 def windows_of(
     arm: RigidArm,

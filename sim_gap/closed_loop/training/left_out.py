@@ -26,9 +26,7 @@ class LeftOut:
 
 def recordings_or_thirds(data: Windows) -> NDArray[np.intp]:
     """Number of the group of each window, (W,): its recording, or the third of a single one."""
-    if len(np.unique(data.recording)) > 1:
-        return data.recording
-    return np.arange(data.count) * FOLDS // data.count
+    return np.arange(data.count) * FOLDS // data.count if data.of_one_recording else data.recording
 
 
 def left_out(search: Search, fit: Fit) -> LeftOut:

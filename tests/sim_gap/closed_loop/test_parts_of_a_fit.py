@@ -299,6 +299,7 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
     monkeypatch.setattr(spread, "errors_of", lambda search: [{}, {}])
     arm = SimpleNamespace(inertial=np.ones((1, 10)))
     data = SimpleNamespace(count=400, joints=1, recording=np.arange(400) // 10, columns={}, arm=arm)
+    data.of_one_recording = False
     search = SimpleNamespace(data=data, scales=Scales(*np.ones((4, 1))), samples=np.array([400.0]))
     fit = Fit({"kp": np.array([15.0]), **{name: np.zeros(1) for name in spread.SCALED}}, (("kp",),))
     for estimate, times in ((spread.covariance, 2.0), (spread.covariance_within, 1.0)):
@@ -307,16 +308,18 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
 
 
 def test_of_one_motion_what_is_left_of_the_way_to_the_command_is_what_another_may_show(monkeypatch) -> None:
-    """A tenth of it at the first joint, nothing at the second; nothing where several recordings show it."""
-    monkeypatch.setattr(spread, "rms_on", lambda data, fit: np.array([0.002, 0.0]))
-    fit = Fit({"kp": np.array([15.0, 10.0]), "coulomb": np.array([0.3, 0.2])}, (("kp", "coulomb"), ("kp",)))
-    torque, one = np.full(2, 0.5), np.ones(2)
-    scales = Scales(torque, one, one, np.full(2, 0.02))
-    search = SimpleNamespace(data=SimpleNamespace(recording=np.zeros(6, int)), scales=scales)
-    share = 0.1 * spread.OTHERWISE
-    found = np.diag(spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp")]))
-    np.testing.assert_allclose(found, [share**2, (share * 0.3 / scales.of("coulomb")[0]) ** 2, 0.0])
-    two = SimpleNamespace(data=SimpleNamespace(recording=np.arange(6) % 2), scales=scales)
+    """A twentieth of it at the first joint, nothing at the second, half at the third, of which no more is unknown than
+    of what a model states; nothing where several recordings show it."""
+    monkeypatch.setattr(spread, "rms_on", lambda data, fit: np.array([0.001, 0.0, 0.01]))
+    fit = Fit({"kp": np.array([15.0, 10.0, 5.0]), "coulomb": np.array([0.3, 0.2, 0.1])}, (("kp", "coulomb"), ("kp",)))
+    torque, one = np.full(3, 0.5), np.ones(3)
+    scales = Scales(torque, one, one, np.full(3, 0.02))
+    search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True), scales=scales)
+    share = 0.05 * spread.OTHERWISE
+    found = np.diag(spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp"), (2, "kp")]))
+    coulomb = share * 0.3 / scales.of("coulomb")[0]
+    np.testing.assert_allclose(found, [share**2, coulomb**2, 0.0, spread.STATED**2])
+    two = SimpleNamespace(data=SimpleNamespace(of_one_recording=False), scales=scales)
     assert not spread._of_one_motion(two, fit, [(0, "kp")]).any()
 
 
