@@ -34,18 +34,24 @@ def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections) -> li
     own, late, _ = tried[int(np.argmin([fit.cost.sum() for fit in fits]))]
     costs = [fit.cost.sum() for fit in fit_models([(model, _in_part(motion, own, late, share)) for share in LOCATED])]
     share = float(LOCATED[np.argmin(costs)])
-    fall = float(fit_model(model, motion).cost.sum() - min(costs))
+    whole = float(fit_model(model, motion).cost.sum())
+    fall = whole - float(min(costs))
     if fall < CLEAR:
-        return _absent_from_a_half(arm, motion, model, stated)
-    part = f"{'after' if late else 'before'} {share:.0%} of the rows"
+        return _absent_from_a_half(arm, motion, model, whole, stated)
+    part = f"{'after' if late else 'before'} {share:.0%} of the recording"
     evidence = f"{part} alone {own.what}: then the logarithm of what the model leaves falls by {fall:.1f}"
     option = f"give both parts as recordings of their own, the {'later' if late else 'earlier'} with {own.option}"
     return [Finding("order", motion.channel, arm.names[own.joints[0]], evidence, option, False, fall)]
 
 
-def _absent_from_a_half(arm: RigidArm, motion: Motion, model: Array, stated: Corrections) -> list[Finding]:
-    """Joints whose torque is absent from one half of the rows, where the model explains the other far better."""
-    whole, middle = float(fit_model(model, motion).cost.sum()), len(model) // 2
+def _absent_from_a_half(
+    arm: RigidArm, motion: Motion, model: Array, whole: float, stated: Corrections
+) -> list[Finding]:
+    """Joints whose torque is absent from one half of the rows, where the model explains the other far better.
+
+    `whole` is the cost of all rows.
+    """
+    middle = len(model) // 2
     halves = {"first": slice(None, middle), "second": slice(middle, None)}
     fits = {half: fit_model(model[rows], rows_of(motion, rows)) for half, rows in halves.items()}
     if whole - min(float(fit.cost.sum()) for fit in fits.values()) < UNEVEN:
@@ -53,7 +59,9 @@ def _absent_from_a_half(arm: RigidArm, motion: Motion, model: Array, stated: Cor
     for half, rows in halves.items():
         for found in find_absent(arm, fits[half], rows_of(motion, rows), stated):
             option = f"give both halves as recordings of their own, this one with {found.option}"
-            return [replace(found, evidence=f"in the {half} half of the rows alone {found.evidence}", option=option)]
+            return [
+                replace(found, evidence=f"in the {half} half of the recording alone {found.evidence}", option=option)
+            ]
     return []
 
 

@@ -115,7 +115,7 @@ def _shared_round(search: Search, fit: Fit, whole: dict[str, tuple[str, ...]], b
     before = search.score(fit)
     trial = improve(search.data, replace(fit, point=point, shared=(*fit.shared, *names)), search.scales, 5)
     fall = before - search.score(trial)
-    if fall.sum() < PRICE * len(names) or (fall / np.maximum(search.samples, 1.0)).max() < LEAST_FALL:
+    if fall.sum() < PRICE * len(names) or (fall < LEAST_FALL * np.maximum(search.samples, 1.0)).all():
         return None
     at_an_end = any(float(trial.point[name][0]) in search.data.ranges[name] for name in names)
     return None if at_an_end else trial
