@@ -11,6 +11,7 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.changed_order import find_changed_order
+from sim_gap.checks.delay import find_delay, find_short_delay
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_mapping
@@ -22,7 +23,6 @@ from sim_gap.checks.rows.held_positions import without_held
 from sim_gap.checks.rows.jumps import find_jumps, find_seam, unwrapped
 from sim_gap.checks.small_zero import find_small_zero
 from sim_gap.checks.torque_source import (
-    find_delay,
     find_gain_command,
     find_same,
     find_source,
@@ -119,7 +119,9 @@ def _mapping(
     rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
     delay, fall = find_delay(mounted, motion, rate, stated)
     if not delay or fall <= SURE + gained:
-        return mapping or midway or find_small_zero(mounted, motion, stated, follows)
+        if mapping or midway:
+            return mapping or midway
+        return [*find_short_delay(mounted, motion, rate, stated), *find_small_zero(mounted, motion, stated, follows)]
     in_time = prepare(_corrected(recording, delay[0], s.label), arm, s.label)
     return [*delay, *find_mapping(arm, motion_of(in_time, motion.channel), stated, follows)]
 

@@ -1,34 +1,18 @@
-"""Sign of rectified readings and source of a torque channel, and its time against the positions'."""
-
-from collections.abc import Mapping
-from dataclasses import replace
+"""Sign of rectified readings, and source of a torque channel."""
 
 import numpy as np
 
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.mapping import FITS
-from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, RigidFit, changed, fit_model
+from sim_gap.checks.rigid_fit import Motion, RigidFit, changed, fit_model
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import Signals
 
 GEAR_FRICTION = 0.13
 """Friction over torque (root sum of squares over the joints that move) from which a channel is a motor's: link sensors
 of two real arms show 0.04 to 0.07, motors of four others 0.26 to 0.6."""
-LAG, LAG_STEP = 1.5, 0.02
-"""Longest delay that is looked for, and its step [s]."""
-OWN_LAG = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 0.12)}
-"""Delays of a channel between which they are an effect of drive or sensor, which the diagnosis finds by itself [s]:
-sensors read late, drives follow a command late, and positions are some milliseconds old."""
-SURE, SCREENED = 0.7, 0.3
-"""Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
-SEVERAL, SURE_OF_SEVERAL = 3, 0.4
-"""Number of joints whose common delay is certain with a smaller fall; sound recordings of such arms reach 0.33, with
-which a link sensor's reading may truly be late, and those of one joint 0.45, as a motion that repeats looks alike."""
-REPEATS, APART = 0.5, 0.12
-"""Share of that fall by which any other minimum of the cost must be higher that is so far away [s]."""
 LAWFUL, STEPS = 0.3, 50
 """Least share of the variance of a command's steps that a law of gains explains (half on OpenArm, where positions,
 velocities and targets are rounded on the bus); least number of such steps."""
@@ -37,7 +21,6 @@ UNRELATED = 0.4
 LITTLE, BETTER = 0.45, 0.4
 """Share of such a reading that model, friction and rotor explain, below which it may be unsigned, and the fall of the
 cost with the model's sign from which it is; sound ones of real arms, a sensor with an offset, are at 0.51 and more."""
-
 TOUCHES = 0.05
 """Lowest fiftieth of a reading that never changes its sign, over its standard deviation, below which it turns round at
 zero, as rectified readings do; sound ones of real arms, a sensor with an offset, stay above 0.2."""
@@ -115,60 +98,3 @@ def find_source(fit: RigidFit, s: Signals, motion: Motion, stated: Corrections) 
         f"holds friction of {share:.0%} of its torque, which a link-side sensor does not feel: it is a motor's effort"
     )
     return [Finding("effort_source", "tau", "all", evidence, "--effort-is motor", "tau_motor" not in s.reading)]
-
-
-def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) -> tuple[list[Finding], float]:
-    """A torque channel whose clock is far off that of the positions, and by how much the cost falls with it.
-
-    `rate` is that of the motion's rows [Hz].
-    """
-    if motion.channel in stated.clock:
-        return [], 0.0
-    model = arm.carried(motion.q, motion.v, motion.a)
-    start = float(fit_model(model, motion).cost.sum())
-    costs, sure = {}, SURE if arm.n < SEVERAL else SURE_OF_SEVERAL
-    if start - arm.n * np.log(FLOOR) < sure:
-        return [], 0.0
-    for rows in np.unique(np.round(np.arange(-LAG, LAG + LAG_STEP, LAG_STEP) * rate).astype(int)):
-        if abs(rows) < len(model) // 4 and start - _delayed_cost(model, motion, int(rows), FEW) > SCREENED * sure:
-            costs[rows / rate] = _delayed_cost(model, motion, int(rows))
-    lag = min(costs, key=costs.__getitem__, default=0.0)
-    fall = start - costs.get(lag, start)
-    early, late = OWN_LAG[motion.channel]
-    if early <= lag <= late or abs(lag) >= LAG - 2.0 * LAG_STEP or fall < sure or _repeats(costs, lag):
-        return [], 0.0
-    lag = _between_rows(model, motion, round(lag * rate)) / rate
-    if 0.0 < lag <= late:
-        return [], 0.0
-    evidence = f"is {abs(lag):.2f} s {'late' if lag > 0 else 'early'} against the positions"
-    option = f"--clock {motion.channel}={-lag:.3f}"
-    return [Finding("clock", motion.channel, "all", evidence, option, True)], fall
-
-
-def _between_rows(model: Array, motion: Motion, rows: int) -> float:
-    """The delay in rows at which the cost is least, by the parabola through a minimum and its neighbours."""
-    before, least, after = (_delayed_cost(model, motion, k) for k in (rows - 1, rows, rows + 1))
-    bend = before - 2.0 * least + after
-    return rows + (float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend > 0.0 else 0.0)
-
-
-def _repeats(costs: Mapping[float, float], lag: float) -> bool:
-    """Whether the cost has another minimum nearly as low: in a motion that repeats, a delay by a period looks alike."""
-    order = sorted(costs)
-    values = [np.inf, *(costs[at] for at in order), np.inf]
-    minima = [at for k, at in enumerate(order, start=1) if values[k] <= min(values[k - 1], values[k + 1])]
-    return any(abs(at - lag) > APART and costs[at] - costs[lag] < REPEATS * SURE for at in minima)
-
-
-def _delayed_cost(model: Array, motion: Motion, rows: int, step: int = 1) -> float:
-    """Cost with the reading taken `rows` later than the motion, on every `step`-th row."""
-    ahead, behind = max(0, -rows), max(0, rows)
-    n = len(model) - abs(rows)
-    moved = replace(
-        motion,
-        q=motion.q[ahead : ahead + n : step],
-        v=motion.v[ahead : ahead + n : step],
-        a=motion.a[ahead : ahead + n : step],
-        reading=motion.reading[behind : behind + n : step],
-    )
-    return float(fit_model(model[ahead : ahead + n : step], moved).cost.sum())

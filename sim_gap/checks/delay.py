@@ -1,0 +1,125 @@
+"""Time of a torque channel against the positions'."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from armlink.recording.corrections import Corrections
+from gcomp.arrays import Array
+from sim_gap.checks.finding import Finding
+from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, fit_model
+from sim_gap.model.rigid_body import RigidArm
+
+LAG, LAG_STEP = 1.5, 0.02
+"""Longest delay that is looked for, and its step [s]."""
+OWN_LAG = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 0.12)}
+"""Delays of a channel between which they are an effect of drive or sensor, which the diagnosis finds by itself [s]:
+sensors read late, drives follow a command late, and positions are some milliseconds old."""
+SURE, SCREENED = 0.7, 0.3
+"""Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
+SEVERAL, SURE_OF_SEVERAL = 3, 0.4
+"""Number of joints whose common delay is certain with a smaller fall; sound recordings of such arms reach 0.33, with
+which a link sensor's reading may truly be late, and those of one joint 0.45, as a motion that repeats looks alike."""
+REPEATS, APART = 0.5, 0.12
+"""Share of that fall by which any other minimum of the cost must be higher that is so far away [s]."""
+SHORT, SHORT_STEP = 0.1, 0.01
+"""Longest delay of a motor's channel that all joints have to show, and its step [s]."""
+TOGETHER, OPPOSED = 0.15, 0.25
+"""Fall of the cost from which such a delay is certain, and the most by which it may rise at other joints, over what it
+falls by at some: sound recordings of real arms reach 0.10, or at two joints 0.5 with rises of 0.2 and more."""
+
+
+def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) -> tuple[list[Finding], float]:
+    """A torque channel whose clock is far off that of the positions, and by how much the cost falls with it.
+
+    `rate` is that of the motion's rows [Hz].
+    """
+    if motion.channel in stated.clock:
+        return [], 0.0
+    model = arm.carried(motion.q, motion.v, motion.a)
+    start = float(fit_model(model, motion).cost.sum())
+    costs, sure = {}, SURE if arm.n < SEVERAL else SURE_OF_SEVERAL
+    if start - arm.n * np.log(FLOOR) < sure:
+        return [], 0.0
+    for rows in np.unique(np.round(np.arange(-LAG, LAG + LAG_STEP, LAG_STEP) * rate).astype(int)):
+        if abs(rows) < len(model) // 4 and start - _delayed_cost(model, motion, int(rows), FEW) > SCREENED * sure:
+            costs[rows / rate] = _delayed_cost(model, motion, int(rows))
+    lag = min(costs, key=costs.__getitem__, default=0.0)
+    fall = start - costs.get(lag, start)
+    early, late = OWN_LAG[motion.channel]
+    if early <= lag <= late or abs(lag) >= LAG - 2.0 * LAG_STEP or fall < sure or _repeats(costs, lag):
+        return [], 0.0
+    lag = _between_rows(model, motion, round(lag * rate)) / rate
+    if 0.0 < lag <= late:
+        return [], 0.0
+    return [_clock(motion.channel, lag)], fall
+
+
+def _between_rows(model: Array, motion: Motion, rows: int) -> float:
+    """The delay in rows at which the cost is least, by the parabola through a minimum and its neighbours."""
+    before, least, after = (_delayed_cost(model, motion, k) for k in (rows - 1, rows, rows + 1))
+    bend = before - 2.0 * least + after
+    return rows + (float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend > 0.0 else 0.0)
+
+
+def _repeats(costs: Mapping[float, float], lag: float) -> bool:
+    """Whether the cost has another minimum nearly as low: in a motion that repeats, a delay by a period looks alike."""
+    order = sorted(costs)
+    values = [np.inf, *(costs[at] for at in order), np.inf]
+    minima = [at for k, at in enumerate(order, start=1) if values[k] <= min(values[k - 1], values[k + 1])]
+    return any(abs(at - lag) > APART and costs[at] - costs[lag] < REPEATS * SURE for at in minima)
+
+
+def _delayed_cost(model: Array, motion: Motion, rows: int, step: int = 1) -> float:
+    """Cost with the reading taken `rows` later than the motion, on every `step`-th row."""
+    ahead, behind = max(0, -rows), max(0, rows)
+    n = len(model) - abs(rows)
+    moved = replace(
+        motion,
+        q=motion.q[ahead : ahead + n : step],
+        v=motion.v[ahead : ahead + n : step],
+        a=motion.a[ahead : ahead + n : step],
+        reading=motion.reading[behind : behind + n : step],
+    )
+    return float(fit_model(model[ahead : ahead + n : step], moved).cost.sum())
+
+
+def find_short_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) -> list[Finding]:
+    """A delay of the motors' channel within a row or two: that of one drive is its own, that of all is the clock's.
+
+    `rate` is that of the motion's rows [Hz].
+    """
+    if motion.channel in stated.clock or motion.channel != "tau_motor" or arm.n < SEVERAL:
+        return []
+    lags, edge = np.arange(-SHORT, SHORT + 0.5 * SHORT_STEP, SHORT_STEP), int(np.ceil(SHORT * rate)) + 1
+    if len(motion.q) < 4 * edge:
+        return []
+    costs = _interpolated_costs(arm, motion, np.arange(len(motion.q)) / rate, slice(edge, -edge), lags)
+    best, middle = int(np.argmin(costs.sum(1))), len(lags) // 2
+    falls = costs[middle] - costs[best]
+    rises = float(-falls[falls < 0.0].sum())
+    if falls.sum() < TOGETHER or rises > OPPOSED * (float(falls.sum()) + rises) or best in (0, len(lags) - 1):
+        return []
+    return [_clock(motion.channel, float(lags[best]))]
+
+
+def _interpolated_costs(arm: RigidArm, motion: Motion, t: Array, rows: slice, lags: Array) -> Array:
+    """Cost of every joint with the reading of some `rows` taken later than the motion by each of `lags` [s], (L, n).
+
+    `t` are the times of all rows [s]. The motion is interpolated and not the reading, whose noise would be less between
+    its rows.
+    """
+    splines = [CubicSpline(t, x) for x in (motion.q, motion.v, motion.a)]
+    costs = []
+    for lag in lags:
+        q, v, a = (spline(t[rows] - lag) for spline in splines)
+        moved = replace(motion, q=q, v=v, a=a, reading=motion.reading[rows])
+        costs.append(fit_model(arm.carried(q, v, a), moved).cost)
+    return np.array(costs)
+
+
+def _clock(channel: str, lag: float) -> Finding:
+    evidence = f"is {abs(lag):.2f} s {'late' if lag > 0 else 'early'} against the positions"
+    return Finding("clock", channel, "all", evidence, f"--clock {channel}={-lag:.3f}", True)
