@@ -76,8 +76,13 @@ def test_a_delay_of_one_drive_is_its_own(by_s: tuple[float, float, float]):
     assert not find_short_delay(arm, read_late(by_s), 100.0, AS_IT_IS)
 
 
-def test_few_rows_and_link_sensors_show_no_short_delay():
+@pytest.mark.parametrize(("by_s", "found"), [(0.03, 0), (-0.03, 1)])
+def test_a_link_sensor_may_be_late_and_never_early(by_s: float, found: int):
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    assert len(find_short_delay(arm, read_late((by_s, by_s, by_s), "tau"), 100.0, AS_IT_IS)) == found
+
+
+def test_few_rows_show_no_short_delay():
     arm, read = load_model(mujoco.MjModel.from_xml_string(THREE)).arm, read_late((0.02, 0.02, 0.02))
     few = Motion(read.q[:30], read.v[:30], read.a[:30], read.reading[:30], "tau_motor")
     assert not find_short_delay(arm, few, 100.0, AS_IT_IS)
-    assert not find_short_delay(arm, read_late((0.02, 0.02, 0.02), "tau"), 100.0, AS_IT_IS)
