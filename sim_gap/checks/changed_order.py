@@ -9,7 +9,7 @@ from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.hypotheses import Hypothesis, hypotheses
 from sim_gap.checks.rigid_fit import FEW, Motion, changed, fit_model, fit_models, rows_of
-from sim_gap.checks.torque_unit import find_absent
+from sim_gap.checks.torque.unit import find_absent
 from sim_gap.model.rigid_body import RigidArm
 
 CLEAR = 0.6

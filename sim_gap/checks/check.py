@@ -11,7 +11,6 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.changed_order import find_changed_order
-from sim_gap.checks.delay import find_delay, find_short_delay
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.mapping import SURE, find_mapping
@@ -22,13 +21,14 @@ from sim_gap.checks.rows.clock import even_times, find_dropped, find_time_unit, 
 from sim_gap.checks.rows.held_positions import without_held
 from sim_gap.checks.rows.jumps import find_jumps, find_seam, unwrapped
 from sim_gap.checks.small_zero import find_small_zero
-from sim_gap.checks.torque_source import (
+from sim_gap.checks.torque.delay import find_delay, find_short_delay
+from sim_gap.checks.torque.source import (
     find_gain_command,
     find_same,
     find_source,
     find_unsigned,
 )
-from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
+from sim_gap.checks.torque.unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import TRIM_S, Signals, prepare

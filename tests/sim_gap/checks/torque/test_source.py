@@ -12,8 +12,8 @@ from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
 from sim_gap.checks.rigid_fit import Motion, RigidFit, fit_rigid
-from sim_gap.checks.torque_source import find_gain_command, find_same, find_source, find_unsigned
-from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
+from sim_gap.checks.torque.source import find_gain_command, find_same, find_source, find_unsigned
+from sim_gap.checks.torque.unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.model.load import load_model
 
 RATE = 25.0

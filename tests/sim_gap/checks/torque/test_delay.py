@@ -6,8 +6,8 @@ import pytest
 from wrong_arms import THREE, motion
 
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
-from sim_gap.checks.delay import find_delay, find_short_delay
 from sim_gap.checks.rigid_fit import Motion
+from sim_gap.checks.torque.delay import find_delay, find_short_delay
 from sim_gap.model.load import load_model
 
 RATE, LATE = 25.0, 0.4

@@ -1,0 +1,1 @@
+"""Checks of a torque channel: what it measures, its unit, and its clock."""
