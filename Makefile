@@ -81,7 +81,7 @@ corruptions: .venv/.dev ## Long campaign outside make test: wrong columns, units
 servopeer: .venv/.dev ## Long campaign outside make test: positions alone, beside mujoco.sysid (ARGS="--sim M --train R --heldout R")
 	$(BIN)/python tests/campaigns/servo_peer.py $(ARGS)
 
-repeats: .venv/.dev ## Long campaign outside make test: positions alone, bands of motion and two recordings of one arm (ARGS="--arms 4", "--sim M --recordings R … --parts 5")
+repeats: .venv/.dev ## Long campaign outside make test: positions alone, bands of motion and two recordings of one arm (ARGS="--arms 4", "--sim M --recordings R … --parts 5 --others 1")
 	$(BIN)/python tests/campaigns/servo_repeats.py $(ARGS)
 
 surfaces: .venv/.dev ## Long campaign outside make test: servo arms above a table, and arms that touch nothing (ARGS="--seeds 1 2")

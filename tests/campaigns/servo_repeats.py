@@ -1,12 +1,12 @@
 """Position-only diagnoses of one arm: do bands hold its other motion, and do two recordings give the same parameters?
 
     python tests/campaigns/servo_repeats.py [--arms 10] [--beyond]
-    python tests/campaigns/servo_repeats.py --sim MODEL.xml --recordings REC … [--parts 5]
+    python tests/campaigns/servo_repeats.py --sim MODEL.xml --recordings REC … [--parts 5] [--others 4]
 
 Simulated two-joint servo arms with drawn gain, friction and damping are diagnosed twice, from different recordings;
-the recordings of a real arm are dealt into parts, and each is diagnosed with the next one held out. With `--beyond` the
-held-out motion is 1.7 times as fast and 1.5 times as wide as that of the training, and torque limits, which the model
-does not state, are 1.0 to 2.5 times what that asks for.
+the recordings of a real arm are dealt into parts, and each is diagnosed with the next ones held out. With `--beyond`
+the held-out motion is 1.7 times as fast and 1.5 times as wide as that of the training, and torque limits, which the
+model does not state, are 1.0 to 2.5 times what that asks for.
 
 Printed are, of each, the share of the held-out motion within the 90 % band, what draws of the parameters leave of the
 training motion over what the fit leaves, in the median and of nine in ten, and of every two diagnoses of an arm the
@@ -19,7 +19,7 @@ import argparse
 import sys
 import tempfile
 from collections.abc import Iterator
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 
 import numpy as np
@@ -69,8 +69,11 @@ def simulated(arms: int, seed: int, beyond: bool) -> Iterator[tuple[str, list[Di
 def recorded(asked: argparse.Namespace) -> Iterator[tuple[str, list[Diagnosis]]]:
     """The diagnoses of the parts of a real arm's recordings."""
     parts = [[load_recording(path) for path in asked.recordings[k :: asked.parts]] for k in range(asked.parts)]
-    pairs = zip(parts, [*parts[1:], parts[0]], strict=True)
-    yield asked.sim.parent.name, [diagnose(asked.sim, train, other) for train, other in pairs]
+    answers = []
+    for k, train in enumerate(parts):
+        others = chain.from_iterable(parts[(k + 1 + n) % asked.parts] for n in range(asked.others))
+        answers.append(diagnose(asked.sim, train, list(others)))
+    yield asked.sim.parent.name, answers
 
 
 def drawn(answer: Diagnosis) -> np.ndarray:
@@ -111,6 +114,7 @@ def main() -> int:
     options.add_argument("--sim", type=Path)
     options.add_argument("--recordings", type=Path, nargs="+")
     options.add_argument("--parts", type=int, default=2)
+    options.add_argument("--others", type=int, default=1, help="parts that are held out")
     asked = options.parse_args()
     holds, inside, overlap, alike = [], [], [], []
     for name, answers in recorded(asked) if asked.sim else simulated(asked.arms, asked.seed, asked.beyond):
