@@ -73,7 +73,7 @@ def check_recording(
     if same and (law := find_gain_command(recording, stated)):
         same, recording = [*same, *law], replace(recording, torque_command=None)
     found = [*wrapped, *repeated, *held, *jitter, *([] if repeated else find_dropped(recording)), *same]
-    s = prepare(recording, arm, label)
+    s = _prepared(recording, arm, label, stated)
     for channel in s.channels:
         motion = motion_of(s, channel)
         mounted = as_mounted(arm, motion)
@@ -86,7 +86,7 @@ def check_recording(
                 recording = _corrected(recording, finding, label)
             if not findings:
                 continue
-            s = prepare(recording, arm, label)
+            s = _prepared(recording, arm, label, stated)
             if channel not in s.channels:  # taken for another one
                 break
             motion = motion_of(s, channel)
@@ -97,6 +97,11 @@ def check_recording(
     for finding in find_seam(recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
     return recording, [*found, *velocity]
+
+
+def _prepared(recording: Recording, arm: RigidArm, label: str, stated: Corrections) -> Signals:
+    """The recording with velocities of its own only if they are those of the positions."""
+    return prepare(sound_velocity(recording, stated)[0], arm, label)
 
 
 def _unsigned(
@@ -118,11 +123,16 @@ def _mapping(
         return midway
     rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
     delay, fall = find_delay(mounted, motion, rate, stated)
-    if not delay or fall <= SURE + gained:
-        if mapping or midway:
+    if mapping or midway:
+        if not delay or fall <= SURE + gained:
             return mapping or midway
-        return [*find_short_delay(mounted, motion, rate, stated), *find_small_zero(mounted, motion, stated, follows)]
-    in_time = prepare(_corrected(recording, delay[0], s.label), arm, s.label)
+    else:
+        zero = find_small_zero(arm, motion, stated, follows)
+        if zero and zero[0].fall > fall:
+            return zero
+        if not delay:
+            return find_short_delay(mounted, motion, rate, stated)
+    in_time = _prepared(_corrected(recording, delay[0], s.label), arm, s.label, stated)
     return [*delay, *find_mapping(arm, motion_of(in_time, motion.channel), stated, follows)]
 
 

@@ -26,6 +26,7 @@ from sim_gap.checks.rigid_fit import (
     fit_rigid,
     rows_of,
 )
+from sim_gap.checks.small_zero import least_cost
 from sim_gap.model.rigid_body import RigidArm
 
 SURE = 0.3
@@ -80,7 +81,7 @@ def find_mapping(
     taken: list[Change] = []
     while len(taken) < 2 * arm.n and not (taken and taken[-1].doubted):
         best = _best(arm, motion, fit, list(hypotheses(arm, motion.channel, stated, follows)))
-        if best is None:
+        if best is None or _is_small_zero(arm, motion, fit, best):
             break
         motion, fit = best.hypothesis.change(motion), best.fit
         taken.append(best)
@@ -123,6 +124,14 @@ def _best(arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypot
     alike = [each.hypothesis for each in found if each.fall > best.fall - ALIKE and not each.doubted]
     others = [h for h in alike if h.kind == own.kind and h.joints == own.joints and h.channels != own.channels]
     return replace(best, others=tuple(others))
+
+
+def _is_small_zero(arm: RigidArm, motion: Motion, fit: RigidFit, change: Change) -> bool:
+    """Whether joints move alike, so that another order does what a zero does that is slightly off, and is far rarer."""
+    if change.hypothesis.kind != "order" or "q" not in change.hypothesis.channels:
+        return False
+    least = min(least_cost(arm, motion, joint)[0] for joint in change.hypothesis.joints)
+    return float(fit.cost.sum()) - least > change.fall - ALIKE
 
 
 def _screened(arm: RigidArm, few: Motion, possible: Sequence[Hypothesis]) -> list[RigidFit]:

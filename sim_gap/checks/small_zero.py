@@ -2,17 +2,20 @@
 
 from collections.abc import Sequence
 
-import numpy as np
+from scipy.optimize import minimize_scalar
 
 from armlink.recording.corrections import Corrections
-from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
-from sim_gap.checks.mounting import as_loaded, body_at
+from sim_gap.checks.mounting import as_loaded, as_mounted, body_at
 from sim_gap.checks.rigid_fit import FEW, Motion, changed, fit_model, fit_rigid, rows_of
 from sim_gap.model.rigid_body import RigidArm
 
 STEP, STEPS = 0.1, 4
-"""Angles that are tried, either way: their step [rad], and how many. The first is an effect of an arm."""
+"""Angles that are tried, either way: their step [rad], and how many."""
+LEAST = 0.15
+"""Smallest angle that is asked about [rad]; a smaller one is an effect of an arm."""
+ROUNDS = 3
+"""Times that tilt and load are fitted in turn with the angle: fitted to wrong angles they take their part of them."""
 FIRST, LIKELY = 0.2, 0.2
 """Angle that is tried first, and the fall from which the others are."""
 CLEAR = 0.4
@@ -23,28 +26,27 @@ those with a zero off by 0.2 to 0.3 rad that MuJoCo's inverse dynamics tell 0.7 
 def find_small_zero(arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequence[str]) -> list[Finding]:
     """A joint whose zero is off by an angle that explains more than a load at the tip and a mass on its own link do.
 
-    Not the last joint's: a moment of its link does the same.
+    Not the last joint's: a moment of its link does the same. A tilt of the base takes its part of the second's.
     """
     if stated.order or stated.joints:
         return []
-    loaded, few = as_loaded(arm, motion), rows_of(motion, slice(None, None, FEW))
+    loaded, few = _as_it_is(arm, motion), rows_of(motion, slice(None, None, FEW))
     start = fit_rigid(loaded, few).cost.sum()
-
-    def fall_at(place: tuple[int, float]) -> float:
-        return float(start - fit_rigid(loaded, _moved(few, *place)).cost.sum())
-
     kinds = ("zero", "sign", "units")
     free = [j for j in range(arm.n - 1) if not any(stated.states(kind, f"q_{j + 1}") for kind in kinds)]
-    falls = {place: fall_at(place) for place in ((j, sign * FIRST) for j in free for sign in (1.0, -1.0))}
-    likely = [place for place, fall in falls.items() if fall > LIKELY]
-    falls |= {(j, k * STEP): fall_at((j, k * STEP)) for j, _ in likely for k in range(-STEPS, STEPS + 1)}
-    j, angle = max(falls, key=falls.__getitem__, default=(0, 0.0))
-    fall = falls.get((j, angle), 0.0)
-    if fall < CLEAR or abs(angle) < 1.5 * STEP:
+    likely = [j for j in free if start - min(_cost(loaded, few, j, angle) for angle in (FIRST, -FIRST)) > LIKELY]
+    if not likely:
         return []
+    cost, j, angle = min(least_cost(loaded, few, j) for j in likely)
+    if start - cost < CLEAR:
+        return []
+    for _ in range(ROUNDS):
+        right = _as_it_is(arm, _moved(motion, j, angle))
+        cost, _, angle = least_cost(right, few, j)
+    fall = float(start - cost)
     model = loaded.carried(motion.q, motion.v, motion.a)
     mass = fit_model(model + body_at(loaded, motion, j)[1], motion).cost.sum()
-    if fit_rigid(loaded, _moved(motion, j, angle)).cost.sum() > mass:
+    if abs(angle) < LEAST or fall < CLEAR or _cost(right, motion, j, angle) > mass:
         return []
     names = [name for name in ("q", *follows) if name != "dq"]
     option = "--zero " + ",".join(f"{name}_{j + 1}={angle:.2f}" for name in names) + f", or q_{j + 1}=0 if it is right"
@@ -54,7 +56,29 @@ def find_small_zero(arm: RigidArm, motion: Motion, stated: Corrections, follows:
     return [Finding("zero", "q", arm.names[j], evidence, option, False, fall)]
 
 
+def _as_it_is(arm: RigidArm, motion: Motion) -> RigidArm:
+    return as_loaded(as_mounted(arm, motion), motion)
+
+
+def least_cost(arm: RigidArm, motion: Motion, joint: int) -> tuple[float, int, float]:
+    """Least summed cost with the zero of a joint off by a small angle, the joint, and that angle [rad]."""
+    angles = [k * STEP for k in range(-STEPS, STEPS + 1)]
+    near = min(angles, key=lambda angle: _cost(arm, motion, joint, angle))
+    found = minimize_scalar(
+        lambda angle: _cost(arm, motion, joint, angle),
+        bounds=(near - STEP, near + STEP),
+        method="bounded",
+        options={"xatol": 0.1 * STEP},
+    )
+    return float(found.fun), joint, float(found.x)
+
+
+def _cost(arm: RigidArm, motion: Motion, joint: int, angle: float) -> float:
+    """Summed cost with the zero of a joint off by an angle."""
+    return float(fit_rigid(arm, _moved(motion, joint, angle)).cost.sum())
+
+
 def _moved(motion: Motion, joint: int, angle: float) -> Motion:
-    shift: Array = np.zeros(motion.q.shape[1])
-    shift[joint] = angle
-    return changed(motion, q=motion.q + shift)
+    q = motion.q.copy()
+    q[:, joint] += angle
+    return changed(motion, q=q)
