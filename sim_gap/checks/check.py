@@ -105,9 +105,17 @@ def _prepared(recording: Recording, arm: RigidArm, label: str, stated: Correctio
 
 
 def _unsigned(
-    _arm: RigidArm, mounted: RigidArm, _: Signals, motion: Motion, _recording: Recording, stated: Corrections
+    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
 ) -> list[Finding]:
-    return find_unsigned(mounted, motion, stated)
+    """Joints that read amounts, unless they do not with the channel's delay taken off."""
+    found = find_unsigned(mounted, motion, stated)
+    if not found or goes_one_way(recording):
+        return found
+    delay, _ = find_delay(mounted, motion, _rate(s, motion), stated)
+    if not delay:
+        return found
+    in_time = _prepared(_corrected(recording, delay[0], s.label), arm, s.label, stated)
+    return [] if not find_unsigned(mounted, motion_of(in_time, motion.channel), stated) else found
 
 
 def _mapping(
@@ -118,20 +126,14 @@ def _mapping(
         return []
     follows = follows_position(recording)
     mapping, midway = find_mapping(arm, motion, stated, follows, mounted), find_changed_order(mounted, motion, stated)
-    gained = sum(finding.fall for finding in mapping)
-    if midway and midway[0].fall > SURE + gained:
-        return midway
-    rate = (len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9)
+    zero = [] if mapping or midway else find_small_zero(arm, motion, stated, follows)
+    rate = _rate(s, motion)
     delay, fall = find_delay(mounted, motion, rate, stated)
-    if mapping or midway:
-        if not delay or fall <= SURE + gained:
-            return mapping or midway
-    else:
-        zero = find_small_zero(arm, motion, stated, follows)
-        if zero and zero[0].fall > fall:
-            return zero
-        if not delay:
-            return find_short_delay(mounted, motion, rate, stated)
+    gained, changed, moved = (sum(each.fall for each in found) for found in (mapping, midway, zero))
+    if not delay or fall <= max(SURE + max(gained, changed), moved):
+        if changed > SURE + gained:
+            return midway
+        return mapping or midway or zero or find_short_delay(mounted, motion, rate, stated)
     in_time = _prepared(_corrected(recording, delay[0], s.label), arm, s.label, stated)
     return [*delay, *find_mapping(arm, motion_of(in_time, motion.channel), stated, follows)]
 
@@ -148,6 +150,11 @@ def _source(
         or ([] if goes_one_way(recording) else find_absent(arm, fit, motion, stated))
     )
     return [*scale, *find_source(fit, s, motion, stated)]
+
+
+def _rate(s: Signals, motion: Motion) -> float:
+    """Rate of a motion's rows [Hz]."""
+    return float((len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9))
 
 
 def _corrected(recording: Recording, finding: Finding, label: str) -> Recording:

@@ -1,5 +1,7 @@
 """Draws faults of mapping, units and clocks into recordings of real arms: named, corrected or refused, never silent.
 
+A correction must make the recording what it was: one that does not counts as if nothing had been noticed.
+
     python tests/campaigns/corrupted_recordings.py --draws 200 [--realdata DIR]
 
 One line a draw, then what was noticed by kind; the recordings as they are must be no finding. Exit status 1 below 98 %
@@ -43,12 +45,34 @@ EFFECTS = {
 """Kinds of draws that are effects of an arm, too, where they are small, and what the diagnosis then names."""
 
 
-def said(arm, recording: Recording) -> str:
+def said(arm, spoiled: Recording, sound: Recording) -> tuple[str, bool]:
+    """What the check says of a recording, and whether it left, or made, anything wrong in what it says is right."""
     try:
-        recording.check("r")
-        return "; ".join(f"{each.finding} {each.option}" for each in check_recording(arm, recording, "r", AS_IT_IS)[1])
+        spoiled.check("r")
+        corrected, found = check_recording(arm, spoiled, "r", AS_IT_IS)
     except BadInput as error:
-        return f"refused: {error}"
+        return f"refused: {error}", False
+    return "; ".join(f"{each.finding} {each.option}" for each in found), bool(found) and differs(corrected, sound)
+
+
+def differs(corrected: Recording, sound: Recording) -> bool:
+    """Whether a joint's positions or torques are not those of the sound recording, at its times."""
+    torque = next(values for name in TORQUE_CHANNELS if (values := getattr(corrected, name)) is not None)
+    for values, true, most in (
+        (corrected.position, sound.position, ANGLES_OFF),
+        (torque, getattr(sound, torque_channel(sound)), TORQUES_OFF),
+    ):
+        off = values - np.column_stack([np.interp(corrected.t, sound.t, x) for x in true.T])
+        if values is corrected.position:
+            off -= 2.0 * np.pi * np.round(np.nanmedian(off, axis=0) / (2.0 * np.pi))
+        if np.any(np.sqrt(np.nanmean(off**2, axis=0)) > most * true.std(axis=0)):
+            return True
+    return False
+
+
+ANGLES_OFF, TORQUES_OFF = 0.3, 1.2
+"""RMS difference from the sound recording from which a corrected one is wrong, over the column's standard deviation;
+a turned sign makes 2, and another joint's column 1.4. Torques have noise, which interpolation changes."""
 
 
 def as_recorded(realdata: Path):
@@ -121,7 +145,7 @@ def main() -> int:
     for folder, file in ARMS:
         recording = load_recording(asked.realdata / folder / f"{file}.csv.gz")
         arms[folder] = load_model(asked.realdata / folder / "sim.xml", (), recording.n).arm, recording
-    alarms = {name: text for name, arm, recording in as_recorded(asked.realdata) if (text := said(arm, recording))}
+    alarms = {name: text for name, arm, own in as_recorded(asked.realdata) if (text := said(arm, own, own)[0])}
     print("as recorded, all recordings with torque:", alarms or "no finding", flush=True)
     random, seen, noticed, unseen = np.random.default_rng(asked.seed), Counter(), Counter(), Counter()
     explained = 0
@@ -133,9 +157,11 @@ def main() -> int:
         spoiled = CORRUPTIONS[kind](recording, random)
         if spoiled is None:
             continue
-        text = said(arm, spoiled)
+        text, wrong = said(arm, spoiled, recording)
         seen[kind] += 1
-        if not text:
+        if wrong:
+            text = f"WRONGLY CORRECTED: {text}"
+        elif not text:
             model = asked.realdata / folder / "sim.xml"
             answer = diagnose(str(model), [spoiled])
             causes = [f"{cause.effect} {cause.confidence:.2f}" for cause in answer.causes]

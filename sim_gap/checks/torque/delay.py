@@ -23,7 +23,7 @@ SEVERAL, SURE_OF_SEVERAL = 3, 0.4
 """Number of joints whose common delay is certain with a smaller fall; sound recordings of such arms reach 0.33, with
 which a link sensor's reading may truly be late, and those of one joint 0.45, as a motion that repeats looks alike."""
 REPEATS, APART = 0.5, 0.12
-"""Share of that fall by which any other minimum of the cost must be higher that is so far away [s]."""
+"""Share of the fall by which any other minimum of the cost must be higher that is so far away [s]."""
 SHORTEST, SHORT, SHORT_STEP = 0.02, 0.1, 0.01
 """Shortest delay that is told from elastic joints, longest one looked for between the rows, and its step [s]."""
 COMMON = {"tau_motor": (0.15, 0.25), "tau": (0.2, 1.0)}
@@ -50,7 +50,7 @@ def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) 
     lag = min(costs, key=costs.__getitem__, default=0.0)
     fall = start - costs.get(lag, start)
     early, late = OWN_LAG[motion.channel]
-    if early <= lag <= late or abs(lag) >= LAG - 2.0 * LAG_STEP or fall < sure or _repeats(costs, lag):
+    if early <= lag <= late or abs(lag) >= LAG - 2.0 * LAG_STEP or fall < sure or _repeats(costs, lag, fall):
         return [], 0.0
     lag = _between_rows(model, motion, round(lag * rate)) / rate
     if 0.0 < lag <= late:
@@ -65,12 +65,12 @@ def _between_rows(model: Array, motion: Motion, rows: int) -> float:
     return rows + (float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend > 0.0 else 0.0)
 
 
-def _repeats(costs: Mapping[float, float], lag: float) -> bool:
+def _repeats(costs: Mapping[float, float], lag: float, fall: float) -> bool:
     """Whether the cost has another minimum nearly as low: in a motion that repeats, a delay by a period looks alike."""
     order = sorted(costs)
     values = [np.inf, *(costs[at] for at in order), np.inf]
     minima = [at for k, at in enumerate(order, start=1) if values[k] <= min(values[k - 1], values[k + 1])]
-    return any(abs(at - lag) > APART and costs[at] - costs[lag] < REPEATS * SURE for at in minima)
+    return any(abs(at - lag) > APART and costs[at] - costs[lag] < REPEATS * max(fall, SURE) for at in minima)
 
 
 def _delayed_cost(model: Array, motion: Motion, rows: int, step: int = 1) -> float:

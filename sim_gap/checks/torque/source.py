@@ -87,12 +87,17 @@ def find_gain_command(recording: Recording, stated: Corrections) -> list[Finding
 
 
 def find_source(fit: RigidFit, s: Signals, motion: Motion, stated: Corrections) -> list[Finding]:
-    """A channel taken for a link sensor's that holds the friction of gears: a motor's."""
+    """A channel taken for a link sensor's that holds the friction of gears: a motor's.
+
+    Not if one joint alone has all that friction: it may be in another unit.
+    """
     if motion.channel != "tau" or stated.effort:
         return []
     moving = np.isfinite(fit.friction)
-    share = np.linalg.norm(np.maximum(fit.friction[moving], 0.0)) / (np.linalg.norm(fit.spread[moving]) + 1e-12)
-    if share < GEAR_FRICTION:
+    friction, spread = np.maximum(fit.friction[moving], 0.0), fit.spread[moving]
+    others = np.arange(len(friction)) != friction.argmax() if len(friction) > 2 else slice(None)
+    share, without = (np.linalg.norm(friction[j]) / (np.linalg.norm(spread[j]) + 1e-12) for j in (slice(None), others))
+    if min(share, without) < GEAR_FRICTION:
         return []
     evidence = (
         f"holds friction of {share:.0%} of its torque, which a link-side sensor does not feel: it is a motor's effort"

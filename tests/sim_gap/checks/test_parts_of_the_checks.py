@@ -68,7 +68,7 @@ def test_every_motion_has_its_own_fit_and_friction_only_where_it_moves() -> None
 @pytest.mark.parametrize(("higher", "repeats"), [(0.9 * REPEATS * SURE, True), (1.1 * REPEATS * SURE, False)])
 def test_a_motion_repeats_if_another_delay_costs_half_of_what_is_sure(higher: float, repeats: bool) -> None:
     costs = {0.0: 3.0, 0.4: 1.0, 0.5: 0.0, 0.6: 1.0, 1.2: 1.0, 1.3: higher, 1.4: 1.0}
-    assert _repeats(costs, 0.5) is repeats
+    assert _repeats(costs, 0.5, SURE) is repeats
 
 
 @pytest.mark.parametrize(("similar", "named"), [(0.0, True), (0.8, False)])
