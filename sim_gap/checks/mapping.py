@@ -34,6 +34,11 @@ SURE = 0.3
 DOUBTED = 0.4
 """Fall from which one that makes a joint much worse, or contradicts the model, is asked about; on sound recordings no
 hypothesis at all reaches 0.25."""
+CERTAIN = 1.0
+"""Fall below which a change is asked about if a joint that it concerns is not explained then, or only by a coefficient
+that no arm has, or if any other change does as much: it may be chance, of a hundred changes and weak joints."""
+TWICE = 2.0
+"""Times a fall by which that of a change that is doubted must be larger to be asked about instead."""
 SCREENED = 0.3
 """Share of that fall that a hypothesis must reach on few rows."""
 ALIKE = 0.05
@@ -64,7 +69,7 @@ class Change:
     doubted: bool
     """Whether a joint is much worse with it, or contradicts the model."""
     others: tuple[Hypothesis, ...] = ()
-    """Other changes at the same joints with which the data fit as well."""
+    """Other changes with which the data fit as well."""
 
 
 def find_mapping(
@@ -75,7 +80,8 @@ def find_mapping(
     `mounted` is the arm `as_mounted` in this motion, if it is known. `follows` are the channels (of `dq`, `q_cmd`)
     whose columns agree with the positions' as they are recorded, so that what is wrong with a position is wrong with
     theirs. All findings are corrected, or none is. A slight fall counts only if every joint concerned is explained
-    then: a model that was fitted to another motion leaves some of them to chance.
+    then, and one that is not large is certain only then: a model that was fitted to another motion leaves some of them
+    to chance.
     """
     fit = _as_an_arm(mounted or as_mounted(arm, motion), motion)
     taken: list[Change] = []
@@ -87,9 +93,11 @@ def find_mapping(
         taken.append(best)
     touched = {joint for each in taken for joint in each.hypothesis.joints}
     sound = not any(each.doubted for each in taken) and _is_sound(fit, touched)
-    slight = sum(each.fall for each in taken) < DOUBTED
-    if slight and not (sound and np.all(fit.explained[list(touched)] > FITS)):
+    explained = sound and bool(np.all(fit.explained[list(touched)] > FITS))
+    if sum(each.fall for each in taken) < DOUBTED and not explained:
         return []
+    if min((each.fall for each in taken), default=0.0) < CERTAIN:
+        sound = explained and _is_plausible(fit, touched)
     sure = sound and not any(each.others for each in taken)
     return [_finding(arm, each, fit, sure) for each in taken]
 
@@ -119,11 +127,12 @@ def _best(arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypot
             found.append(Change(hypothesis, better, fall, doubted))
     if not found:
         return None
-    best = max(found, key=lambda each: (not each.doubted, each.fall))
+    best = max(found, key=lambda each: each.fall if each.doubted else TWICE * each.fall)
     own = best.hypothesis
     alike = [each.hypothesis for each in found if each.fall > best.fall - ALIKE and not each.doubted]
-    others = [h for h in alike if h.kind == own.kind and h.joints == own.joints and h.channels != own.channels]
-    return replace(best, others=tuple(others))
+    if best.fall > CERTAIN:
+        alike = [h for h in alike if h.kind == own.kind and h.joints == own.joints and h.channels != own.channels]
+    return replace(best, others=tuple(h for h in alike if h is not own))
 
 
 def _is_small_zero(arm: RigidArm, motion: Motion, fit: RigidFit, change: Change) -> bool:
@@ -181,12 +190,21 @@ def _is_sound(fit: RigidFit, touched: Collection[int]) -> bool:
     return plausible and fits and (not touched or bool(np.median(fit.explained[list(touched)]) > FITS))
 
 
+def _is_plausible(fit: RigidFit, touched: Collection[int]) -> bool:
+    """Whether joints that the model explains have a coefficient that arms have."""
+    low, high = PLAUSIBLE
+    explains = fit.own_share * fit.scale > STRONG_SHARE
+    return bool(np.all(((low < fit.scale) & (fit.scale < high) | ~explains)[list(touched)]))
+
+
 def _finding(arm: RigidArm, change: Change, fit: RigidFit, sure: bool) -> Finding:
     own = change.hypothesis
     joint = "all" if len(own.joints) == arm.n > 1 else arm.names[own.joints[0]]
     share = float(np.min(fit.explained[list(own.joints)]))
     evidence = f"{own.what}: then the model explains {share:.0%} (logarithm of what is left falls by {change.fall:.1f})"
     if change.others:
-        evidence += f"; or {' or '.join(other.channels[0] for other in change.others)}, which it explains as well"
+        same = all(other.joints == own.joints for other in change.others)
+        names = " or ".join(other.channels[0] for other in change.others) if same else "other changes"
+        evidence += f"; or {names}, with which it explains as much"
     option = ", or ".join(each.option for each in (own, *change.others))
     return Finding(own.kind, own.channels[0], joint, evidence, option, sure, change.fall)
