@@ -89,7 +89,7 @@ def find_gain_command(recording: Recording, stated: Corrections) -> list[Finding
 def find_source(fit: RigidFit, s: Signals, motion: Motion, stated: Corrections) -> list[Finding]:
     """A channel taken for a link sensor's that holds the friction of gears: a motor's.
 
-    Not if one joint alone has all that friction: it may be in another unit.
+    One joint that has all that friction is asked about: it may be in another unit.
     """
     if motion.channel != "tau" or stated.effort:
         return []
@@ -97,9 +97,24 @@ def find_source(fit: RigidFit, s: Signals, motion: Motion, stated: Corrections) 
     friction, spread = np.maximum(fit.friction[moving], 0.0), fit.spread[moving]
     others = np.arange(len(friction)) != friction.argmax() if len(friction) > 2 else slice(None)
     share, without = (np.linalg.norm(friction[j]) / (np.linalg.norm(spread[j]) + 1e-12) for j in (slice(None), others))
-    if min(share, without) < GEAR_FRICTION:
+    if share < GEAR_FRICTION:
         return []
+    if without < GEAR_FRICTION:
+        return _odd_joint(int(np.flatnonzero(moving)[friction.argmax()]), fit, s, stated)
     evidence = (
         f"holds friction of {share:.0%} of its torque, which a link-side sensor does not feel: it is a motor's effort"
     )
     return [Finding("effort_source", "tau", "all", evidence, "--effort-is motor", "tau_motor" not in s.reading)]
+
+
+def _odd_joint(j: int, fit: RigidFit, s: Signals, stated: Corrections) -> list[Finding]:
+    """A joint's reading that holds friction, unlike those of the others' link sensors."""
+    column = f"tau_{j + 1}"
+    if stated.states("units", column):
+        return []
+    evidence = (
+        f"holds friction of {fit.friction[j] / fit.spread[j]:.0%} of its torque, which a link-side sensor does not "
+        "feel, and no other joint does: amperes, or a motor's effort?"
+    )
+    option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
+    return [Finding("scale", "tau", s.arm.names[j], evidence, option, False)]

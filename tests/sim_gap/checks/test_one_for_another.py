@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armlink.errors import BadInput
-from armlink.recording.corrections import AS_IT_IS
+from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
@@ -71,7 +71,11 @@ def test_one_joint_in_another_unit_makes_no_motors_of_link_sensors(arms, joint):
     arm, recording = arms["panda"]
     torque = recording.torque.copy()
     torque[:, joint] *= 10.0
-    assert check_recording(arm, replace(recording, torque=torque), "r", AS_IT_IS)[1] == []
+    column = f"tau_{joint + 1}"
+    with pytest.raises(BadInput, match=f"holds friction of .*--units {column}=A:K"):
+        check_recording(arm, replace(recording, torque=torque), "r", AS_IT_IS)
+    stated = parse_corrections(units=[f"{column}=N·m"])
+    assert check_recording(arm, replace(recording, torque=torque), "r", stated)[1] == []
 
 
 def test_a_motion_that_repeats_tells_no_delay_of_a_motors_effort(arms):
