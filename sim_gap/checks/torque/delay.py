@@ -31,6 +31,9 @@ COMMON = {"tau_motor": (0.15, 0.25), "tau": (0.2, 1.0)}
 falls by at some: motors of real arms reach 0.10, or at two joints 0.5 with rises of 0.2 and more. Link sensors, of
 which one may be late, are never early: on real and simulated arms the cost falls by up to 0.08."""
 
+ALL = 0.5
+"""Least median of the joints' own delays, over the common one: play in one joint bends the torque of another alone."""
+
 
 def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) -> tuple[list[Finding], float]:
     """A torque channel whose clock is far off that of the positions, and by how much the cost falls with it.
@@ -101,11 +104,13 @@ def find_short_delay(arm: RigidArm, motion: Motion, rate: float, stated: Correct
         return []
     costs = _interpolated_costs(arm, motion, np.arange(len(motion.q)) / rate, slice(edge, -edge), lags)
     best, least, opposed = int(np.argmin(costs.sum(1))), *COMMON[motion.channel]
+    lag, own = float(lags[best]), float(np.median(lags[costs.argmin(axis=0)]))
     falls = costs[np.argmin(np.abs(lags))] - costs[best]
     rises = float(-falls[falls < 0.0].sum())
-    if abs(lags[best]) < SHORTEST - 1e-9 or falls.sum() < least or rises > opposed * (float(falls.sum()) + rises):
+    clear = falls.sum() >= least and rises <= opposed * (float(falls.sum()) + rises)
+    if abs(lag) < SHORTEST - 1e-9 or not clear or own * lag < ALL * lag**2:
         return []
-    return [_clock(motion.channel, float(lags[best]))]
+    return [_clock(motion.channel, lag)]
 
 
 def _interpolated_costs(arm: RigidArm, motion: Motion, t: Array, rows: slice, lags: Array) -> Array:

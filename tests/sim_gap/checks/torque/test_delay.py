@@ -1,5 +1,7 @@
 """A torque channel's clock against the positions': found if it is one delay, not if several would do."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -74,6 +76,16 @@ def test_a_short_delay_of_all_motors_is_that_of_their_clock(by_s: float):
 def test_a_delay_of_one_drive_is_its_own(by_s: tuple[float, float, float]):
     arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
     assert not find_short_delay(arm, read_late(by_s), 100.0, AS_IT_IS)
+
+
+@pytest.mark.parametrize("joint", [0, 1, 2])
+def test_what_one_joint_shows_early_is_no_clock_of_the_link_sensors(joint: int):
+    """Play between encoder and link does so, of the torque of a joint nearer to the base."""
+    arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
+    read = read_late(tuple(-0.04 * (j == joint) for j in range(3)), "tau")
+    hardly_tell = 0.6 * read.reading.std(axis=0) * (np.arange(3) != joint)
+    noise = hardly_tell * np.random.default_rng(5).normal(size=read.q.shape)
+    assert not find_short_delay(arm, replace(read, reading=read.reading + noise), 100.0, AS_IT_IS)
 
 
 @pytest.mark.parametrize(("by_s", "found"), [(0.03, 0), (-0.03, 1)])
