@@ -1,6 +1,7 @@
 """Draws faults of mapping, units and clocks into recordings of real arms: named, corrected or refused, never silent.
 
-A correction must make the recording what it was: one that does not counts as if nothing had been noticed.
+A correction must make the recording what it was, as far as it can tell: one that does not counts as if nothing had been
+noticed.
 
     python tests/campaigns/corrupted_recordings.py --draws 200 [--realdata DIR]
 
@@ -45,14 +46,15 @@ EFFECTS = {
 """Kinds of draws that are effects of an arm, too, where they are small, and what the diagnosis then names."""
 
 
-def said(arm, spoiled: Recording, sound: Recording) -> tuple[str, bool]:
-    """What the check says of a recording, and whether it left, or made, anything wrong in what it says is right."""
+def said(arm, spoiled: Recording, sound: Recording) -> tuple[str, Recording | None]:
+    """What the check says of a recording, and the recording that it took for right, if that is not the sound one."""
     try:
         spoiled.check("r")
         corrected, found = check_recording(arm, spoiled, "r", AS_IT_IS)
     except BadInput as error:
-        return f"refused: {error}", False
-    return "; ".join(f"{each.finding} {each.option}" for each in found), bool(found) and differs(corrected, sound)
+        return f"refused: {error}", None
+    text = "; ".join(f"{each.finding} {each.option}" for each in found)
+    return text, corrected if found and differs(corrected, sound) else None
 
 
 def differs(corrected: Recording, sound: Recording) -> bool:
@@ -158,11 +160,11 @@ def main() -> int:
         if spoiled is None:
             continue
         text, wrong = said(arm, spoiled, recording)
+        model = asked.realdata / folder / "sim.xml"
         seen[kind] += 1
-        if wrong:
+        if wrong and worse_by(mujoco.MjModel.from_xml_path(str(model)), recording, wrong) > AS_WELL:
             text = f"WRONGLY CORRECTED: {text}"
         elif not text:
-            model = asked.realdata / folder / "sim.xml"
             answer = diagnose(str(model), [spoiled])
             causes = [f"{cause.effect} {cause.confidence:.2f}" for cause in answer.causes]
             fitting = [cause for cause in answer.causes if cause.effect in EFFECTS.get(kind, ())]
