@@ -42,7 +42,7 @@ TWICE = 2.0
 SCREENED = 0.3
 """Share of that fall that a hypothesis must reach on few rows."""
 ALIKE = 0.05
-"""Difference of the falls below which two changes at the same joints cannot be told from each other."""
+"""Difference of the falls below which two changes cannot be told from each other."""
 MOST_WORSE = 0.5
 """Most that the cost of any joint may rise with a hypothesis, as a share of the fall of all."""
 FITS = 0.65
@@ -111,7 +111,7 @@ def _as_an_arm(mounted: RigidArm, motion: Motion) -> RigidFit:
 
 
 def _best(arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypothesis]) -> Change | None:
-    """The hypothesis that lowers the cost most, if by enough; one that is doubted only if no other does."""
+    """The hypothesis that lowers the cost most, if by enough; one that is doubted only if it does so by far more."""
     found = []
     for hypothesis, screened in zip(
         possible, _screened(arm, rows_of(motion, slice(None, None, FEW)), possible), strict=True
