@@ -62,7 +62,7 @@ def hypotheses(arm: RigidArm, channel: str, stated: Corrections, follows: Sequen
         orders.append(tuple(reversed(range(arm.n))))
     for order in orders:
         for channels in ((*positions, channel), positions, (channel,)):
-            yield _ordered(arm, order, channels, channel)
+            yield ordered(arm, order, channels, channel)
 
 
 def _exchanged(n: int, i: int, k: int) -> tuple[int, ...]:
@@ -71,14 +71,14 @@ def _exchanged(n: int, i: int, k: int) -> tuple[int, ...]:
     return tuple(order)
 
 
-def _ordered(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str], torque: str) -> Hypothesis:
+def ordered(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str], torque: str) -> Hypothesis:
     """Columns of some channels in another order."""
     touched = tuple(j for j, other in enumerate(order) if j != other)
     names = ", ".join(arm.names[j] for j in touched)
     what = f"is in another order ({names} hold {', '.join(arm.names[order[j]] for j in touched)})"
     option = "--map " + ",".join(f"{name}_{j + 1}={name}_{order[j] + 1}" for name in channels for j in touched)
     values = [*(("q", "v", "a") if "q" in channels else ()), *(("reading",) if torque in channels else ())]
-    return Hypothesis("order", tuple(channels), touched, what, option, _permuted(order, values))
+    return Hypothesis("order", tuple(channels), touched, what, option, permuted(order, values))
 
 
 def _turned(joints: tuple[int, ...], torque: bool) -> Callable[[Motion], Motion]:
@@ -107,7 +107,9 @@ def _degrees(motion: Motion) -> Motion:
     return changed(motion, q=motion.q * TURN, v=motion.v * TURN, a=motion.a * TURN)
 
 
-def _permuted(order: tuple[int, ...], names: Sequence[str]) -> Callable[[Motion], Motion]:
+def permuted(order: Sequence[int], names: Sequence[str]) -> Callable[[Motion], Motion]:
+    """Columns of some fields of a motion in another order."""
+
     def change(motion: Motion) -> Motion:
         values: dict[str, Array] = {name: getattr(motion, name)[:, list(order)] for name in names}
         return changed(motion, **values)

@@ -14,8 +14,9 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
-from sim_gap.checks.hypotheses import Hypothesis, hypotheses
+from sim_gap.checks.hypotheses import Hypothesis, hypotheses, ordered
 from sim_gap.checks.mounting import as_loaded, as_mounted
+from sim_gap.checks.orders import likely_orders
 from sim_gap.checks.rigid_fit import (
     FEW,
     STRONG_SHARE,
@@ -43,6 +44,8 @@ SCREENED = 0.3
 """Share of that fall that a hypothesis must reach on few rows."""
 ALIKE = 0.05
 """Difference of the falls below which two changes cannot be told from each other."""
+MOST_OPTIONS = 2
+"""Most options that are spelt out."""
 MOST_WORSE = 0.5
 """Most that the cost of any joint may rise with a hypothesis, as a share of the fall of all."""
 FITS = 0.65
@@ -84,9 +87,11 @@ def find_mapping(
     to chance.
     """
     fit = _as_an_arm(mounted or as_mounted(arm, motion), motion)
+    orders = _orders(arm, motion, stated, follows) if _is_odd(fit) else []
     taken: list[Change] = []
     while len(taken) < 2 * arm.n and not (taken and taken[-1].doubted):
-        best = _best(arm, motion, fit, list(hypotheses(arm, motion.channel, stated, follows)))
+        first = [] if taken else orders
+        best = _best(arm, motion, fit, [*hypotheses(arm, motion.channel, stated, follows), *first])
         if best is None or _is_small_zero(arm, motion, fit, best):
             break
         motion, fit = best.hypothesis.change(motion), best.fit
@@ -100,6 +105,22 @@ def find_mapping(
         sound = explained and _is_plausible(fit, touched)
     sure = sound and not any(each.others for each in taken)
     return [_finding(arm, each, fit, sure) for each in taken]
+
+
+def _is_odd(fit: RigidFit) -> bool:
+    """Whether a joint is not explained, or contradicts the model: then every order is looked at."""
+    return bool(np.any(fit.explained < FITS)) or any(_contradicts(fit, [j]) for j in range(len(fit.scale)))
+
+
+def _orders(arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequence[str]) -> list[Hypothesis]:
+    """Orders of all joints' columns, of their positions and of their torques that fit best."""
+    if stated.order or stated.joints:
+        return []
+    positions, torque = ("q", *follows), motion.channel
+    return [
+        ordered(arm, order, (*(positions if moved else ()), *((torque,) if read else ())), torque)
+        for order, moved, read in likely_orders(arm, motion)
+    ]
 
 
 def _as_an_arm(mounted: RigidArm, motion: Motion) -> RigidFit:
@@ -122,17 +143,29 @@ def _best(arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypot
         better = fit_rigid(arm, moved)
         fall = float(_told(hypothesis, moved, fit, better).sum())
         worse = float(np.max(better.cost - fit.cost))
-        doubted = worse >= MOST_WORSE * fall or _contradicts(better, hypothesis.joints)
+        settled = _contradicts(fit, hypothesis.joints)  # which it no longer does
+        doubted = worse >= MOST_WORSE * fall and not settled or _contradicts(better, hypothesis.joints)
         if fall > (DOUBTED if doubted else SURE):
             found.append(Change(hypothesis, better, fall, doubted))
     if not found:
         return None
     best = max(found, key=lambda each: each.fall if each.doubted else TWICE * each.fall)
+    as_good = [each for each in found if each.fall > best.fall - ALIKE and each.doubted == best.doubted]
+    best = min(as_good, key=lambda each: (len(each.hypothesis.joints) if _is_near(each, best) else arm.n, -each.fall))
     own = best.hypothesis
     alike = [each.hypothesis for each in found if each.fall > best.fall - ALIKE and not each.doubted]
     if best.fall > CERTAIN:
         alike = [h for h in alike if h.kind == own.kind and h.joints == own.joints and h.channels != own.channels]
-    return replace(best, others=tuple(h for h in alike if h is not own))
+        alike += [each.hypothesis for each in found if _is_near(each, best)]
+    others = {h.option: h for h in alike if h.option != own.option}
+    return replace(best, others=tuple(others.values()))
+
+
+def _is_near(change: Change, best: Change) -> bool:
+    """Whether an order is no farther from the recorded one than the best, and hardly worse."""
+    own, other = best.hypothesis, change.hypothesis
+    near = other.kind == own.kind == "order" and other.channels == own.channels and len(other.joints) <= len(own.joints)
+    return near and change.fall > best.fall - DOUBTED
 
 
 def _is_small_zero(arm: RigidArm, motion: Motion, fit: RigidFit, change: Change) -> bool:
@@ -206,5 +239,6 @@ def _finding(arm: RigidArm, change: Change, fit: RigidFit, sure: bool) -> Findin
         same = all(other.joints == own.joints for other in change.others)
         names = " or ".join(other.channels[0] for other in change.others) if same else "other changes"
         evidence += f"; or {names}, with which it explains as much"
-    option = ", or ".join(each.option for each in (own, *change.others))
+    options = [each.option for each in (own, *change.others)]
+    option = ", or ".join([*options[:MOST_OPTIONS], *(["another order"] if len(options) > MOST_OPTIONS else [])])
     return Finding(own.kind, own.channels[0], joint, evidence, option, sure, change.fall)

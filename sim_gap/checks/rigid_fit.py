@@ -105,6 +105,17 @@ def fit_models(pairs: Sequence[tuple[Array, Motion]], springs: bool = False) -> 
     ]
 
 
+def least_costs(pairs: Sequence[tuple[Array, Motion]]) -> Array:
+    """Least summed cost of model torques and motions of one arm by least squares, whatever the signs, (M,)."""
+    grams = np.array([_covariances(model, motion, False) for model, motion in pairs])
+    grams /= np.maximum(grams[..., -1:, -1:], 1e-18)
+    columns, reading = grams[..., :4, :4], grams[..., :4, -1:]
+    size = np.sqrt(np.maximum(np.diagonal(columns, axis1=-2, axis2=-1), 1e-12))
+    columns, reading = columns / size[..., None] / size[..., None, :], reading / size[..., None]
+    explained = (reading * _solved(columns, reading)).sum((-2, -1))
+    return np.asarray(np.log(1.0 - np.clip(explained, 0.0, 1.0) + FLOOR).sum(-1))
+
+
 def _covariances(model: Array, motion: Motion, springs: bool) -> Array:
     """Of model torque, direction, velocity, acceleration, position and reading of every joint, (n, 6, 6)."""
     turned = motion.q if springs else 0.0 * motion.q
