@@ -144,7 +144,7 @@ def _best(arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypot
         fall = float(_told(hypothesis, moved, fit, better).sum())
         worse = float(np.max(better.cost - fit.cost))
         settled = _contradicts(fit, hypothesis.joints)  # which it no longer does
-        doubted = worse >= MOST_WORSE * fall and not settled or _contradicts(better, hypothesis.joints)
+        doubted = (worse >= MOST_WORSE * fall and not settled) or _contradicts(better, hypothesis.joints)
         if fall > (DOUBTED if doubted else SURE):
             found.append(Change(hypothesis, better, fall, doubted))
     if not found:

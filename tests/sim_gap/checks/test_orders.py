@@ -44,26 +44,21 @@ def test_any_order_is_put_right(arms, channels, seed):
     np.testing.assert_allclose(checked.motor_torque, recording.motor_torque)
 
 
-@pytest.mark.parametrize("order", [[0, 4, 1, 3, 2, 5], [1, 2, 5, 0, 4, 3]])
+@pytest.mark.parametrize("order", [[1, 2, 5, 0, 4, 3], [0, 5, 1, 4, 2, 3]])
 def test_another_order_is_no_angle_in_degrees(arms, order):
     """As degrees, positions of another order hardly move: then friction and a rotor explain most of what is read."""
     arm, recording = arms["tx40"]
-    spoiled = in_order(recording, order, POSITIONS + TORQUES)
-    try:
-        checked, found = check_recording(arm, spoiled, "r", AS_IT_IS)
-    except BadInput as refused:
-        assert "is in another order" in str(refused)
-        return
-    assert {each.finding for each in found} == {"order"}
-    np.testing.assert_allclose(checked.position[:, :3], recording.position[:, :3])
+    with pytest.raises(BadInput, match="is in another order"):
+        check_recording(arm, in_order(recording, order, POSITIONS + TORQUES), "r", AS_IT_IS)
 
 
 def test_an_order_that_another_explains_nearly_as_well_is_asked_about(arms):
     """Gravity does not load the first joint: its column, and that of a wrist, are told by little."""
     arm, recording = arms["ur10"]
     spoiled = in_order(recording, [4, 0, 2, 3, 1, 5], POSITIONS + TORQUES)
-    with pytest.raises(BadInput, match="joint_1, joint_2, joint_5 hold joint_2, joint_5, joint_1.*or other changes"):
+    with pytest.raises(BadInput, match=r"or other changes, .*, or --map q_2=q_5,q_5=q_2") as refused:
         check_recording(arm, spoiled, "r", AS_IT_IS)
+    assert "joint_1, joint_2, joint_5 hold joint_2, joint_5, joint_1" in str(refused.value)
 
 
 def test_the_plainest_of_orders_that_explain_as_much_is_taken(arms):
