@@ -44,6 +44,9 @@ SCREENED = 0.3
 """Share of that fall that a hypothesis must reach on few rows."""
 ALIKE = 0.05
 """Difference of the falls below which two changes cannot be told from each other."""
+NEARLY = 0.4
+"""Difference of the falls below which an order is not certain beside another that moves no more joints: first joint and
+wrist of a UR10 exchanged are 0.3 apart."""
 MOST_OPTIONS = 2
 """Most options that are spelt out."""
 MOST_WORSE = 0.5
@@ -147,25 +150,29 @@ def _best(arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypot
         doubted = (worse >= MOST_WORSE * fall and not settled) or _contradicts(better, hypothesis.joints)
         if fall > (DOUBTED if doubted else SURE):
             found.append(Change(hypothesis, better, fall, doubted))
-    if not found:
-        return None
+    return _likeliest(found) if found else None
+
+
+def _likeliest(found: Sequence[Change]) -> Change:
+    """The change that explains most, of orders that explain as much the one of fewest joints; with the others beside
+    it that it cannot be told from."""
     best = max(found, key=lambda each: each.fall if each.doubted else TWICE * each.fall)
-    as_good = [each for each in found if each.fall > best.fall - ALIKE and each.doubted == best.doubted]
-    best = min(as_good, key=lambda each: (len(each.hypothesis.joints) if _is_near(each, best) else arm.n, -each.fall))
+    as_good = [each for each in found if _is_near(each, best, ALIKE) and each.doubted == best.doubted]
+    best = min(as_good, key=lambda each: (len(each.hypothesis.joints), -each.fall), default=best)
     own = best.hypothesis
     alike = [each.hypothesis for each in found if each.fall > best.fall - ALIKE and not each.doubted]
     if best.fall > CERTAIN:
         alike = [h for h in alike if h.kind == own.kind and h.joints == own.joints and h.channels != own.channels]
-        alike += [each.hypothesis for each in found if _is_near(each, best)]
+        alike += [each.hypothesis for each in found if _is_near(each, best, NEARLY)]
     others = {h.option: h for h in alike if h.option != own.option}
     return replace(best, others=tuple(others.values()))
 
 
-def _is_near(change: Change, best: Change) -> bool:
-    """Whether an order is no farther from the recorded one than the best, and hardly worse."""
+def _is_near(change: Change, best: Change, margin: float) -> bool:
+    """Whether an order of the same columns moves no more joints than the best, and explains less by no more than so."""
     own, other = best.hypothesis, change.hypothesis
-    near = other.kind == own.kind == "order" and other.channels == own.channels and len(other.joints) <= len(own.joints)
-    return near and change.fall > best.fall - DOUBTED
+    same = other.kind == own.kind == "order" and other.channels == own.channels
+    return same and len(other.joints) <= len(own.joints) and change.fall > best.fall - margin
 
 
 def _is_small_zero(arm: RigidArm, motion: Motion, fit: RigidFit, change: Change) -> bool:
