@@ -24,7 +24,7 @@ TRIED, LOCATED = np.linspace(0.25, 0.75, 3), np.linspace(0.05, 0.95, 37)
 def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
     """An order of the torque columns that the rows before or after some place alone have; `arm` is as mounted."""
     model = arm.carried(motion.q, motion.v, motion.a)
-    orders = [h for h in hypotheses(arm, motion.channel, stated, ()) if h.kind == "order"]
+    orders = [h for h in hypotheses(arm, motion, stated, ()) if h.kind == "order"]
     own_orders = [h for h in orders if h.channels == (motion.channel,)]
     tried = [(own, late, share) for own in own_orders for late in (False, True) for share in TRIED]
     if not tried:

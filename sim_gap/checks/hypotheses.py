@@ -29,8 +29,9 @@ class Hypothesis:
     change: Callable[[Motion], Motion]
 
 
-def hypotheses(arm: RigidArm, channel: str, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
+def hypotheses(arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
     """Every way in which one column, or all of a channel, may be wrong, less those that the user has settled."""
+    channel = motion.channel
 
     def settled(kind: str, channel: str, joints: Sequence[int]) -> bool:
         return any(stated.states(kind, f"{channel}_{j + 1}") for j in joints)
@@ -42,7 +43,8 @@ def hypotheses(arm: RigidArm, channel: str, stated: Corrections, follows: Sequen
     positions, every, opposite = ("q", *follows), tuple(range(arm.n)), "has the opposite sign"
     if not settled("sign", channel, every):
         yield Hypothesis("sign", (channel,), every, opposite, option("sign", [channel], "-1"), _turned(every, True))
-    if not settled("units", "q", every):
+    far = np.median(np.abs(motion.q).max(axis=0)) > math.pi  # as angles in degrees are, and those of one joint are not
+    if far and not settled("units", "q", every):
         yield Hypothesis("scale", ("q",), every, "is in degrees", option("units", positions, "deg"), _degrees)
     for j in range(arm.n):
         if not settled("sign", channel, (j,)):

@@ -37,7 +37,8 @@ DOUBTED = 0.4
 hypothesis at all reaches 0.25."""
 CERTAIN = 1.0
 """Fall below which a change is asked about if a joint that it concerns is not explained then, or only by a coefficient
-that no arm has, or if any other change does as much: it may be chance, of a hundred changes and weak joints."""
+that no arm has, or if any other change does as much: it may be chance, of a hundred changes and weak joints. Likewise
+of the thousands of orders of more than two joints."""
 TWICE = 2.0
 """Times a fall by which that of a change that is doubted must be larger to be asked about instead."""
 SCREENED = 0.3
@@ -94,7 +95,7 @@ def find_mapping(
     taken: list[Change] = []
     while len(taken) < 2 * arm.n and not (taken and taken[-1].doubted):
         first = [] if taken else orders
-        best = _best(arm, motion, fit, [*hypotheses(arm, motion.channel, stated, follows), *first])
+        best = _best(arm, motion, fit, [*hypotheses(arm, motion, stated, follows), *first])
         if best is None or _is_small_zero(arm, motion, fit, best):
             break
         motion, fit = best.hypothesis.change(motion), best.fit
@@ -104,7 +105,7 @@ def find_mapping(
     explained = sound and bool(np.all(fit.explained[list(touched)] > FITS))
     if sum(each.fall for each in taken) < DOUBTED and not explained:
         return []
-    if min((each.fall for each in taken), default=0.0) < CERTAIN:
+    if any(each.fall < CERTAIN or _is_of_many(each) for each in taken):
         sound = explained and _is_plausible(fit, touched)
     sure = sound and not any(each.others for each in taken)
     return [_finding(arm, each, fit, sure) for each in taken]
@@ -169,10 +170,10 @@ def _likeliest(found: Sequence[Change]) -> Change:
 
 
 def _is_near(change: Change, best: Change, margin: float) -> bool:
-    """Whether an order of the same columns moves no more joints than the best, and explains less by no more than so."""
+    """Whether an order moves no more joints than the best one, and explains less by no more than so."""
     own, other = best.hypothesis, change.hypothesis
-    same = other.kind == own.kind == "order" and other.channels == own.channels
-    return same and len(other.joints) <= len(own.joints) and change.fall > best.fall - margin
+    both = other.kind == own.kind == "order"
+    return both and len(other.joints) <= len(own.joints) and change.fall > best.fall - margin
 
 
 def _is_small_zero(arm: RigidArm, motion: Motion, fit: RigidFit, change: Change) -> bool:
@@ -180,7 +181,13 @@ def _is_small_zero(arm: RigidArm, motion: Motion, fit: RigidFit, change: Change)
     if change.hypothesis.kind != "order" or "q" not in change.hypothesis.channels:
         return False
     least = min(least_cost(arm, motion, joint)[0] for joint in change.hypothesis.joints)
-    return float(fit.cost.sum()) - least > change.fall - ALIKE
+    margin = NEARLY if _is_of_many(change) else ALIKE
+    return float(fit.cost.sum()) - least > change.fall - margin
+
+
+def _is_of_many(change: Change) -> bool:
+    """Whether a change is an order of more than two joints, of which there are thousands."""
+    return change.hypothesis.kind == "order" and len(change.hypothesis.joints) > 2
 
 
 def _screened(arm: RigidArm, few: Motion, possible: Sequence[Hypothesis]) -> list[RigidFit]:
