@@ -105,7 +105,9 @@ def find_mapping(
     explained = sound and bool(np.all(fit.explained[list(touched)] > FITS))
     if sum(each.fall for each in taken) < DOUBTED and not explained:
         return []
-    if any(each.fall < CERTAIN or _is_of_many(each) for each in taken):
+    if any(_is_of_many(each) for each in taken):
+        sound = explained
+    if any(each.fall < CERTAIN for each in taken):
         sound = explained and _is_plausible(fit, touched)
     sure = sound and not any(each.others for each in taken)
     return [_finding(arm, each, fit, sure) for each in taken]
