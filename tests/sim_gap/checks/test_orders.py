@@ -34,10 +34,9 @@ def in_order(recording: Recording, order: list[int], channels: tuple[str, ...]) 
 
 
 @pytest.mark.parametrize("channels", [POSITIONS, TORQUES, POSITIONS + TORQUES], ids=["positions", "torques", "all"])
-@pytest.mark.parametrize("seed", range(2))
-def test_any_order_is_put_right(arms, channels, seed):
+def test_any_order_is_put_right(arms, channels):
     arm, recording = arms["ur10e"]
-    order = np.random.default_rng(seed).permutation(recording.n).tolist()
+    order = np.random.default_rng(1).permutation(recording.n).tolist()
     checked, found = check_recording(arm, in_order(recording, order, channels), "r", AS_IT_IS)
     assert {each.finding for each in found} == {"order"}
     np.testing.assert_allclose(checked.position, recording.position)
