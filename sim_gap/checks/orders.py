@@ -29,9 +29,9 @@ def likely_orders(arm: RigidArm, motion: Motion) -> list[tuple[tuple[int, ...], 
     moved = [permuted(order, ("q", "v", "a"))(few) for order in orders]
     made = arm.carried(*(np.concatenate([getattr(each, name) for each in moved]) for name in ("q", "v", "a")))
     found = [(order, False, True) for order in _torque_orders(arm, few, orders)]
-    for whole in (True, False):
-        read = [permuted(order, ("reading",))(each) for order, each in zip(orders, moved, strict=True)]
-        pairs = list(zip(np.split(made, len(moved)), read if whole else moved, strict=True))
+    both = [permuted(order, ("reading",))(each) for order, each in zip(orders, moved, strict=True)]
+    for whole, motions in ((True, both), (False, moved)):
+        pairs = list(zip(np.split(made, len(motions)), motions, strict=True))
         roughly = np.argsort(least_costs(pairs))[:ROUGHLY].tolist()
         costs = [fit.cost.sum() for fit in fit_models([pairs[k] for k in roughly])]
         found += [(orders[roughly[k]], True, whole) for k in np.argsort(costs)[:LIKELY].tolist()]
