@@ -75,7 +75,7 @@ def record(
     wrong: Wrong,
     seed: int = 0,
     seconds: float = 60.0,
-    rate: float = 100.0,
+    rate: float = 50.0,
     noise: float = 0.02,
     channels: tuple[str, ...] = ("tau", "tau_motor"),
 ) -> Recording:

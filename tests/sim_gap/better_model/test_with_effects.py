@@ -70,7 +70,7 @@ def test_a_shared_motor_becomes_a_fixed_tendon(tmp_path):
     recordings = []
     for seed in (1, 2):
         one = record(nominal.mujoco_model, Wrong(), seed=seed, seconds=30, noise=0.002, channels=("tau_motor",))
-        _, _, v, a = motion(3, 30, 100.0, seed)
+        _, _, v, a = motion(3, 30, 50.0, seed)
         speed, push = v[:, 2] + 0.8 * v[:, 1], a[:, 2] + 0.8 * a[:, 1]
         lost = 0.05 * push + 0.8 * np.tanh(speed / 0.002) + 0.3 * speed
         recordings.append(replace(one, motor_torque=one.motor_torque + lost[:, None] * np.array([0.0, 0.8, 1.0])))

@@ -22,7 +22,7 @@ REAL = model_text(kp=GAIN, friction=0.15)
 def fitted_with(rotor: float) -> tuple[Search, Fit]:
     """A fit of gain and friction about a model that states such rotors [kg·m²]."""
     sim = load_model(mujoco.MjModel.from_xml_string(REAL.replace(f'armature="{ROTOR}"', f'armature="{rotor}"')))
-    data = windows_of(sim.arm, [record(REAL, seed, 24.0, fast=2.0) for seed in (1, 2)], ["one", "two"])
+    data = windows_of(sim.arm, [record(REAL, seed, 14.0, fast=2.0) for seed in (1, 2)], ["one", "two"])
     search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 4e-4))
     names = ("kp", "coulomb", "viscous")
     return search, improve(data, Fit(search.nominal, (names, names)), search.scales, 12)

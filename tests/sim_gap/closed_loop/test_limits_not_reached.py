@@ -26,7 +26,7 @@ FOUND = ("kp", "coulomb", "viscous")
 def of(text: str) -> tuple[Search, Fit]:
     """Search and fit of a training recording of the arm without limits."""
     sim = load_model(mujoco.MjModel.from_xml_string(text))
-    data = windows_of(sim.arm, [record(TEXT, 1, 28.0)], ["run"])
+    data = windows_of(sim.arm, [record(TEXT, 1, 14.0)], ["run"])
     search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
     return search, improve(data, Fit(search.nominal, (FOUND, FOUND)), search.scales)
 
@@ -80,7 +80,7 @@ def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> Non
     search, fit = arm
     spread = replace(covariance(search, fit), limits=limits.unreached(search, fit))
     data = search.data
-    faster = windows_of(data.arm, [record(TEXT, 2, 28.0)], ["other"], data.dt)
+    faster = windows_of(data.arm, [record(TEXT, 2, 14.0)], ["other"], data.dt)
     faster = replace(faster, command=FASTER * faster.command, measured=FASTER * faster.measured)
     others = left_out(search, fit)
     for heldout, widened in ((data, False), (faster, True)):
@@ -97,7 +97,7 @@ def test_the_band_holds_motion_beyond_the_training_whatever_the_limit_is(arm, ov
     data = search.data
     torque = np.abs(GAIN * (data.command - data.recorded)).max(axis=(0, 2))
     real = model_text(kp=GAIN, friction=0.2, limits=over * torque if np.isfinite(over) else ())
-    other = windows_of(data.arm, [record(real, 3, 28.0, wide=1.5, fast=1.7)], ["other"], data.dt)
+    other = windows_of(data.arm, [record(real, 3, 14.0, wide=1.5, fast=1.7)], ["other"], data.dt)
     spread = covariance(search, fit)
     others = left_out(search, fit)
     known, open_ = (

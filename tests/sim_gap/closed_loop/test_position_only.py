@@ -30,7 +30,7 @@ REAL = model_text(kp=15.0, friction=0.25)
 @pytest.fixture(scope="module")
 def answer(tmp_path_factory):
     sim = written(tmp_path_factory.mktemp("arm"), model_text(kp=120.0, friction=0.0))
-    return diagnose(sim, [record(REAL, 1, 28.0)], [record(REAL, 2, 14.0)])
+    return diagnose(sim, [record(REAL, 1, 20.0)], [record(REAL, 2, 14.0)])
 
 
 @pytest.mark.slow

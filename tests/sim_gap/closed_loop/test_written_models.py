@@ -30,7 +30,7 @@ OTHER = record(TEXT, 3, 21.0, load=LOAD)
 def made(tmp_path_factory) -> tuple[SimModel, Search, Fit]:
     """An arm whose gears rub under load, and the fit that knows it."""
     sim = load_model(written(tmp_path_factory.mktemp("arm"), TEXT))
-    data = windows_of(sim.arm, [record(TEXT, seed, 28.0, load=LOAD) for seed in (1, 2)], ["one", "two"])
+    data = windows_of(sim.arm, [record(TEXT, seed, 14.0, load=LOAD) for seed in (1, 2)], ["one", "two"])
     search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
     known = ("kp", "coulomb", "viscous", "load")
     return sim, search, improve(data, Fit(search.nominal, (known, known)), search.scales)
