@@ -139,7 +139,8 @@ def test_what_is_written_runs_by_itself_and_closes_the_gap(tmp_path):
     (tmp_path / "arm.xml").write_text(THREE)
     wrong = Wrong(coulomb=np.full(3, 0.6), load=np.array([0.0, 0.3, 0.0]), ripple=np.array([0.0, 0.0, 0.5]))
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
-    train, other = (record(model, wrong, seed=s, seconds=40, rate=100.0, noise=0.002, channels=("tau_motor",)) for s in (1, 2))
+    made = {"seconds": 40, "rate": 100.0, "noise": 0.002, "channels": ("tau_motor",)}
+    train, other = (record(model, wrong, seed=s, **made) for s in (1, 2))
     answer = diagnose(tmp_path / "arm.xml", [train], [other])
     lines = write_model(answer.internals.model, answer.internals.estimate, tmp_path / "closed.xml")
     assert any(line.startswith("friction.load joint_2") for line in lines)
