@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host random_kills daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fuzz_files fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: surfaces mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
+.PHONY: long surfaces mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -21,7 +21,7 @@ venv: .venv/.dev ## Make .venv with the package and everything needed to work on
 demo: .venv/.runtime ## The whole job on a simulated arm; writes armlink-demo/report.html (ARGS="--seed 3" goes to armlink demo)
 	$(BIN)/armlink demo $(ARGS)
 
-test: .venv/.dev ## Run every test, those on real SocketCAN included (ARGS goes to pytest)
+test: .venv/.dev ## Run every test but the long ones, those on real SocketCAN included (ARGS goes to pytest)
 	@scripts/install-system
 	scripts/run-tests $(ARGS)
 
@@ -37,6 +37,9 @@ format: .venv/.dev ## Put the code in shape
 
 bench: .venv/.dev ## Measure side by side with peers; writes benchmarks/latest.json
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python benchmarks/run.py
+
+long: .venv/.dev ## The tests that make test leaves out: more arms, cases and draws of what it samples (ARGS goes to pytest)
+	$(BIN)/python -m pytest -q -n 2 -m long $(ARGS)
 
 soak: .venv/.dev ## Long campaigns outside make test: kills, faults, simulated days, random arms (CAMPAIGNS="kill_host web", ARGS)
 	@status=0; for name in $(CAMPAIGNS); do \

@@ -204,7 +204,7 @@ def test_recursion_that_takes_gains_and_positions_for_right() -> None:
     ("poses", "expected", "gain_rms"),
     [
         (2, [0.121, 0.110, 0.044, 0.044, 0.012, 0.018, 0.0056], (0.31, 0.51)),
-        (4, [0.072, 0.069, 0.030, 0.027, 0.0068, 0.0105, 0.0027], (0.20, 0.24)),
+        pytest.param(4, [0.072, 0.069, 0.030, 0.027, 0.0068, 0.0105, 0.0027], (0.20, 0.24), marks=pytest.mark.long),
     ],
 )
 def test_gains_offsets_and_position_offsets_unknown_with_a_mass_of_two_kilograms(
@@ -237,7 +237,7 @@ def test_equation_l_that_takes_positions_for_right() -> None:
     assert (rms.min(), rms.max()) == pytest.approx((1.1, 2.7), rel=0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_weights_distal_joints_take_the_noise_of_proximal_sensors() -> None:
     betas, gains = [], []
     for true, rows in calibrations(2, 100):
@@ -255,7 +255,7 @@ def reading(values: Parameters) -> Array:
     return values.gain * (regressor @ values.beta) + values.offset
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_a_mass_a_gain_prior_leaves_only_the_common_scale_in_doubt() -> None:
     """Readings are predicted to hundredths of a newton-metre, gain ratios known to parts in a thousand."""
     arm = make_sarcos()

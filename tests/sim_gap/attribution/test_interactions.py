@@ -42,7 +42,10 @@ def test_a_sensors_gain_and_a_payload():
     assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(2.0, rel=0.03)
 
 
-@pytest.mark.parametrize("degrees", [30.0, 90.0, 150.0])
+LONG = pytest.mark.long
+
+
+@pytest.mark.parametrize("degrees", [pytest.param(30.0, marks=LONG), 90.0, pytest.param(150.0, marks=LONG)])
 def test_a_base_that_is_turned_far(degrees):
     angles = np.radians(degrees) * np.array([0.8, -0.6])
     real = mujoco.MjModel.from_xml_string(THREE)

@@ -92,6 +92,7 @@ def test_tx40_has_rotors_and_a_coupled_wrist(realdata):
     assert answer.heldout_after[2] <= 1.5
 
 
+@pytest.mark.long
 def test_lwr4_is_not_made_worse_on_another_trajectory(realdata):
     folder = realdata / "lwr4"
     train, other = (load_recording(folder / f"{name}.csv.gz") for name in ("train", "other"))

@@ -56,7 +56,9 @@ def test_velocities_of_other_joints_are_no_other_order_of_the_positions(arms):
     np.testing.assert_array_equal(checked.position, recording.position)
 
 
-@pytest.mark.parametrize(("folder", "by_s"), [("lwr4", 0.6), ("lwr4", -0.9), ("panda", -1.2)])
+@pytest.mark.parametrize(
+    ("folder", "by_s"), [("lwr4", 0.6), pytest.param("lwr4", -0.9, marks=pytest.mark.long), ("panda", -1.2)]
+)
 def test_a_delay_is_no_unsigned_joint_and_no_order_that_changes(arms, folder, by_s):
     arm, recording = arms[folder]
     t = recording.t

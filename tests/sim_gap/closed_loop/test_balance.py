@@ -64,7 +64,7 @@ def test_servos_that_are_never_off_or_always_change_nothing(swinging) -> None:
     assert balanced(perfect, fit).weight[:, off].max() == pytest.approx(LEAST)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_swing_parts_friction_from_the_servos_brake_and_spoils_nothing(tmp_path: Path) -> None:
     """The servo's back-EMF brakes 80 times as much as the gear, which only the swing shows.
 
