@@ -162,12 +162,12 @@ def _joints(grams: Array, unsigned: Mask) -> Array:
     units = np.where(size > 1e-9, size, 1.0)
     units[:, 4] = np.where(size[:, 4] > 1e-6, size[:, 4], np.inf)
     scaled = (grams / units[:, None] / units[:, :, None])[there]
-    correlation, own = _partial(scaled)
+    roots, (correlation, own) = _roots(scaled), _partial(scaled)
     free = _solved(scaled[:, :4, :4], scaled[:, :4, -1:])[:, 1, 0]
     for k, j in enumerate(there.tolist()):
         both = (1.0, -1.0)
         signs = [(1.0,), *[both if unsigned[j] else (1.0,)] * 3, *([both] if np.isfinite(units[j, 4]) else [])]
-        coefficient, explained = _positive_fit(scaled[k], signs)
+        coefficient, explained = _positive_fit(roots[k], signs)
         out[j, :2] = explained, coefficient * spread[j] / units[j, 0]
     out[there, 2], out[there, 3] = correlation, own * units[there, 0] / spread[there]
     out[there, 4] = free * spread[there] / units[there, 1]
@@ -188,14 +188,15 @@ def _solved(grams: Array, sides: Array) -> Array:
     return np.asarray(np.linalg.pinv(grams, rcond=1e-12, hermitian=True) @ sides)
 
 
-def _positive_fit(gram: Array, signs: Sequence[tuple[float, ...]]) -> tuple[float, float]:
-    """First coefficient of a fit with none negative, of the columns with each of their signs, and the share of the
-    reading's variance explained.
+def _roots(grams: Array) -> Array:
+    """Roots of covariances (J, p, p), whose columns have the same least squares as those that made them, (J, p, p)."""
+    values, vectors = np.linalg.eigh(grams)
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., None] * np.swapaxes(vectors, -1, -2))
 
-    By a root of the covariance, which has the same least squares as the columns have.
-    """
-    values, vectors = np.linalg.eigh(gram)
-    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+def _positive_fit(root: Array, signs: Sequence[tuple[float, ...]]) -> tuple[float, float]:
+    """First coefficient of a fit with none negative, of the columns with each of their signs, and the share of the
+    reading's variance explained, from a root of the covariance (p, p)."""
     chosen = np.stack([sign * root[:, k] for k, both in enumerate(signs) for sign in both], axis=1)
     coefficients, rest = nnls(chosen, root[:, -1])
     return float(coefficients[0]), float(1.0 - rest**2)

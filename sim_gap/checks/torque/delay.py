@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Finding
-from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, fit_model
+from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, fit_model, fit_models
 from sim_gap.model.rigid_body import RigidArm
 
 LAG, LAG_STEP = 1.5, 0.02
@@ -120,12 +120,12 @@ def _interpolated_costs(arm: RigidArm, motion: Motion, t: Array, rows: slice, la
     its rows.
     """
     splines = [CubicSpline(t, x) for x in (motion.q, motion.v, motion.a)]
-    costs = []
+    pairs = []
     for lag in lags:
         q, v, a = (spline(t[rows] - lag) for spline in splines)
         moved = replace(motion, q=q, v=v, a=a, reading=motion.reading[rows])
-        costs.append(fit_model(arm.carried(q, v, a), moved).cost)
-    return np.array(costs)
+        pairs.append((arm.carried(q, v, a), moved))
+    return np.array([fit.cost for fit in fit_models(pairs)])
 
 
 def _clock(channel: str, lag: float) -> Finding:
