@@ -69,10 +69,18 @@ function decide(one, verb) {
 
 export const fetchProposals = async () => showProposals(await get("/api/proposals"));
 
+let shown = "";
+
+// What is unchanged stays as it is, and the button that has the keyboard's focus keeps it: it would be lost with its element.
 export function showProposals(all) {
-  const open = all.filter((one) => one.state === "pending");
+  const said = JSON.stringify(all);
+  if (said === shown) return;
+  shown = said;
+  const open = all.filter((one) => one.state === "pending"), list = by("proposal-list");
+  const focused = list.contains(document.activeElement) ? document.activeElement.ariaLabel : null;
   by("proposals").hidden = open.length === 0;
-  by("proposal-list").replaceChildren(...open.map(pending));
+  list.replaceChildren(...open.map(pending));
+  if (focused) [...list.querySelectorAll("button")].find((one) => one.ariaLabel === focused)?.focus();
   const done = all.filter((one) => one.state !== "pending").slice(0, 10);
   by("decided").hidden = done.length === 0;
   by("decided-list").replaceChildren(...done.map((one) => {

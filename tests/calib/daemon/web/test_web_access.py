@@ -80,3 +80,18 @@ def test_a_decision_by_keyboard_alone(browser: Browser, server: Served, view: Ma
     page.get_by_label("Your name").fill("ann")
     page.keyboard.press("Enter")
     expect(page.locator("#decided-list")).to_contain_text("approved by ann")
+
+
+def test_the_focus_stays_where_it_is_while_the_page_is_brought_up_to_date(
+    browser: Browser, server: Served, view: MadeUpView
+) -> None:
+    """Every two seconds, and when another proposal is made: Enter would have gone nowhere."""
+    page = opened(browser, server, view, 1200)
+    page.locator(".proposal button.main").focus()
+    for _ in range(2):
+        with page.expect_response("**/api/proposals"):
+            pass
+    assert page.evaluate("document.activeElement.ariaLabel") == "Approve joint_2"
+    server.do(lambda: view.propose("joint_3"))
+    expect(page.locator(".proposal")).to_have_count(2)
+    assert page.evaluate("document.activeElement.ariaLabel") == "Approve joint_2"
