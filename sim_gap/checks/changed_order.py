@@ -15,6 +15,8 @@ from sim_gap.model.rigid_body import RigidArm
 CLEAR = 0.6
 """Fall of the cost, with an order in a part of the rows, from which it is asked about: on sound recordings of real arms
 none reaches 0.1, on those with two torques exchanged from the middle on they reach 1.2 and more."""
+SCREENED = 0.3
+"""Share of that fall that an order must reach on few rows to be looked at."""
 UNEVEN = 1.0
 """Fall of the cost from all rows to one half of them from which a torque may be absent from the other."""
 TRIED, LOCATED = np.linspace(0.25, 0.75, 3), np.linspace(0.05, 0.95, 37)
@@ -30,12 +32,14 @@ def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections) -> li
     if not tried:
         return []
     few = rows_of(motion, slice(None, None, FEW))
-    fits = fit_models([(model[::FEW], _in_part(few, *each)) for each in tried])
-    own, late, _ = tried[int(np.argmin([fit.cost.sum() for fit in fits]))]
-    costs = [fit.cost.sum() for fit in fit_models([(model, _in_part(motion, own, late, share)) for share in LOCATED])]
-    share = float(LOCATED[np.argmin(costs)])
-    whole = float(fit_model(model, motion).cost.sum())
-    fall = whole - float(min(costs))
+    fits = fit_models([(model[::FEW], each) for each in (few, *(_in_part(few, *each) for each in tried))])
+    roughly = np.array([fit.cost.sum() for fit in fits])
+    own, late, _ = tried[int(np.argmin(roughly[1:]))]
+    whole, fall, share = float(fit_model(model, motion).cost.sum()), 0.0, 0.0
+    if roughly[0] - roughly[1:].min() > SCREENED * CLEAR:
+        located = fit_models([(model, _in_part(motion, own, late, each)) for each in LOCATED])
+        costs = [fit.cost.sum() for fit in located]
+        fall, share = whole - float(min(costs)), float(LOCATED[np.argmin(costs)])
     if fall < CLEAR:
         return _absent_from_a_half(arm, motion, model, whole, stated)
     part = f"{'after' if late else 'before'} {share:.0%} of the recording"

@@ -164,10 +164,13 @@ def _joints(grams: Array, unsigned: Mask) -> Array:
     scaled = (grams / units[:, None] / units[:, :, None])[there]
     roots, (correlation, own) = _roots(scaled), _partial(scaled)
     free = _solved(scaled[:, :4, :4], scaled[:, :4, -1:])[:, 1, 0]
+    signed = _solved(scaled[:, :5, :5], scaled[:, :5, -1:])[..., 0]
+    physical = (signed[:, 0] >= 0.0) & (unsigned[there] | np.all(signed[:, 1:4] >= 0.0, axis=1))
+    shares = (signed * scaled[:, :5, -1]).sum(-1)
     for k, j in enumerate(there.tolist()):
         both = (1.0, -1.0)
         signs = [(1.0,), *[both if unsigned[j] else (1.0,)] * 3, *([both] if np.isfinite(units[j, 4]) else [])]
-        coefficient, explained = _positive_fit(roots[k], signs)
+        coefficient, explained = (signed[k, 0], shares[k]) if physical[k] else _positive_fit(roots[k], signs)
         out[j, :2] = explained, coefficient * spread[j] / units[j, 0]
     out[there, 2], out[there, 3] = correlation, own * units[there, 0] / spread[there]
     out[there, 4] = free * spread[there] / units[there, 1]

@@ -102,10 +102,15 @@ def find_short_delay(arm: RigidArm, motion: Motion, rate: float, stated: Correct
         lags = lags[lags < 0.5 * SHORT_STEP]
     if len(motion.q) < 4 * edge:
         return []
-    costs = _interpolated_costs(arm, motion, np.arange(len(motion.q)) / rate, slice(edge, -edge), lags)
-    best, least, opposed = int(np.argmin(costs.sum(1))), *COMMON[motion.channel]
+    t, (least, opposed) = np.arange(len(motion.q)) / rate, COMMON[motion.channel]
+    now = int(np.argmin(np.abs(lags)))
+    for step in (FEW, 1):
+        costs = _interpolated_costs(arm, motion, t, slice(edge, -edge, step), lags)
+        best = int(np.argmin(costs.sum(1)))
+        if float((costs[now] - costs[best]).sum()) < SCREENED * least:
+            return []
     lag, own = float(lags[best]), float(np.median(lags[costs.argmin(axis=0)]))
-    falls = costs[np.argmin(np.abs(lags))] - costs[best]
+    falls = costs[now] - costs[best]
     rises = float(-falls[falls < 0.0].sum())
     clear = falls.sum() >= least and rises <= opposed * (float(falls.sum()) + rises)
     if abs(lag) < SHORTEST - 1e-9 or not clear or own * lag < ALL * lag**2:
@@ -119,12 +124,11 @@ def _interpolated_costs(arm: RigidArm, motion: Motion, t: Array, rows: slice, la
     `t` are the times of all rows [s]. The motion is interpolated and not the reading, whose noise would be less between
     its rows.
     """
-    splines = [CubicSpline(t, x) for x in (motion.q, motion.v, motion.a)]
-    pairs = []
-    for lag in lags:
-        q, v, a = (spline(t[rows] - lag) for spline in splines)
-        moved = replace(motion, q=q, v=v, a=a, reading=motion.reading[rows])
-        pairs.append((arm.carried(q, v, a), moved))
+    after = t[rows] - lags[:, None]
+    q, v, a = (CubicSpline(t, x)(after) for x in (motion.q, motion.v, motion.a))
+    models = arm.carried(*(x.reshape(-1, arm.n) for x in (q, v, a))).reshape(q.shape)
+    reading = motion.reading[rows]
+    pairs = [(model, replace(motion, q=q[k], v=v[k], a=a[k], reading=reading)) for k, model in enumerate(models)]
     return np.array([fit.cost for fit in fit_models(pairs)])
 
 
