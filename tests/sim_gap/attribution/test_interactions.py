@@ -154,6 +154,7 @@ def test_a_body_that_is_mounted_in_another_way_on_the_held_out_recording():
     assert answer.heldout_after.max() < 0.05
 
 
+@pytest.mark.long
 def test_loaded_recordings_judged_on_one_without_the_body():
     made = [_with_body(angle, seed) for seed, angle in enumerate((0.0, 0.0, None))]
     answer = diagnose(model(), made[:2], made[2:], labels=["a", "b", "c"])
@@ -173,6 +174,7 @@ def test_a_light_payload_is_not_taken_for_mass_moments_of_all_links():
     assert answer.causes[0].parameters["arm"]["mass"].value == pytest.approx(0.4, rel=0.03)
 
 
+@pytest.mark.long
 def test_two_causes_that_replace_one_another_are_not_both_called_minor():
     """At a shoulder whose load keeps its sign and size, Coulomb and load-dependent friction do the same."""
     arm = compile_model(Path(__file__).parents[2] / "models" / "ur10e.urdf")

@@ -78,6 +78,7 @@ def test_the_written_model_has_constants_friction_and_rotors(answer, tmp_path):
     assert closed.dof_frictionloss == pytest.approx(DRIVES.coulomb, rel=0.1)
 
 
+@pytest.mark.long
 def test_constants_that_are_all_off_alike_may_be_masses_and_the_answer_says_so(model_file):
     alike = replace(DRIVES, motor_gain=np.array([0.79, 0.81, 0.8]))
     made = [record(model(), alike, seed, 40.0, 50.0, channels=("tau_motor",)) for seed in (1, 2)]

@@ -30,7 +30,7 @@ def joints(answer: Diagnosis, effect: str) -> set[str]:
 
 def test_ur10e(realdata):
     folder = realdata / "ur10e"
-    load = lambda name: load_recording(folder / f"{name}.csv.gz")  # noqa: E731
+    load = lambda name: thinned(folder / f"{name}.csv.gz", 2)  # noqa: E731
     answer = diagnose(folder / "sim.xml", [load("train_a"), load("train_b")], [load("heldout")])
     assert answer.verdict == "explained"
     assert answer.causes[0].effect == "friction.coulomb"
@@ -54,6 +54,7 @@ def test_the_payload_of_one_recording_is_found_beside_what_is_wrong_with_the_arm
     assert any("is present in recording 3 alone" in note for note in answer.notes)
 
 
+@pytest.mark.long
 def test_a_loaded_recording_alone_says_that_the_arm_itself_may_be_heavier(realdata):
     """The empty arm already looks heavier at the flange than its URDF: one recording cannot tell that from the load."""
     folder = realdata / "ur10e"

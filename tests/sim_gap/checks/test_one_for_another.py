@@ -13,6 +13,8 @@ from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
 from sim_gap.model.load import load_model
 
+LONG = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def arms(realdata: Path):
@@ -57,7 +59,7 @@ def test_velocities_of_other_joints_are_no_other_order_of_the_positions(arms):
 
 
 @pytest.mark.parametrize(
-    ("folder", "by_s"), [("lwr4", 0.6), pytest.param("lwr4", -0.9, marks=pytest.mark.long), ("panda", -1.2)]
+    ("folder", "by_s"), [pytest.param("lwr4", 0.6, marks=LONG), pytest.param("lwr4", -0.9, marks=LONG), ("panda", -1.2)]
 )
 def test_a_delay_is_no_unsigned_joint_and_no_order_that_changes(arms, folder, by_s):
     arm, recording = arms[folder]

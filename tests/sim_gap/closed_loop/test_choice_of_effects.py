@@ -53,6 +53,7 @@ def test_an_effect_that_the_arm_does_not_have_is_taken_out_and_friction_stays(se
     assert all(likely["friction.coulomb", (j,)] < 0.01 for j in (0, 1))
 
 
+@pytest.mark.long
 def test_a_payload_that_the_arm_does_not_have_is_compared_with_the_joints_own_effects(several) -> None:
     search, fit = several
     names = ("payload.mass", "payload.x", "payload.z")
