@@ -38,6 +38,7 @@ def test_calibrate_and_identify_finds_the_hidden_gains(tmp_path):
     assert "mass moments" in printed
 
 
+@pytest.mark.long
 def test_observe_a_drift_names_the_joint_and_its_size(tmp_path):
     printed = printed_by("observe_a_drift.py", tmp_path)
     gain, offset = re.search(r"proposal at elbow: gain (\S+), offset (\S+) N·m", printed).groups()

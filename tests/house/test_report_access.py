@@ -23,6 +23,7 @@ def complaints(browser: Browser, page: Path, width: int) -> list[str]:
     )
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("width", [1280, 390])
 def test_axe_finds_nothing_and_would_find_a_heading_without_words(tmp_path, width):
     import plotly.graph_objects as go

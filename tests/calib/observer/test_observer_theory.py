@@ -39,7 +39,7 @@ def cause_of_pickup(arm, beta, mass, random) -> str:
     return "drift" if verdict.is_drift else verdict.cause
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fewer_than_one_payload_in_two_hundred_is_called_drift(sarcos, sarcos_beta) -> None:
     """0.05 to 3 kg, alarm then cause test: none of 700, which bounds the share at 0.43 % with 95 % confidence."""
     random = np.random.default_rng(0)

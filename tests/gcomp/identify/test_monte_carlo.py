@@ -200,11 +200,12 @@ def test_recursion_that_takes_gains_and_positions_for_right() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(
     ("poses", "expected", "gain_rms"),
     [
         (2, [0.121, 0.110, 0.044, 0.044, 0.012, 0.018, 0.0056], (0.31, 0.51)),
-        pytest.param(4, [0.072, 0.069, 0.030, 0.027, 0.0068, 0.0105, 0.0027], (0.20, 0.24), marks=pytest.mark.long),
+        (4, [0.072, 0.069, 0.030, 0.027, 0.0068, 0.0105, 0.0027], (0.20, 0.24)),
     ],
 )
 def test_gains_offsets_and_position_offsets_unknown_with_a_mass_of_two_kilograms(

@@ -47,6 +47,7 @@ def machine_beside(t: np.ndarray) -> np.ndarray:
     return 1.5 * np.sign(np.sin(2 * np.pi * 0.4 * t))
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("force", [knock, leaning, machine_beside])
 def test_a_force_from_outside_is_blamed_on_nothing(force):
     answer = diagnosed(pushed(force))
@@ -84,6 +85,7 @@ def dead(recording: Recording) -> Recording:
     return replace(recording, torque=torque)
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("odd", [stuck, dead])
 def test_a_stuck_sensor_is_named_and_blames_no_effect(odd):
     answer = diagnosed(odd)

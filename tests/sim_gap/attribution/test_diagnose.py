@@ -45,6 +45,7 @@ SINGLE = [
 ]
 
 
+@pytest.mark.sample(6)
 @pytest.mark.parametrize(("effect", "place", "name", "truth", "wrong", "channels"), SINGLE)
 def test_one_effect_is_named_first_with_its_joint_and_size(effect, place, name, truth, wrong, channels):
     answer = diagnosed(wrong, channels)

@@ -115,6 +115,7 @@ def test_load_dependent_friction_of_a_hobby_servo_is_named(realdata):
     assert answer.heldout_after[0] < 0.5 * answer.heldout_before[0]
 
 
+@pytest.mark.long
 def test_a_swing_with_the_servo_off_leaves_what_its_command_shows(realdata):
     """An STS3250 with a pendulum: with the swing the held-out motion was left 2.5 to 5 times as large as without."""
     folder = realdata / "bam_servo"

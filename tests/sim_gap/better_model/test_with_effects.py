@@ -21,10 +21,10 @@ CASES = {
     "spring": Wrong(spring=np.array([0.0, 2.0, 0.0])),
     "position offset": Wrong(position_offset=np.array([0.0, 0.12, 0.0])),
 }
-SAMPLE = ("payload", "position offset")
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=() if x in SAMPLE else pytest.mark.long) for x in CASES])
+@pytest.mark.sample(2)
+@pytest.mark.parametrize("name", CASES)
 def test_the_written_model_has_no_gap_any_more(tmp_path, name):
     (tmp_path / "arm.xml").write_text(THREE)
     nominal = load_model(tmp_path / "arm.xml")

@@ -29,6 +29,7 @@ def script() -> str:
     return found
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", ARMS)
 def test_the_reported_roll_out_is_that_of_the_exported_files(tmp_path, name):
     (tmp_path / "arm.xml").write_text(THREE)

@@ -239,6 +239,7 @@ def labels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return {label["effects"][0]["effect"]: label for label in found}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("effect", SHOWN)
 def test_effect_shows_in_its_channels_only(labels: dict[str, Any], effect: str) -> None:
     gaps = labels[effect]["gap"]

@@ -33,6 +33,7 @@ def stated_too_heavy() -> tuple[Search, Fit]:
     return fitted_with(4 * ROTOR)
 
 
+@pytest.mark.long
 def test_rotors_that_are_stated_too_heavy_are_found(stated_too_heavy) -> None:
     search, fit = stated_too_heavy
     other = min(at_other_scales(search, fit), key=lambda each: search.score(each).sum())

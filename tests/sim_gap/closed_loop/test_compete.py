@@ -40,7 +40,7 @@ def started(
     return search, fit
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_delay_is_not_told_as_another_gain() -> None:
     """Without gravity a lower gain with its damping follows as late as a delayed one."""
     seen = record(WEIGHTLESS, 1, 14.0)

@@ -34,6 +34,7 @@ def still(recording: Recording) -> Recording:
     return replace(recording, position_command=command, position=position)
 
 
+@pytest.mark.long
 def test_its_values_are_the_models_and_a_note_says_so(answer: Diagnosis) -> None:
     fit = answer.internals.fit
     assert fit.active[1] == ()
@@ -44,6 +45,7 @@ def test_its_values_are_the_models_and_a_note_says_so(answer: Diagnosis) -> None
     assert note.startswith("elbow: the command rests in all that is fitted")
 
 
+@pytest.mark.long
 def test_nothing_is_said_of_limits_that_its_motion_does_not_reach(answer: Diagnosis) -> None:
     assert {each.joint for each in answer.internals.spread.limits} == {0}
     assert not any("does not reach" in note and "elbow" in note for note in answer.notes)
@@ -59,6 +61,7 @@ def test_a_joint_rests_by_its_command_and_one_without_a_command_does_not() -> No
         assert rests(windows_of(arm, [recording], ["run"])).tolist() == [False, expected]
 
 
+@pytest.mark.long
 def test_the_other_joint_is_told_as_well_as_if_there_were_no_such(answer: Diagnosis) -> None:
     fit = answer.internals.fit
     assert fit.point["kp"][0] == pytest.approx(GAIN, rel=0.02)
@@ -67,6 +70,7 @@ def test_the_other_joint_is_told_as_well_as_if_there_were_no_such(answer: Diagno
     assert np.isfinite(answer.band.width).all()
 
 
+@pytest.mark.long
 def test_the_exported_model_moves_and_the_resting_joint_as_before(answer: Diagnosis) -> None:
     """With 36,000 N·m/rad, which held the elbow as well, it flew apart."""
     assert answer.rollout.after[0] < 0.03 * answer.rollout.before[0]
