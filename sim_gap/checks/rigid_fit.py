@@ -154,6 +154,7 @@ def _joints(grams: Array, unsigned: Mask) -> Array:
 
     A sensor on the link feels no gear, and a joint at rest no friction (`unsigned`): then the sign of those columns
     says nothing, and they have both.
+    Least squares of any sign are the fit where their signs are right, as they mostly are.
     """
     size = np.sqrt(np.diagonal(grams, axis1=1, axis2=2))
     spread = size[:, -1]
@@ -162,15 +163,16 @@ def _joints(grams: Array, unsigned: Mask) -> Array:
     units = np.where(size > 1e-9, size, 1.0)
     units[:, 4] = np.where(size[:, 4] > 1e-6, size[:, 4], np.inf)
     scaled = (grams / units[:, None] / units[:, :, None])[there]
-    roots, (correlation, own) = _roots(scaled), _partial(scaled)
+    correlation, own = _partial(scaled)
     free = _solved(scaled[:, :4, :4], scaled[:, :4, -1:])[:, 1, 0]
-    signed = _solved(scaled[:, :5, :5], scaled[:, :5, -1:])[..., 0]
-    physical = (signed[:, 0] >= 0.0) & (unsigned[there] | np.all(signed[:, 1:4] >= 0.0, axis=1))
-    shares = (signed * scaled[:, :5, -1]).sum(-1)
-    for k, j in enumerate(there.tolist()):
-        both = (1.0, -1.0)
+    best = _solved(scaled[:, :5, :5], scaled[:, :5, -1:])[..., 0]
+    out[there, 0] = (best * scaled[:, :5, -1]).sum(-1)
+    out[there, 1] = best[:, 0] * spread[there] / units[there, 0]
+    physical = (best[:, 0] >= 0.0) & (unsigned[there] | np.all(best[:, 1:4] >= 0.0, axis=1))
+    for k in np.flatnonzero(~physical).tolist():
+        j, both = there[k], (1.0, -1.0)
         signs = [(1.0,), *[both if unsigned[j] else (1.0,)] * 3, *([both] if np.isfinite(units[j, 4]) else [])]
-        coefficient, explained = (signed[k, 0], shares[k]) if physical[k] else _positive_fit(roots[k], signs)
+        coefficient, explained = _positive_fit(scaled[k], signs)
         out[j, :2] = explained, coefficient * spread[j] / units[j, 0]
     out[there, 2], out[there, 3] = correlation, own * units[there, 0] / spread[there]
     out[there, 4] = free * spread[there] / units[there, 1]
@@ -191,15 +193,14 @@ def _solved(grams: Array, sides: Array) -> Array:
     return np.asarray(np.linalg.pinv(grams, rcond=1e-12, hermitian=True) @ sides)
 
 
-def _roots(grams: Array) -> Array:
-    """Roots of covariances (J, p, p), whose columns have the same least squares as those that made them, (J, p, p)."""
-    values, vectors = np.linalg.eigh(grams)
-    return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., None] * np.swapaxes(vectors, -1, -2))
-
-
-def _positive_fit(root: Array, signs: Sequence[tuple[float, ...]]) -> tuple[float, float]:
+def _positive_fit(gram: Array, signs: Sequence[tuple[float, ...]]) -> tuple[float, float]:
     """First coefficient of a fit with none negative, of the columns with each of their signs, and the share of the
-    reading's variance explained, from a root of the covariance (p, p)."""
+    reading's variance explained.
+
+    By a root of the covariance, which has the same least squares as the columns have.
+    """
+    values, vectors = np.linalg.eigh(gram)
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     chosen = np.stack([sign * root[:, k] for k, both in enumerate(signs) for sign in both], axis=1)
     coefficients, rest = nnls(chosen, root[:, -1])
     return float(coefficients[0]), float(1.0 - rest**2)
