@@ -234,7 +234,7 @@ def labels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A short case of an effect of every kind, made as the check makes them; the labels by effect."""
     folder = tmp_path_factory.mktemp("blind")
     wanted = [Recipe(f"case_{k:04d}", (effect,), (23, k)) for k, effect in enumerate(SHOWN)]
-    make_cases(wanted, folder / "cases", folder / "labels", train_s=6.0, heldout_s=5.0)
+    make_cases(wanted, folder / "cases", folder / "labels", train_s=10.0, heldout_s=7.0)
     found = [json.loads(path.read_text()) for path in sorted((folder / "labels").glob("*.json"))]
     return {label["effects"][0]["effect"]: label for label in found}
 

@@ -18,6 +18,7 @@ from sim_gap.model.load import load_model
 GAIN, BRAKE, GEAR = 15.0, 0.8, 0.01
 REAL = model_text(kp=GAIN, friction=0.01, damping=GEAR).replace(f'kp="{GAIN}"', f'kp="{GAIN}" kv="{BRAKE}"')
 STIFFER = model_text(kp=8.0 * GAIN, friction=0.0, damping=0.0)
+MOTORS = STIFFER.replace("<position", "<motor").replace(f' kp="{8.0 * GAIN}"', "")
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +66,12 @@ def test_servos_that_are_never_off_or_always_change_nothing(swinging) -> None:
 
 
 @pytest.mark.long
-def test_a_swing_parts_friction_from_the_servos_brake_and_spoils_nothing(tmp_path: Path) -> None:
-    """The servo's back-EMF brakes 80 times as much as the gear, which only the swing shows.
-
-    A model without servos: `test_realdata.test_a_swing_with_the_servo_off_leaves_what_its_command_shows`.
-    """
-    sim = written(tmp_path, STIFFER)
-    train = [record(REAL, 1, 18.0), record(REAL, 2, 14.0, released=4.0)]
-    answer = diagnose(sim, train, [record(REAL, 3, 10.0)])
+@pytest.mark.parametrize("text", [STIFFER, MOTORS], ids=["servos in the model", "none"])
+def test_a_swing_parts_friction_from_the_servos_brake_and_spoils_nothing(tmp_path: Path, text: str) -> None:
+    """The servo's back-EMF brakes 80 times as much as the gear, which only the swing shows."""
+    sim = written(tmp_path, text)
+    train = [record(REAL, 1, 24.0), record(REAL, 2, 14.0, released=6.0)]
+    answer = diagnose(sim, train, [record(REAL, 3, 18.0)])
     point = answer.internals.fit.point
     np.testing.assert_allclose(point["back_emf"], BRAKE, rtol=0.1)
     np.testing.assert_allclose(point["viscous"], GEAR, atol=0.02)

@@ -23,7 +23,7 @@ def answer(tmp_path_factory) -> Diagnosis:
     real = model_text(kp=GAIN, friction=0.15)
     folder: Path = tmp_path_factory.mktemp("arm")
     sim = written(folder, model_text(kp=MODEL_GAIN, friction=0.0))
-    return diagnose(sim, [still(record(real, 1, 14.0))], [record(real, 2, 10.0)])
+    return diagnose(sim, [still(record(real, 1, 24.0))], [record(real, 2, 18.0)])
 
 
 def still(recording: Recording) -> Recording:
