@@ -29,8 +29,8 @@ ROOT = Path(__file__).parents[2]
 PAGES = ("first-run", "sweeps", "records", "observer", "daemon", "diagnosing-a-gap")
 FENCE = re.compile(r"^```(?:sh|\{ \.sh \.run \})\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL)
 LEFT_OUT = {
-    "make demo": "tests/campaigns/demo_seeds.py runs it",
-    "armlink demo": "tests/house/test_first_hour.py runs it for an arm file",
+    "make demo": "tests/house/test_first_hour.py runs the demo",
+    "armlink demo": "the same, for an arm file too",
     "armlink sim": "runs all the while",
     "sudo ": "changes the machine",
     "podman ": "builds an image; tests/house/test_container.py checks its files and options",
