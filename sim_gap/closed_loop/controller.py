@@ -23,6 +23,8 @@ GRID = 12
 """Stiffnesses that are tried at the start."""
 RESTS_RAD = 0.002
 """Way of a command over all recordings below which it rests [rad]."""
+HOLDS_HZ = 5.0, 30.0
+"""Least and highest natural frequency of the controller that is assumed for a joint that rests [Hz]."""
 KINDS: dict[str, tuple[str, ...]] = {
     "P": ("delay",),
     "PD": ("kd", "delay"),
@@ -115,14 +117,18 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     kinds = {"P": ()} if own.complete else {kind: (*parts, *servo) for kind, parts in KINDS.items()}
     if not own.complete and always_on:  # then all damping may be the servo's, which ends at a limit of its torque
         search = replace(search, nominal={**search.nominal, "kv": np.full(search.data.joints, np.inf)})
+    at_rest = rests(search.data)
+    search = replace(search, resting=frozenset(np.flatnonzero(at_rest).tolist()))
+    search = replace(search, nominal=_holding(search, at_rest & ~np.isfinite(own.kp)))
     few = replace(search, data=thinned_moving(search.data, FEW))
     fits: dict[str, Fit] = {}
     scores: dict[str, float] = {}
     for kind, parts in kinds.items():
         progress(f"controller: {kind}")
         needed = () if own.complete else ("kp", "viscous", *parts)
-        fits[kind] = improve(few.data, _as_excluded(few, _from_grid(few, parts), needed), search.scales, 5)
-        scores[kind] = float(few.score(fits[kind]).sum()) + PRICE * search.data.joints * len(parts)
+        start = _at_rest(search, _as_excluded(few, _from_grid(few, parts), needed))
+        fits[kind] = improve(few.data, start, search.scales, 5)
+        scores[kind] = float(few.score(fits[kind])[~at_rest].sum()) + PRICE * int((~at_rest).sum()) * len(parts)
     kind = min(scores, key=lambda name: scores[name])
     kept = {"controller.stiffness"} | {
         e.id for e in EFFECTS.values() if e.controller and e.parameters[0] in kinds[kind]
@@ -133,9 +139,6 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     if "feed" not in kinds[kind]:
         left_out.add("actuator.gain")
     found = replace(search, kept=frozenset(kept), excluded=search.excluded | left_out)
-    if own.complete:
-        found = replace(found, resting=frozenset(np.flatnonzero(rests(search.data)).tolist()))
-        fits[kind] = _at_rest(found, fits[kind])
     if not own.complete:
         point = dict(found.nominal)
         for name in ("kp", *kinds[kind]):
@@ -151,14 +154,32 @@ def rests(data: Windows) -> Mask:
     return np.asarray(on.any(axis=(0, 2)) & (ends[0] - ends[1] < RESTS_RAD))
 
 
+def _holding(search: Search, joints: Mask) -> dict[str, Array]:
+    """The nominal values, with a controller at joints (J,) that rest and have none: critically damped, and as stiff as
+    gravity and the error at rest tell, within bounds. From no motion no more follows, and a simulation has to hold them."""
+    data, held = search.data, dict(search.nominal)
+    inertia, flat = search.scales.inertia, (0, 2)
+    pull, error = (np.sqrt(np.mean(each**2, axis=flat)) for each in (data.gravity, data.command - data.recorded))
+    seen = np.sqrt(pull / np.maximum(error, 1e-6) / inertia)
+    frequency = np.clip(seen, *(2.0 * np.pi * hz for hz in HOLDS_HZ))
+    held["kp"] = np.where(joints, inertia * frequency**2, held["kp"])
+    held["viscous"] = np.where(joints, 2.0 * inertia * frequency, held["viscous"])
+    return held
+
+
 def _at_rest(search: Search, fit: Fit) -> Fit:
-    """The fit with the model's own values at the joints that rest."""
+    """The fit with the nominal values at the joints that rest."""
+    if not search.resting:
+        return fit
     point = {name: values.copy() for name, values in fit.point.items()}
     for j in search.resting:
         for name in point:
             point[name][j] = search.nominal[name][j]
     return replace(
-        fit, point=point, active=tuple(() if j in search.resting else own for j, own in enumerate(fit.active))
+        fit,
+        point=point,
+        active=tuple(() if j in search.resting else own for j, own in enumerate(fit.active)),
+        rms=None,
     )
 
 

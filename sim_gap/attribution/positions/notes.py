@@ -37,9 +37,8 @@ def notes(found: Identified) -> list[str]:
         )
     if found.search.resting:
         listed = ", ".join(names[j] for j in sorted(found.search.resting))
-        out.append(
-            f"{listed}: the command rests in all that is fitted, from which nothing follows: the model's values stay"
-        )
+        assumed = "a controller that holds it is assumed" if found.search.open_controller else "the model's values stay"
+        out.append(f"{listed}: the command rests in all that is fitted, from which nothing follows: {assumed}")
     if limits := described(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
     out += [*_touching(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]

@@ -11,7 +11,9 @@ from servo_arm import model_text, record, written
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.closed_loop.controller import rests
+from sim_gap.closed_loop.columns import with_columns
+from sim_gap.closed_loop.controller import nominal_controller, nominal_point, rests, scales_of, starting_fit
+from sim_gap.closed_loop.search import Search
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
 
@@ -75,3 +77,22 @@ def test_the_exported_model_moves_and_the_resting_joint_as_before(answer: Diagno
     """With 36,000 N·m/rad, which held the elbow as well, it flew apart."""
     assert answer.rollout.after[0] < 0.03 * answer.rollout.before[0]
     assert answer.rollout.after[1] == pytest.approx(answer.rollout.before[1], rel=0.05)
+
+
+def test_a_model_without_servos_gets_one_that_holds_the_resting_joint_and_moves_nothing() -> None:
+    """A gripper that stays open in all episodes had 1.8 MN·m/rad, with which the written model shook its arm."""
+    text = model_text(kp=GAIN, friction=0.15)
+    bare = text[: text.index("<actuator>")] + "</mujoco>"
+    sim = load_model(mujoco.MjModel.from_xml_string(bare.replace('frictionloss="0.15"', "")))
+    data = with_columns(windows_of(sim.arm, [still(record(text, 1, 18.0))], ["run"]))
+    own = nominal_controller(sim)
+    excluded = frozenset({"actuator.back_emf"})
+    search = Search(data, scales_of(data), nominal_point(data, own), np.full(2, 3e-4), excluded)
+    search, fit, _ = starting_fit(search, own, lambda text: None)
+    assert search.resting == {1}
+    assert search.open_controller
+    assert fit.active[1] == ()
+    inertia = search.scales.inertia[1]
+    assert 5.0 <= np.sqrt(fit.point["kp"][1] / inertia) / (2.0 * np.pi) <= 30.001
+    assert fit.point["viscous"][1] == pytest.approx(2.0 * np.sqrt(fit.point["kp"][1] * inertia))
+    assert fit.point["kp"][0] == pytest.approx(GAIN, rel=0.1)
