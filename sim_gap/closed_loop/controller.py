@@ -72,6 +72,8 @@ def nominal_controller(sim: SimModel) -> Nominal:
         own.kp[j], own.kv[j] = -model.actuator_biasprm[i, 1] * gear**2, -model.actuator_biasprm[i, 2] * gear**2
         if model.actuator_forcelimited[i]:
             own.limit[j] = float(np.abs(model.actuator_forcerange[i]).max()) * abs(gear)
+        if model.jnt_actfrclimited[sim.joints[j]]:  # as URDF states it, for all actuators of a joint
+            own.limit[j] = min(own.limit[j], float(np.abs(model.jnt_actfrcrange[sim.joints[j]]).max()))
         if model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_PID:
             own.ki[j], slew = model.actuator_gainprm[i, 0] * gear**2, float(model.actuator_dynprm[i, 1])
             own.slew[j] = slew / abs(gear) if slew > 0.0 else np.inf
@@ -156,12 +158,13 @@ def rests(data: Windows) -> Mask:
 
 def _holding(search: Search, joints: Mask) -> dict[str, Array]:
     """The nominal values, with a controller at joints (J,) that rest and have none: critically damped, and as stiff as
-    gravity and the error at rest tell, within bounds. From no motion no more follows, and a simulation has to hold them."""
+    gravity and the error at rest tell, within bounds; a simulation has to hold them.
+    """
     data, held = search.data, dict(search.nominal)
     inertia, flat = search.scales.inertia, (0, 2)
     pull, error = (np.sqrt(np.mean(each**2, axis=flat)) for each in (data.gravity, data.command - data.recorded))
     seen = np.sqrt(pull / np.maximum(error, 1e-6) / inertia)
-    frequency = np.clip(seen, *(2.0 * np.pi * hz for hz in HOLDS_HZ))
+    frequency = np.clip(seen, 2.0 * np.pi * HOLDS_HZ[0], 2.0 * np.pi * HOLDS_HZ[1])
     held["kp"] = np.where(joints, inertia * frequency**2, held["kp"])
     held["viscous"] = np.where(joints, 2.0 * inertia * frequency, held["viscous"])
     return held

@@ -13,6 +13,7 @@ from gcomp.arrays import Array, Mask
 from sim_gap.closed_loop.balance import balanced, counted
 from sim_gap.closed_loop.choice.compete import select_about
 from sim_gap.closed_loop.choice.doubt import settled
+from sim_gap.closed_loop.choice.solver import fitted_solver, nominal_solver, solvers
 from sim_gap.closed_loop.columns import shared_effects, with_columns
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
@@ -104,14 +105,20 @@ def identify(
     other = windows_of(sim.arm, heldout, labels[len(train) :], fitted.dt, scale[len(train) :], surface)
     judged = with_columns(thinned(other, JUDGED))
     own = nominal_controller(sim)
-    nominal = nominal_point(fitted, own)
     data = thinned_moving(fitted, SEARCHED)
+    nominal = nominal_point(fitted, own)
     scales, floor = scales_of(fitted), noise_floor(fitted)
     never = frozenset(withhold) | _frozen(sim, fitted)
     search = Search(balanced(data), scales, nominal, floor, never)
-    search, fit, kind = starting_fit(search, own, progress)
-    search = replace(search, data=counted(search, data, fit))
-    fit = select_about(search, replace(fit, rms=None), progress)
+    kinds = solvers(sim, search) if own.complete else []
+    search = nominal_solver(search, kinds) if kinds else search
+    search, start, kind = starting_fit(search, own, progress)
+    search = replace(search, data=counted(search, data, start))
+    fit = select_about(search, replace(start, rms=None), progress)
+    if kinds and (solver := fitted_solver(search, fit, kinds)):
+        progress("with MuJoCo's solver")
+        search = replace(search, nominal={**search.nominal, **solver})
+        fit = select_about(search, replace(start.with_values(**solver), rms=None), progress)
     progress("final fit")
     search = replace(search, data=counted(search, fitted, fit))
     fit = improve(search.data, replace(fit, rms=None), scales, 6)

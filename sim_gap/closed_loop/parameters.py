@@ -39,6 +39,7 @@ PARAMETERS = {
         Parameter("back_emf", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),
         Parameter("stribeck", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
         Parameter("stribeck_velocity", "rad/s", 0.1, 0.1, 0.01, 1.0),
+        Parameter("creep", "rad/s", 0.0, 0.02, 0.0, 0.5),
         Parameter("load", "N·m/(N·m)", 0.0, 0.1, 0.0, 2.0),
         Parameter("asymmetry", "1", 0.0, 0.1, -0.95, 0.95),
         Parameter("armature", "kg·m²", 0.0, 0.3, 0.0, np.inf, "inertia"),
@@ -85,6 +86,7 @@ EFFECTS = {
         LoopEffect(
             "friction.stribeck", ("stribeck", "stribeck_velocity"), ("breakaway", "velocity"), ("friction.coulomb",)
         ),
+        LoopEffect("friction.creep", ("creep",), ("speed",), ("friction.coulomb",)),
         LoopEffect("friction.load", ("load",), ("coefficient",)),
         LoopEffect("friction.asymmetric", ("asymmetry",), ("ratio",), ("friction.coulomb",)),
         LoopEffect("transmission.spring", ("spring", "offset"), ("stiffness", "torque")),

@@ -3,7 +3,7 @@
 Velocities stand half a step before positions (leapfrog), and damping acts on the mean of two of them, so that the error
 is of second order in the step: one of first order would show as a command that comes half a step early and a heavier
 joint. Friction, damping too strong for the step and a position gain too high for it are implicit, so that it is stable
-for any gains, and a joint sticks where friction exceeds what drives it.
+for any gains, and a joint sticks where friction exceeds what drives it, or creeps, if it may.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,9 +22,13 @@ AHEAD = 40_000
 """Most cells times steps for which what does not depend on the motion is made at once, likewise."""
 TURN = 1.5
 """Largest deviation from the recorded angle for which gravity's torque is continued [rad]."""
+LIGHTEST = 0.01
+"""Least share of a joint's inertia that damping of another simulation leaves."""
 Values = Mapping[str, Array]
 """Parameter → (P, J); the names are those of `parameters` and of `Windows.columns`, and `kv`: as much of `viscous` as
-the servo makes within its limit while it is on."""
+the servo makes within its limit while it is on. `early` and `servo_late` are about a recording that another simulation
+made: the half step by which its torques act early, and the times by which damping by its servos and friction under
+which a joint creeps are late [s]."""
 
 
 def simulate(data: Windows, values: Values) -> Array:
@@ -54,6 +58,8 @@ class _Joints:
         scaled = bool(np.any(data.scale != 1.0))
         self.kp, self.kd, self.ki = (self.of(n) * data.scale if scaled else self.of(n) for n in ("kp", "kd", "ki"))
         self.brake = np.minimum(self.of("kv"), self.of("viscous"))
+        self.delay = self.of("delay") - self.of("early")
+        self.solved = self.of("early") * self.of("viscous") - self.of("servo_late") * self.brake
         dt, gain = data.dt, self.of("gain", 1.0)
         stiff, self.damped = dt * dt * self.kp * gain, dt * self.kd * gain
         share = stiff / (data.inertia.mean(0) + self.of("armature")) - EXPLICIT
@@ -90,9 +96,9 @@ class _Joints:
 
     def _late(self, signal: Array, part: slice) -> Array:
         """A signal of the command as it arrives, (B, P, J, W)."""
-        if "delay" not in self.active:
+        if not self.active & {"delay", "early"}:
             return signal[part, None]
-        late = self.of("delay")[:, :, 0] / self.data.dt
+        late = self.delay[:, :, 0] / self.data.dt
         whole = np.floor(late).astype(int)
         joints, at = np.arange(self.data.joints), np.arange(part.start, part.stop)[:, None, None] - whole
         after, before = (np.clip(k, 0, len(signal) - 1) for k in (at, at - 1))
@@ -105,6 +111,8 @@ class _Joints:
         1 where the servo is `on`, and `free` of its limit.
         """
         mass, outside = own + self.of("armature"), self.of("viscous") - self.brake * (1.0 - free)
+        if "early" in self.active:
+            mass = np.maximum(mass + self.solved, LIGHTEST * mass)
         lost = self.data.dt * (outside + self.of("back_emf") * on) + free * self.damped
         carried = mass - np.minimum(0.5 * lost, mass)
         return carried, carried + lost + free * self.stiff
@@ -129,7 +137,7 @@ class _Joints:
         data, ki = self.data, self.ki
         begun = np.where(self.of("feed") > 0.5, data.first_torque[1], data.first_torque[0])
         held = (begun / self.of("gain", 1.0) - self.kp * data.first_error) / np.maximum(ki, 1e-9) * (ki > 0.0)
-        return np.asarray(data.error_sum - self.of("delay") * data.travel + held)
+        return np.asarray(data.error_sum - self.delay * data.travel + held)
 
 
 def _run(joints: _Joints) -> Array:
@@ -138,6 +146,8 @@ def _run(joints: _Joints) -> Array:
     limit, most = of("limit", np.inf), of("slew", np.inf) * dt
     clipped, slewed = bool(np.isfinite(limit).any()), bool(np.isfinite(most).any())
     braking, moving = joints.kd + joints.brake, bool(active & {"stribeck", "asymmetry"})
+    creeps, creep = "creep" in active, np.maximum(of("creep"), 1e-9)
+    lag = of("creep_lag") / dt * (of("creep") > 0.0)
     turn, step = (np.full(joints.shape, x) for x in (TURN, dt))  # numpy is slower with numbers
     q, v, target = (np.broadcast_to(x, joints.shape).copy() for x in (*data.start, data.command[0]))
     total = joints.integral() if "ki" in active else np.zeros(1)
@@ -178,14 +188,18 @@ def _run(joints: _Joints) -> Array:
         torque += rest
         if "spring" in active:
             torque -= of("spring") * q
-        before = v.copy() if moving else None
+        before = v.copy() if moving or creeps else None
         v *= carried
         torque *= step
         v += torque
         v /= effective
         if held or moving:
             grip = joints.grip(data.load[k], effective, v, before)
-        v -= _within(v, grip)
+        stopped = v
+        if before is not None and creeps:
+            share = grip / creep
+            stopped = share * (v + lag * (v - before)) / (1.0 + share * (1.0 + lag))
+        v -= _within(stopped, grip)
         q += step * v
     return out
 

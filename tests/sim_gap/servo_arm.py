@@ -17,10 +17,15 @@ from sim_gap.model.load import load_model
 JOINTS = ("shoulder", "elbow")
 
 
-def model_text(kp: float, friction: float, damping: float = 0.8, limits: Sequence[float] = ()) -> str:
-    """MJCF of the arm: gravity about both joints, gains in N·m/rad, limits of the servos' torque in N·m."""
+def model_text(
+    kp: float, friction: float, damping: float = 0.8, limits: Sequence[float] = (), *, creeps: bool = False
+) -> str:
+    """MJCF of the arm: gravity about both joints, gains in N·m/rad, limits of the servos' torque in N·m.
+
+    If it `creeps`, friction is as MuJoCo's usual solver parameters make it, else it holds a joint at rest.
+    """
     limited = [f' forcerange="{-x} {x}"' for x in limits] or ["", ""]
-    sticks = 'solreffriction="0.01 1" solimpfriction="0.999 0.9999 0.001 0.5 2"'
+    sticks = "" if creeps else 'solreffriction="0.01 1" solimpfriction="0.999 0.9999 0.001 0.5 2"'
     joint = f'axis="0 1 0" damping="{damping}" frictionloss="{friction}" armature="0.02" {sticks}'
     return f"""<mujoco model="servo_arm"><option timestep="0.002" integrator="implicitfast"/><worldbody>
 <body name="upper"><joint name="shoulder" {joint}/><inertial pos="0.1 0 0" mass="0.6" diaginertia="2e-3 2e-3 2e-3"/>

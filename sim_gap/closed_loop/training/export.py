@@ -23,6 +23,7 @@ from sim_gap.closed_loop.training.ranges import widened, write_range
 from sim_gap.effects.base import tilted
 from sim_gap.model.load import SimModel
 from sim_gap.model.rigid_body import inertial_of
+from sim_gap.model.solver_friction import solver_parameters
 
 NATIVE = {
     "controller.stiffness": "actuator kp",
@@ -34,6 +35,7 @@ NATIVE = {
     "actuator.rotor_inertia": "joint armature",
     "friction.coulomb": "joint frictionloss",
     "friction.viscous": "joint damping",
+    "friction.creep": "joint solimpfriction",
     "transmission.spring": "joint stiffness and springref",
     "link.payload": "body inertial",
     "link.mass_moment": "body inertial",
@@ -46,9 +48,6 @@ IN_MODULE = "friction.stribeck", "friction.load", "friction.asymmetric"
 """Effects that the module beside a model applies."""
 WRITTEN = frozenset({*NATIVE, *IN_MODULE})
 """Effects of a model with its module."""
-STICKS = {"solref_friction": [0.01, 1.0], "solimp_friction": [0.999, 0.9999, 0.001, 0.5, 2.0]}
-"""Solver parameters with which a joint under friction rests; with MuJoCo's usual ones it creeps to where no friction is
-needed, within a tenth of a second on a small arm."""
 POSITION_INPUT = 1
 """MuJoCo's code of an actuator whose only input is a position."""
 
@@ -114,6 +113,7 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
     spec.option.gravity = tilted(sim.arm.gravity, np.array(angles))
     spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
     spec.option.integrator = _implicit()
+    _set_friction(spec, sim, native)
     spec.compile()
     head = "Left out, MJCF has no field for them (the rest was fitted without them):"
     comment = xml_comment([head, *left]) if left else ""
@@ -158,12 +158,21 @@ def _implicit() -> Any:
 def _set_joint(joint: Any, fit: Fit, j: int, unit: float) -> None:
     """Give a joint of a file what the fit has; angles of joints in the file's `unit`."""
     joint.frictionloss, joint.armature = float(fit.point["coulomb"][j]), float(fit.point["armature"][j])
-    joint.solref_friction, joint.solimp_friction = STICKS["solref_friction"], STICKS["solimp_friction"]
     joint.damping[0] = float(fit.point["viscous"][j] - _of_servo(fit, j))
     stiffness = float(fit.point["spring"][j])
     if stiffness > 1e-9:
         joint.stiffness[0] = stiffness
         joint.springref = -unit * float(fit.point["offset"][j]) / stiffness
+
+
+def _set_friction(spec: Any, sim: SimModel, fit: Fit) -> None:
+    """Let the joints of a file rest under friction, or creep as fast as the fit has them: with MuJoCo's usual solver
+    parameters a joint creeps to where no friction is needed, within a tenth of a second on a small arm."""
+    made = spec.compile()
+    for j, number in enumerate(sim.joints):
+        joint, weight = spec.joints[number], float(made.dof_invweight0[made.jnt_dofadr[number]])
+        values = solver_parameters(float(fit.point["coulomb"][j]), float(fit.point["creep"][j]), weight)
+        joint.solref_friction, joint.solimp_friction = values
 
 
 def _of_servo(fit: Fit, j: int) -> float:

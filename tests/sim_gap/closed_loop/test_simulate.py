@@ -13,6 +13,7 @@ from sim_gap.closed_loop.simulate import simulate
 from sim_gap.closed_loop.training.export import POSITION_INPUT
 from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
+from sim_gap.model.solver_friction import creep_speeds
 
 TEXT = model_text(kp=15.0, friction=0.2)
 
@@ -31,6 +32,21 @@ def test_agrees_with_mujoco_on_a_servo_with_friction() -> None:
     found = evaluate(data, Fit(point, ((), ())))
     moved = np.sqrt(np.mean((data.command - data.recorded) ** 2, axis=(0, 2)))
     assert (joint_rms(data, found.rms) < np.maximum(0.03 * moved, 1.5e-3)).all()
+
+
+def test_agrees_with_mujoco_on_friction_under_which_a_joint_creeps() -> None:
+    """MuJoCo's usual solver parameters, and the half step by which it is early."""
+    text = model_text(kp=15.0, friction=0.2, creeps=True)
+    sim = load_model(mujoco.MjModel.from_xml_string(text))
+    data = windows_of(sim.arm, [record(text, 1, 20.0)], ["run"])
+    early = np.full(2, -0.5 * sim.mujoco_model.opt.timestep)
+    point = {**nominal_point(data, nominal_controller(sim)), "delay": early}
+    speeds = creep_speeds(sim.mujoco_model, [0, 1])
+    creeping, resting = (
+        joint_rms(data, evaluate(data, Fit({**point, "creep": each}, ((), ()))).rms) for each in (speeds, 0.0 * speeds)
+    )
+    assert (creeping < 6e-4).all()
+    assert (creeping < 0.8 * resting).all()
 
 
 def test_the_step_shows_neither_as_a_lead_nor_as_inertia() -> None:

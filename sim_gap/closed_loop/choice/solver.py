@@ -1,0 +1,56 @@
+"""Whether recordings move as MuJoCo's solver moves the nominal model, or as an arm that its parameters describe.
+
+In MuJoCo torques act from half a step before, damping is taken at a step's end or, in a servo and with Euler's method,
+at its start, and joints creep under friction. All that is about numbers and not about the arm: recordings of another
+simulation have it, those of a real arm have not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.closed_loop.fit import Fit, Point, evaluate, improve
+from sim_gap.closed_loop.search import PRICE, Search
+from sim_gap.model.load import SimModel
+from sim_gap.model.solver_friction import creep_speeds, creep_times
+
+
+def solvers(sim: SimModel, search: Search) -> list[dict[str, Array]]:
+    """What recordings may have of a solver, (J,) each: nothing, or what MuJoCo's does with the nominal model, without
+    and with its friction."""
+    import mujoco
+
+    model, method, dofs = sim.mujoco_model, mujoco.mjtIntegrator, sim.mujoco_model.jnt_dofadr[list(sim.joints)]
+    step = float(model.opt.timestep) * (model.opt.integrator != method.mjINT_RK4) * np.ones(sim.n)
+    none = np.zeros(sim.n)
+    steps = {"early": 0.5 * step, "servo_late": step * (model.opt.integrator == method.mjINT_EULER)}
+    rests = {"creep": none, "creep_lag": none}
+    lag = np.maximum(creep_times(model, dofs) - 0.5 * (step + search.data.dt), 0.0)
+    creeps = {"creep": creep_speeds(model, dofs), "creep_lag": lag}
+    return [{"early": none, "servo_late": none, **rests}, {**steps, **rests}, {**steps, **creeps}]
+
+
+def nominal_solver(search: Search, kinds: Sequence[Point]) -> Search:
+    """The search with the nominal model moved as the first of some solvers, or as another that leaves clearly less."""
+    points = [{**search.nominal, **kind} for kind in kinds]
+    none = ((),) * search.data.joints
+    scores = [float(search.score(evaluate(search.data, Fit(point, none))).sum()) for point in points]
+    return replace(search, nominal=points[_clearly_best(search, scores)])
+
+
+def fitted_solver(search: Search, fit: Fit, kinds: Sequence[Point]) -> dict[str, Array] | None:
+    """Of the other solvers that which leaves clearly less than the search's own once effects are fitted, which at first
+    hide a solver's; None without such."""
+    own = search.nominal
+    others = [kind for kind in kinds if any(np.any(kind[name] != own[name]) for name in kind)]
+    tried = [improve(search.data, replace(fit.with_values(**kind), rms=None), search.scales, 4) for kind in others]
+    best = _clearly_best(search, [float(search.score(each).sum()) for each in (fit, *tried)])
+    return dict(others[best - 1]) if best else None
+
+
+def _clearly_best(search: Search, scores: Sequence[float]) -> int:
+    """Number of the least of some scores, or 0 if it is not clearly less than the first."""
+    best = int(np.argmin(scores))
+    return best if scores[best] < scores[0] - PRICE * search.data.joints else 0
