@@ -13,7 +13,7 @@ from gcomp.arrays import Array, Mask
 from sim_gap.closed_loop.balance import balanced, counted
 from sim_gap.closed_loop.choice.compete import select_about
 from sim_gap.closed_loop.choice.doubt import settled
-from sim_gap.closed_loop.choice.solver import fitted_solver, nominal_solver, solvers
+from sim_gap.closed_loop.choice.solver import nominal_solver, other_solver, priced, solvers
 from sim_gap.closed_loop.columns import shared_effects, with_columns
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.closed_loop.fit import Fit, evaluate, improve
@@ -115,10 +115,11 @@ def identify(
     search, start, kind = starting_fit(search, own, progress)
     search = replace(search, data=counted(search, data, start))
     fit = select_about(search, replace(start, rms=None), progress)
-    if kinds and (solver := fitted_solver(search, fit, kinds)):
-        progress("with MuJoCo's solver")
-        search = replace(search, nominal={**search.nominal, **solver})
-        fit = select_about(search, replace(start.with_values(**solver), rms=None), progress)
+    if kinds and (solver := other_solver(search, fit, kinds)):
+        progress("with another solver")
+        there = replace(search, nominal={**search.nominal, **solver})
+        again = select_about(there, replace(start.with_values(**solver), rms=None), progress)
+        search, fit = (there, again) if priced(there, again) < priced(search, fit) else (search, fit)
     progress("final fit")
     search = replace(search, data=counted(search, fitted, fit))
     fit = improve(search.data, replace(fit, rms=None), scales, 6)

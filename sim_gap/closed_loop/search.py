@@ -71,6 +71,11 @@ class Search:
         return np.asarray(judged / INDEPENDENT_S)
 
 
+def size_of(fit: Fit) -> int:
+    """Number of parameters of a fit."""
+    return sum(len(own) for own in fit.active) + len(fit.shared)
+
+
 def price(search: Search, count: int) -> Array:
     """Least fall of the score for `count` more parameters, per joint (J,)."""
     return np.asarray(np.maximum(PRICE * count, search.samples * LEAST_FALL))

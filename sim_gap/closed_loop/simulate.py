@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.closed_loop.columns import payload_inertia
 from sim_gap.closed_loop.windows import Windows
 
 EXPLICIT = 0.5
@@ -64,6 +65,10 @@ class _Joints:
         stiff, self.damped = dt * dt * self.kp * gain, dt * self.kd * gain
         share = stiff / (data.inertia.mean(0) + self.of("armature")) - EXPLICIT
         self.stiff = stiff * np.clip(share, 0.0, 1.0)
+        self.payload: dict[str, Array] = {}
+        if "payload.mass" in self.active:
+            x, y, z = (self.of(f"payload.{axis}") for axis in "xyz")
+            self.payload = payload_inertia(self.of("payload.mass"), (x, y, z), data.arm)
         self.geared = bool(np.any(gain != 1.0)) or bool(np.any(data.served != 1.0))
 
     def of(self, name: str, neutral: float = 0.0) -> Array:
@@ -88,6 +93,8 @@ class _Joints:
         for name in data.columns:
             if name in self.active:
                 rest = rest - self.of(name) * data.columns[name][part, None]
+        for name in self.payload.keys() & data.columns.keys():
+            rest = rest - self.payload[name] * data.columns[name][part, None]
         carried, effective = self.inertias(data.inertia[part, None], on, on)
         grip = self.grip(data.load[part, None], effective)
         every = (command, push, self.of("gain", 1.0) * on, rest, carried, effective, grip)

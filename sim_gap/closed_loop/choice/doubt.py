@@ -21,7 +21,7 @@ from sim_gap.closed_loop.choice.scale import ROTORS, at_other_scales
 from sim_gap.closed_loop.columns import shared_effects
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
-from sim_gap.closed_loop.search import INDEPENDENT_S, PRICE, Group, Search, merged, price, shared_of, taken_out
+from sim_gap.closed_loop.search import INDEPENDENT_S, PRICE, Group, Search, merged, price, shared_of, size_of, taken_out
 
 CALM = 0.5
 """Share of a joint's RMS over all windows below which what is left of a window tells little."""
@@ -76,7 +76,7 @@ def _others(search: Search, fit: Fit, progress: Progress) -> Iterator[Other]:
     for effect in shared_of(fit, search):
         progress(f"without {effect}")
         other = improve(search.data, select(own, taken_out(search, fit, (effect, ()))), search.scales, 4)
-        more = PRICE * (_size(fit) - _size(other))
+        more = PRICE * (size_of(fit) - size_of(other))
         yield Other((effect, ()), other, _doubt(search, fit, other, range(search.data.joints), more))
     for other in at_other_scales(search, fit):
         yield from _of_each_joint(search, fit, other, ROTORS)
@@ -87,17 +87,13 @@ def _others(search: Search, fit: Fit, progress: Progress) -> Iterator[Other]:
 def _of_each_joint(search: Search, fit: Fit, other: Fit, called: str) -> Iterator[Other]:
     """Another fit with other effects, at each joint that it differs at; of all, if something couples them."""
     if fit.shared:
-        more = PRICE * (_size(fit) - _size(other))
+        more = PRICE * (size_of(fit) - size_of(other))
         yield Other((called, ()), other, _doubt(search, fit, other, range(search.data.joints), more))
         return
     for j, own in enumerate(other.active):
         if own != fit.active[j]:
             more = PRICE * (len(fit.active[j]) - len(own))
             yield Other((called, (j,)), merged(fit, other, j), _doubt(search, fit, other, (j,), more))
-
-
-def _size(fit: Fit) -> int:
-    return sum(len(own) for own in fit.active) + len(fit.shared)
 
 
 def _doubt(search: Search, fit: Fit, other: Fit, joints: Iterable[int], least: float) -> float:

@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.closed_loop.choice.prune import pruned
 from sim_gap.closed_loop.fit import Fit, Point, evaluate, improve
-from sim_gap.closed_loop.search import PRICE, Search
+from sim_gap.closed_loop.search import PRICE, Search, size_of
 from sim_gap.model.load import SimModel
 from sim_gap.model.solver_friction import creep_speeds, creep_times
 
@@ -40,14 +41,28 @@ def nominal_solver(search: Search, kinds: Sequence[Point]) -> Search:
     return replace(search, nominal=points[_clearly_best(search, scores)])
 
 
-def fitted_solver(search: Search, fit: Fit, kinds: Sequence[Point]) -> dict[str, Array] | None:
-    """Of the other solvers that which leaves clearly less than the search's own once effects are fitted, which at first
-    hide a solver's; None without such."""
-    own = search.nominal
-    others = [kind for kind in kinds if any(np.any(kind[name] != own[name]) for name in kind)]
-    tried = [improve(search.data, replace(fit.with_values(**kind), rms=None), search.scales, 4) for kind in others]
-    best = _clearly_best(search, [float(search.score(each).sum()) for each in (fit, *tried)])
-    return dict(others[best - 1]) if best else None
+def other_solver(search: Search, fit: Fit, kinds: Sequence[Point]) -> dict[str, Array] | None:
+    """The other solver with which effects are worth choosing again; None without such.
+
+    A delay, inertia and friction at every joint may stand for a solver: it is worth it where with the solver as many
+    parameters as there are joints are not needed, or much less is left.
+    """
+    own, found = search.nominal, []
+    for kind in kinds:
+        if all(np.array_equal(kind[name], own[name]) for name in kind):
+            continue
+        there = replace(search, nominal={**own, **kind})
+        moved = improve(there.data, replace(fit.with_values(**kind), rms=None), there.scales, 4)
+        needed = pruned(there, moved)
+        fewer = size_of(fit) - size_of(needed) >= search.data.joints
+        found.append((priced(there, needed) - PRICE * search.data.joints * (1 if fewer else -1), kind))
+    best, kind = min(found, key=lambda each: each[0])
+    return dict(kind) if best < priced(search, fit) else None
+
+
+def priced(search: Search, fit: Fit) -> float:
+    """Score of a fit with what its parameters cost."""
+    return float(search.score(fit).sum()) + PRICE * size_of(fit)
 
 
 def _clearly_best(search: Search, scores: Sequence[float]) -> int:

@@ -15,14 +15,13 @@ from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.with_effects import body_parameters, mujoco_quaternion, possible, spec_of, split
 from sim_gap.better_model.xml_comment import xml_comment
-from sim_gap.closed_loop.columns import shared_effects
+from sim_gap.closed_loop.columns import payload_inertia, shared_effects
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS
 from sim_gap.closed_loop.search import Search, effect_there, taken_out, without
 from sim_gap.closed_loop.training.ranges import widened, write_range
 from sim_gap.effects.base import tilted
 from sim_gap.model.load import SimModel
-from sim_gap.model.rigid_body import inertial_of
 from sim_gap.model.solver_friction import solver_parameters
 
 NATIVE = {
@@ -219,11 +218,8 @@ def _link_changes(search: Search, fit: Fit) -> dict[int, Array]:
         float(fit.point[f"payload.{p}"][0]) if f"payload.{p}" in fit.shared else 0.0 for p in ("mass", "x", "y", "z")
     ]
     if any(payload):
-        mass, moment = payload[0], np.array(payload[1:])
-        centre = moment / mass if abs(mass) > 1e-6 else np.zeros(3)
-        body = inertial_of(mass, centre, np.zeros((3, 3)))
-        body[1:4] = moment
-        changes[n - 1] = body
+        mass, x, y, z = (np.array(value) for value in payload)
+        changes[n - 1] = np.array([*payload, *payload_inertia(mass, (x, y, z), search.data.arm).values()])
     for link in range(n):
         moment = np.array([float(fit.point.get(f"moment{link}.{axis}", np.zeros(1))[0]) for axis in "xyz"])
         if moment.any():
