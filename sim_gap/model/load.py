@@ -13,6 +13,7 @@ from gcomp.arrays import Array
 from sim_gap.model.arm_joints import arm_hinges, hinges_of
 from sim_gap.model.from_arm import is_arm_file, nominal_model
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
+from sim_gap.model.solver_friction import creep_speeds
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,7 @@ def rigid_arm(model: Any, joints: Sequence[int]) -> RigidArm:
         armature=model.dof_armature[dof].copy(),
         damping=linear_part(model.dof_damping, model.nv)[dof],
         frictionloss=model.dof_frictionloss[dof].copy(),
+        creep=creep_speeds(model, dof),
         stiffness=linear_part(model.jnt_stiffness, model.njnt)[list(joints)],
         rest=model.qpos_spring[adr].copy(),
         tendons=tendons_of(model, joints),

@@ -66,6 +66,8 @@ class RigidArm:
     damping: Array
     frictionloss: Array
     """Motor-side terms of the nominal joints, (n,) each: kg·m², N·m·s/rad, N·m."""
+    creep: Array
+    """Speed up to which MuJoCo lets the nominal joints creep under less than that friction [rad/s], (n,)."""
     stiffness: Array
     rest: Array
     """Springs of the nominal joints, beside the motor and on the link side, (n,) each: N·m/rad, rad."""

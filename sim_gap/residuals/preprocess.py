@@ -24,6 +24,8 @@ from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, t
 from sim_gap.residuals.spikes import Spikes, around_spikes, counted, spikes_of
 from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals
 
+SLIDES, MOST_CREEP = 1.5, 0.2
+"""Speed from which a joint of a simulation slides, over that up to which it creeps; the most that it is [rad/s]."""
 BAND_HZ = 6.0
 """Pass band in which model and recording are compared [Hz]."""
 SMOOTH_HZ = 20.0
@@ -169,8 +171,8 @@ class Signals:
 
     @cached_property
     def moving(self) -> Array:
-        """1 if a joint moves faster than the creeping speed, (K, n)."""
-        return (np.abs(self.v) > CREEP).astype(float)
+        """1 if a joint moves faster than the creeping speed, or than a simulation of the model creeps, (K, n)."""
+        return (np.abs(self.v) > np.clip(SLIDES * self.arm.creep, CREEP, MOST_CREEP)).astype(float)
 
     def release(self) -> None:
         """Free what is large and can be computed again; of signals as they were read, not what is asked for again."""

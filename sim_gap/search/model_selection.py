@@ -104,7 +104,9 @@ def with_lost(
         return store, chosen
     grids = {key: effects()[key[0]].hints.grid(store.data.signals, key[1]) for key in lost}
     shapes = [Term(*key, shape) for key, grid in grids.items() for shape in grid]
-    search = Search(NormalEquations(store, [*chosen, *shapes]), chosen)
+    needed = {key for term in shapes for key in term.beneath} - {term.key for term in chosen} - lost
+    beneath = [term for term in wanted if term.key in needed]
+    search = Search(NormalEquations(store, [*chosen, *shapes, *beneath]), chosen)
     search.take_back(lost)
     return converged(nominal, search.active, store.values) if len(search.active) > len(chosen) else (store, chosen)
 

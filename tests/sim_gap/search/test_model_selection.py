@@ -100,6 +100,17 @@ def test_a_limit_that_got_lost_comes_back_at_the_level_at_which_it_can_exist():
     assert level(kept[0]) < 0.05 * limit
 
 
+def test_breakaway_that_got_lost_comes_back_with_the_friction_that_it_adds_to():
+    """The search was ended by a KeyError if that friction had got lost, too."""
+    wrong = Wrong(coulomb=np.array([0.0, 0.6, 0.0]), breakaway=np.array([0.0, 0.6, 0.0]))
+    recording = record(model(), wrong, seed=1, seconds=40, rate=50.0, channels=("tau_motor",))
+    signals = prepare(recording, load_model(model()).arm, "a recording")
+    store = ColumnStore(ResidualSet((signals,), layout_of([signals])))
+    lost = [Term("friction.coulomb", 1), Term("friction.stribeck", 1, (0.1,))]
+    _, kept = with_lost(store, lost, store, [])
+    assert {term.key for term in kept} == {term.key for term in lost}
+
+
 def test_errors_of_folds_predicted_from_the_others_are_those_of_fits_one_by_one():
     """Least squares of the columns themselves, weighted and with the prior."""
     normal = normal_equations(Wrong(payload=0.5, offset=np.array([0.4, 0.0, 0.0])))
