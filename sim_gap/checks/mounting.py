@@ -14,7 +14,8 @@ MOUNTED = 0.1
 UPSIDE_DOWN = 0.98
 """Cosine from which gravity is nearly opposite: then a turned sign of all torques is as good, and far more common."""
 TOOL_REACH = 0.4
-"""Farthest centre of mass of a tool from the last joint, as a share of the arm's length."""
+"""Farthest centre of mass of a tool from the last joint, as a share of the arm's length; or the last link's end, which
+is twice as far away as the link's own centre of mass."""
 
 
 def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
@@ -53,8 +54,10 @@ def as_loaded(arm: RigidArm, motion: Motion, without: int | None = None) -> Rigi
     """
     tip, believed = arm.n - 1, [j for j in range(arm.n) if j != without]
     body, _ = body_at(arm, motion, tip, believed)
-    reach = float(np.linalg.norm(arm.offset[1:], axis=1).sum())
-    if body[0] <= 0.0 or float(np.linalg.norm(body[1:])) > TOOL_REACH * max(reach, 1e-9) * body[0]:
+    reach = TOOL_REACH * float(np.linalg.norm(arm.offset[1:], axis=1).sum())
+    link = arm.inertial[tip]
+    end = 2.0 * float(np.linalg.norm(link[1:4]) / max(link[0], 1e-9))
+    if body[0] <= 0.0 or float(np.linalg.norm(body[1:])) > max(reach, end, 1e-9) * body[0]:
         return arm
     inertial = arm.inertial.copy()
     inertial[tip, :4] += body

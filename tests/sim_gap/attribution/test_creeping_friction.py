@@ -11,7 +11,7 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 
 RATE, SECONDS = 100, 30
-MASS, PLACE = 0.1, (0.12, 0.0, 0.03)
+MASS, PLACE = 0.25, (0.12, 0.0, 0.03)
 
 
 def arm(load: str = "") -> str:
