@@ -24,8 +24,9 @@ def creep_speeds(model: Any, dofs: Sequence[int]) -> Array:
     """Speed below which each degree of freedom creeps under less than its friction loss [rad/s], (n,); 0 without."""
     rows = list(dofs)
     least = np.clip(model.dof_solimp[rows, 0], *IMPEDANCES)
-    stiffness = least / (1.0 - least) / model.dof_invweight0[rows] / creep_times(model, dofs)
-    return np.asarray(model.dof_frictionloss[rows] / np.maximum(stiffness, 1e-12))
+    weight = np.maximum(model.dof_invweight0[rows], 1e-9)
+    stiffness = least / (1.0 - least) / weight / creep_times(model, dofs)
+    return np.asarray(model.dof_frictionloss[rows] / stiffness)
 
 
 def creep_times(model: Any, dofs: Sequence[int]) -> Array:

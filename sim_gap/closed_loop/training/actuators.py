@@ -13,7 +13,7 @@ from sim_gap.closed_loop.training.draws import draw
 DRAWS = 400
 """Draws of the parameters from which the range of a delay is taken."""
 RANGE = 0.05, 0.95
-ABOUT = "Friction of other kinds is taken into Coulomb and viscous friction."
+ABOUT = "Friction of other kinds is taken into Coulomb and viscous friction; that joints creep under it is left out."
 
 
 def write_actuators(found: Identified, path: Path, step: float = 0.005) -> None:
