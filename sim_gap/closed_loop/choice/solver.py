@@ -19,18 +19,20 @@ from sim_gap.model.solver_friction import creep_speeds, creep_times
 
 
 def solvers(sim: SimModel, search: Search) -> list[dict[str, Array]]:
-    """What recordings may have of a solver, (J,) each: nothing, or what MuJoCo's does with the nominal model, without
-    and with its friction."""
+    """What recordings may have of a solver, (J,) each: nothing, and what MuJoCo's does with the nominal model, without
+    and with its friction, as far as it does anything.
+    """
     import mujoco
 
     model, method, dofs = sim.mujoco_model, mujoco.mjtIntegrator, sim.mujoco_model.jnt_dofadr[list(sim.joints)]
     step = float(model.opt.timestep) * (model.opt.integrator != method.mjINT_RK4) * np.ones(sim.n)
-    none = np.zeros(sim.n)
+    none, speeds = np.zeros(sim.n), creep_speeds(model, dofs)
     steps = {"early": 0.5 * step, "servo_late": step * (model.opt.integrator == method.mjINT_EULER)}
     rests = {"creep": none, "creep_lag": none}
     lag = np.maximum(creep_times(model, dofs) - 0.5 * (step + search.data.dt), 0.0)
-    creeps = {"creep": creep_speeds(model, dofs), "creep_lag": lag}
-    return [{"early": none, "servo_late": none, **rests}, {**steps, **rests}, {**steps, **creeps}]
+    kinds = [{"early": none, "servo_late": none, **rests}]
+    kinds += [{**steps, **rests}] if np.any(step) else []
+    return kinds + ([{**steps, "creep": speeds, "creep_lag": lag}] if np.any(speeds) else [])
 
 
 def nominal_solver(search: Search, kinds: Sequence[Point]) -> Search:
@@ -56,8 +58,8 @@ def other_solver(search: Search, fit: Fit, kinds: Sequence[Point]) -> dict[str, 
         needed = pruned(there, moved)
         fewer = size_of(fit) - size_of(needed) >= search.data.joints
         found.append((priced(there, needed) - PRICE * search.data.joints * (1 if fewer else -1), kind))
-    best, kind = min(found, key=lambda each: each[0])
-    return dict(kind) if best < priced(search, fit) else None
+    better = [each for each in found if each[0] < priced(search, fit)]
+    return dict(min(better, key=lambda each: each[0])[1]) if better else None
 
 
 def priced(search: Search, fit: Fit) -> float:

@@ -166,7 +166,8 @@ def _set_joint(joint: Any, fit: Fit, j: int, unit: float) -> None:
 
 def _set_friction(spec: Any, sim: SimModel, fit: Fit) -> None:
     """Let the joints of a file rest under friction, or creep as fast as the fit has them: with MuJoCo's usual solver
-    parameters a joint creeps to where no friction is needed, within a tenth of a second on a small arm."""
+    parameters a joint creeps to where no friction is needed, within a tenth of a second on a small arm.
+    """
     made = spec.compile()
     for j, number in enumerate(sim.joints):
         joint, weight = spec.joints[number], float(made.dof_invweight0[made.jnt_dofadr[number]])

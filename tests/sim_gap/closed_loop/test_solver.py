@@ -56,6 +56,17 @@ def test_an_arm_that_no_step_moves_has_nothing_of_a_solver() -> None:
     assert all(np.all(found.nominal[name] == 0.0) for name in ("early", "servo_late", "creep"))
 
 
+def test_where_a_solver_does_nothing_there_is_none_to_choose() -> None:
+    """Runge-Kutta without friction ended in an empty minimum where all values were alike."""
+    sim, search = search_on(arm(), arm(method="RK4").replace('frictionloss="0.15"', ""))
+    kinds = solvers(sim, search)
+    assert len(kinds) == 1
+    search = nominal_solver(search, kinds)
+    assert other_solver(search, evaluate(search.data, Fit(search.nominal, ((), ()))), kinds) is None
+    sim, search = search_on(arm(), arm().replace('frictionloss="0.15"', ""))
+    assert len(solvers(sim, search)) == 2
+
+
 def test_delay_and_inertia_that_stand_for_a_solver_are_seen_to() -> None:
     sim, search = search_on(arm(), arm())
     kinds = solvers(sim, search)
