@@ -87,7 +87,7 @@ servopeer: .venv/.dev ## Long campaign outside make test: positions alone, besid
 repeats: .venv/.dev ## Long campaign outside make test: positions alone, bands of motion and two recordings of one arm (ARGS="--arms 4", "--sim M --recordings R … --parts 5 --others 1")
 	$(BIN)/python tests/campaigns/servo_repeats.py $(ARGS)
 
-elsewhere: .venv/.dev ## Long campaign outside make test: arms that MuJoCo simulates with its defaults (ARGS="--cases 24 --seed 1 --torques")
+elsewhere: .venv/.dev ## Long campaign outside make test: arms that MuJoCo simulates with its defaults (ARGS="--cases 24 --seed 1 --rate 30 --torques")
 	$(BIN)/python tests/campaigns/simulated_elsewhere.py $(ARGS)
 
 surfaces: .venv/.dev ## Long campaign outside make test: servo arms above a table, and arms that touch nothing (ARGS="--seeds 1 2")

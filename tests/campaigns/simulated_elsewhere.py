@@ -1,6 +1,6 @@
 """Arms as others simulate them: published URDF files in MuJoCo with its defaults, one effect or none, blind.
 
-    python tests/campaigns/simulated_elsewhere.py [--cases N] [--seed S] [--torques] [--models FOLDER]
+    python tests/campaigns/simulated_elsewhere.py [--cases N] [--seed S] [--rate HZ] [--torques] [--models FOLDER]
 
 The files come from PyPI (example-robot-data) into FOLDER, by default a temporary one. Servos with the gains below
 follow reaches and sums of sines; positions and commands are recorded, or with `--torques` positions, velocities and the
@@ -26,7 +26,7 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 
-STEP_S, RATE_HZ, SECONDS = 0.002, 100, 30
+STEP_S, SECONDS = 0.002, 30
 NOISE_RAD, NOISE_RAD_S, NOISE_NM = 1e-4, 1e-3, 0.02
 RIGHT, CONFIDENT = 0.85, 0.8
 ALIKE = {"friction.coulomb": ("friction.creep", "friction.stribeck"), "link.payload": ("link.mass_moment",)}
@@ -161,10 +161,11 @@ def commands(arm: Arm, steps: int, random: np.random.Generator, reaching: bool) 
     return np.concatenate(parts)[:steps]
 
 
-def recorded(spec: Any, arm: Arm, random: np.random.Generator, reaching: bool, torques: bool) -> Recording:
-    """Commands held from row to row and positions; with `torques` smooth commands, velocities and motors' torques."""
+def recorded(spec: Any, arm: Arm, random: np.random.Generator, every: int, reaching: bool, torques: bool) -> Recording:
+    """Commands held from row to row, `every` so many steps, and positions; with `torques` smooth commands, velocities
+    and motors' torques."""
     model = spec.compile()
-    data, n, every = mujoco.MjData(model), len(arm.gains), round(1.0 / RATE_HZ / STEP_S)
+    data, n = mujoco.MjData(model), len(arm.gains)
     given = commands(arm, round(SECONDS / STEP_S), random, reaching)
     data.qpos[:], data.ctrl[:] = given[0], given[0]
     for i in np.flatnonzero(model.actuator_history[:, 0]).tolist():
@@ -184,13 +185,13 @@ def recorded(spec: Any, arm: Arm, random: np.random.Generator, reaching: bool, t
             np.split(np.array(rows), 4, axis=1), (NOISE_RAD, 0.0, NOISE_RAD_S, NOISE_NM), strict=True
         )
     )
-    t, names = np.arange(len(rows)) / RATE_HZ, tuple(joint.name for joint in spec.joints)
+    t, names = np.arange(len(rows)) * every * STEP_S, tuple(joint.name for joint in spec.joints)
     if torques:
         return Recording(t=t, position=q, velocity=v, motor_torque=torque, names=names)
     return Recording(t=t, position=q, position_command=wanted, names=names)
 
 
-def case(name: str, effect: str, seed: int, models: Path, torques: bool) -> Diagnosis:
+def case(name: str, effect: str, seed: int, models: Path, every: int, torques: bool) -> Diagnosis:
     """The diagnosis of one arm with one effect, or none."""
     arm, random = ARMS[name], np.random.default_rng(seed)
     spec = nominal(arm, models)
@@ -199,7 +200,7 @@ def case(name: str, effect: str, seed: int, models: Path, torques: bool) -> Diag
         sim.write_text(spec.to_xml(), encoding="utf-8")
         if effect:
             (BODIES | JOINTS | SERVOS)[effect](spec, int(random.integers(0, 5)), random)
-        made = [recorded(spec, arm, random, reaching, torques) for reaching in (True, False, True, False)]
+        made = [recorded(spec, arm, random, every, reaching, torques) for reaching in (True, False, True, False)]
         return diagnose(sim, made[:2], made[2:])
 
 
@@ -208,6 +209,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=24)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--rate", type=float, default=100.0, help="rows and commands a second")
     parser.add_argument("--torques", action="store_true")
     parser.add_argument("--models", type=Path)
     options = parser.parse_args()
@@ -221,7 +223,7 @@ def main() -> int:
         seed = options.seed * 1000 + k
         random = np.random.default_rng(seed)
         name, effect = list(ARMS)[k % len(ARMS)], effects[int(random.integers(len(effects)))]
-        answer = case(name, effect, seed, models, options.torques)
+        answer = case(name, effect, seed, models, round(1.0 / options.rate / STEP_S), options.torques)
         causes = [(cause.effect, round(cause.confidence, 2)) for cause in answer.causes]
         print(f"{k} {name} {effect or 'none'}: {answer.verdict} {answer.unexplained:.1%} {causes}", flush=True)
         same = {effect, *ALIKE.get(effect, ())}
