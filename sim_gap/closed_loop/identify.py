@@ -13,6 +13,7 @@ from gcomp.arrays import Array, Mask
 from sim_gap.closed_loop.balance import balanced, counted
 from sim_gap.closed_loop.choice.compete import select_about
 from sim_gap.closed_loop.choice.doubt import settled
+from sim_gap.closed_loop.choice.own_motion import OwnMotion, own_motion
 from sim_gap.closed_loop.choice.solver import nominal_solver, other_solver, priced, solvers
 from sim_gap.closed_loop.columns import shared_effects, with_columns
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of, starting_fit
@@ -63,6 +64,8 @@ class Identified:
     margin: Array
     sound: Sound | None
     """The nominal model's gap beside what small errors make of it; None if the controller had to be found."""
+    own: OwnMotion | None
+    """The motion that the nominal model makes along the commands; None if the controller had to be found."""
     native: Fit
     export: Exported | None
     """The model to be used alone; None if the model did not come from a file."""
@@ -97,9 +100,10 @@ def identify(
     `gains` are `RECORDING=VALUE`, the controller's gain in recordings that differ in it. Raises BadInput.
     """
     scale = gain_scales(gains, labels)
-    sim = wide_enough(sim, [*train, *heldout])
+    recordings = [*train, *heldout]
+    sim = wide_enough(sim, recordings)
     progress("reading motion and model torques")
-    surface = find_surface(sim.arm, [*train, *heldout])
+    surface = find_surface(sim.arm, recordings)
     whole = windows_of(sim.arm, train, labels[: len(train)], scales=scale[: len(train)], surface=surface)
     fitted = with_columns(thinned_moving(whole, FITTED))
     other = windows_of(sim.arm, heldout, labels[len(train) :], fitted.dt, scale[len(train) :], surface)
@@ -112,6 +116,10 @@ def identify(
     search = Search(balanced(data), scales, nominal, floor, never)
     kinds = solvers(sim, search) if own.complete else []
     search = nominal_solver(search, kinds) if kinds else search
+    apart = tuple(touched(surface, sim.arm, recording) for recording in recordings)
+    itself = own_motion(sim, recordings, scale, apart) if own.complete else None
+    if itself is not None:
+        search = replace(search, floor=np.maximum(floor, itself.missed(search, kinds)))
     search, start, kind = starting_fit(search, own, progress)
     search = replace(search, data=counted(search, data, start))
     fit = select_about(search, replace(start, rms=None), progress)
@@ -124,10 +132,10 @@ def identify(
     search = replace(search, data=counted(search, fitted, fit))
     fit = improve(search.data, replace(fit, rms=None), scales, 6)
     fit, others = settled(search, fit, progress)
-    if own.complete:
-        fit = not_worse(search, fit)
+    if itself is not None:
+        fit = not_worse(search, fit, itself.gaps.max(0))
     progress("each effect on held-out data")
-    margin = _margin(search, fit, floor)
+    margin = _margin(search, fit)
     split = sound(search, judged, margin) if own.complete else None
     matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
     few = counted(search, data, fit)
@@ -153,13 +161,14 @@ def identify(
         heldout_after=rms_on(judged, fit),
         margin=margin,
         sound=split,
+        own=itself,
         native=native,
         export=exported(sim, search, fit, native) if sim.path is not None else None,
         beside=with_module(sim, search, fit) if sim.path is not None else None,
         recordings=tuple(heldout),
         gains=tuple(scale[len(train) :]),
         surface=surface,
-        touched=tuple(touched(surface, sim.arm, recording) for recording in (*train, *heldout)),
+        touched=apart,
     )
 
 
@@ -205,16 +214,18 @@ def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:
     return frozenset(never if bool((data.served < 0.5).any()) else never | {"actuator.back_emf"})
 
 
-def not_worse(search: Search, fit: Fit) -> Fit:
-    """The fit with the nominal model's own values at each joint at which they leave less of the training motion."""
+def not_worse(search: Search, fit: Fit, gap: Array) -> Fit:
+    """The fit with the nominal model's own values at each joint at which they leave less of the training motion, or no
+    more than twice the noise floor, or whose `gap` of the model that MuJoCo moves is no more (J,) [rad]."""
     bare = fit
     for j in range(search.data.joints):
         for effect in effects_at(fit, j):
             bare = without(search, bare, effect, j)
-    worse = rms_on(search.data, fit) > rms_on(search.data, bare)
-    for j in np.flatnonzero(worse).tolist():
+    left = rms_on(search.data, bare)
+    needless = (rms_on(search.data, fit) > left) | (np.minimum(left, gap) < 2.0 * search.floor)
+    for j in np.flatnonzero(needless).tolist():
         fit = merged(fit, bare, j)
-    return evaluate(search.data, fit) if worse.any() else fit
+    return evaluate(search.data, fit) if needless.any() else fit
 
 
 def noise_floor(data: Windows) -> Array:
@@ -225,11 +236,11 @@ def noise_floor(data: Windows) -> Array:
     return np.asarray(np.maximum(np.sqrt(np.mean(rest**2, axis=(0, 2))), LEAST_FLOOR))
 
 
-def _margin(search: Search, fit: Fit, floor: Array) -> Array:
+def _margin(search: Search, fit: Fit) -> Array:
     """RMS from which it is a gap, per joint (J,) [rad]."""
     torque = np.minimum(TORQUE_MARGIN, SHARE_MARGIN * search.scales.torque)
     matters = np.minimum(torque / fit.point["kp"], SHARE_MARGIN * search.scales.angle)
-    return np.asarray(np.maximum(2.0 * floor, matters))
+    return np.asarray(np.maximum(2.0 * search.floor, matters))
 
 
 def columns_of_effect(found: Identified, effect: str) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ PARAMETERS = {
         Parameter("kd", "N·m·s/rad", 0.0, 0.05),
         Parameter("ki", "N·m/(rad·s)", 0.0, 0.5),
         Parameter("feed", "1", 0.0, 1.0, 0.0, 1.5),
-        Parameter("delay", "s", 0.0, 0.01, -0.02, 0.4),
+        Parameter("delay", "s", 0.0, 0.01, -0.05, 0.4),
         Parameter("slew", "rad/s", np.inf, 1.0, 0.02),
         Parameter("dead", "rad", 0.0, 0.5, 0.0, 0.2, "angle"),
         Parameter("limit", "N·m", np.inf, 1.0, 1e-3, np.inf, "torque"),

@@ -127,6 +127,7 @@ def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdic
 def _is_within(found: Identified) -> bool:
     """Whether no joint's gap matters, in training and held-out recordings, or is what a sound arm may have."""
     within = all(bool(np.all(gap < found.margin)) for gap in (found.train_before, found.heldout_before))
+    within = within or (found.own is not None and bool(np.all(found.own.gaps < found.margin)))
     return within or (found.sound is not None and found.sound.explained)
 
 

@@ -9,12 +9,13 @@ from sim_gap.closed_loop.training.bands import SHARE
 from sim_gap.closed_loop.training.export import Exported
 from sim_gap.closed_loop.training.limits import described
 from sim_gap.closed_loop.training.ranges import widened
-from sim_gap.closed_loop.training.spread import undecided_scale
+from sim_gap.closed_loop.training.spread import interval, undecided_scale
 from sim_gap.closed_loop.windows import Windows
 
 FAR = 3.0
 """So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
-
+NEAR_A_ROW = 0.2
+"""Share of the sampling period within which a time is taken for whole rows."""
 AT_TIMES = 0.01
 """Share of the held-out samples from which a note says that they are faster than any that was fitted."""
 
@@ -41,7 +42,7 @@ def notes(found: Identified) -> list[str]:
         out.append(f"{listed}: the command rests in all that is fitted, from which nothing follows: {assumed}")
     if limits := described(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
-    out += [*_touching(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
+    out += [*_early(found), *_touching(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
     if found.export is not None and found.export.lines:
         module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}{module}")
@@ -71,6 +72,27 @@ def running_free(found: Identified, rollout: Rollout | None) -> list[str]:
     ]
     told = "the corrected model in MuJoCo, running free along the held-out commands, is further off"
     return [*out, f"{told}: {', '.join(far)}"] if far else out
+
+
+def _early(found: Identified) -> list[str]:
+    """A note of commands that act before their time, as those of rows with the position of a later row do."""
+    early = {}
+    for j in range(found.sim.n):
+        if "delay" not in found.fit.active[j]:
+            continue
+        value, _, high, _ = interval(found.search, found.fit, found.within, j, "delay")
+        if high < 0.0:
+            early[found.sim.arm.names[j]] = value
+    if not early:
+        return []
+    period, time = found.heldout.period, float(np.median([*early.values()]))
+    rows = round(time / period)
+    time = rows * period if rows and abs(time / period - rows) < NEAR_A_ROW else time
+    listed = ", ".join(f"{name} {value:.3g} s" for name, value in early.items())
+    return [
+        f"commands act before their rows' time ({listed}), as no controller does: rows that hold the position of a "
+        f"later time, or clocks that differ; state it with --clock q_cmd={time:.3g}"
+    ]
 
 
 def _touching(found: Identified) -> list[str]:
