@@ -1,0 +1,67 @@
+"""The motion that the nominal model makes along the commands by itself, moved by MuJoCo.
+
+Where it is what was measured there is no gap, whatever a simulation of each joint by itself says. And that simulation
+can be tried on it: of rows that are 30 ms apart the others' motion between them does not follow, which a joint feels.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armlink.recording.recording import Recording, slice_rows
+from gcomp.arrays import Array, Mask
+from sim_gap.closed_loop.choice.solver import nominal_solver
+from sim_gap.closed_loop.columns import with_columns
+from sim_gap.closed_loop.fit import Fit, Point
+from sim_gap.closed_loop.judge import rms_on
+from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, commanded, replay
+from sim_gap.closed_loop.windows import thinned, windows_of
+from sim_gap.model.load import SimModel
+
+TRIED = 8
+"""Windows of its own motion on which the simulation of each joint by itself is tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class OwnMotion:
+    """What MuJoCo makes of the nominal model along the commands of each recording."""
+
+    sim: SimModel
+    made: tuple[Recording, ...]
+    """The recordings as the model would have made them, as far as all joints are commanded without a break."""
+    scales: tuple[float, ...]
+    """The controller's gains in each over those in the first."""
+    gaps: Array
+    """RMS of simulated minus measured positions of each recording and joint, (R, n) [rad]; infinite if it is short."""
+
+    def missed(self, search: Search, kinds: Sequence[Point]) -> Array:
+        """RMS by which the simulation of each joint by itself misses this motion, (n,) [rad]; nothing of short ones."""
+        long = [k for k, gap in enumerate(self.gaps) if np.isfinite(gap).all()]
+        if not long:
+            return np.zeros(self.sim.n)
+        some, scales = [self.made[k] for k in long], [self.scales[k] for k in long]
+        data = windows_of(self.sim.arm, some, ["the model's own motion"] * len(some), search.data.dt, scales)
+        data = with_columns(thinned(data, TRIED))
+        as_it_moves = nominal_solver(replace(search, data=data), kinds).nominal
+        return rms_on(data, Fit(as_it_moves, ((),) * data.joints))
+
+
+def own_motion(
+    sim: SimModel, recordings: Sequence[Recording], scales: Sequence[float], apart: Sequence[Mask]
+) -> OwnMotion:
+    """Move the nominal model, which has a controller at every joint, along the commands of each recording.
+
+    `scales` are the gains of the controller in each over those in the first; rows set `apart` (K,) are not judged.
+    """
+    itself = Simulated(sim.mujoco_model, tuple(sim.joints))
+    made, gaps = [], np.full((len(recordings), sim.n), np.inf)
+    for k, (recording, scale, left_out) in enumerate(zip(recordings, scales, apart, strict=True)):
+        t, positions, measured = replay(itself.with_gain(scale), recording)
+        part = commanded(recording)
+        made.append(replace(slice_rows(recording, part), position=positions))
+        if len(t) and t[-1] - t[0] >= 2.0 * OPENING_S:
+            judged = (t >= t[0] + OPENING_S) & ~left_out[part]
+            gaps[k] = np.sqrt(np.nanmean((positions - measured)[judged] ** 2, axis=0))
+    return OwnMotion(sim, tuple(made), tuple(scales), gaps)
