@@ -77,7 +77,7 @@ def diagnose_positions(
         margin=found.margin,
         heldout_is=heldout_is,
         rollout=rollout,
-        notes=(*notes(found), *running_free(found, rollout)),
+        notes=(*notes(found), *running_free(found, rollout, gap=verdict != "no_gap")),
         checks=tuple(checks),
         band=found.band,
         left_out=float(np.concatenate(found.heldout_touched).mean()),

@@ -53,9 +53,9 @@ def _in_module(beside: Exported) -> str:
     return ", ".join(f"{effect} {joint}" for effect, joint, _ in beside.effects)
 
 
-def running_free(found: Identified, rollout: Rollout | None) -> list[str]:
-    """Notes of a file that is written and leaves more than the nominal model, and of the joints at which it leaves much
-    more of the gap than the fit."""
+def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> list[str]:
+    """Notes of a file that is written and leaves more than the nominal model, whether there is a `gap` or not, and of
+    the joints at which it leaves much more of the gap than the fit."""
     if rollout is None:
         return []
     out = []
@@ -63,7 +63,7 @@ def running_free(found: Identified, rollout: Rollout | None) -> list[str]:
         before, after = (float(np.sqrt(np.mean(x**2))) for x in (rollout.before, rollout.after))
         out.append(
             f"running free, the corrected model leaves more ({after:.3g} rad) than the nominal one ({before:.3g} rad): "
-            "it is nothing to train with; give recordings of other motion"
+            + ("it is nothing to train with; give recordings of other motion" if gap else "use the model as it is")
         )
     left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
     far = [

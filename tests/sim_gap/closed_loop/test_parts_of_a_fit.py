@@ -170,10 +170,20 @@ def test_a_joint_that_is_left_worse_than_by_the_model_keeps_the_models_values(da
     point = nominal_point(data, nominal_controller(sim))
     search = Search(data, scales_of(data), point, np.full(2, 3e-4))
     stuck = {**point, "kp": point["kp"] * [1.0, 0.1]}
-    fit = not_worse(search, evaluate(data, Fit(stuck, (("kp",), ("kp",)))))
+    fit = not_worse(search, evaluate(data, Fit(stuck, (("kp",), ("kp",)))), np.full(2, np.inf))
     np.testing.assert_array_equal(fit.point["kp"], point["kp"])
     assert fit.active == (("kp",), ())
     np.testing.assert_array_equal(fit.rms, evaluate(data, Fit(point, ((), ()))).rms)
+
+
+def test_a_joint_that_mujoco_moves_as_it_was_measured_keeps_the_models_values(data: Windows) -> None:
+    sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
+    point = {**nominal_point(data, nominal_controller(sim)), "coulomb": np.zeros(2)}
+    search = Search(data, scales_of(data), point, np.full(2, 3e-4))
+    fit = improve(data, Fit(point, (("coulomb",), ("coulomb",))), scales_of(data))
+    assert np.all(fit.point["coulomb"] > 0.1)
+    kept = not_worse(search, fit, np.array([5e-4, 7e-4]))
+    assert kept.point["coulomb"].tolist() == [0.0, fit.point["coulomb"][1]]
 
 
 def test_what_the_whole_arm_has_stays_where_a_joint_takes_the_models_values(data: Windows) -> None:
@@ -182,7 +192,7 @@ def test_what_the_whole_arm_has_stays_where_a_joint_takes_the_models_values(data
     point = nominal_point(seen, nominal_controller(sim))
     search = Search(seen, scales_of(seen), point, np.full(2, 3e-4))
     stuck = {**point, "kp": point["kp"] * [1.0, 0.1], "moment1.x": np.full(2, 0.001)}
-    fit = not_worse(search, evaluate(seen, Fit(stuck, (("kp",), ("kp",)), ("moment1.x",))))
+    fit = not_worse(search, evaluate(seen, Fit(stuck, (("kp",), ("kp",)), ("moment1.x",))), np.full(2, np.inf))
     np.testing.assert_array_equal(fit.point["kp"], point["kp"])
     np.testing.assert_array_equal(fit.point["moment1.x"], [0.001, 0.001])
     assert fit.shared == ("moment1.x",)

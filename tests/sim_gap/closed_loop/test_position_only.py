@@ -51,9 +51,9 @@ def test_names_the_controller_and_the_friction(answer) -> None:
 def test_a_gap_that_matters_nowhere_is_none() -> None:
     """Causes that make a gap within the margin smaller are as minor as it; so are those of a sound arm's gap."""
 
-    def verdict(*gaps: float, sound: SimpleNamespace | None = None) -> str:
+    def verdict(*gaps: float, sound: SimpleNamespace | None = None, own: SimpleNamespace | None = None) -> str:
         gap, search = np.array(gaps), SimpleNamespace(open_controller=sound is None)
-        found = SimpleNamespace(margin=np.full(2, 1e-4), sound=sound, search=search, train_before=gap)
+        found = SimpleNamespace(margin=np.full(2, 1e-4), sound=sound, own=own, search=search, train_before=gap)
         found.heldout_before, found.heldout_after = gap, 0.1 * gap
         return _verdict(found, [SimpleNamespace(confounded_with=(), confidence=0.75)], 0.01)
 
@@ -61,6 +61,8 @@ def test_a_gap_that_matters_nowhere_is_none() -> None:
     assert verdict(0.0010, 0.0018) == "explained"
     assert verdict(0.0010, 0.0018, sound=SimpleNamespace(explained=False)) == "explained"
     assert verdict(0.0010, 0.0018, sound=SimpleNamespace(explained=True)) == "no_gap"
+    assert verdict(0.0010, 0.0018, own=SimpleNamespace(gaps=np.array([[5e-5, 9e-5], [8e-5, 7e-5]]))) == "no_gap"
+    assert verdict(0.0010, 0.0018, own=SimpleNamespace(gaps=np.array([[5e-5, 9e-5], [8e-5, 2e-4]]))) == "explained"
 
 
 def test_joints_that_go_further_than_in_training_are_noted() -> None:

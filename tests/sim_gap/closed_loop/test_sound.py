@@ -27,7 +27,7 @@ def split(model, real: str):
     nominal = nominal_point(train, nominal_controller(model))
     search = Search(train, scales_of(train), nominal, noise_floor(train))
     fit = evaluate(train, Fit(nominal, ((),) * 2))
-    margin = _margin(search, fit, search.floor)
+    margin = _margin(search, fit)
     return sound(search, heldout, margin), margin, rms_on(train, fit)
 
 
