@@ -26,11 +26,12 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """A public name, loaded at first use."""
     if name in __all__:
-        from importlib.metadata import entry_points
+        from armlink.contributed import contributed
 
-        for point in entry_points(group="armlink.api", name=name):
-            globals()[name] = point.load()
-            return globals()[name]
+        for point in contributed("armlink.api"):
+            if point.name == name:
+                globals()[name] = point.load()
+                return globals()[name]
     raise AttributeError(f"module 'armlink' has no attribute {name!r}; it offers {', '.join(__all__)}")
 
 

@@ -5,7 +5,6 @@ import json
 import os
 import shlex
 from functools import cache, cached_property
-from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -15,6 +14,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
+from armlink.contributed import contributed
 from armlink.errors import BadInput
 from armlink.key_errors import describe, describe_all, meant
 from armlink.names import JointName, Name
@@ -125,12 +125,12 @@ def _parse_drive(keys: Any) -> Any:
 
 @cache
 def _drive_settings(family: str) -> type[Section]:
-    points = entry_points(group="armlink.drives", name=family)
-    if not points:
-        known = ", ".join(sorted({point.name for point in entry_points(group="armlink.drives")}))
-        raise ValueError(f"no drive family {family!r}; there are {known}")
-    settings: type[Section] = next(iter(points)).load().settings
-    return settings
+    for point in contributed("armlink.drives"):
+        if point.name == family:
+            settings: type[Section] = point.load().settings
+            return settings
+    known = ", ".join(sorted({point.name for point in contributed("armlink.drives")}))
+    raise ValueError(f"no drive family {family!r}; there are {known}")
 
 
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -303,7 +303,7 @@ class ArmFile(Section):
 
 def bundled_arms() -> dict[str, Path]:
     """Names and paths of the arm files that installed packages carry (entry-point group `armlink.arms`)."""
-    folders = [files(point.value) for point in entry_points(group="armlink.arms")]
+    folders = [files(point.value) for point in contributed("armlink.arms")]
     return {
         Path(str(entry)).stem: Path(str(entry))
         for folder in folders
@@ -358,7 +358,7 @@ def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:
         raise BadInput(f"{path}: key path: not a key of the arm file; remove it")
     content, section, model = _with_simulated_bus(dict(content), path), "", ArmFile
     try:
-        for point in entry_points(group="armlink.sections"):
+        for point in contributed("armlink.sections"):
             if content.get(point.name) is not None:
                 section, model = point.name, point.load()
                 content[section] = model.model_validate(content[section])

@@ -5,11 +5,12 @@ import importlib.util
 import os
 import re
 import sys
-from importlib.metadata import EntryPoint, entry_points, requires, version
+from importlib.metadata import EntryPoint, requires, version
 from pathlib import Path
 from typing import Any
 
 from armlink import completion
+from armlink.contributed import contributed
 from armlink.termination import terminate_as_interrupt
 
 PURPOSE = (
@@ -34,7 +35,7 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program's name) and return its exit status."""
-    points = {point.name: point for point in entry_points(group="armlink.commands")}
+    points = {point.name: point for point in contributed("armlink.commands")}
     if not arguments or arguments[0] in ("--help", "-h"):
         sys.stdout.write(_help(points))
         return 0 if arguments else USAGE_STATUS

@@ -1,9 +1,9 @@
 """Drive families by name, from the entry-point group `armlink.drives`."""
 
 from functools import cache
-from importlib.metadata import entry_points
 
 from armlink.bus.can_bus import CanBus
+from armlink.contributed import contributed
 from armlink.drives.family import Family
 from armlink.drives.found import FoundDrives
 from armlink.errors import BadInput
@@ -13,17 +13,17 @@ GROUP = "armlink.drives"
 
 def family_names() -> list[str]:
     """Names of the installed families."""
-    return sorted({point.name for point in entry_points(group=GROUP)})
+    return sorted({point.name for point in contributed(GROUP)})
 
 
 @cache
 def family(name: str) -> Family:
     """The family of this name; raises BadInput."""
-    points = entry_points(group=GROUP, name=name)
-    if not points:
-        raise BadInput(f"no drive family {name!r}; there are {', '.join(family_names())}")
-    found: Family = next(iter(points)).load()
-    return found
+    for point in contributed(GROUP):
+        if point.name == name:
+            found: Family = point.load()
+            return found
+    raise BadInput(f"no drive family {name!r}; there are {', '.join(family_names())}")
 
 
 def found_drives(bus: CanBus) -> FoundDrives:

@@ -1,10 +1,10 @@
 """The simulated drives of an arm that are no CANopen nodes, by family and bus."""
 
 from collections.abc import Callable, Sequence
-from importlib.metadata import entry_points
 from zlib import crc32
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.contributed import contributed
 from armlink.drives.damiao.models import MODELS
 from armlink.errors import BadInput
 from sim_bus.drives.cubemars import CubeMarsDrive, CubeMarsFront
@@ -73,7 +73,7 @@ GROUP = "armlink.simulated_drives"
 
 def simulated_families() -> dict[str, Callable[[ArmFile, Sequence[Joint], Send], Front]]:
     """Families that are simulated, by name."""
-    return FAMILIES | {point.name: point.load() for point in entry_points(group=GROUP)}
+    return FAMILIES | {point.name: point.load() for point in contributed(GROUP)}
 
 
 def build_fronts(arm: ArmFile, motors: Sequence[Motor], send: Callable[[str], Send]) -> list[tuple[str, Front]]:

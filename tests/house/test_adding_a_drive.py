@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from armlink import contributed
 from armlink.arm_file import load_arm
 from armlink.cli import run
 from armlink.drives.orders import Limits, Mode, Order, Power
@@ -35,12 +36,14 @@ def installed(tmp_path, monkeypatch):
     assert len(points) == 2
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
+    contributed.installed.cache_clear()
     yield tmp_path
     import sys
 
     for module in ("acme", "acme_sim"):
         sys.modules.pop(module, None)
     family.cache_clear()
+    contributed.installed.cache_clear()
 
 
 def test_it_is_short():

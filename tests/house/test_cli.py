@@ -24,7 +24,7 @@ def command(monkeypatch):
         module.target = target
         monkeypatch.setitem(sys.modules, "made_up_command", module)
         point = EntryPoint(name="work", value="made_up_command:target", group="armlink.commands")
-        monkeypatch.setattr(cli, "entry_points", lambda group: [point])
+        monkeypatch.setattr(cli, "contributed", lambda group: [point])
 
     return register
 
@@ -152,7 +152,7 @@ def work():
     finally:
         print("joints safe", flush=True)
 module = types.ModuleType("made_up"); module.work = work; sys.modules["made_up"] = module
-cli.entry_points = lambda group: [EntryPoint("work", "made_up:work", group)]
+cli.contributed = lambda group: [EntryPoint("work", "made_up:work", group)]
 sys.argv = ["armlink", "work"]
 cli.main()
 """
@@ -210,7 +210,7 @@ def test_help_takes_less_than_0_3_s_of_cpu_and_loads_no_heavy_package():
 
 
 def commands() -> dict[str, EntryPoint]:
-    return {point.name: point for point in cli.entry_points(group="armlink.commands")}
+    return {point.name: point for point in cli.contributed("armlink.commands")}
 
 
 SUB_COMMANDS = [(name,) for name in sorted(commands())] + [

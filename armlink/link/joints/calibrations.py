@@ -6,12 +6,12 @@ A calibration in the host is in force by record: what the entry-point group `arm
 
 import logging
 from collections.abc import Callable, Sequence
-from importlib.metadata import entry_points
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
+from armlink.contributed import contributed
 from armlink.drives.family import KeepsCalibration
 from armlink.errors import BadInput
 from armlink.link.joints.ask import LinkAsk
@@ -27,7 +27,7 @@ log = logging.getLogger("armlink")
 
 def calibrations_by_record(arm: ArmFile) -> list[Calibration | None]:
     """What the records of an arm say, joint by joint; None where no record is in force."""
-    for point in entry_points(group="armlink.calibrations"):
+    for point in contributed("armlink.calibrations"):
         provide: Provider = point.load()
         return list(provide(arm))
     return [None] * len(arm.require_link().joints)

@@ -1,0 +1,20 @@
+"""What installed packages contribute to armlink, by group of entry points.
+
+Looking into every installed package takes tens of milliseconds, and an arm file needs it twice: it is done once in a
+process.
+"""
+
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+
+def contributed(group: str) -> tuple[EntryPoint, ...]:
+    """Entry points of a group, such as `armlink.commands`."""
+    return tuple(installed().select(group=group))
+
+
+@cache
+def installed() -> Any:
+    """Entry points of all packages as they were at the first call."""
+    return entry_points()
