@@ -108,6 +108,7 @@ def test_a_wrong_kind_is_one_line(call, says):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.long
 def test_a_user_s_script_passes_mypy_strict(tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT)
     done = subprocess.run(

@@ -53,6 +53,7 @@ def written(folder, *changes) -> str:
     return str(folder / "arm.yaml")
 
 
+@pytest.mark.long
 def test_a_damping_that_is_too_low_for_what_the_joint_turns_is_named(tmp_path):
     path = bundled_arms()["openarm"]
     content = yaml.safe_load(path.read_text(encoding="utf-8"))

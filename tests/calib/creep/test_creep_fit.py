@@ -121,6 +121,7 @@ def test_a_vertical_axis_is_named_with_its_remedy() -> None:
     assert not any(gravity_record(fit, arm(True), record).identifiable[:2])
 
 
+@pytest.mark.long
 def test_an_arm_whose_axes_meet_has_no_scale_until_the_place_of_the_mass_is_measured() -> None:
     wrist = creep_arm(16)
     planned = plan_creep(wrist)

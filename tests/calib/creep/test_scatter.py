@@ -106,6 +106,7 @@ def fitted(**changes: float) -> tuple[CreepFit, Array, Array]:
     return fit, made.warm_gain, made.state.coulomb
 
 
+@pytest.mark.long
 def test_ripple_is_fitted_and_does_not_widen_the_intervals() -> None:
     plain, *_ = fitted(cogging=0.0)
     rippled, gain, coulomb = fitted(cogging=0.6)

@@ -40,6 +40,7 @@ def test_random_arms_are_calibrated_and_identified(seed: int, n: int) -> None:
     assert np.all(_rms(_torque(arm, gravity.recursive.beta, poses) - true) < 0.02 * np.abs(true).max(axis=0))
 
 
+@pytest.mark.long
 def test_intervals_hold_the_truth() -> None:
     arm = random_arm(41, 4)
     inside = []

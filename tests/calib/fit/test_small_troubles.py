@@ -115,6 +115,7 @@ def _unloaded(q: np.ndarray) -> SweepReadings:
     )
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("level", [0.0, 1.0, 3.0])
 def test_a_realistic_arm_keeps_the_truth_within_its_intervals(real, level: float) -> None:
     fit, truth, *_ = real[level]

@@ -52,6 +52,7 @@ def test_an_offset_drift_of_any_joint_is_put_right(sarcos, sarcos_beta, joint) -
     assert offset_error <= 0.05
 
 
+@pytest.mark.long
 def test_without_drift_nothing_is_proposed(sarcos, sarcos_beta) -> None:
     bench = Bench(sarcos, sarcos_beta, 20)
     assert "proposal" not in kinds(bench.work(1000))
@@ -101,6 +102,7 @@ def test_a_collision_is_not_drift(sarcos, sarcos_beta) -> None:
     assert events[-1].evidence["cause"] == "none"
 
 
+@pytest.mark.long
 def test_a_slow_drift_is_followed(sarcos, sarcos_beta) -> None:
     """2 % an hour on one joint for half an hour."""
     bench = Bench(sarcos, sarcos_beta, 60)

@@ -152,6 +152,7 @@ def test_separate_fits_averaged_are_far_worse_than_stacked_ones() -> None:
     assert torque_rms(found) == pytest.approx(expected, rel=0.2)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("poses", "sensors", "weighted", "expected"),
     [

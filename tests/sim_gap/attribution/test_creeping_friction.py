@@ -53,6 +53,7 @@ def test_an_arm_like_its_model_has_no_gap(sim: Path) -> None:
     assert answer.verdict == "no_gap"
 
 
+@pytest.mark.long
 def test_a_payload_is_told_alone(sim: Path) -> None:
     place = " ".join(map(str, PLACE))
     load = f'<body pos="{place}"><inertial pos="0 0 0" mass="{MASS}" diaginertia="1e-6 1e-6 1e-6"/></body>'

@@ -22,6 +22,7 @@ def value(answer, effect: str, place: str, name: str):
     return cause.parameters[place][name]
 
 
+@pytest.mark.long
 def test_a_payload_and_friction_that_grows_with_the_load_it_adds():
     wrong = Wrong(payload=3.0, load=np.array([0.10, 0.0, 0.0]))
     train, other = (record(model(), wrong, seed=s, seconds=40, channels=("tau_motor",)) for s in (1, 2))
@@ -141,6 +142,7 @@ def _with_body(angle: float | None, seed: int):
     return record(model(), wrong, seed=seed, seconds=30, rate=50.0)
 
 
+@pytest.mark.long
 def test_a_body_that_is_mounted_in_another_way_on_the_held_out_recording():
     made = [_with_body(angle, seed) for seed, angle in enumerate((None, 0.0, 2.0))]
     answer = diagnose(model(), made[:2], made[2:], labels=["a", "b", "c"])

@@ -61,6 +61,7 @@ def test_a_lag_within_the_margin_of_its_channel_is_told_where_it_shows_throughou
     assert "actuator.lag" in {first.effect, *first.confounded_with}
 
 
+@pytest.mark.long
 def test_the_same_noise_without_a_lag_is_no_gap():
     assert diagnosed(noise=(9.0, 5.0)).verdict == "no_gap"
     assert diagnosed(noise=(0.0, 0.4)).verdict == "no_gap"

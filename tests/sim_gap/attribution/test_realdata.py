@@ -65,6 +65,7 @@ def test_a_loaded_recording_alone_says_that_the_arm_itself_may_be_heavier(realda
     assert any("recordings of the arm without the payload" in note for note in answer.notes)
 
 
+@pytest.mark.long
 def test_panda_is_wrong_in_its_masses(realdata):
     answer = split(realdata / "panda", 0.6)
     assert answer.causes[0].effect == "link.mass_moment"
@@ -77,6 +78,7 @@ def test_panda_is_wrong_in_its_masses(realdata):
     assert np.all(answer.heldout_after[1:4] <= [0.6, 0.6, 0.7])
 
 
+@pytest.mark.long
 def test_ur10_has_friction_that_is_more_than_coulomb_and_viscous(realdata):
     answer = split(realdata / "ur10", 0.6)
     assert "joint_1" in joints(answer, "friction.stribeck") or "joint_2" in joints(answer, "friction.load")
@@ -84,6 +86,7 @@ def test_ur10_has_friction_that_is_more_than_coulomb_and_viscous(realdata):
     assert answer.heldout_after[1] < 2.0
 
 
+@pytest.mark.long
 def test_tx40_has_rotors_and_a_coupled_wrist(realdata):
     """Of nine seconds the last three are kept back to judge on: enough, though it is short."""
     answer = diagnose(realdata / "tx40" / "sim.xml", [thinned(realdata / "tx40" / "recording.csv.gz", 5)])

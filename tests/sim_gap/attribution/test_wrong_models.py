@@ -50,6 +50,7 @@ def chain() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{links}</worldbody></mujoco>")
 
 
+@pytest.mark.long
 def test_the_search_goes_on_where_the_most_promising_terms_cannot_exist():
     """Couplings with negative friction lead on every joint: behind them stand damping and friction themselves."""
     nominal = chain()

@@ -66,6 +66,7 @@ def pinocchio_q(model: pinocchio.Model, order: list[int], q: np.ndarray) -> np.n
     return out
 
 
+@pytest.mark.long
 def test_a_diagnosis_writes_urdf_and_says_what_it_lacks(tmp_path):
     (tmp_path / "arm.xml").write_text(THREE)
     wrong = Wrong(coulomb=np.full(3, 0.6), payload=0.8, rotor=np.array([0.8, 0.0, 0.0]), load=np.array([0.0, 0.3, 0.0]))

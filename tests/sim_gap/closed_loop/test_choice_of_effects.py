@@ -43,6 +43,7 @@ def test_one_recording_says_nothing_of_others() -> None:
     assert _tail(np.arange(8.0), np.zeros(8, int), PRICE) == 0.0
 
 
+@pytest.mark.long
 def test_an_effect_that_the_arm_does_not_have_is_taken_out_and_friction_stays(several) -> None:
     search, fit = several
     more = improve(search.data, with_effect(search, fit, "transmission.spring", 1), search.scales)

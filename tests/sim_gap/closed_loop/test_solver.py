@@ -67,6 +67,7 @@ def test_where_a_solver_does_nothing_there_is_none_to_choose() -> None:
     assert len(solvers(sim, search)) == 2
 
 
+@pytest.mark.long
 def test_delay_and_inertia_that_stand_for_a_solver_are_seen_to() -> None:
     sim, search = search_on(arm(), arm())
     kinds = solvers(sim, search)

@@ -35,6 +35,7 @@ def diagnosed(wrong: Wrong, reads: Callable[[np.ndarray], np.ndarray]) -> Diagno
     return diagnose(model(), recordings[:1], recordings[1:])
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("halves", [np.array([WIDTH]), np.linspace(0.0, 2.0 * WIDTH, 40)], ids=["abrupt", "gradual"])
 def test_the_width_is_found_however_it_sets_in(halves):
     answer = diagnosed(Wrong(), lambda torque: stays_behind(torque, halves))
