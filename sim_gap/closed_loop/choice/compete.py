@@ -15,8 +15,6 @@ from sim_gap.closed_loop.search import LEAST_FALL, PRICE, Search, merged, only, 
 TRIES = 2
 """Candidates per joint that are fitted in a round."""
 ROUNDS = 6
-FAR = 10.0
-"""Factor between fitted and nominal gain from which the nominal controller is not where the search starts again."""
 Progress = Callable[[str], None]
 
 
@@ -45,11 +43,10 @@ def select_about(search: Search, fit: Fit, progress: Progress = lambda text: Non
     """The better of two selections: from `fit`, whose gains and friction are free, and from the nominal model as it is.
 
     A free gain with damping takes the place of a delay, of a limit or of friction, which then are not looked for any
-    more. A nominal controller that is far from the fitted one is no start.
+    more.
     """
     found = select(search, fit, progress)
-    away = np.abs(np.log(found.point["kp"] / search.nominal["kp"]))
-    if search.open_controller or not np.all(away < np.log(FAR)):
+    if search.open_controller:
         return found
     progress("from the model's own controller")
     own = {name: values.copy() for name, values in search.nominal.items()}

@@ -22,6 +22,9 @@ from sim_gap.model.load import SimModel
 
 TRIED = 8
 """Windows of its own motion on which the simulation of each joint by itself is tried."""
+ROUGHER = 1.5
+"""Times the RMS of second differences of the measured positions up to which that of the model's own tells anything:
+one that swings where the arm does not is no such motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +38,18 @@ class OwnMotion:
     """The controller's gains in each over those in the first."""
     gaps: Array
     """RMS of simulated minus measured positions of each recording and joint, (R, n) [rad]; infinite if it is short."""
+    rougher: Array
+    """RMS of second differences of simulated over those of measured positions, (R, n)."""
 
     def missed(self, search: Search, kinds: Sequence[Point]) -> Array:
-        """RMS by which the simulation of each joint by itself misses this motion, (n,) [rad]; nothing of short ones."""
-        long = [k for k, gap in enumerate(self.gaps) if np.isfinite(gap).all()]
-        if not long:
+        """RMS by which the simulation of each joint by itself misses this motion, (n,) [rad].
+
+        Nothing of recordings that are short, or much smoother.
+        """
+        like = np.flatnonzero(np.isfinite(self.gaps).all(axis=1) & (self.rougher < ROUGHER).all(axis=1)).tolist()
+        if not like:
             return np.zeros(self.sim.n)
-        some, scales = [self.made[k] for k in long], [self.scales[k] for k in long]
+        some, scales = [self.made[k] for k in like], [self.scales[k] for k in like]
         data = windows_of(self.sim.arm, some, ["the model's own motion"] * len(some), search.data.dt, scales)
         data = with_columns(thinned(data, TRIED))
         as_it_moves = nominal_solver(replace(search, data=data), kinds).nominal
@@ -56,7 +64,7 @@ def own_motion(
     `scales` are the gains of the controller in each over those in the first; rows set `apart` (K,) are not judged.
     """
     itself = Simulated(sim.mujoco_model, tuple(sim.joints))
-    made, gaps = [], np.full((len(recordings), sim.n), np.inf)
+    made, (gaps, rougher) = [], np.full((2, len(recordings), sim.n), np.inf)
     for k, (recording, scale, left_out) in enumerate(zip(recordings, scales, apart, strict=True)):
         t, positions, measured = replay(itself.with_gain(scale), recording)
         part = commanded(recording)
@@ -64,4 +72,6 @@ def own_motion(
         if len(t) and t[-1] - t[0] >= 2.0 * OPENING_S:
             judged = (t >= t[0] + OPENING_S) & ~left_out[part]
             gaps[k] = np.sqrt(np.nanmean((positions - measured)[judged] ** 2, axis=0))
-    return OwnMotion(sim, tuple(made), tuple(scales), gaps)
+            own, seen = (np.nanmean(np.diff(q[judged], 2, axis=0) ** 2, axis=0) for q in (positions, measured))
+            rougher[k] = np.sqrt(own / np.maximum(seen, 1e-18))
+    return OwnMotion(sim, tuple(made), tuple(scales), gaps, rougher)
