@@ -119,7 +119,7 @@ def identify(
     apart = tuple(touched(surface, sim.arm, recording) for recording in recordings)
     itself = own_motion(sim, recordings, scale, apart) if own.complete else None
     if itself is not None:
-        search = replace(search, floor=np.maximum(floor, itself.missed(search, kinds)))
+        search = replace(search, floor=itself.floor(search, kinds))
     search, start, kind = starting_fit(search, own, progress)
     search = replace(search, data=counted(search, data, start))
     fit = select_about(search, replace(start, rms=None), progress)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armlink.recording.recording import Recording, slice_rows
 from gcomp.arrays import Array, Mask
@@ -16,12 +17,16 @@ from sim_gap.closed_loop.columns import with_columns
 from sim_gap.closed_loop.fit import Fit, Point
 from sim_gap.closed_loop.judge import rms_on
 from sim_gap.closed_loop.search import Search
+from sim_gap.closed_loop.tracks import SMOOTH_HZ, SMOOTH_SHARE, period_of
 from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, commanded, replay
 from sim_gap.closed_loop.windows import thinned, windows_of
 from sim_gap.model.load import SimModel
+from sim_gap.residuals.resampling import low_pass
 
 TRIED = 8
 """Windows of its own motion on which the simulation of each joint by itself is tried."""
+EXACT = 1e-6
+"""Noise of positions that nothing was read with [rad]."""
 ROUGHER = 1.5
 """Times the RMS of second differences of the measured positions up to which that of the model's own tells anything:
 one that swings where the arm does not is no such motion."""
@@ -40,19 +45,31 @@ class OwnMotion:
     """RMS of simulated minus measured positions of each recording and joint, (R, n) [rad]; infinite if it is short."""
     rougher: Array
     """RMS of second differences of simulated over those of measured positions, (R, n)."""
+    noise: Array
+    """RMS of the gap about its smooth course, (R, n) [rad]."""
+
+    @property
+    def alike(self) -> NDArray[np.intp]:
+        """Numbers of the recordings that are long enough and in which the model moves no rougher than the arm."""
+        return np.flatnonzero(np.isfinite(self.gaps).all(axis=1) & (self.rougher < ROUGHER).all(axis=1))
+
+    def floor(self, search: Search, kinds: Sequence[Point]) -> Array:
+        """RMS below which nothing can be seen, (n,) [rad], from that of the measured positions about their smooth
+        course, in `search`: of rows 30 ms apart that is more the motion between them than noise."""
+        if not self.alike.size:
+            return search.floor
+        noise = np.sqrt(np.mean(self.noise[self.alike] ** 2, axis=0))
+        return np.maximum(np.minimum(search.floor, noise), self.missed(search, kinds))
 
     def missed(self, search: Search, kinds: Sequence[Point]) -> Array:
-        """RMS by which the simulation of each joint by itself misses this motion, (n,) [rad].
-
-        Nothing of recordings that are short, or much smoother.
-        """
-        like = np.flatnonzero(np.isfinite(self.gaps).all(axis=1) & (self.rougher < ROUGHER).all(axis=1)).tolist()
-        if not like:
+        """RMS by which the simulation of each joint by itself misses this motion where it is `alike`, (n,) [rad]."""
+        some, scales = [self.made[k] for k in self.alike], [self.scales[k] for k in self.alike]
+        if not some:
             return np.zeros(self.sim.n)
-        some, scales = [self.made[k] for k in like], [self.scales[k] for k in like]
         data = windows_of(self.sim.arm, some, ["the model's own motion"] * len(some), search.data.dt, scales)
         data = with_columns(thinned(data, TRIED))
-        as_it_moves = nominal_solver(replace(search, data=data), kinds).nominal
+        exact = replace(search, data=data, floor=np.full(self.sim.n, EXACT))
+        as_it_moves = nominal_solver(exact, kinds).nominal
         return rms_on(data, Fit(as_it_moves, ((),) * data.joints))
 
 
@@ -64,14 +81,18 @@ def own_motion(
     `scales` are the gains of the controller in each over those in the first; rows set `apart` (K,) are not judged.
     """
     itself = Simulated(sim.mujoco_model, tuple(sim.joints))
-    made, (gaps, rougher) = [], np.full((2, len(recordings), sim.n), np.inf)
+    made, (gaps, rougher, noise) = [], np.full((3, len(recordings), sim.n), np.inf)
     for k, (recording, scale, left_out) in enumerate(zip(recordings, scales, apart, strict=True)):
         t, positions, measured = replay(itself.with_gain(scale), recording)
         part = commanded(recording)
         made.append(replace(slice_rows(recording, part), position=positions))
         if len(t) and t[-1] - t[0] >= 2.0 * OPENING_S:
             judged = (t >= t[0] + OPENING_S) & ~left_out[part]
-            gaps[k] = np.sqrt(np.nanmean((positions - measured)[judged] ** 2, axis=0))
+            gap = (positions - measured)[judged]
+            gaps[k] = np.sqrt(np.nanmean(gap**2, axis=0))
+            period = period_of(recording)
+            smooth = low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period), 1.0 / period)(np.nan_to_num(gap))
+            noise[k] = np.sqrt(np.nanmean((gap - smooth) ** 2, axis=0))
             own, seen = (np.nanmean(np.diff(q[judged], 2, axis=0) ** 2, axis=0) for q in (positions, measured))
             rougher[k] = np.sqrt(own / np.maximum(seen, 1e-18))
-    return OwnMotion(sim, tuple(made), tuple(scales), gaps, rougher)
+    return OwnMotion(sim, tuple(made), tuple(scales), gaps, rougher, noise)

@@ -34,6 +34,13 @@ def test_what_is_missed_of_motion_between_rows_is_found_on_the_models_own(
     assert np.all(own.gaps < 1.2 * READ)
     missed = own.missed(search, solvers(sim, search))
     assert least < missed.max() < most
+    rough = replace(search, floor=np.full(2, 5.0 * READ))
+    floor = own.floor(rough, solvers(sim, search))
+    np.testing.assert_array_equal(floor, np.maximum(own.noise[0], missed))
+    assert np.all(floor > 0.7 * READ)
+    assert np.all(floor < 1.3 * READ)
+    swinging = replace(own, rougher=np.full((1, 2), 2.0))
+    np.testing.assert_array_equal(swinging.floor(rough, solvers(sim, search)), rough.floor)
 
 
 def test_a_recording_too_short_to_move_along_says_nothing() -> None:
