@@ -25,6 +25,8 @@ from sim_gap.residuals.resampling import low_pass
 
 TRIED = 8
 """Windows of its own motion on which the simulation of each joint by itself is tried."""
+LEAST_ROWS = 20
+"""Rows that tell a gap and its noise."""
 EXACT = 1e-6
 """Noise of positions that nothing was read with [rad]."""
 ROUGHER = 1.5
@@ -86,13 +88,12 @@ def own_motion(
         t, positions, measured = replay(itself.with_gain(scale), recording)
         part = commanded(recording)
         made.append(replace(slice_rows(recording, part), position=positions))
-        if len(t) and t[-1] - t[0] >= 2.0 * OPENING_S:
-            judged = (t >= t[0] + OPENING_S) & ~left_out[part]
+        period = period_of(recording)
+        judged = (t - t.min(initial=np.inf) >= OPENING_S) & ~left_out[part] & np.isfinite(measured).all(axis=1)
+        if judged.sum() * period >= OPENING_S and judged.sum() >= LEAST_ROWS:
             gap = (positions - measured)[judged]
-            gaps[k] = np.sqrt(np.nanmean(gap**2, axis=0))
-            period = period_of(recording)
-            smooth = low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period), 1.0 / period)(np.nan_to_num(gap))
-            noise[k] = np.sqrt(np.nanmean((gap - smooth) ** 2, axis=0))
-            own, seen = (np.nanmean(np.diff(q[judged], 2, axis=0) ** 2, axis=0) for q in (positions, measured))
-            rougher[k] = np.sqrt(own / np.maximum(seen, 1e-18))
+            smooth = low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period), 1.0 / period)(gap)
+            own, seen = (np.diff(q[judged], 2, axis=0) for q in (positions, measured))
+            gaps[k], noise[k] = (np.sqrt(np.mean(x**2, axis=0)) for x in (gap, gap - smooth))
+            rougher[k] = np.sqrt(np.mean(own**2, axis=0) / np.maximum(np.mean(seen**2, axis=0), 1e-18))
     return OwnMotion(sim, tuple(made), tuple(scales), gaps, rougher, noise)

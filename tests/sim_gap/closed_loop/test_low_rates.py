@@ -67,3 +67,15 @@ def test_rows_with_the_position_of_the_next_are_told_with_their_remedy(tmp_path)
         assert found["time"].value == pytest.approx(-PERIOD, abs=2e-3)
     (note,) = [each for each in answer.notes if each.startswith("commands act before their rows' time")]
     assert note.endswith("--clock q_cmd=-0.034")
+
+
+@pytest.mark.parametrize("rows", [0, 5, 25])
+def test_where_hardly_a_row_is_judged_the_models_own_motion_says_nothing(rows: int) -> None:
+    sim = load_model(mujoco.MjModel.from_xml_string(STIFF))
+    recording = record(STIFF, 1, 4.0, 20.0)
+    position = recording.position.copy()
+    position[len(position) - rows :, 1] = np.nan
+    apart = np.arange(len(position)) < 75 if rows != 25 else np.zeros(len(position), bool)
+    own = own_motion(sim, [replace(recording, position=position)], [1.0], [apart])
+    assert np.isfinite(own.gaps).all() == (rows == 25)
+    assert (own.alike.size > 0) == (rows == 25)
