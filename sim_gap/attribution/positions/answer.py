@@ -94,7 +94,13 @@ def _left(found: Identified) -> float:
 
 
 def _matters(found: Identified, stage: Stage) -> bool:
-    return bool((stage.share > LEAST_SHRINK).any()) and _differs(found, stage)
+    return _lowers(found, stage) and _differs(found, stage)
+
+
+def _lowers(found: Identified, stage: Stage) -> bool:
+    """Whether it lowers the gap of a joint that has one."""
+    gap = np.maximum(stage.before, found.heldout_before)
+    return bool(((stage.share > LEAST_SHRINK) & (gap > found.margin)).any())
 
 
 def _differs(found: Identified, stage: Stage) -> bool:

@@ -12,7 +12,7 @@ from servo_arm import model_text, record, written
 
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.attribution.positions.answer import _verdict
+from sim_gap.attribution.positions.answer import _lowers, _verdict
 from sim_gap.attribution.positions.notes import _beyond, _faster, _released
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
@@ -63,6 +63,15 @@ def test_a_gap_that_matters_nowhere_is_none() -> None:
     assert verdict(0.0010, 0.0018, sound=SimpleNamespace(explained=True)) == "no_gap"
     assert verdict(0.0010, 0.0018, own=SimpleNamespace(gaps=np.array([[5e-5, 9e-5], [8e-5, 7e-5]]))) == "no_gap"
     assert verdict(0.0010, 0.0018, own=SimpleNamespace(gaps=np.array([[5e-5, 9e-5], [8e-5, 2e-4]]))) == "explained"
+
+
+def test_what_lowers_a_gap_that_is_none_is_no_cause() -> None:
+    """A controller that had to be found leaves the shoulder a gap, and the elbow none that Coulomb friction lowers."""
+    found = SimpleNamespace(heldout_before=np.array([0.002, 0.001]), margin=np.array([0.001, 0.004]))
+    halved = SimpleNamespace(before=np.array([0.002, 0.001]), share=np.array([0.0, 0.5]))
+    assert not _lowers(found, halved)
+    assert _lowers(found, SimpleNamespace(before=halved.before, share=halved.share[::-1]))
+    assert _lowers(found, SimpleNamespace(before=np.array([0.002, 0.005]), share=halved.share))
 
 
 def test_joints_that_go_further_than_in_training_are_noted() -> None:
