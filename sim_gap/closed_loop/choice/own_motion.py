@@ -49,6 +49,8 @@ class OwnMotion:
     """RMS of second differences of simulated over those of measured positions, (R, n)."""
     noise: Array
     """RMS of the gap about its smooth course, (R, n) [rad]."""
+    bends: Array
+    """RMS of the simulated positions about theirs, (R, n) [rad]."""
 
     @property
     def alike(self) -> NDArray[np.intp]:
@@ -57,11 +59,13 @@ class OwnMotion:
 
     def floor(self, search: Search, kinds: Sequence[Point]) -> Array:
         """RMS below which nothing can be seen, (n,) [rad], from that of the measured positions about their smooth
-        course, in `search`: of rows 30 ms apart that is more the motion between them than noise."""
+        course, in `search`, less what the model's own motion has of that: of rows 30 ms apart it is nearly all."""
         if not self.alike.size:
             return search.floor
-        noise = np.sqrt(np.mean(self.noise[self.alike] ** 2, axis=0))
-        return np.maximum(np.minimum(search.floor, noise), self.missed(search, kinds))
+        noise, bends = (np.sqrt(np.mean(x[self.alike] ** 2, axis=0)) for x in (self.noise, self.bends))
+        rest = np.sqrt(np.maximum(search.floor**2 - bends**2, 0.0))
+        noise = np.minimum(np.maximum(rest, noise), search.floor)
+        return np.asarray(np.maximum(noise, self.missed(search, kinds)))
 
     def missed(self, search: Search, kinds: Sequence[Point]) -> Array:
         """RMS by which the simulation of each joint by itself misses this motion where it is `alike`, (n,) [rad]."""
@@ -83,7 +87,7 @@ def own_motion(
     `scales` are the gains of the controller in each over those in the first; rows set `apart` (K,) are not judged.
     """
     itself = Simulated(sim.mujoco_model, tuple(sim.joints))
-    made, (gaps, rougher, noise) = [], np.full((3, len(recordings), sim.n), np.inf)
+    made, (gaps, rougher, noise, bends) = [], np.full((4, len(recordings), sim.n), np.inf)
     for k, (recording, scale, left_out) in enumerate(zip(recordings, scales, apart, strict=True)):
         t, positions, measured = replay(itself.with_gain(scale), recording)
         part = commanded(recording)
@@ -92,8 +96,10 @@ def own_motion(
         judged = (t - t.min(initial=np.inf) >= OPENING_S) & ~left_out[part] & np.isfinite(measured).all(axis=1)
         if judged.sum() * period >= OPENING_S and judged.sum() >= LEAST_ROWS:
             gap = (positions - measured)[judged]
-            smooth = low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period), 1.0 / period)(gap)
+            smooth = low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period), 1.0 / period)
             own, seen = (np.diff(q[judged], 2, axis=0) for q in (positions, measured))
-            gaps[k], noise[k] = (np.sqrt(np.mean(x**2, axis=0)) for x in (gap, gap - smooth))
+            moved = positions[judged]
+            each = (gap, gap - smooth(gap), moved - smooth(moved))
+            gaps[k], noise[k], bends[k] = (np.sqrt(np.mean(x**2, axis=0)) for x in each)
             rougher[k] = np.sqrt(np.mean(own**2, axis=0) / np.maximum(np.mean(seen**2, axis=0), 1e-18))
-    return OwnMotion(sim, tuple(made), tuple(scales), gaps, rougher, noise)
+    return OwnMotion(sim, tuple(made), tuple(scales), gaps, rougher, noise, bends)
