@@ -26,12 +26,11 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """A public name, loaded at first use."""
     if name in __all__:
-        from armlink.contributed import contributed
+        from armlink.contributed import named
 
-        for point in contributed("armlink.api"):
-            if point.name == name:
-                globals()[name] = point.load()
-                return globals()[name]
+        if (found := named("armlink.api", name)) is not None:
+            globals()[name] = found
+            return found
     raise AttributeError(f"module 'armlink' has no attribute {name!r}; it offers {', '.join(__all__)}")
 
 

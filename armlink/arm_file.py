@@ -14,7 +14,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
-from armlink.contributed import contributed
+from armlink.contributed import contributed, named
 from armlink.errors import BadInput
 from armlink.key_errors import describe, describe_all, meant
 from armlink.names import JointName, Name
@@ -125,12 +125,12 @@ def _parse_drive(keys: Any) -> Any:
 
 @cache
 def _drive_settings(family: str) -> type[Section]:
-    for point in contributed("armlink.drives"):
-        if point.name == family:
-            settings: type[Section] = point.load().settings
-            return settings
-    known = ", ".join(sorted({point.name for point in contributed("armlink.drives")}))
-    raise ValueError(f"no drive family {family!r}; there are {known}")
+    found = named("armlink.drives", family)
+    if found is None:
+        known = ", ".join(sorted({point.name for point in contributed("armlink.drives")}))
+        raise ValueError(f"no drive family {family!r}; there are {known}")
+    settings: type[Section] = found.settings
+    return settings
 
 
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]

@@ -14,6 +14,11 @@ def contributed(group: str) -> tuple[EntryPoint, ...]:
     return tuple(installed().select(group=group))
 
 
+def named(group: str, name: str) -> Any:
+    """What is contributed to a group under a name, loaded; None if nothing is. The first counts."""
+    return next((point.load() for point in contributed(group) if point.name == name), None)
+
+
 @cache
 def installed() -> Any:
     """Entry points of all packages as they were at the first call."""

@@ -3,7 +3,7 @@
 from functools import cache
 
 from armlink.bus.can_bus import CanBus
-from armlink.contributed import contributed
+from armlink.contributed import contributed, named
 from armlink.drives.family import Family
 from armlink.drives.found import FoundDrives
 from armlink.errors import BadInput
@@ -19,11 +19,10 @@ def family_names() -> list[str]:
 @cache
 def family(name: str) -> Family:
     """The family of this name; raises BadInput."""
-    for point in contributed(GROUP):
-        if point.name == name:
-            found: Family = point.load()
-            return found
-    raise BadInput(f"no drive family {name!r}; there are {', '.join(family_names())}")
+    found: Family | None = named(GROUP, name)
+    if found is None:
+        raise BadInput(f"no drive family {name!r}; there are {', '.join(family_names())}")
+    return found
 
 
 def found_drives(bus: CanBus) -> FoundDrives:

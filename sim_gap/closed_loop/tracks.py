@@ -43,6 +43,11 @@ def in_one_order(recordings: Sequence[Recording]) -> list[int]:
     return sorted(range(len(recordings)), key=content)
 
 
+def smoothing(period: float, dt: float) -> Callable[[Array], Array]:
+    """The low pass of motion that was recorded every `period`, on a time base of `dt` [s]."""
+    return low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period, 0.4 / dt), 1.0 / dt)
+
+
 def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Track:
     """Motion, command and the model's torques along both, on an even time base."""
     if recording.position_command is None or not np.isfinite(recording.position_command).any():
@@ -50,8 +55,7 @@ def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Trac
     period = period_of(recording)
     t = np.arange(recording.t[0], recording.t[-1], dt)
     raw = bridged(recording.t, recording.position, t, label, "q")
-    cut = min(SMOOTH_HZ, SMOOTH_SHARE / period, 0.4 / dt)
-    smooth = low_pass(cut, 1.0 / dt)
+    smooth = smoothing(period, dt)
     q = smooth(raw)
     v = np.gradient(q, dt, axis=0)
     a = np.gradient(v, dt, axis=0)

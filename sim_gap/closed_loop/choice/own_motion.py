@@ -17,11 +17,10 @@ from sim_gap.closed_loop.columns import with_columns
 from sim_gap.closed_loop.fit import Fit, Point
 from sim_gap.closed_loop.judge import rms_on
 from sim_gap.closed_loop.search import Search
-from sim_gap.closed_loop.tracks import SMOOTH_HZ, SMOOTH_SHARE, period_of
-from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, commanded, replay
+from sim_gap.closed_loop.tracks import period_of, smoothing
+from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, commanded, judged, replay
 from sim_gap.closed_loop.windows import thinned, windows_of
 from sim_gap.model.load import SimModel
-from sim_gap.residuals.resampling import low_pass
 
 TRIED = 8
 """Windows of its own motion on which the simulation of each joint by itself is tried."""
@@ -93,12 +92,11 @@ def own_motion(
         part = commanded(recording)
         made.append(replace(slice_rows(recording, part), position=positions))
         period = period_of(recording)
-        judged = (t - t.min(initial=np.inf) >= OPENING_S) & ~left_out[part] & np.isfinite(measured).all(axis=1)
-        if judged.sum() * period >= OPENING_S and judged.sum() >= LEAST_ROWS:
-            gap = (positions - measured)[judged]
-            smooth = low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period), 1.0 / period)
-            own, seen = (np.diff(q[judged], 2, axis=0) for q in (positions, measured))
-            moved = positions[judged]
+        rows = judged(t, left_out[part]) & np.isfinite(measured).all(axis=1)
+        if rows.sum() * period >= OPENING_S and rows.sum() >= LEAST_ROWS:
+            gap = (positions - measured)[rows]
+            smooth, moved = smoothing(period, period), positions[rows]
+            own, seen = (np.diff(q, 2, axis=0) for q in (moved, measured[rows]))
             each = (gap, gap - smooth(gap), moved - smooth(moved))
             gaps[k], noise[k], bends[k] = (np.sqrt(np.mean(x**2, axis=0)) for x in each)
             rougher[k] = np.sqrt(np.mean(own**2, axis=0) / np.maximum(np.mean(seen**2, axis=0), 1e-18))

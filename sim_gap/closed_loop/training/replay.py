@@ -117,10 +117,15 @@ def replay_rms(
         if np.diff(recording.t[part]).sum() < 2.0 * OPENING_S:
             continue
         t, positions, measured = replay(arm.with_gain(gain), recording, longest)
-        gap = (positions - measured)[(t >= t[0] + OPENING_S) & ~left_out[part]]
+        gap = (positions - measured)[judged(t, left_out[part])]
         total += np.nansum(gap**2, axis=0)
         count += np.isfinite(gap).sum(0)
     return np.asarray(np.sqrt(total / np.where(count > 0, count, np.nan)))
+
+
+def judged(t: Array, left_out: Mask) -> Mask:
+    """Replayed rows that are judged, (K,): those after the opening that are not left out."""
+    return np.asarray(t - t.min(initial=np.inf) >= OPENING_S) & ~left_out
 
 
 def commanded(recording: Recording, longest: float = LONGEST_S) -> slice:
