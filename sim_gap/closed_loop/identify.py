@@ -28,6 +28,7 @@ from sim_gap.closed_loop.training.export import Exported, exported, native_fit, 
 from sim_gap.closed_loop.training.left_out import left_out
 from sim_gap.closed_loop.training.limits import unreached
 from sim_gap.closed_loop.training.ranges import wide_enough
+from sim_gap.closed_loop.training.replay import Simulated, replay_rms
 from sim_gap.closed_loop.training.spread import Covariance, covariance, covariance_within, vague_limits
 from sim_gap.closed_loop.windows import Windows, thinned, thinned_moving, windows_of
 from sim_gap.model.load import SimModel
@@ -65,7 +66,10 @@ class Identified:
     sound: Sound | None
     """The nominal model's gap beside what small errors make of it; None if the controller had to be found."""
     own: OwnMotion | None
-    """The motion that the nominal model makes along the commands; None if the controller had to be found."""
+    """The motion that the nominal model makes along the training commands; None if the controller had to be found."""
+    moved_before: Array
+    """RMS gap of the nominal model that MuJoCo moves along the held-out commands [rad]; NaN if the controller had to be
+    found, or none is commanded long enough."""
     native: Fit
     export: Exported | None
     """The model to be used alone; None if the model did not come from a file."""
@@ -115,11 +119,14 @@ def identify(
     never = frozenset(withhold) | _frozen(sim, fitted)
     search = Search(balanced(data), scales, nominal, floor, never)
     kinds = solvers(sim, search) if own.complete else []
-    search = nominal_solver(search, kinds) if kinds else search
     apart = tuple(touched(surface, sim.arm, recording) for recording in recordings)
-    itself = own_motion(sim, recordings, scale, apart) if own.complete else None
-    if itself is not None:
+    itself, moved = None, np.full(sim.n, np.nan)
+    if own.complete:
+        search = nominal_solver(search, kinds)
+        itself = own_motion(sim, train, scale[: len(train)], apart[: len(train)])
         search = replace(search, floor=itself.floor(search, kinds))
+        model = Simulated(sim.mujoco_model, tuple(sim.joints))
+        moved = replay_rms(model, heldout, scale[len(train) :], apart=apart[len(train) :])
     search, start, kind = starting_fit(search, own, progress)
     search = replace(search, data=counted(search, data, start))
     fit = select_about(search, replace(start, rms=None), progress)
@@ -162,6 +169,7 @@ def identify(
         margin=margin,
         sound=split,
         own=itself,
+        moved_before=moved,
         native=native,
         export=exported(sim, search, fit, native) if sim.path is not None else None,
         beside=with_module(sim, search, fit) if sim.path is not None else None,

@@ -133,7 +133,8 @@ def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdic
 def _is_within(found: Identified) -> bool:
     """Whether no joint's gap matters, in training and held-out recordings, or is what a sound arm may have."""
     within = all(bool(np.all(gap < found.margin)) for gap in (found.train_before, found.heldout_before))
-    within = within or (found.own is not None and bool(np.all(found.own.gaps < found.margin)))
+    if found.own is not None:
+        within = within or all(bool(np.all(gap < found.margin)) for gap in (found.own.gaps, found.moved_before))
     return within or (found.sound is not None and found.sound.explained)
 
 
@@ -221,9 +222,6 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
         return replay_rms(arm, found.recordings, found.gains, longest, found.heldout_touched)
 
     after = gap(simulated(found.sim, made))
-    before = after * np.nan
-    if found.nominal_has_controller:
-        before = gap(Simulated(found.sim.mujoco_model, found.sim.joints))
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
     effects = []
     for cause, stage in taken:
@@ -233,4 +231,4 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
         alone, without = (gap(less(found.sim, found.search, made, some), SHORT_S) for some in (others, [stage.group]))
         effects.append(EffectRollout(cause.effect, cause.joints, alone, without))
     effects.sort(key=lambda each: -float(np.nanmax(each.without)))
-    return Rollout(longest, before, after, tuple(effects), closed_loop=True)
+    return Rollout(longest, found.moved_before, after, tuple(effects), closed_loop=True)

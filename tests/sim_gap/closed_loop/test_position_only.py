@@ -1,6 +1,7 @@
 import json
 import sys
 import types
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,9 +52,15 @@ def test_names_the_controller_and_the_friction(answer) -> None:
 def test_a_gap_that_matters_nowhere_is_none() -> None:
     """Causes that make a gap within the margin smaller are as minor as it; so are those of a sound arm's gap."""
 
-    def verdict(*gaps: float, sound: SimpleNamespace | None = None, own: SimpleNamespace | None = None) -> str:
+    def verdict(
+        *gaps: float,
+        sound: SimpleNamespace | None = None,
+        moved: tuple[Sequence[float], Sequence[float]] | None = None,
+    ) -> str:
         gap, search = np.array(gaps), SimpleNamespace(open_controller=sound is None)
-        found = SimpleNamespace(margin=np.full(2, 1e-4), sound=sound, own=own, search=search, train_before=gap)
+        found = SimpleNamespace(margin=np.full(2, 1e-4), sound=sound, own=None, search=search, train_before=gap)
+        if moved is not None:
+            found.own, found.moved_before = SimpleNamespace(gaps=np.array(moved[:1])), np.array(moved[1])
         found.heldout_before, found.heldout_after = gap, 0.1 * gap
         return _verdict(found, [SimpleNamespace(confounded_with=(), confidence=0.75)], 0.01)
 
@@ -61,8 +68,10 @@ def test_a_gap_that_matters_nowhere_is_none() -> None:
     assert verdict(0.0010, 0.0018) == "explained"
     assert verdict(0.0010, 0.0018, sound=SimpleNamespace(explained=False)) == "explained"
     assert verdict(0.0010, 0.0018, sound=SimpleNamespace(explained=True)) == "no_gap"
-    assert verdict(0.0010, 0.0018, own=SimpleNamespace(gaps=np.array([[5e-5, 9e-5], [8e-5, 7e-5]]))) == "no_gap"
-    assert verdict(0.0010, 0.0018, own=SimpleNamespace(gaps=np.array([[5e-5, 9e-5], [8e-5, 2e-4]]))) == "explained"
+    assert verdict(0.0010, 0.0018, moved=([5e-5, 9e-5], [8e-5, 7e-5])) == "no_gap"
+    assert verdict(0.0010, 0.0018, moved=([5e-5, 9e-5], [8e-5, 2e-4])) == "explained"
+    assert verdict(0.0010, 0.0018, moved=([5e-5, 2e-4], [8e-5, 7e-5])) == "explained"
+    assert verdict(0.0010, 0.0018, moved=([5e-5, 9e-5], [np.nan, np.nan])) == "explained"
 
 
 def test_what_lowers_a_gap_that_is_none_is_no_cause() -> None:
