@@ -84,34 +84,28 @@ class BasicDrives:
         """See Drives. Most cycles find every drive on and well, and look no further."""
         if self.powers.count(Power.ON) == self.m and not any(self.faults):
             return None
-        if stalled := self.stalled(modes):
-            return Stall(stalled)
+        for joint, mode in enumerate(modes):
+            if mode and (stopped := self.own_stop(joint)):
+                return Stall(stopped)
         for joint, mode in enumerate(modes):
             power = self.powers[joint]
             if self.faults[joint]:
                 return BusFault(f"{self.where(joint)}: {self.faults[joint]}")
             if power is Power.FAULT:
                 return BusFault(f"{self.where(joint)}: the drive has a fault")
-            if mode and power is Power.STOPPED:
-                return Stall(f"{self.where(joint)}: stopped by itself: it did not hear its host")
             if mode and power not in (Power.ON, Power.UNKNOWN):
                 return BusFault(f"{self.where(joint)}: power is {power.value}, expected on")
         return None
-
-    def stalled(self, modes: Sequence[int]) -> str:
-        """Which drive's watchdog ran out, by signs of the family's own; empty if none did, or none would show it."""
-        return ""
 
     def has_restarted(self) -> int | None:
         """See Drives: no drive tells."""
         return None
 
-    def own_stop(self) -> str:
+    def own_stop(self, joint: int) -> str:
         """See Drives."""
-        for joint, power in enumerate(self.powers):
-            if power is Power.STOPPED:
-                return f"{self.names[joint]} stopped itself"
-        return ""
+        if self.powers[joint] is not Power.STOPPED:
+            return ""
+        return f"{self.where(joint)}: stopped by itself: it did not hear its host"
 
     def stuck(self, joint: int, target: Power, seconds: float) -> str:
         """See Drives."""

@@ -162,8 +162,8 @@ class Drives(Protocol):
         """A drive that has restarted since the set-up, so that its settings are lost; None if none has."""
         ...
 
-    def own_stop(self) -> str:
-        """The first drive that stopped by itself because it did not hear its host, in words; empty if none."""
+    def own_stop(self, joint: int) -> str:
+        """Why a drive stopped by itself, where that is because it did not hear its host; else empty."""
         ...
 
     def stuck(self, joint: int, target: Power, seconds: float) -> str:

@@ -286,7 +286,8 @@ class Commander:
 
     def _own_stop(self) -> str:
         """The first joint that stopped itself since it did not hear its host, in words; empty if none."""
-        return next((stop for group in self.loop.groups if (stop := group.drives.own_stop())), "")
+        drives = ((group.drives, drive) for group in self.loop.groups for drive in range(len(group.places)))
+        return next((stop for each, drive in drives if (stop := each.own_stop(drive))), "")
 
     def _note_gap(self, seconds: float, now: float) -> None:
         """No commands were sent for so long before `now` [s]; the longest of late is kept."""

@@ -323,9 +323,9 @@ class CanopenDrives:
         """See Drives."""
         return min(self.known.restarted, default=None)
 
-    def own_stop(self) -> str:
+    def own_stop(self, joint: int) -> str:
         """See Drives."""
-        return faults.stopped_itself(self.known)
+        return faults.stopped_itself(self.known, joint)
 
     def stuck(self, joint: int, target: Power, seconds: float) -> str:
         """See Drives."""

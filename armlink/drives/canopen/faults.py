@@ -79,14 +79,13 @@ def is_own_watchdog(known: Known, joint: int) -> bool:
     return bool(codes & WATCHDOGS) or (not codes and state_of(known.statuses[joint]) is State.QUICK_STOP)
 
 
-def stopped_itself(known: Known) -> str:
-    """The first joint that its own watch of the host has stopped, in words; empty if there is none."""
-    for joint, name in enumerate(known.names):
-        if is_own_watchdog(known, joint):
-            codes = [code for place, code, _ in known.emergencies if place == joint and code in WATCHDOGS]
-            why = f" (emergency {codes[0]:04X}h, {emcy.name_of(codes[0])})" if codes else ""
-            return f"{name} stopped itself{why}"
-    return ""
+def stopped_itself(known: Known, joint: int) -> str:
+    """That a joint's own watch of the host has stopped it, in words; empty if it has not."""
+    if not is_own_watchdog(known, joint):
+        return ""
+    codes = [code for place, code, _ in known.emergencies if place == joint and code in WATCHDOGS]
+    why = f" (emergency {codes[0]:04X}h, {emcy.name_of(codes[0])})" if codes else ""
+    return f"{known.names[joint]} stopped itself{why}"
 
 
 def node_fault(known: Known) -> str | None:

@@ -231,16 +231,11 @@ class CubeMarsDrives(MitDrives):
         """See Drives."""
         return not self._known[joint].on
 
-    def stalled(self, modes: Sequence[int]) -> str:
-        """See BasicDrives."""
-        return self.own_stop()
-
-    def own_stop(self) -> str:
+    def own_stop(self, joint: int) -> str:
         """See Drives."""
-        for joint, known in enumerate(self._known):
-            if known.stopped:
-                return f"{self.where(joint)}: without a command for its deadline: its CAN timeout has let it go"
-        return ""
+        if not self._known[joint].stopped:
+            return ""
+        return f"{self.where(joint)}: without a command for its deadline: its CAN timeout has let it go"
 
     def forget(self, restarts: bool = False) -> None:
         """See Drives."""

@@ -182,10 +182,6 @@ class DamiaoDrives(MitDrives):
             return Power.STOPPED if known.damping else Power.ON
         return POWERS.get(known.state, Power.FAULT)
 
-    def stalled(self, modes: Sequence[int]) -> str:
-        """See BasicDrives."""
-        return self.own_stop()
-
     def state_request(self, joint: int) -> list[Frame]:
         """See Drives."""
         return [(frames.REGISTERS_ID, frames.refresh_request(self._settings[joint].id))]
@@ -194,12 +190,11 @@ class DamiaoDrives(MitDrives):
         """See Drives: in every state but enabled."""
         return self._known[joint].state != ENABLED
 
-    def own_stop(self) -> str:
+    def own_stop(self, joint: int) -> str:
         """See Drives."""
-        for joint, known in enumerate(self._known):
-            if known.state == State.LOST_COMMUNICATION:
-                return f"{self.where(joint)}: lost communication (state Dh): its TIMEOUT ran out, the torque is off"
-        return ""
+        if self._known[joint].state != State.LOST_COMMUNICATION:
+            return ""
+        return f"{self.where(joint)}: lost communication (state Dh): its TIMEOUT ran out, the torque is off"
 
     # ---- listening
 

@@ -265,20 +265,15 @@ class MoteusDrives(BasicDrives):
             )
         )
 
-    def stalled(self, modes: Sequence[int]) -> str:
-        """See BasicDrives."""
-        return self.own_stop()
-
     def state_request(self, joint: int) -> list[Frame]:
         """See Drives: a query."""
         return [self.poll(first=False)[joint]]
 
-    def own_stop(self) -> str:
+    def own_stop(self, joint: int) -> str:
         """See Drives."""
-        for joint, known in enumerate(self._known):
-            if known.mode == frames.Mode.TIMEOUT:
-                return f"{self.where(joint)}: its watchdog ran out: it damps until it is stopped (mode 11)"
-        return ""
+        if self._known[joint].mode != frames.Mode.TIMEOUT:
+            return ""
+        return f"{self.where(joint)}: its watchdog ran out: it damps until it is stopped (mode 11)"
 
     # ---- listening
 

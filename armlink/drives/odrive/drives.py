@@ -271,22 +271,17 @@ class ODriveDrives(BasicDrives):
             return self.note(Reading(joint, temperature=max(values)))
         return None
 
-    def stalled(self, modes: Sequence[int]) -> str:
-        """See BasicDrives."""
-        return self.own_stop()
-
     def lets_go(self, joint: int) -> bool:
         """See Drives: in every state but closed loop."""
         beat = self._known[joint].heartbeat
         return beat is not None and beat.state != AxisState.CLOSED_LOOP
 
-    def own_stop(self) -> str:
+    def own_stop(self, joint: int) -> str:
         """See Drives."""
-        for joint, known in enumerate(self._known):
-            beat = known.heartbeat
-            if beat is not None and beat.state != AxisState.CLOSED_LOOP and beat.error & AxisError.WATCHDOG:
-                return f"{self.where(joint)}: its watchdog ran out: idle, the torque is off"
-        return ""
+        beat = self._known[joint].heartbeat
+        if beat is None or beat.state == AxisState.CLOSED_LOOP or not beat.error & AxisError.WATCHDOG:
+            return ""
+        return f"{self.where(joint)}: its watchdog ran out: idle, the torque is off"
 
     def forget(self, restarts: bool = False) -> None:
         """See Drives; the next request goes out at once."""

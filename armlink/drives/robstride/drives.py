@@ -183,13 +183,6 @@ class RobStrideDrives(BasicDrives):
         """See Drives: another host."""
         return BusFault(self._intruder) if self._intruder else None
 
-    def stalled(self, modes: Sequence[int]) -> str:
-        """See BasicDrives: a watchdog that ran out shows as mode reset alone."""
-        for joint, mode in enumerate(modes):
-            if mode and self._stopped_itself(joint):
-                return f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off"
-        return ""
-
     def state_request(self, joint: int) -> list[Frame]:
         """See Drives: the torque limit, written as it is, since a reading is answered without the mode."""
         known, settings = self._known[joint], self._settings[joint]
@@ -203,16 +196,12 @@ class RobStrideDrives(BasicDrives):
         """See Drives: in every mode but run."""
         return self._known[joint].mode != frames.Mode.RUN
 
-    def own_stop(self) -> str:
-        """See Drives."""
-        for joint, name in enumerate(self.names):
-            if self._stopped_itself(joint):
-                return f"{name} stopped itself (mode reset)"
-        return ""
-
-    def _stopped_itself(self, joint: int) -> bool:
+    def own_stop(self, joint: int) -> str:
+        """See Drives: a watchdog that ran out shows as mode reset alone."""
         known = self._known[joint]
-        return known.was_on and known.mode == frames.Mode.RESET and not known.faults
+        if not known.was_on or known.mode != frames.Mode.RESET or known.faults:
+            return ""
+        return f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off"
 
     def forget(self, restarts: bool = False) -> None:
         """See Drives."""

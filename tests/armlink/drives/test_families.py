@@ -114,7 +114,7 @@ def test_a_silent_host_ends_as_the_traits_say(bench):
     fault = bench.drives.fault([Mode.POSITION] * 6, bench.arm.time)
     assert isinstance(fault, Stall)
     assert "base" in str(fault)
-    assert bench.drives.own_stop()
+    assert bench.drives.own_stop(0)
     bench.drives.forget()
     assert bench.walk()
 
