@@ -105,7 +105,7 @@ class BasicDrives:
         """See Drives."""
         if self.powers[joint] is not Power.STOPPED:
             return ""
-        return f"{self.where(joint)}: stopped by itself: it did not hear its host"
+        return f"{self.where(joint)} stopped itself: it did not hear its host"
 
     def stuck(self, joint: int, target: Power, seconds: float) -> str:
         """See Drives."""

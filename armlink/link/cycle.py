@@ -6,13 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from armlink.arrays import Array
 from armlink.clock import Clock
 from armlink.drives.family import Drives
 from armlink.drives.orders import Mode, Order, Power
 from armlink.errors import BusFault, HostLate, Refused, Silence
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault, refusal, silence
-from armlink.link.gate import JointLimits, Seen, beyond, hold_at, pass_gate, start_from
+from armlink.link.gate import JointLimits, Seen, beyond, hold_at, is_fresh, pass_gate, start_from
 from armlink.link.integral import Integral
 from armlink.link.types import Command, Sample
 
@@ -52,6 +53,10 @@ class Commander:
         self._commanded = [OFF] * self.n
         self._integrals: list[Integral | None] = [None] * self.n
         self._with_gains = False
+        self._caught: set[int] = set()
+        """Joints that are being switched on again after their drives stopped by themselves."""
+        self._mute_cycles = 0
+        """Cycles of `keep` in a row in which nothing could be sent."""
         self._seen_now: list[Seen] = []
         self._due = 0.0
         self.unhurried = False
@@ -140,6 +145,69 @@ class Commander:
                 mode = POSITION if on or walk or wanted is Power.ON else OFF
                 self.passed[place] = order._replace(power=wanted, walk=walk, mode=mode)
         return loop.exchange(self.passed, now)
+
+    def keep(self, goal: Array | None = None) -> Sample:
+        """A cycle in which each joint that can be held is, at its target or led towards `goal` (n,) [rad].
+
+        Nothing is raised for a joint that the gate refuses (it brakes), that is silent or has a fault (it is told to
+        stop), or whose drive stopped since it did not hear its host (it is switched on again where it stands). Raises
+        BusFault where nothing could be sent for ENABLE_SECONDS.
+        """
+        loop, now = self.loop, self._await_turn()
+        self._seen_now = seen = self._seen(now, True)
+        self._commanded = [POSITION] * self.n
+        for group in loop.groups:
+            restarted = group.drives.has_restarted() is not None
+            for drive, place in enumerate(group.places):
+                order = None if restarted else self._kept(group.drives, drive, place, seen[place], goal)
+                self.passed[place] = order or self._braked(place, seen[place])
+        try:
+            sample = self._keep_sending(now)
+        except BusFault:
+            self._mute_cycles += 1
+            if self._mute_cycles > ENABLE_SECONDS / self.period:
+                raise
+            return loop.sample(now)
+        self._mute_cycles = 0
+        return sample
+
+    def _keep_sending(self, now: float) -> Sample:
+        try:
+            return self.loop.exchange(self.passed, now)
+        except Refused:  # what the bytes would say is beyond a limit: brake
+            self.passed[:] = [self._braked(place, each) for place, each in enumerate(self._seen_now)]
+            return self.loop.exchange(self.passed, now)
+
+    def _kept(self, drives: Drives, drive: int, place: int, seen: Seen, goal: Array | None) -> Order | None:
+        """The order by which a joint is held; None where it cannot be."""
+        limits, held, integral = self.limits[place], self.passed[place], self._integrals[place]
+        power = drives.power(drive)
+        if power is Power.FAULT or not (is_fresh(seen.age, self.max_age) and math.isfinite(seen.position)):
+            return None
+        if power is Power.ON:
+            self._caught.discard(place)
+            target = seen.position if held.mode != POSITION else held.position if goal is None else float(goal[place])
+            torque = 0.0
+            if integral is not None:
+                torque = integral.update(limits, POSITION, held.position, held.velocity, seen)
+            return pass_gate(limits, POSITION, torque, target, 0.0, held, seen)
+        if power is not Power.STOPPED and place not in self._caught and not drives.own_stop(drive):
+            return None
+        self._caught.add(place)
+        if integral is not None:
+            integral.reset()
+        order = hold_at(limits, 0.0, seen.position, seen)
+        return order._replace(power=Power.ON, walk=True, mode=POSITION)
+
+    def _braked(self, place: int, seen: Seen) -> Order:
+        """The order to stop a joint as its drive can, from where it stands."""
+        position = seen.position if math.isfinite(seen.position) else self.passed[place].position
+        return start_from(self.limits[place], seen.torque, position)._replace(power=Power.STOPPED)
+
+    @property
+    def held(self) -> list[bool]:
+        """Which joints the newest cycle of `keep` held or led (n,)."""
+        return [order.power is Power.ON and not order.walk for order in self.passed]
 
     def walk(self, target: Power) -> Sample:
         """Cycle until every joint is in `target` (ON or OFF), a step each cycle; returns the last sample.

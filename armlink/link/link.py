@@ -1,5 +1,6 @@
 """The link: an arm's joint controllers on a CAN bus; samples in SI units out, limited commands in."""
 
+import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,10 +17,11 @@ from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.family import Guarded
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup, law_torque
-from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence
+from armlink.errors import BadInput, BusFault, HostLate, Silence
 from armlink.link.bus_load import overload
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
+from armlink.link.ends import Cause, cause_of, end
 from armlink.link.faults import bus_fault
 from armlink.link.gate import JointLimits, start_from
 from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window
@@ -28,8 +30,9 @@ from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
 from armlink.link.joints.groups import Group, make_groups
 from armlink.link.joints.values import values_of
-from armlink.link.park import leave, park, require_deadman
+from armlink.link.park import falling, park, require_deadman
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
+from armlink.termination import Presses, said
 
 if TYPE_CHECKING:
     import can
@@ -51,8 +54,8 @@ P = ParamSpec("P")
 class Link(Calibrations):
     """Context manager: `with Link.open(arm) as link: link.start(); link.enable(); link.cycle(command)`.
 
-    Leaving it, however, leaves the joints in quick stop, where they hold, unless `disable` was called. Where drives let
-    go without their host, leaving it in order parks the arm if its file says where (`link.park`).
+    Leaving it, however, brings the arm to its end as `armlink.link.ends` has it: joints whose drives hold stay in quick
+    stop; an arm that would fall is parked, or let down, and only then loses its power.
     """
 
     def __init__(
@@ -79,7 +82,7 @@ class Link(Calibrations):
         self.calibrate_host(simulated=self._lock_step)
         self.setups: list[Setup] = []
         """What start() found, in joint order."""
-        self._cycling = self._enabled = False
+        self._cycling = self._enabled = self._held = False
         self._since = 0.0
         self.position_step = np.full(self.n, np.inf)
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
@@ -100,19 +103,23 @@ class Link(Calibrations):
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Park where drives would let the arm fall, if the bus is sound; quick stop of joints that are still enabled,
-        and close the bus."""
-        try:
-            if not isinstance(error, BusFault):
-                leave(self, lambda text: None)
-        except (BusFault, Refused) as failed:
-            log.warning("%s: not parked: %s", self.arm.name, failed)
-        finally:
-            self._let_go()
+        """See `close`."""
+        self.close(cause_of(error))
 
-    def _let_go(self) -> None:
+    def _say(self, text: str) -> None:
+        log.debug("%s: %s", self.arm.name, text)
+
+    def close(self, cause: Cause = Cause.DONE, tell: Tell | None = None) -> None:
+        """Bring the arm to its end (`armlink.link.ends`), and close the bus; `tell` is told what is being done.
+
+        Ctrl-C no longer raises meanwhile; pressed twice it lets the arm go.
+        """
         try:
-            self.stop()
+            if tell is not None:
+                end(self, cause, tell)
+            else:
+                with Presses() as presses:
+                    end(self, cause, said(self.arm.name, presses))
         finally:
             self.bus.shutdown()
             if self._hold is not None:
@@ -122,6 +129,16 @@ class Link(Calibrations):
     def enabled(self) -> bool:
         """Whether the joints are enabled and cycles must go on."""
         return self._enabled
+
+    @property
+    def held(self) -> bool:
+        """Whether the joints were stopped and have to be held by cycles of `keep`, since their drives would let go."""
+        return self._held
+
+    @property
+    def falls(self) -> bool:
+        """Whether some drive lets go, or sinks, when its host falls silent."""
+        return bool(falling(self))
 
     @property
     def addresses(self) -> list[tuple[str, str]]:
@@ -180,8 +197,11 @@ class Link(Calibrations):
     def start(self) -> None:
         """Check the drives, set them up with the device's own limits, start them.
 
-        Raises Refused for another controller than the arm file states, BusFault, BadInput.
+        The set-up takes their power: an arm that would fall is brought to its end first. Raises Refused for another
+        controller than the arm file states, BusFault, BadInput.
         """
+        if self.falls:
+            end(self, Cause.DONE, self._say)
         self._hold = self._hold or ArmHold(self.bus, self.addresses)
         missing = [
             f"{self.names[group.places[joint]]} ({self.section.joints[group.places[joint]].settings.address})"
@@ -295,7 +315,7 @@ class Link(Calibrations):
             self._mind_overload(fault)
             raise
         self._forget()
-        self._enabled = True
+        self._enabled, self._held = True, False
         self._last = Command.hold(np.array(self._loop.latest_position))
         return sample
 
@@ -334,7 +354,7 @@ class Link(Calibrations):
     def disable(self) -> None:
         """Take the power from every joint: a joint without a brake falls. Raises BusFault."""
         self._require_start()
-        self._enabled = False
+        self._enabled = self._held = False
         self.commander.walk(Power.OFF)
 
     def _require_start(self) -> None:
@@ -345,7 +365,7 @@ class Link(Calibrations):
         """One cycle: wait for its time, gate, frames out, readings in.
 
         Raises Refused where the gate refuses the command, BusFault for a fault of bus or joint; the joints have been
-        sent to quick stop before either is raised. Raises Crossed if a joint crossed a bound of the command's guard:
+        stopped before either is raised (see `stop`). Raises Crossed if a joint crossed a bound of the command's guard:
         the joints then keep the command until the next.
         """
         if not self._enabled:
@@ -394,10 +414,33 @@ class Link(Calibrations):
         """Forget samples of the past: in process there are none."""
 
     def stop(self) -> None:
-        """Quick stop of every joint, as far as the bus still carries it; the joints stay in it, holding."""
+        """Stop every joint, as far as the bus still carries it: by quick stop, in which drives hold.
+
+        Where drives would let go, the host holds the joints (`held`): it makes cycles of `keep` until they are enabled
+        again or the arm comes to its end.
+        """
         if not self._enabled:
             return
         self._enabled = False
+        if not self.falls:
+            self.commander.stop()
+            return
+        self._held = True
+        with contextlib.suppress(BusFault):
+            self.keep()
+
+    def keep(self, goal: Array | None = None) -> Sample:
+        """One cycle that holds every joint that can be held, or leads it towards `goal` (n,) [rad].
+
+        Raises BusFault where nothing can be sent, and nothing for the fault of a joint.
+        """
+        sample = self.commander.keep(goal)
+        self._last = Command.hold(np.array([order.position for order in self.commander.passed]))
+        return sample
+
+    def let_go(self) -> None:
+        """Stop every joint and hold none: where drives let go, the arm falls."""
+        self._enabled = self._held = False
         self.commander.stop()
 
     def inside(
@@ -417,6 +460,8 @@ class Link(Calibrations):
                 continue
             if self._enabled and self._last is not None:
                 self.cycle(replace(self._last, t=None))
+            elif self._held:
+                self.keep()
             elif not self._loop.receive(remaining):
                 return False
         return True

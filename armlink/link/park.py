@@ -1,18 +1,16 @@
-"""Stowing the arm in a pose of its file before its drives lose their power: for drives that let go without a host."""
+"""Stowing an arm before its drives lose their power: in a pose of its file, or let down along its own load."""
 
-import logging
 import math
-from contextlib import closing
 from typing import Protocol
 
 import numpy as np
 
 from armlink.arm_file import ArmFile, LinkSection
 from armlink.arrays import Array
-from armlink.errors import BadInput, Refused
-from armlink.link.guard import Crossed, Guard
+from armlink.errors import BadInput, BusFault, Refused
+from armlink.link.cycle import Commander
 from armlink.link.joints.groups import Group, traits_of
-from armlink.link.types import Command, Sample, Samples, Setpoints, Tell
+from armlink.link.types import Sample, Tell
 
 PEAK = 1.875
 """Peak speed over mean speed of the path, whose parameter is 10 s³ − 15 s⁴ + 6 s⁵."""
@@ -22,9 +20,18 @@ REST_SECONDS = 0.5
 """The arm rests in its pose for this long before the power goes [s]."""
 STOWED = 0.1
 """A joint that is further than this from its pose has not arrived [rad]."""
-TELL_EVERY = 0.5
-"""[s]."""
-log = logging.getLogger("armlink")
+TELL_SECONDS = 0.5
+"""Time between two reports of progress [s]."""
+LOWERING_SPEED = 0.1
+"""An arm without a pose to park in is let down no faster [rad/s]: a hand's width a second at an arm's length."""
+LIGHT_LOAD = 0.05
+"""Share of max_torque below which a load lets its joint down more slowly, so that it comes to rest where it hangs."""
+LOWERED = 0.01
+"""An arm whose joints have all moved less than this within LOWERED_SECONDS rests [rad]."""
+LOWERED_SECONDS = 2.0
+"""See LOWERED [s]."""
+LONGEST_LOWERING = 60.0
+"""The power goes then, whether the arm rests or not [s]: half a turn at LOWERING_SPEED takes half of it."""
 
 
 class Parked(Protocol):
@@ -36,6 +43,7 @@ class Parked(Protocol):
     n: int
     period: float
     groups: tuple[Group, ...]
+    commander: Commander
 
     @property
     def enabled(self) -> bool:
@@ -47,12 +55,8 @@ class Parked(Protocol):
         """Newest position readings (n,) [rad]."""
         ...
 
-    def cycle(self, command: Command) -> Sample:
-        """One cycle."""
-        ...
-
-    def play(self, setpoints: Setpoints) -> Samples:
-        """One row a cycle."""
+    def keep(self, goal: Array | None = None) -> Sample:
+        """One cycle that holds every joint that can be held, or leads it towards `goal` (n,) [rad]."""
         ...
 
     def disable(self) -> None:
@@ -60,7 +64,7 @@ class Parked(Protocol):
         ...
 
 
-def let_go(link: Parked) -> list[str]:
+def falling(link: Parked) -> list[str]:
     """Joints whose drives do not hold on their own when their host falls silent."""
     traits = traits_of(link.groups, link.n)
     return [name for name, each in zip(link.names, traits, strict=True) if each.silence != "holds"]
@@ -80,52 +84,77 @@ def require_deadman(link: Parked) -> None:
 def park(link: Parked, tell: Tell) -> None:
     """Move the arm to `link.park`, let it rest there, and take the power from every joint.
 
-    The joints move together on a straight line in joint space, which must be clear. `tell` is told how far it is.
-    Raises BadInput where the arm file has no such pose, Refused where a joint is blocked (the joints then hold where
-    they stand), BusFault.
+    The joints move together on a straight line in joint space, which must be clear; one that cannot be held is left
+    out. `tell` is told how long it still takes. Raises BadInput where the arm file has no such pose, Refused where a
+    joint is blocked (the joints then hold where they stand), BusFault where nothing can be sent.
     """
     stowed = link.section.park
     if stowed is None:
         raise BadInput(f"{link.arm.path}: key link.park is missing: give the pose in which the arm rests without power")
     goal = np.array(stowed.pose)
-    start = link.cycle(Command.hold(link.latest_position)).position
+    start = link.keep().position
     start = np.where(np.isfinite(start), start, link.latest_position)
     path = straight(start, goal, speeds(link, stowed.speed), link.period)
-    away = np.full(link.n, np.inf)
-    guard = Guard(-away, away, np.full(link.n, LAG))
-    every = max(1, round(TELL_EVERY / link.period))
+    every = cycles(link, TELL_SECONDS)
+    for row, target in enumerate(path):
+        if row % every == 0:
+            left = (len(path) - row) * link.period + REST_SECONDS
+            tell(f"parking, {left:.0f} s left; Ctrl-C twice lets the arm fall")
+        link.keep(target)
+        _require_following(link, target, LAG, "does not follow (something is in the way, or its drive is too weak)")
+    for _ in range(cycles(link, REST_SECONDS)):
+        link.keep(goal)
+    _require_following(link, goal, STOWED, "has not arrived")
+    _power_off(link)
+    tell("parked, the power is off")
+
+
+def _power_off(link: Parked) -> None:
+    """Take the power; a joint that could not be held need not tell that it is off."""
+    lost = not all(link.commander.held)
     try:
-        with closing(link.play(Setpoints.follow(path, guard))) as samples:
-            for row, _ in enumerate(samples):
-                if row % every == 0:
-                    tell(f"park: {row / len(path):.0%}")
-    except Crossed as crossed:
-        link.cycle(Command.hold(link.latest_position))
-        raise Refused(f"park: {crossed}: something is in the way, or its drive is too weak; the joints hold") from None
-    for _ in range(max(1, round(REST_SECONDS / link.period))):
-        link.cycle(Command.hold(goal))
-    off = np.abs(link.latest_position - goal)
-    if (off > STOWED).any():
-        joint = int(np.argmax(off))
-        raise Refused(f"park: {link.names[joint]}: {off[joint]:.2f} rad from its pose: the joints hold")
-    tell("park: power off")
-    link.disable()
+        link.disable()
+    except BusFault:
+        if not lost:
+            raise
 
 
-def leave(link: Parked, tell: Tell) -> None:
-    """The end of work in order: park where drives would let the arm fall, else leave it as it is. Raises as `park`."""
-    falling = let_go(link)
-    if not link.enabled or not falling:
-        return
-    if link.section.park is None:
-        log.warning(
-            "%s: %s: the drives do not hold without their host, and the arm file has no link.park: the arm sinks or "
-            "falls now",
-            link.arm.name,
-            ", ".join(falling),
+def _require_following(link: Parked, target: Array, most: float, how: str) -> None:
+    """Raise Refused, the joints holding, where one that is held is further than `most` [rad] from its target."""
+    off = np.where(link.commander.held, np.abs(link.latest_position - target), 0.0)
+    joint = int(np.argmax(off))
+    if off[joint] > most:
+        link.keep(link.latest_position)
+        raise Refused(
+            f"park: {link.names[joint]}: at {link.latest_position[joint]:.3f} rad it {how} to {target[joint]:.3f} rad; "
+            "the joints hold"
         )
-        return
-    park(link, tell)
+
+
+def let_down(link: Parked, tell: Tell, why: str) -> None:
+    """Lower the arm as its own load pulls it, slowly, until it rests; then take the power.
+
+    Each joint moves against the torque that its drive makes to hold it: downhill, whatever the arm carries, and away
+    from what it presses on. Raises BusFault where nothing can be sent.
+    """
+    target, before = np.array(link.latest_position), np.array(link.latest_position)
+    light = LIGHT_LOAD * np.array([joint.max_torque for joint in link.section.joints])
+    lower, upper = np.array([(each.lower, each.upper) for each in link.commander.limits]).T
+    every, window = cycles(link, TELL_SECONDS), cycles(link, LOWERED_SECONDS)
+    for row in range(cycles(link, LONGEST_LOWERING)):
+        if row % every == 0:
+            tell(f"letting the arm down, {LONGEST_LOWERING - row * link.period:.0f} s at most: {why}")
+        load = np.nan_to_num(np.array(link.commander.loop.latest_motor_torque))
+        target -= speeds(link, LOWERING_SPEED) * link.period * np.clip(load / light, -1.0, 1.0)
+        here = link.latest_position
+        target = np.clip(target, np.maximum(here - LAG, lower), np.minimum(here + LAG, upper))
+        link.keep(target)
+        if row % window == window - 1:
+            if np.abs(link.latest_position - before).max() < LOWERED:
+                break
+            before = link.latest_position
+    _power_off(link)
+    tell("let down, the power is off")
 
 
 def straight(start: Array, goal: Array, speed: Array, period: float) -> Array:
@@ -141,3 +170,8 @@ def speeds(link: Parked, speed: float) -> Array:
     """The speed of a way to park, no joint beyond what it may turn at (n,) [rad/s]."""
     fastest: Array = np.minimum(speed, np.array([joint.max_velocity for joint in link.section.joints]))
     return fastest
+
+
+def cycles(link: Parked, seconds: float) -> int:
+    """Cycles in so many seconds, at least one."""
+    return max(1, round(seconds / link.period))

@@ -1,24 +1,43 @@
-"""How a process that makes the cycles ends: when its job goes, not when a signal reaches the whole group."""
+"""The end of a process that makes the cycles: it is the job's to begin, and nothing cuts it short but a person."""
 
+import os
 import signal
 import time
+from collections.abc import Callable
 from types import FrameType
+from typing import Any
+
+from armlink.link.ends import Cause
+from armlink.loop.channel import Channel, Closed
+from armlink.loop.messages import Drop, End, Told
+from armlink.termination import Dropped
 
 GRACE = 2.0
 """After SIGTERM the job has this long to end this process [s]."""
+SILENT_END = 10.0
+"""A process that says nothing for this long while it brings its arm to the end hangs [s]."""
+TOLD_EVERY = 0.2
+"""[s]."""
+OF_THE_TERMINAL = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
+OF_A_SERVICE = (signal.SIGTERM, signal.SIGABRT)
+"""systemd sends them to every process of a unit: at its stop, and where its watchdog has run out."""
 
 
 class Ending:
-    """SIGINT and SIGTERM are left to the job, which gets them too: it closes its end, and says how it ended.
+    """Signals of the terminal and of the service manager are left to the job: it ends this process, and says how.
 
     A job that does not within GRACE after SIGTERM hangs, and this process then ends by itself.
     """
 
-    def __init__(self) -> None:
-        """Take over the signals of this process."""
+    def __init__(self, own_session: bool = True) -> None:
+        """Take over the signals of this process; `own_session`: leave the terminal, too."""
         self._asked: float | None = None
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, self._note)
+        if own_session and os.getsid(0) != os.getpid():
+            os.setsid()
+        for number in OF_THE_TERMINAL:
+            signal.signal(number, signal.SIG_IGN)
+        for number in OF_A_SERVICE:
+            signal.signal(number, self._note)
 
     @property
     def due(self) -> bool:
@@ -28,3 +47,54 @@ class Ending:
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self._asked is None:
             self._asked = time.monotonic()
+
+
+def telling(channel: Channel, aside: Callable[[Any], None] = lambda message: None) -> Callable[[str], None]:
+    """What tells the job how far the end of its arm is, as long as the job is there; raises Dropped when it says so.
+
+    `aside` takes whatever else the job says meanwhile.
+    """
+
+    def tell(text: str) -> None:
+        try:
+            channel.put(Told(0, text))
+            channel.flush()
+            messages = channel.receive()
+        except Closed:
+            return
+        for message in messages:
+            if isinstance(message, Drop):
+                raise Dropped
+            aside(message)
+
+    return tell
+
+
+def see_out(channel: Channel, runs: Callable[[], bool], cause: Cause, tell: Callable[[str], None]) -> bool:
+    """Have the process at the other end bring its arm to the end, and wait until it has ended; whether it has.
+
+    `tell` is told what it does, and may raise Dropped: the arm is then let go. `runs` tells whether the process runs.
+    One that says nothing for SILENT_END hangs. Closes the channel.
+    """
+    heard, dropped = time.monotonic(), False
+    try:
+        channel.put(End(cause))
+        while runs() and time.monotonic() - heard < SILENT_END:
+            channel.flush()
+            channel.wait(TOLD_EVERY)
+            try:
+                for message in channel.receive():
+                    heard = time.monotonic()
+                    if isinstance(message, Told):
+                        tell(message.text)
+                tell("")
+            except Dropped:
+                if not dropped:
+                    channel.put(Drop())
+                dropped = True
+    except Closed:
+        pass
+    channel.close()
+    while runs() and time.monotonic() - heard < SILENT_END:
+        time.sleep(TOLD_EVERY / 10)
+    return not runs()

@@ -9,6 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.errors import ArmlinkError
+from armlink.link.ends import Cause
 from armlink.link.types import Sample, Setpoints
 
 
@@ -50,7 +51,19 @@ class Run:
 
 @dataclass(frozen=True)
 class Cut:
-    """Stop where the playing is; the last command stays in force."""
+    """Stop where the playing is; the last command stays in force. A function that is being called is interrupted."""
+
+
+@dataclass(frozen=True)
+class End:
+    """Bring the arm to its end, and end."""
+
+    cause: Cause
+
+
+@dataclass(frozen=True)
+class Drop:
+    """Let the arm go at once, whatever is done to end it."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +82,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Told:
-    """What a call that is under way is doing."""
+    """What a call that is under way is doing; id 0: the end of the arm."""
 
     id: int
     text: str

@@ -1,11 +1,12 @@
 """The process that owns an arm's bus and keeps its cycle: `python -m armlink.loop.process FD`, started by a RemoteLink.
 
 It makes every cycle on time whatever the job is doing: it plays what the job has sent ahead, and keeps the last command
-when there is nothing left. When the job ends or is killed the joints are stopped, or the arm is parked where its drives
-would let it fall. When the job falls silent while joints are under torque control, they are held where they stand;
-under position control they keep their targets.
+when there is nothing left. It has a session of its own: what reaches the job from its terminal does not reach it. When
+the job ends or is killed it brings the arm to its end (`armlink.link.ends`). When the job falls silent while joints are
+under torque control, they are held where they stand; under position control they keep their targets.
 """
 
+import contextlib
 import math
 import pickle
 import socket
@@ -17,14 +18,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
-from armlink.errors import ArmlinkError, Stall
+from armlink.errors import ArmlinkError, BusFault, Refused, Stall
+from armlink.link.ends import Cause
 from armlink.link.gate import TORQUE_MODES
 from armlink.link.guard import Crossed
 from armlink.link.link import Link
 from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.channel import Channel, Closed
-from armlink.loop.ending import Ending
-from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, Told, pack
+from armlink.loop.ending import Ending, telling
+from armlink.loop.messages import Alive, Answer, Call, Cut, End, Open, Play, Run, Stopped, Told, pack
 from armlink.loop.realtime import prepare
 
 IDLE = 0.05
@@ -55,30 +57,42 @@ class DriveLoop:
         """Whether rows are being played, and the job need be neither heard nor told."""
         self._controlled = False
         """Whether a controller is being run."""
-        self.called = False
-        """Whether a function of the job is being called."""
+        self._end: End | None = None
+        """How the job wants the arm to end."""
+        self._fault: ArmlinkError = BusFault("the joints are not enabled: start() and enable() come before cycle()")
+        """Why the joints are not enabled."""
         self._beside = ThreadPoolExecutor(1)
         self._unpickled: Future[Controller] | None = None
         """A controller that is on its way."""
         self._heard = time.monotonic()
 
-    def run(self, ending: Ending) -> None:
-        """Until the job has gone."""
+    def run(self, ending: Ending) -> Cause:
+        """Until the job says how the arm is to end, or SIGTERM is for this process alone; raises Closed where the job
+        has gone."""
         while not ending.due:
             if not self._busy:
                 for message in self._channel.receive():
                     self._heard = time.monotonic()
                     self._handle(message)
+            if self._end is not None:
+                return self._end.cause
             if self._link.enabled:
                 self._cycle()
+            elif self._link.held:
+                self._keep()
             else:
                 self._channel.flush()
                 self._channel.wait(IDLE)
+        return Cause.INTERRUPTED
 
     def _handle(self, message: object) -> None:
         match message:
             case Call():
                 self._call(message)
+            case End():
+                self._end = message
+            case Play() | Run() if not self._link.enabled:
+                self._channel.put(Stopped(self._fault))
             case Play(id, setpoints):
                 if id != self._id:
                     self._begin(id)
@@ -105,14 +119,14 @@ class DriveLoop:
         try:
             kwargs = dict(call.kwargs)
             if callable(call.what):
-                self.called = True
                 answer = Answer(call.id, call.what(link, lambda text: self._tell(call.id, text), *call.args, **kwargs))
             else:
                 found = getattr(link, call.what)
                 answer = Answer(call.id, found(*call.args, **kwargs) if callable(found) else found)
         except ArmlinkError as error:
             answer = Answer(call.id, error=error)
-        self.called = False
+        except KeyboardInterrupt:
+            answer = Answer(call.id, error=Refused("interrupted"))
         if link.enabled and (callable(call.what) or call.what in ENABLING):
             self._begin(0)
             self._last = link.last
@@ -120,7 +134,19 @@ class DriveLoop:
         self._channel.flush()
 
     def _tell(self, id: int, text: str) -> None:
+        """Tell what a function does; raises KeyboardInterrupt in it where the job says so."""
         self._channel.put(Told(id, text))
+        self._channel.flush()
+        for message in self._channel.receive():
+            if isinstance(message, End):
+                self._end = message
+            if isinstance(message, Cut | End):
+                raise KeyboardInterrupt
+
+    def _keep(self) -> None:
+        """Hold the joints, which were stopped."""
+        with contextlib.suppress(BusFault):  # where nothing can be sent the next cycle tries again
+            self._link.keep()
         self._channel.flush()
 
     def _cycle(self) -> None:
@@ -136,6 +162,7 @@ class DriveLoop:
             self._channel.put(Stopped(crossed))
         except ArmlinkError as error:
             self._begin(self._id)
+            self._fault = error
             self._channel.put(Stopped(error))
         else:
             self._channel.put((self._id, row, pack(sample, *self._link.sent)), True)
@@ -178,7 +205,7 @@ class DriveLoop:
 
 
 def main(number: int) -> None:
-    """Serve the job at the other end of socket `number`; the joints are safe at the end, however that comes."""
+    """Serve the job at the other end of socket `number`; the arm comes to its end, however that comes."""
     ending = Ending()
     channel = Channel(socket.socket(fileno=number))
     try:
@@ -189,15 +216,15 @@ def main(number: int) -> None:
             channel.put(Answer(0, error=error))
             channel.flush(1.0)
             return
-        with link:
+        cause = Cause.FAILED
+        try:
             channel.put(Answer(0, prepare()))
             sys.setswitchinterval(SWITCH)
-            loop = DriveLoop(channel, link)
-            try:
-                loop.run(ending)
-            except Closed:
-                if loop.called:  # interrupted a second time: the joints stop where they are
-                    link.stop()
+            cause = DriveLoop(channel, link).run(ending)
+        except Closed:
+            cause = Cause.LOST
+        finally:
+            link.close(cause, telling(channel))
     except Closed:
         return
 

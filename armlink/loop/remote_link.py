@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import logging
 import pickle
 import socket
 import subprocess
@@ -17,14 +16,16 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.drives.orders import DriveIdentity
-from armlink.errors import BusFault, Refused
-from armlink.link.park import leave, park
+from armlink.errors import BusFault
+from armlink.link.ends import Cause, cause_of
+from armlink.link.park import park
 from armlink.link.types import Calibration, Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.channel import Channel, Closed
+from armlink.loop.ending import see_out
 from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
+from armlink.termination import Presses, said
 
-log = logging.getLogger("armlink")
 CHUNK = 50
 """Rows of one message: unpickling more would hold up a cycle."""
 TOLD_EVERY = 0.2
@@ -33,8 +34,6 @@ ANSWER = 60.0
 """Longest wait for an answer of the loop [s]; starting an arm takes some seconds."""
 SAMPLE = 5.0
 """Longest wait for a sample of an enabled arm [s]."""
-END = 3.0
-"""The process gets this long to leave the joints safe [s]."""
 
 
 class RemoteLink:
@@ -57,7 +56,9 @@ class RemoteLink:
         self._tell_on: Tell = lambda text: None
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", "armlink.loop.process", str(theirs.fileno())]
-        self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
+        self._process = subprocess.Popen(
+            command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
+        )
         theirs.close()
         self._channel = Channel(ours)
         try:
@@ -65,7 +66,7 @@ class RemoteLink:
             self.realtime: Realtime = self._answer(0)
             """Real-time permissions of the process that makes the cycles."""
         except BaseException:
-            self._end()
+            self._end(Cause.FAILED)
             raise
 
     def __enter__(self) -> Self:
@@ -73,19 +74,8 @@ class RemoteLink:
         return self
 
     def __exit__(self, kind: object, error: object, tb: object) -> None:
-        """As Link: park where drives would let the arm fall, stop, close the bus, end the process.
-
-        After an interruption (Ctrl-C) the arm is parked too; a second one stops it where it is.
-        """
-        try:
-            if not isinstance(error, BusFault):
-                self.inside(leave, lambda text: None)
-        except (BusFault, Refused) as failed:
-            log.warning("%s: not parked: %s", self.arm.name, failed)
-        finally:
-            with contextlib.suppress(BusFault):
-                self.stop()
-            self._end()
+        """As Link: the process brings the arm to its end, whatever the error, and closes the bus."""
+        self._end(cause_of(error if isinstance(error, BaseException) else None))
 
     @property
     def pid(self) -> int:
@@ -183,7 +173,8 @@ class RemoteLink:
         try:
             return self._call(function, *args, **kw)
         except KeyboardInterrupt:
-            self._channel.close()  # the function ends at its next `tell`, and the joints are stopped
+            with contextlib.suppress(BusFault):  # the function ends at its next `tell`
+                self._put(Cut())
             raise
 
     def cycle(self, command: Command) -> Sample:
@@ -306,12 +297,11 @@ class RemoteLink:
             f"the process that drives the arm has ended (status {status}): the joints stop by their own deadline"
         )
 
-    def _end(self) -> None:
-        self._channel.close()
-        try:
-            self._process.wait(END)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
+    def _end(self, cause: Cause) -> None:
+        with Presses() as presses:
+            tell = said(self.arm.name, presses)
+            if not see_out(self._channel, lambda: self._process.poll() is None, cause, tell):
+                self._process.kill()
             self._process.wait()
 
 

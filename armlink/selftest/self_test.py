@@ -16,7 +16,7 @@ from armlink.link.faults import bus_fault
 from armlink.link.gate_limits import drive_limits
 from armlink.link.joints.groups import traits_of
 from armlink.link.link import Link
-from armlink.link.park import let_go, park, speeds, straight
+from armlink.link.park import falling, park, speeds, straight
 from armlink.link.types import Command, Sample, Tell
 
 CHECKS = ("set-up", "answers", "enables and holds", "silence", "park")
@@ -77,7 +77,9 @@ class SelfTest:
             if self.results and all(each.outcome != "failed" for each in self.results):
                 self._add(link.names[0], "answers", "failed", reason)
         finally:
-            if link.commander.passed and not self._parked:
+            if link.enabled:
+                link.stop()
+            elif link.commander.passed and not self._parked:
                 link.commander.stop()
         for check in CHECKS:
             for name in link.names:
@@ -173,12 +175,12 @@ class SelfTest:
     def _park(self) -> str:
         """Stow the arm where drives let go without their host; returns why it is not stowed."""
         link = self.link
-        falling = let_go(link)
-        if link.section.park is None and falling:
-            for name in falling:
-                self._add(name, "park", "absent", "link.park: the joint sinks or falls when the work ends")
-        if link.section.park is None or not falling:
-            return "every drive holds on its own" if not falling else "no link.park"
+        letting_go = falling(link)
+        if link.section.park is None and letting_go:
+            for name in letting_go:
+                self._add(name, "park", "absent", "link.park: the arm is let down slowly when the work ends")
+        if link.section.park is None or not letting_go:
+            return "every drive holds on its own" if not letting_go else "no link.park"
         start = link.clock.now()
         try:
             park(link, self.progress)

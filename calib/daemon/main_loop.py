@@ -13,7 +13,10 @@ from pathlib import Path
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
-from armlink.loop.messages import Answer
+from armlink.link.ends import Cause
+from armlink.link.types import Tell
+from armlink.loop.messages import Answer, Told
+from armlink.termination import Presses, said
 from calib.daemon.environment import Environment
 from calib.daemon.loop.loop_messages import Down, Started
 from calib.daemon.loop.loop_process import LoopControllers, LoopProcess
@@ -56,12 +59,17 @@ class Daemon:
         self._why = "stopped"
         self._ticked = self._kept_alive = -math.inf
         self._notified = ""
+        self._presses = Presses()
+        self._replacing: asyncio.Task[None] | None = None
+        """Ends a bus process and starts another."""
 
     async def run(self) -> None:
-        """Run until SIGTERM or SIGINT; leaves the joints safe."""
+        """Run until SIGTERM, SIGINT or SIGQUIT; then the arm comes to its end (`armlink.link.ends`), however long that
+        takes, and Ctrl-C pressed twice lets it go."""
         for number, act in {
             signal.SIGTERM: lambda: self._end("SIGTERM"),
             signal.SIGINT: lambda: self._end("SIGINT"),
+            signal.SIGQUIT: lambda: self._end("SIGQUIT"),
             signal.SIGHUP: self._reload,
             signal.SIGUSR1: lambda: self.service.tours.request("asked for by signal"),
         }.items():
@@ -78,8 +86,10 @@ class Daemon:
                     ending.result()
         finally:
             self._notify("STOPPING=1")
+            if self._replacing is not None:
+                await self._replacing
             self._loop.remove_reader(self.process.fileno())
-            self.process.close()
+            await asyncio.to_thread(self.process.close, Cause.INTERRUPTED, self._ending())
             for task in (web, timer, ended):
                 task.cancel()
             await asyncio.gather(web, timer, ended, return_exceptions=True)
@@ -92,8 +102,23 @@ class Daemon:
         await server.serve(self.view, socket=given.socket, tcp=given.tcp, token=given.token)
 
     def _end(self, why: str) -> None:
+        if self._ended.is_set():
+            if why == "SIGINT":
+                self._presses.press()
+            return
         self._why = why
         self._ended.set()
+
+    def _ending(self) -> Tell:
+        """What is told while the arm comes to its end: it goes to the log, and systemd waits."""
+        say = said(self.arm.name, self._presses)
+
+        def tell(text: str) -> None:
+            if text:
+                self._notify(f"STATUS={text}", f"EXTEND_TIMEOUT_USEC={round(SILENT_SECONDS * 1e6)}")
+            say(text)
+
+        return tell
 
     async def _timer(self) -> None:
         due = time.monotonic()
@@ -122,7 +147,7 @@ class Daemon:
 
     def _judge(self, now: float, stood_still: float) -> None:
         """Replace a bus process that hangs; not because this process itself stood still (stopped, say) [s]."""
-        if stood_still > PAUSE_SECONDS:
+        if stood_still > PAUSE_SECONDS or (self._replacing is not None and not self._replacing.done()):
             self._heard = max(self._heard, now)
         if now - self._heard > SILENT_SECONDS:
             self._messages()  # what waits here is a sign of life too
@@ -140,15 +165,23 @@ class Daemon:
         for message in messages:
             if isinstance(message, Started):
                 log.info(f"bus process: {message.realtime}")
+            if isinstance(message, Told):
+                self._notify(f"STATUS={message.text}")
+                continue
             self.service.take(message)
 
     def _restart(self, why: str) -> None:
-        """Replace the bus process; meanwhile the joints' own deadlines hold them."""
+        """Replace the bus process; it brings the arm to its end first, if it can."""
+        if self._replacing is not None and not self._replacing.done():
+            return
         log.error(why)
         if self.process.fileno() >= 0:
             self._loop.remove_reader(self.process.fileno())
-        self.process.close()
         self.service.take(Down(why))
+        self._replacing = asyncio.create_task(self._replace())
+
+    async def _replace(self) -> None:
+        await asyncio.to_thread(self.process.close, Cause.FAILED, said(self.arm.name, self._presses))
         try:
             self.process = LoopProcess(self.options.loop(self.arm))
         except OSError as error:

@@ -9,9 +9,10 @@ import numpy as np
 
 from armlink.bus.arm_hold import ArmHold
 from armlink.errors import ArmlinkError, BusFault, Refused
+from armlink.link.ends import Cause, cause_of
 from armlink.link.link import Link
 from armlink.link.listener import RESOLUTION, Listener
-from armlink.link.types import Calibration, Command, Sample
+from armlink.link.types import Calibration, Command, Sample, Tell
 from armlink.loop.messages import Answer, Call
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Message, Progress, Up
@@ -34,8 +35,9 @@ class ArmLoop:
     A fault of bus or joint is a message, never an exception: the bus is opened again until that succeeds.
     """
 
-    def __init__(self, options: LoopOptions) -> None:
-        self.options = options
+    def __init__(self, options: LoopOptions, tell: Tell = lambda text: None) -> None:
+        """`tell` is told how far the end of the arm is; it may raise Dropped."""
+        self.options, self.tell = options, tell
         self._tour: list[int] | None = None
         self._reported = -1
         self._source: Link | Listener | None = None
@@ -58,21 +60,23 @@ class ArmLoop:
                 return [self._open()]
             return self._cycle()
         except ArmlinkError as error:
-            self.close()
+            self.close(cause_of(error))
             return self._down(str(error))
 
     def wait(self) -> float:
         """Time to wait before the next run() [s]: 0 while the bus is open."""
         return 0.0 if self._source is not None else RETRY_SECONDS
 
-    def close(self) -> None:
-        """Close the bus; joints that were enabled hold in quick stop."""
+    def close(self, cause: Cause = Cause.DONE) -> None:
+        """Bring the arm to its end (`armlink.link.ends`), telling `self.tell` how far that is, and close the bus."""
         source, self._source, self._targets, self._tour = self._source, None, None, None
-        if source is not None:
-            try:
+        try:
+            if isinstance(source, Link):
+                source.close(cause, self.tell)
+            elif source is not None:
                 source.__exit__(None, None, None)
-            except (ArmlinkError, OSError):
-                return  # the bus is gone already: the joints' own deadlines stop them
+        except (ArmlinkError, OSError):
+            return  # the bus is gone already: the joints' own deadlines stop them
 
     def handle(self, call: Call) -> Answer:
         """Carry out a call; every failure is in the answer."""
@@ -82,7 +86,7 @@ class ArmLoop:
         try:
             return Answer(call.id, self._do(source, call))
         except BusFault as error:
-            self.close()
+            self.close(cause_of(error))
             return Answer(call.id, error=error)
         except ArmlinkError as error:
             return Answer(call.id, error=error)

@@ -10,7 +10,7 @@ from armlink.arm_file import ArmFile
 from armlink.bus.can_bus import CanBus
 from armlink.drives.board import Event
 from armlink.link.types import Sample, Stats
-from armlink.loop.messages import Alive, Answer
+from armlink.loop.messages import Alive, Answer, Told
 from armlink.loop.realtime import Realtime
 from gcomp.arrays import Array
 
@@ -108,4 +108,4 @@ class Progress:
     """Poses."""
 
 
-Message = Alive | Started | Batch | Up | Down | Answer | Progress
+Message = Alive | Told | Started | Batch | Up | Down | Answer | Progress

@@ -9,18 +9,17 @@ from concurrent.futures import Future, InvalidStateError
 from multiprocessing.process import BaseProcess
 
 from armlink.errors import BusFault
-from armlink.link.types import Calibration
+from armlink.link.ends import Cause
+from armlink.link.types import Calibration, Tell
 from armlink.loop.channel import Channel, Closed
-from armlink.loop.ending import Ending
-from armlink.loop.messages import Alive, Answer, Call
+from armlink.loop.ending import Ending, see_out, telling
+from armlink.loop.messages import Alive, Answer, Call, End
 from armlink.loop.open import is_in_process
 from armlink.loop.realtime import prepare
 from calib.daemon.loop.loop_messages import Batch, LoopOptions, Message, Started
 
 ANSWER_SECONDS = 10.0
 """A call that the loop has not answered within this time has failed [s]."""
-END_SECONDS = 2.0
-"""Time for the loop's process to leave the joints safe, before it is killed [s]."""
 BATCHES = 100
 """Batches that wait for a busy service: 10 s; older ones are dropped."""
 ENDED = "the bus loop's process has ended"
@@ -124,13 +123,15 @@ class LoopProcess:
                 waiting.set_result(message)
         return messages
 
-    def close(self) -> None:
-        """End the process, which leaves the joints safe; if it does not end it is killed, and the joints time out."""
-        self._channel.close()
-        self._process.join(END_SECONDS)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+    def close(self, cause: Cause = Cause.DONE, tell: Tell = lambda text: None) -> None:
+        """End the process, which brings the arm to its end, and wait for it; one that hangs is killed.
+
+        `tell` is told what it does, and may raise Dropped.
+        """
+        with self._sending:
+            if not see_out(self._channel, self._process.is_alive, cause, tell):
+                self._process.kill()
+        self._process.join()
         self._give_up()
 
     def ask(self, call: Call) -> Answer:
@@ -169,7 +170,8 @@ def _child(end: socket.socket, options: LoopOptions, inherited: socket.socket | 
     ending, channel = Ending(), Channel(end, BATCHES)
     from calib.daemon.loop.arm_loop import ArmLoop  # not loaded in the service
 
-    loop = ArmLoop(options)
+    waiting: list[Call | End] = []  # said while the arm was brought to an end
+    cause, loop = Cause.FAILED, ArmLoop(options, telling(channel, waiting.append))
     if options.open_bus is None and not is_in_process(options.arm, options.bus):
         channel.put(Started(prepare()))
     try:
@@ -179,10 +181,16 @@ def _child(end: socket.socket, options: LoopOptions, inherited: socket.socket | 
             channel.flush()
             if loop.wait():
                 channel.wait(loop.wait())
-            for call in channel.receive():
-                channel.put(loop.handle(call))
+            messages = [*waiting, *channel.receive()]
+            waiting.clear()
+            for message in messages:
+                if isinstance(message, End):
+                    cause = message.cause
+                    return
+                channel.put(loop.handle(message))
             channel.flush()
+        cause = Cause.INTERRUPTED
     except Closed:
-        return  # the service is gone: leave the joints safe
+        cause = Cause.LOST
     finally:
-        loop.close()
+        loop.close(cause)

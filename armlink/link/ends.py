@@ -1,0 +1,128 @@
+"""How the work on an arm ends: one table, by what its drives do and why the work ends.
+
+Drives that hold by themselves are sent to quick stop. Drives that let go when their host falls silent need it to the
+last: the arm is held, then parked in `link.park`, or let down along its own load, and only then loses its power.
+"""
+
+from contextlib import suppress
+from enum import Enum
+from typing import Protocol
+
+from armlink.errors import BusFault, Refused, Stall
+from armlink.link.park import Parked, cycles, let_down, park
+from armlink.link.types import Tell
+from armlink.termination import Dropped
+
+CATCH_SECONDS = 3.0
+"""Joints that were let go are caught within this time, or not at all [s]: what a walk to power takes at most."""
+
+
+class Response(Enum):
+    """What is done with the arm, in the words of the table in docs/safety.md."""
+
+    QUICK_STOP = "quick stop: the drives hold"
+    HOLD = "hold"
+    PARK = "hold, park, power off"
+    LET_GO = "let go"
+
+
+class Cause(Enum):
+    """Why the work ends, in the words of the table in docs/safety.md."""
+
+    DONE = "the work is done"
+    INTERRUPTED = "Ctrl-C, Ctrl-\\, SIGTERM, SIGHUP, `systemctl stop`"
+    FAILED = "an exception in the job, a full disk"
+    REFUSED = "the gate refuses a command, a bound is crossed"
+    STALLED = "the cycle stood still, drives stopped by themselves"
+    FAULT = "a drive has a fault or falls silent; another host, a flood"
+    LOST = "the job is killed"
+    SILENT = "the job is silent, or suspended (Ctrl-Z)"
+    DROPPED = "Ctrl-C twice within two seconds, while parking"
+
+
+ENDS: dict[Cause, tuple[Response, Response]] = {
+    Cause.DONE: (Response.QUICK_STOP, Response.PARK),
+    Cause.INTERRUPTED: (Response.QUICK_STOP, Response.PARK),
+    Cause.FAILED: (Response.QUICK_STOP, Response.PARK),
+    Cause.REFUSED: (Response.QUICK_STOP, Response.PARK),
+    Cause.STALLED: (Response.QUICK_STOP, Response.PARK),
+    Cause.FAULT: (Response.QUICK_STOP, Response.PARK),
+    Cause.LOST: (Response.QUICK_STOP, Response.PARK),
+    Cause.SILENT: (Response.HOLD, Response.HOLD),
+    Cause.DROPPED: (Response.QUICK_STOP, Response.LET_GO),
+}
+"""For arms whose drives all hold, and for arms with drives that let go."""
+
+
+class Ended(Parked, Protocol):
+    """The part of a link that its end needs."""
+
+    @property
+    def held(self) -> bool:
+        """Whether the joints are held by the host alone."""
+        ...
+
+    @property
+    def falls(self) -> bool:
+        """Whether some drive lets go when its host falls silent."""
+        ...
+
+    def stop(self) -> None:
+        """Stop every joint."""
+        ...
+
+    def let_go(self) -> None:
+        """Stop every joint and hold none."""
+        ...
+
+
+def cause_of(error: BaseException | None) -> Cause:
+    """Why the work ends, by the exception that left it."""
+    match error:
+        case None:
+            return Cause.DONE
+        case KeyboardInterrupt():
+            return Cause.INTERRUPTED
+        case Stall():
+            return Cause.STALLED
+        case BusFault():
+            return Cause.FAULT
+        case Refused():
+            return Cause.REFUSED
+    return Cause.FAILED
+
+
+def end(link: Ended, cause: Cause, tell: Tell) -> None:
+    """Bring an arm to its end; raises nothing. `tell` may raise Dropped: the arm is then let go at once."""
+    if not (link.enabled or link.held):
+        return
+    response = ENDS[cause][link.falls]
+    link.stop()
+    if response is Response.LET_GO:
+        link.let_go()
+    if response is not Response.PARK:
+        return
+    try:
+        _stow(link, tell)
+    except Dropped:
+        link.let_go()
+    except BusFault as fault:
+        link.let_go()
+        with suppress(Dropped):
+            tell(f"not parked, {fault}: the drives let the arm go")
+
+
+def _stow(link: Ended, tell: Tell) -> None:
+    """Catch what fell, park or let down, and take the power."""
+    for _ in range(cycles(link, CATCH_SECONDS)):
+        link.keep()
+        if all(link.commander.held):
+            break
+    why = "the arm file has no link.park"
+    if link.section.park is not None:
+        try:
+            park(link, tell)
+            return
+        except Refused as blocked:
+            why = str(blocked)
+    let_down(link, tell, why)

@@ -1,0 +1,173 @@
+"""Every end of the work on an arm that its drives would let fall: parked, and no joint thrown about on the way."""
+
+import errno
+import logging
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from armlink.arm_file import bundled_arms, parse_arm
+from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence, Stall
+from armlink.link.ends import ENDS, Cause, cause_of
+from armlink.link.guard import Crossed
+from armlink.termination import Presses, said
+from ends_bench import EXTRA_SPEED, FALLING, EndsBench
+
+ERRORS = {
+    "done": None,
+    "interrupted": KeyboardInterrupt(),
+    "exception": ZeroDivisionError(),
+    "exit": SystemExit(1),
+    "disk full": OSError(errno.ENOSPC, "No space left on device"),
+    "bad input": BadInput("a file"),
+    "refused": Refused("a check"),
+    "crossed": Crossed("elbow", 2, "lag", 0.0, 0.5),
+    "bus fault": BusFault("a drive"),
+    "stall": Stall("the job was silent"),
+    "host late": HostLate(0.2, 0.1),
+    "silence": Silence("elbow: no reading"),
+}
+CATCH_SPEED = 2.5
+"""Where the cycle itself stood still the drives have let go for 0.1 to 0.2 s before they can be caught [rad/s]."""
+every_family = pytest.mark.parametrize("name", FALLING)
+
+
+@pytest.mark.sample(5)
+@pytest.mark.parametrize(
+    ("name", "end"),
+    [(FALLING[(first + number) % 5], end) for first in range(5) for number, end in enumerate(ERRORS)],
+)
+def test_whatever_ends_the_job_the_arm_is_parked(name, end):
+    bench = EndsBench(name)
+    bench.leave(ERRORS[end])
+    assert not any(bench.powered)
+    assert bench.away() < 0.1
+    speed = np.minimum(bench.arm.link.park.speed, [joint.max_velocity for joint in bench.arm.link.joints])
+    assert (bench.peak < speed + EXTRA_SPEED).all(), bench.peak
+
+
+@every_family
+def test_a_command_that_the_gate_refuses_leaves_the_arm_held(name):
+    bench = EndsBench(name)
+    with pytest.raises(Refused, match="gate: ") as refused:
+        bench.float_torque(5.0)
+    assert bench.link.held
+    assert any(bench.powered)
+    for _ in range(500):
+        bench.link.keep()
+    assert np.abs(bench.sim.plant.velocity).max() < 0.05, "it holds as long as nobody decides"
+    bench.leave(refused.value)
+    assert not any(bench.powered)
+    assert bench.away() < 0.1
+    assert (bench.peak < 1.5 + EXTRA_SPEED).all(), bench.peak
+
+
+@every_family
+def test_one_drive_that_falls_silent_does_not_let_the_others_go(name):
+    bench = EndsBench(name)
+    bench.bus.inject("node.silent:wrist_3")
+    with pytest.raises(BusFault) as fault:
+        bench.hold(3.0)
+    bench.leave(fault.value)
+    others = np.arange(6) != 5
+    assert (bench.peak[others] < 3.0).all(), f"the wrist that hangs free strikes its stop: {bench.peak}"
+    assert np.abs(bench.sim.plant.position - bench.arm.link.park.pose)[others].max() < 0.25
+    assert not any(bench.powered)
+
+
+@every_family
+def test_a_drive_that_stops_by_itself_is_caught(name):
+    bench = EndsBench(name)
+    bench.bus.inject("drive.trip:shoulder")
+    with pytest.raises(BusFault) as fault:
+        bench.hold(3.0)
+    bench.leave(fault.value)
+    assert (bench.peak < CATCH_SPEED).all(), bench.peak
+    assert bench.away() < 0.1
+    assert not any(bench.powered)
+
+
+@every_family
+def test_a_host_that_stood_still_catches_the_arm(name):
+    bench = EndsBench(name)
+    bench.sim.advance(0.15)  # longer than link.deadline: every drive has let go
+    with pytest.raises(BusFault) as fault:
+        bench.hold(3.0)
+    bench.leave(fault.value)
+    assert (bench.peak < 2 * CATCH_SPEED).all(), bench.peak
+    assert bench.away() < 0.1
+
+
+def test_an_arm_without_a_pose_is_let_down_slowly(caplog):
+    path = bundled_arms()["six-damiao"]
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    del content["link"]["park"]
+    bench = EndsBench(parse_arm(content, path))
+    start = float(np.abs(bench.sim.gravity_torque(bench.sim.plant.position[None]))[0].max())
+    with caplog.at_level(logging.WARNING, "armlink"):
+        bench.leave(None)
+    assert re.search(r"letting the arm down, \d+ s at most: the arm file has no link\.park", caplog.text)
+    assert not any(bench.powered)
+    assert (bench.peak < 0.1 + EXTRA_SPEED).all(), bench.peak
+    left = np.abs(bench.sim.gravity_torque(bench.sim.plant.position[None]))[0].max()
+    assert left < 0.2 * start, "it hangs where it rests"
+    bench.sim.advance(2.0)
+    assert (bench.peak < 0.1 + EXTRA_SPEED).all(), "and does not fall further"
+
+
+def test_an_arm_that_is_blocked_on_its_way_is_let_down(caplog):
+    bench = EndsBench("six-damiao")
+    at = float(bench.sim.plant.position[1])
+    bench.sim.plant.model.jnt_range[1] = (at - 0.02, at + 0.02)  # something is in the way
+    bench.sim.plant.model.jnt_limited[1] = 1
+    with caplog.at_level(logging.WARNING, "armlink"):
+        bench.leave(None)
+    assert "does not follow" in caplog.text
+    assert (bench.peak < 0.4 + EXTRA_SPEED).all(), bench.peak
+    assert not any(bench.powered)
+
+
+def test_only_two_presses_within_two_seconds_let_the_arm_go(monkeypatch, caplog):
+    now = [0.0]
+    monkeypatch.setattr("armlink.termination.time.monotonic", lambda: now[0])
+    presses = Presses()
+    tell = said("arm", presses)
+    for now[0] in (0.0, 2.5, 5.0):
+        presses.press()
+        tell("parking, 12 s left")
+    assert "once more within 2 s lets the arm fall" in caplog.text
+    assert caplog.text.count("parking, 12 s left") == 1
+    assert not presses.dropped
+    now[0] = 6.5
+    presses.press()
+    bench = EndsBench("six-damiao")
+    with caplog.at_level(logging.WARNING, "armlink"):
+        bench.link.close(Cause.INTERRUPTED, said("arm", presses))
+    assert all(bench.powered), "told to stop, which damps until the drives miss their host"
+    bench.sim.advance(0.5)
+    assert not any(bench.powered)
+
+
+def test_a_link_that_holds_the_arm_takes_up_its_work_again():
+    bench = EndsBench("six-robstride")
+    with pytest.raises(Refused):
+        bench.float_torque(5.0)
+    with pytest.raises(BusFault, match="not enabled"):
+        bench.hold(0.1)
+    bench.link.recover()
+    bench.hold(1.0)
+    assert not bench.link.held
+    bench.leave(None)
+    assert (bench.peak < 1.5 + EXTRA_SPEED).all(), bench.peak
+
+
+def test_the_table_of_ends_is_the_page_s():
+    page = (Path(__file__).parents[3] / "docs" / "safety.md").read_text(encoding="utf-8")
+    for cause in Cause:
+        holds, falls = ENDS[cause]
+        row = rf"\| {re.escape(cause.value)} \| {re.escape(holds.value)} \| {re.escape(falls.value)} \|"
+        assert re.search(row, page), f"docs/safety.md has no row for: {cause.value}"
+    assert {cause_of(error) for error in ERRORS.values()} < set(Cause)

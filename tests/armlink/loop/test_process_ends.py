@@ -1,0 +1,178 @@
+"""Ends of a job between processes, in real time: a pendulum that its drive would let fall, held out by a job."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "drives"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "sim_bus" / "drives"))
+
+import serving
+
+from armlink.arm_file import Bus
+
+DRIVE = {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 40, "kd": 2.0}
+LINK = {"rate": 100, "deadline": 0.5, "park": {"pose": [0.0], "speed": 0.8}}
+OUT = 1.2
+"""Where the job holds the pendulum: most of its weight pulls [rad]."""
+FASTEST = 0.8 + 1.0
+"""Speed of parking, and what may come on top [rad/s]."""
+JOB = """
+import sys
+import numpy as np
+from armlink.arm_file import load_arm
+from armlink.link.park import straight
+from armlink.link.types import Command, Setpoints
+from armlink.loop.remote_link import RemoteLink
+from armlink.termination import terminate_as_interrupt
+with terminate_as_interrupt(), RemoteLink(load_arm(sys.argv[1]), sys.argv[2]) as link:
+    link.start()
+    link.enable()
+    for _ in link.play(Setpoints.follow(straight(link.position_sent, np.array([float(sys.argv[3])]), np.ones(1), 0.01))):
+        pass
+    print(link.pid, flush=True)
+    while True:
+        link.cycle(Command.hold(link.position_sent))
+"""
+
+
+class Pendulum:
+    """The served arm, its file, and the job that holds it."""
+
+    def __init__(self, served: serving.Served, path: Path, bus: str) -> None:
+        self.served, self.path, self.bus = served, path, bus
+        self.fastest = 0.0
+        self.job: subprocess.Popen[str] | None = None
+        plant, step = served.arm.plant, served.arm.plant.step
+
+        def watched(*args: object) -> None:
+            step(*args)  # type: ignore[arg-type]
+            self.fastest = max(self.fastest, abs(float(plant.velocity[0])))
+
+        plant.step = watched  # type: ignore[method-assign, assignment]
+
+    @property
+    def powered(self) -> bool:
+        return bool(self.served.drive.motor.powered)
+
+    def hold_out(self) -> int:
+        """Start the job; the process id of what makes its cycles."""
+        self.job = subprocess.Popen(
+            [sys.executable, "-c", JOB, str(self.path), self.bus, str(OUT)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert self.job.stdout is not None
+        loop = int(self.job.stdout.readline())
+        self.fastest = 0.0
+        return loop
+
+    def send(self, number: signal.Signals) -> None:
+        """To the job's whole process group, as a terminal does."""
+        assert self.job is not None
+        os.killpg(self.job.pid, number)
+
+    def require_parked(self) -> None:
+        assert serving.wait_for(lambda: not self.powered, 30.0), "it still has power"
+        assert abs(self.served.angle) < 0.1
+        assert self.fastest < FASTEST
+
+
+@pytest.fixture
+def pendulum(tmp_path: Path) -> Iterator[Pendulum]:
+    group = f"239.74.172.{os.getpid() % 200 + 1}"
+    bus = Bus(interface="udp_multicast", channel=group)
+    with serving.served(DRIVE, bus=bus, **LINK) as served:
+        content = served_content(group)
+        path = tmp_path / "pendulum.yaml"
+        path.write_text(yaml.safe_dump(content))
+        pendulum = Pendulum(served, path, f"udp_multicast:{group}")
+        try:
+            yield pendulum
+        finally:
+            if pendulum.job is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(pendulum.job.pid, signal.SIGKILL)
+                pendulum.job.communicate()
+
+
+def served_content(group: str) -> dict[str, object]:
+    """The arm file of what `serving.pendulum` makes."""
+    return {
+        "name": "pendulum",
+        "serial": "P-1",
+        "kinematics": {"gravity": [9.81, 0.0, 0.0], "joints": [{"name": "hinge", "lower": -2.0, "upper": 2.0}]},
+        "link": {
+            "bus": {"interface": "udp_multicast", "channel": group},
+            "joints": [{"name": "hinge", "drive": DRIVE, "rated_torque": 10.0, "max_torque": 20.0}],
+            **LINK,
+        },
+    }
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL])
+def test_a_signal_to_the_job_s_group_parks_the_arm(pendulum: Pendulum, number: signal.Signals) -> None:
+    pendulum.hold_out()
+    pendulum.send(number)
+    assert pendulum.job is not None
+    _, told = pendulum.job.communicate(timeout=60)
+    pendulum.require_parked()
+    assert number is signal.SIGKILL or "parking, " in told
+
+
+def test_a_job_that_is_stopped_holds_the_arm_and_parks_it_once_it_ends(pendulum: Pendulum) -> None:
+    pendulum.hold_out()
+    pendulum.send(signal.SIGSTOP)
+    time.sleep(2.0)
+    assert pendulum.powered
+    assert abs(pendulum.served.angle - OUT) < 0.1
+    assert pendulum.fastest < 1.0
+    pendulum.send(signal.SIGINT)
+    pendulum.send(signal.SIGCONT)
+    pendulum.require_parked()
+
+
+def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulum) -> None:
+    pendulum.hold_out()
+    pendulum.send(signal.SIGINT)
+    assert pendulum.job is not None
+    assert pendulum.job.stderr is not None
+    told = pendulum.job.stderr.readline()
+    assert "parking, " in told
+    assert "Ctrl-C" in told
+    pendulum.send(signal.SIGINT)
+    assert "Ctrl-C once more within 2 s lets the arm fall" in pendulum.job.stderr.readline()
+    assert pendulum.powered
+    pendulum.send(signal.SIGINT)
+    assert serving.wait_for(lambda: not pendulum.powered, 10.0)
+    pendulum.job.communicate(timeout=30)
+
+
+def test_a_daemon_that_is_stopped_parks_the_arm_first(pendulum: Pendulum, tmp_path: Path) -> None:
+    content = yaml.safe_load(pendulum.path.read_text())
+    pendulum.path.write_text(yaml.safe_dump(content))
+    pendulum.hold_out()
+    pendulum.send(signal.SIGKILL)
+    pendulum.require_parked()
+    pendulum.served.do(lambda: pendulum.served.arm.turn_by_hand(0, OUT))
+    command = [Path(sys.executable).parent / "armlink", "daemon", pendulum.path, "--state", tmp_path / "state"]
+    pendulum.fastest = 0.0
+    with subprocess.Popen(
+        [*command, "--store", tmp_path / "records.db"], stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as daemon:
+        assert serving.wait_for(lambda: pendulum.powered, 60.0)
+        time.sleep(1.0)
+        pendulum.fastest = 0.0
+        os.killpg(daemon.pid, signal.SIGTERM)
+        assert daemon.wait(60) == 0
+    pendulum.require_parked()
