@@ -19,7 +19,7 @@ EXTRA_SPEED = 1.0
 
 
 class EndsBench:
-    """An arm that is led to where gravity pulls most at its shoulder; `peak` is the largest speed of each joint since."""
+    """An arm led to where gravity pulls most at its shoulder; `peak` is the largest speed of each joint since."""
 
     def __init__(self, name: str | ArmFile) -> None:
         """Enabled, at full stretch, holding."""
@@ -47,7 +47,9 @@ class EndsBench:
     def stretched(self) -> np.ndarray:
         """A pose, 0.15 rad within the stops, whose gravity torque is large and within what the joints may make."""
         random = np.random.default_rng(3)
-        lower, upper = (np.array([getattr(each, key) for each in self.arm.kinematics.joints]) for key in ("lower", "upper"))
+        lower, upper = (
+            np.array([getattr(each, key) for each in self.arm.kinematics.joints]) for key in ("lower", "upper")
+        )
         poses = random.uniform(lower + 0.15, upper - 0.15, (4000, 6))
         loads = np.abs(self.sim.gravity_torque(poses))
         most = np.array([joint.max_torque for joint in self.arm.require_link().joints])

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from ends_bench import EXTRA_SPEED, FALLING, EndsBench
 
 from armlink.arm_file import bundled_arms, parse_arm
 from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence, Stall
 from armlink.link.ends import ENDS, Cause, cause_of
 from armlink.link.guard import Crossed
 from armlink.termination import Presses, said
-from ends_bench import EXTRA_SPEED, FALLING, EndsBench
 
 ERRORS = {
     "done": None,

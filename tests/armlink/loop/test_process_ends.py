@@ -14,6 +14,7 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "drives"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "sim_bus" / "drives"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "sim_bus"))
 
 import serving
 
@@ -36,7 +37,8 @@ from armlink.termination import terminate_as_interrupt
 with terminate_as_interrupt(), RemoteLink(load_arm(sys.argv[1]), sys.argv[2]) as link:
     link.start()
     link.enable()
-    for _ in link.play(Setpoints.follow(straight(link.position_sent, np.array([float(sys.argv[3])]), np.ones(1), 0.01))):
+    path = straight(link.position_sent, np.array([float(sys.argv[3])]), np.ones(1), 0.01)
+    for _ in link.play(Setpoints.follow(path)):
         pass
     print(link.pid, flush=True)
     while True:
@@ -147,8 +149,7 @@ def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulu
     pendulum.send(signal.SIGINT)
     assert pendulum.job is not None
     assert pendulum.job.stderr is not None
-    told = pendulum.job.stderr.readline()
-    assert "parking, " in told
+    told = next(line for line in pendulum.job.stderr if "parking, " in line)
     assert "Ctrl-C" in told
     pendulum.send(signal.SIGINT)
     assert "Ctrl-C once more within 2 s lets the arm fall" in pendulum.job.stderr.readline()
@@ -159,19 +160,13 @@ def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulu
 
 
 def test_a_daemon_that_is_stopped_parks_the_arm_first(pendulum: Pendulum, tmp_path: Path) -> None:
-    content = yaml.safe_load(pendulum.path.read_text())
-    pendulum.path.write_text(yaml.safe_dump(content))
-    pendulum.hold_out()
-    pendulum.send(signal.SIGKILL)
-    pendulum.require_parked()
     pendulum.served.do(lambda: pendulum.served.arm.turn_by_hand(0, OUT))
     command = [Path(sys.executable).parent / "armlink", "daemon", pendulum.path, "--state", tmp_path / "state"]
     pendulum.fastest = 0.0
     with subprocess.Popen(
         [*command, "--store", tmp_path / "records.db"], stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as daemon:
-        assert serving.wait_for(lambda: pendulum.powered, 60.0)
-        time.sleep(1.0)
+        assert serving.wait_for(lambda: pendulum.powered and (tmp_path / "state" / "api.sock").exists(), 60.0)
         pendulum.fastest = 0.0
         os.killpg(daemon.pid, signal.SIGTERM)
         assert daemon.wait(60) == 0
