@@ -47,14 +47,14 @@ def hold_afloat(
     with open_arm(arm_file, bus) as link:
         link.start()
         link.enable()
-        screen.print(f"{arm_file.name}: floating by {source}; Ctrl-C ends it, the joints hold then")
+        screen.print(f"{arm_file.name}: floating by {source}; Ctrl-C ends it")
         try:
             result = run_float(link, arm_file, beta, calibration, seconds=seconds or float("inf"))
         finally:  # Ctrl-C is its usual end
             with suppress(ArmlinkError):
                 lateness = link.stats.lateness
                 warn_late(arm_file, lateness)
-    screen.print(f"floated {result.seconds:.1f} s; the joints hold")
+    screen.print(f"floated {result.seconds:.1f} s")
     write_json(
         json_file,
         {
