@@ -76,7 +76,7 @@ class Presses:
             self.press()
 
 
-def said(name: str, presses: Presses) -> Callable[[str], None]:
+def said(name: str, presses: Presses, level: int = logging.WARNING) -> Callable[[str], None]:
     """What is told at the end of an arm, said once for each phase; raises Dropped where a person pressed twice.
 
     A text begins with its phase, up to a comma; an empty one only asks whether to go on.
@@ -89,6 +89,6 @@ def said(name: str, presses: Presses) -> Callable[[str], None]:
         phase = text.partition(",")[0]
         if phase and phase not in phases:
             phases.add(phase)
-            log.warning("%s: %s", name, text)
+            log.log(level, "%s: %s", name, text)
 
     return tell

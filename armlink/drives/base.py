@@ -97,9 +97,9 @@ class BasicDrives:
                 return BusFault(f"{self.where(joint)}: power is {power.value}, expected on")
         return None
 
-    def has_restarted(self) -> int | None:
+    def has_restarted(self, joint: int) -> bool:
         """See Drives: no drive tells."""
-        return None
+        return False
 
     def own_stop(self, joint: int) -> str:
         """See Drives."""

@@ -158,8 +158,8 @@ class Drives(Protocol):
         """
         ...
 
-    def has_restarted(self) -> int | None:
-        """A drive that has restarted since the set-up, so that its settings are lost; None if none has."""
+    def has_restarted(self, joint: int) -> bool:
+        """Whether a drive has restarted since the set-up, so that its settings are lost."""
         ...
 
     def own_stop(self, joint: int) -> str:

@@ -157,9 +157,8 @@ class Commander:
         self._seen_now = seen = self._seen(now, True)
         self._commanded = [POSITION] * self.n
         for group in loop.groups:
-            restarted = group.drives.has_restarted() is not None
             for drive, place in enumerate(group.places):
-                order = None if restarted else self._kept(group.drives, drive, place, seen[place], goal)
+                order = self._kept(group.drives, drive, place, seen[place], goal)
                 self.passed[place] = order or self._braked(place, seen[place])
         try:
             sample = self._keep_sending(now)
@@ -182,7 +181,8 @@ class Commander:
         """The order by which a joint is held; None where it cannot be."""
         limits, held, integral = self.limits[place], self.passed[place], self._integrals[place]
         power = drives.power(drive)
-        if power is Power.FAULT or not (is_fresh(seen.age, self.max_age) and math.isfinite(seen.position)):
+        answers = is_fresh(seen.age, self.max_age) and math.isfinite(seen.position)
+        if power is Power.FAULT or not answers or drives.has_restarted(drive):
             return None
         if power is Power.ON:
             self._caught.discard(place)
@@ -255,7 +255,8 @@ class Commander:
 
     def restarted(self) -> bool:
         """Whether some drive has restarted."""
-        return any(group.drives.has_restarted() is not None for group in self.loop.groups)
+        drives = ((group.drives, drive) for group in self.loop.groups for drive in range(len(group.places)))
+        return any(each.has_restarted(drive) for each, drive in drives)
 
     def _torque_told(self, since: list[float]) -> bool:
         """Whether each joint that has torque control has told its torque since it has power, from time `since` on."""

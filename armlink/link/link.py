@@ -119,7 +119,7 @@ class Link(Calibrations):
                 end(self, cause, tell)
             else:
                 with Presses() as presses:
-                    end(self, cause, said(self.arm.name, presses))
+                    end(self, cause, said(self.arm.name, presses, logging.INFO if self._lock_step else logging.WARNING))
         finally:
             self.bus.shutdown()
             if self._hold is not None:
@@ -238,10 +238,10 @@ class Link(Calibrations):
     def _alone(self) -> None:
         """Raise BusFault where another host was heard or a controller has restarted."""
         for group in self.groups:
-            joint = group.drives.has_restarted()
-            if joint is not None:
-                name = self.names[group.places[joint]]
-                raise BusFault(f"{name}: its controller has just restarted (boot-up message): start again")
+            for drive, place in enumerate(group.places):
+                if group.drives.has_restarted(drive):
+                    told = f"{self.names[place]}: its controller has just restarted (boot-up message): start again"
+                    raise BusFault(told)
         fault = bus_fault(self.names, self._loop.watch, 0)
         if fault:
             raise BusFault(fault)

@@ -319,9 +319,9 @@ class CanopenDrives:
             self._sound = (list(own), known.displays.copy(), known.statuses.copy())
         return fault
 
-    def has_restarted(self) -> int | None:
+    def has_restarted(self, joint: int) -> bool:
         """See Drives."""
-        return min(self.known.restarted, default=None)
+        return joint in self.known.restarted
 
     def own_stop(self, joint: int) -> str:
         """See Drives."""

@@ -107,7 +107,7 @@ def test_an_arm_without_a_pose_is_let_down_slowly(caplog):
     del content["link"]["park"]
     bench = EndsBench(parse_arm(content, path))
     start = float(np.abs(bench.sim.gravity_torque(bench.sim.plant.position[None]))[0].max())
-    with caplog.at_level(logging.WARNING, "armlink"):
+    with caplog.at_level(logging.INFO, "armlink"):
         bench.leave(None)
     assert re.search(r"letting the arm down, \d+ s at most: the arm file has no link\.park", caplog.text)
     assert not any(bench.powered)
@@ -123,7 +123,7 @@ def test_an_arm_that_is_blocked_on_its_way_is_let_down(caplog):
     at = float(bench.sim.plant.position[1])
     bench.sim.plant.model.jnt_range[1] = (at - 0.02, at + 0.02)  # something is in the way
     bench.sim.plant.model.jnt_limited[1] = 1
-    with caplog.at_level(logging.WARNING, "armlink"):
+    with caplog.at_level(logging.INFO, "armlink"):
         bench.leave(None)
     assert "does not follow" in caplog.text
     assert (bench.peak < 0.4 + EXTRA_SPEED).all(), bench.peak
@@ -144,7 +144,7 @@ def test_only_two_presses_within_two_seconds_let_the_arm_go(monkeypatch, caplog)
     now[0] = 6.5
     presses.press()
     bench = EndsBench("six-damiao")
-    with caplog.at_level(logging.WARNING, "armlink"):
+    with caplog.at_level(logging.INFO, "armlink"):
         bench.link.close(Cause.INTERRUPTED, said("arm", presses))
     assert all(bench.powered), "told to stop, which damps until the drives miss their host"
     bench.sim.advance(0.5)

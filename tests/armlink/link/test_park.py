@@ -60,7 +60,7 @@ def test_parking_stows_the_arm_and_takes_the_power(name):
 def test_a_joint_that_is_blocked_on_the_way_holds(caplog):
     arm = load_arm("six-damiao")
     sim = simulated(arm)
-    with caplog.at_level(logging.WARNING, "armlink"), Link(arm, LockStepBus(arm=sim)) as link:
+    with caplog.at_level(logging.INFO, "armlink"), Link(arm, LockStepBus(arm=sim)) as link:
         link.start()
         link.enable()
         away(arm, link, [0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
@@ -75,7 +75,7 @@ def test_a_joint_that_is_blocked_on_the_way_holds(caplog):
 
 def test_without_a_pose_the_arm_is_let_down_and_it_says_so(caplog):
     arm = without_park("six-robstride")
-    with caplog.at_level(logging.WARNING, "armlink"), Link(arm, LockStepBus(arm=simulated(arm))) as link:
+    with caplog.at_level(logging.INFO, "armlink"), Link(arm, LockStepBus(arm=simulated(arm))) as link:
         link.start()
         link.enable()
         with pytest.raises(BadInput, match=r"key link\.park is missing"):
