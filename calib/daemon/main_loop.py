@@ -152,6 +152,7 @@ class Daemon:
         if now - self._heard > SILENT_SECONDS:
             self._messages()  # what waits here is a sign of life too
         if now - self._heard > SILENT_SECONDS:
+            self.process.kill()
             self._restart("the bus loop's process hangs")
 
     def _messages(self) -> None:

@@ -134,6 +134,10 @@ class LoopProcess:
         self._process.join()
         self._give_up()
 
+    def kill(self) -> None:
+        """End a process that hangs: the drives' own deadlines decide. `close` comes after it."""
+        self._process.kill()
+
     def ask(self, call: Call) -> Answer:
         """Send a call and wait for its answer."""
         answer: Future[Answer] = Future()

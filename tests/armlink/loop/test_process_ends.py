@@ -20,8 +20,15 @@ import serving
 
 from armlink.arm_file import Bus
 
-DRIVE = {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 40, "kd": 2.0}
+DRIVES = {
+    "damiao": {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 40, "kd": 2.0},
+    "cubemars": {"family": "cubemars", "id": 2, "model": "AK80-9", "can_timeout": 10_000, "kp": 40, "kd": 2.0},
+    "robstride": {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 2.0},
+    "moteus": {"family": "moteus", "id": 4},
+    "odrive": {"family": "odrive", "node": 5},
+}
 LINK = {"rate": 100, "deadline": 0.5, "park": {"pose": [0.0], "speed": 0.8}}
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL)
 OUT = 1.2
 """Where the job holds the pendulum: most of its weight pulls [rad]."""
 FASTEST = 0.8 + 1.0
@@ -91,13 +98,13 @@ class Pendulum:
 
 
 @pytest.fixture
-def pendulum(tmp_path: Path) -> Iterator[Pendulum]:
-    group = f"239.74.172.{os.getpid() % 200 + 1}"
-    bus = Bus(interface="udp_multicast", channel=group)
-    with serving.served(DRIVE, bus=bus, **LINK) as served:
-        content = served_content(group)
+def pendulum(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Pendulum]:
+    """By default of a Damiao drive."""
+    group, family = f"239.74.172.{os.getpid() % 200 + 1}", getattr(request, "param", "damiao")
+    bus = Bus(interface="udp_multicast", channel=group, fd=family == "moteus")
+    with serving.served(DRIVES[family], fd=bus.fd, bus=bus, **LINK) as served:
         path = tmp_path / "pendulum.yaml"
-        path.write_text(yaml.safe_dump(content))
+        path.write_text(yaml.safe_dump(arm_file(family, bus)))
         pendulum = Pendulum(served, path, f"udp_multicast:{group}")
         try:
             yield pendulum
@@ -108,21 +115,26 @@ def pendulum(tmp_path: Path) -> Iterator[Pendulum]:
                 pendulum.job.communicate()
 
 
-def served_content(group: str) -> dict[str, object]:
+def arm_file(family: str, bus: Bus) -> dict[str, object]:
     """The arm file of what `serving.pendulum` makes."""
     return {
         "name": "pendulum",
         "serial": "P-1",
         "kinematics": {"gravity": [9.81, 0.0, 0.0], "joints": [{"name": "hinge", "lower": -2.0, "upper": 2.0}]},
         "link": {
-            "bus": {"interface": "udp_multicast", "channel": group},
-            "joints": [{"name": "hinge", "drive": DRIVE, "rated_torque": 10.0, "max_torque": 20.0}],
+            "bus": {"interface": "udp_multicast", "channel": bus.channel, "fd": bus.fd},
+            "joints": [{"name": "hinge", "drive": DRIVES[family], "rated_torque": 10.0, "max_torque": 20.0}],
             **LINK,
         },
     }
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL])
+@pytest.mark.sample(5)
+@pytest.mark.parametrize(
+    ("pendulum", "number"),
+    [(list(DRIVES)[(first + place) % 5], number) for first in range(5) for place, number in enumerate(SIGNALS)],
+    indirect=["pendulum"],
+)
 def test_a_signal_to_the_job_s_group_parks_the_arm(pendulum: Pendulum, number: signal.Signals) -> None:
     pendulum.hold_out()
     pendulum.send(number)
