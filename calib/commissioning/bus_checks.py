@@ -85,13 +85,35 @@ def _drives(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFindin
     groups = make_groups(arm_file, opened)
     kind = groups[0].family
     if len(groups) == 1 and kind.examine is not None:
-        for finding in kind.examine(arm_file, opened, bus):
-            yield SetupFinding(finding.level, finding.what, finding.where, finding.remedy)
+        found = [
+            SetupFinding(each.level, each.what, each.where, each.remedy) for each in kind.examine(arm_file, opened, bus)
+        ]
+        yield from found
+        if all(each.level != "error" for each in found):
+            yield from _places(Link(arm_file, opened))
         return
     link = Link(arm_file, opened)
+    good = True
     for each in link.scan():
         where = f"{link.names[each.joint]} ({each.address})"
         if not each.present:
             yield SetupFinding("error", f"no answer on {bus}", where, "check its power, wiring and id")
         elif each.mismatch:
             yield another_drive(each.mismatch, where)
+        good = good and each.present and not each.mismatch
+    if good:
+        yield from _places(link)
+
+
+def _places(link: Link) -> Iterator[SetupFinding]:
+    """Joints that cannot stand where their drives read them."""
+    positions = link.read_positions()
+    before = link.turns.misplaced(positions)
+    link.correct_turns()
+    after = {each.joint for each in link.turns.misplaced(link.read_positions())}
+    for each in before:
+        where = f"{each.name} ({link.section.joints[each.joint].settings.address})"
+        if each.joint in after:
+            yield SetupFinding("error", each.what, where, each.remedy)
+        else:
+            yield SetupFinding("hint", each.what, where, f"corrected at each start: {link.turns.note(each.joint)}")
