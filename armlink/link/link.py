@@ -182,10 +182,11 @@ class Link(Calibrations):
         }
         return [found[joint] for joint in range(self.n)]
 
-    def start(self) -> None:
+    def start(self, to_enable: bool = True) -> None:
         """Check the drives, set them up with the device's own limits, start them.
 
-        Raises Refused for another controller than the arm file states, BusFault, BadInput.
+        Raises Refused for another controller than the arm file states, and for a joint that cannot stand where it
+        reads, unless nothing is `to_enable`; BusFault, BadInput.
         """
         self._hold = self._hold or ArmHold(self.bus, self.addresses)
         missing = [
@@ -201,6 +202,8 @@ class Link(Calibrations):
             log.warning("%s: %s", self.arm.name, self._overloaded)
         self.require_alone()
         self._set_up()
+        if to_enable:
+            self.turns.require(self.set_up_positions)
         loop = self._loop
         loop.drain()
         self._alone()
@@ -240,7 +243,6 @@ class Link(Calibrations):
             own = [self.values.limits(place, wanted[place]) for place in group.places]
             found |= dict(zip(group.places, group.drives.set_up(self._ask(group), own), strict=True))
         self.setups = [found[joint] for joint in range(self.n)]
-        self.turns.require(self.set_up_positions)
         self.position_step = np.array([each.position_step for each in self.setups]) / self.values.gear
         self._limits, passed = wanted, []
         limits = [self._gate_limits(joint) for joint in range(self.n)]

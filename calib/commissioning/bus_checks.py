@@ -8,7 +8,10 @@ from armlink.bus.can_bus import CanBus
 from armlink.bus.open import open_link_bus, resolve_bus
 from armlink.errors import ArmlinkError
 from armlink.link.bus_load import HIGH_LOAD, bus_loads
+from armlink.link.gate_limits import joint_ranges
 from armlink.link.joints.groups import make_groups
+from armlink.link.joints.values import values_of
+from armlink.link.joints.whole_turns import WholeTurns
 from armlink.link.link import Link
 from calib.commissioning.finding import Level, SetupFinding
 
@@ -57,6 +60,24 @@ def _load(arm_file: ArmFile) -> Iterator[SetupFinding]:
         if load.share > HIGH_LOAD:
             level: Level = "error" if load.share > 1 else "warning"
             yield SetupFinding(level, load.what, f"{arm_file.path}: link.rate", load.remedy)
+
+
+def turn_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Joints of which nothing shows that their drive has lost a whole turn."""
+    link = arm_file.require_link()
+    try:
+        turns = WholeTurns(arm_file, values_of(arm_file, make_groups(arm_file)), joint_ranges(arm_file))
+    except ArmlinkError:  # told, with its remedy, by who needs the stops or the drives
+        return
+    found = [f"{link.joints[joint].name} ({turn:.3g} rad)" for joint, turn in turns.unnoticed()]
+    if found:
+        yield SetupFinding(
+            "hint",
+            f"a drive that wakes a whole turn of its output off may still read between the stops: {', '.join(found)}",
+            f"{arm_file.path}: link.joints",
+            "nothing here can tell it: such a joint needs an encoder that knows its turn, or a look at its position "
+            "before it moves",
+        )
 
 
 def _absent_interface(bus: Bus) -> SetupFinding | None:

@@ -55,18 +55,20 @@ class Misplacement:
         """What is wrong with the drive, and what to do."""
         if not self.turns:
             return (
-                "no whole turn of its drive explains it: zero, direction or gear is wrong, or the stops are; "
-                "correct them in the arm file"
+                "no whole turn of its drive explains it: zero, direction, gear, the stops or the scale of the reading "
+                "are wrong: correct the arm file (armlink check --scales hand judges the scale)"
             )
-        zeros = [f"zero: {self.zero_after(turns)} ({_in_words(turns)})" for turns in self.turns[:MOST_NAMED]]
+        zeros = [f"zero: {self.zero_after(turns)} ({_in_words(turns)})" for turns in self.turns]
         if len(self.turns) == 1:
             automatic = "" if self.automatic else ", or turns: auto"
             return (
                 f"its drive has lost count of whole turns: set {zeros[0]} in its drive{automatic}, or power it again "
                 "in the turn that it was set up in"
             )
-        more = len(self.turns) - len(zeros)
-        listed = " or ".join(zeros) + (f" or {more} more" if more > 0 else "")
+        listed = " or ".join(zeros)
+        if len(zeros) > MOST_NAMED:
+            ends = " to ".join(f"zero: {self.zero_after(turns)}" for turns in (min(self.turns), max(self.turns)))
+            listed = f"{zeros[0]} or another of {ends}, in steps of {TURN:.4f},"
         chosen = ": turns: auto cannot choose" if self.automatic else ""
         return f"several whole turns of its drive explain it{chosen}: find out which, and set {listed} in its drive"
 
@@ -125,6 +127,15 @@ class WholeTurns:
         most = math.floor((reading - self._lower[joint]) / (TURN / gear))
         lost = sorted(range(least, most + 1), key=lambda turns: (turns % gear != 0, abs(turns)))
         return tuple(int(direction) * turns for turns in lost)
+
+    def unnoticed(self) -> list[tuple[int, float]]:
+        """Joints whose range is so wide that a lost turn may leave the reading between the stops, and that turn [rad]."""
+        found = []
+        for joint, (lower, upper) in enumerate(self._stops):
+            turn = TURN / float(self._values.gear[joint])
+            if lower + turn <= self._upper[joint] or upper - turn >= self._lower[joint]:
+                found.append((joint, turn))
+        return found
 
     def require(self, positions: Sequence[float] | Array) -> None:
         """Raise Refused where a joint cannot stand where it reads, naming every one."""
