@@ -129,7 +129,7 @@ class WholeTurns:
         return tuple(int(direction) * turns for turns in lost)
 
     def unnoticed(self) -> list[tuple[int, float]]:
-        """Joints whose range is so wide that a lost turn may leave the reading between the stops, and that turn [rad]."""
+        """Joints whose range is so wide that a lost turn may leave the reading between the stops; that turn [rad]."""
         found = []
         for joint, (lower, upper) in enumerate(self._stops):
             turn = TURN / float(self._values.gear[joint])
