@@ -152,8 +152,8 @@ def test_a_joint_that_leans_on_its_stop_by_a_sensor_that_reads_too_much_is_not_r
         content, path = content_of(name)
         for end in ("lower", "upper"):
             start = [row[end] for row in content["kinematics"]["joints"]]
-            content["sim"] |= {"start": start, "sensors": {"position_gain": [1.02] * 6}}
-            content["sim"]["sensors"]["position_offset"] = [0.05 if end == "upper" else -0.05] * 6
+            content["sim"] |= {"start": start, "sensors": {"position_gain": [1 / 1.02] * 6}}
+            content["sim"]["sensors"]["position_offset"] = [-0.05 if end == "upper" else 0.05] * 6
             arm = parse_arm(copy.deepcopy(content), path)
             with Link(arm, LockStepBus(arm=SimulatedArm(arm, Truth.of(arm)))) as link:
                 link.start()
