@@ -148,7 +148,7 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
     emergencies = [f"{each['joint']}: {each['code']} {each['meaning']}" for each in answer["emergencies"][-5:]]
     if bus["dropped"]:
         line += f", {bus['dropped']} lost because this process read too slowly"
-    misplaced = [f"{each['joint']}: {each['misplaced']}" for each in answer["joints"] if "misplaced" in each]
+    misplaced = [f"{each['joint']}: {each['misplaced']}" for each in answer["joints"] if each["misplaced"]]
     return Group(table, line, *misplaced, *emergencies, *_cycle(answer.get("cycle")))
 
 

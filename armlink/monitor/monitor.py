@@ -115,7 +115,6 @@ class Monitor:
         group = next(group for group in self._groups if joint in group.places)
         misplaced = self._places.found.get(joint)
         return {
-            **({} if misplaced is None else {"misplaced": f"{misplaced.what}: {misplaced.remedy}"}),
             "joint": self.names[joint],
             "family": self._families[joint],
             "position": float(sample.position[joint]),
@@ -124,6 +123,7 @@ class Monitor:
             "motor_torque": float(sample.motor_torque[joint]),
             "state": None if status == NO_STATUS else group.family.state_name(status),
             "age": float(sample.age[joint]),
+            "misplaced": None if misplaced is None else f"{misplaced.what}: {misplaced.remedy}",
             **group.drives.details(group.places.index(joint), sends),
         }
 

@@ -56,7 +56,7 @@ class Misplacement:
         if not self.turns:
             return (
                 "no whole turn of its drive explains it: zero, direction, gear, the stops or the scale of the reading "
-                "are wrong: correct the arm file (armlink check --scales hand judges the scale)"
+                "are wrong: correct the arm file (check --scales hand judges the scale)"
             )
         zeros = [f"zero: {self.zero_after(turns)} ({_in_words(turns)})" for turns in self.turns]
         if len(self.turns) == 1:
