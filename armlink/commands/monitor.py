@@ -148,7 +148,8 @@ def _table(title: str, answer: dict[str, Any]) -> "Group":
     emergencies = [f"{each['joint']}: {each['code']} {each['meaning']}" for each in answer["emergencies"][-5:]]
     if bus["dropped"]:
         line += f", {bus['dropped']} lost because this process read too slowly"
-    return Group(table, line, *emergencies, *_cycle(answer.get("cycle")))
+    misplaced = [f"{each['joint']}: {each['misplaced']}" for each in answer["joints"] if each["misplaced"]]
+    return Group(table, line, *misplaced, *emergencies, *_cycle(answer.get("cycle")))
 
 
 def _cycle(cycle: dict[str, Any] | None) -> list[str]:

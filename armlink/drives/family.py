@@ -244,6 +244,15 @@ class TellsCurrent(Protocol):
 
 
 @runtime_checkable
+class TellsPosition(Protocol):
+    """Drives that tell where they stand without being set up."""
+
+    def positions(self, ask: Ask) -> list[float]:
+        """Position of every drive [rad], NaN of one that does not answer or whose scale is not known. Sets nothing."""
+        ...
+
+
+@runtime_checkable
 class Guarded(Protocol):
     """Drives whose command frames a guard of the bus can check by their bytes alone."""
 

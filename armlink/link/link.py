@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from types import TracebackType
@@ -15,7 +16,7 @@ from armlink.bus.adapters import as_bus
 from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.family import Guarded
+from armlink.drives.family import Guarded, TellsPosition
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup, law_torque
 from armlink.errors import BadInput, BusFault, HostLate, Silence
 from armlink.link.bus_load import overload
@@ -30,6 +31,7 @@ from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
 from armlink.link.joints.groups import Group, make_groups
 from armlink.link.joints.values import values_of
+from armlink.link.joints.whole_turns import WholeTurns, positions_before_power
 from armlink.link.park import falling, park, require_deadman
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.termination import Presses, said
@@ -71,10 +73,13 @@ class Link(Calibrations):
         self.n, self.rate, self.period = len(self.names), section.rate, 1.0 / section.rate
         self._lock_step = self.bus.clock is not None
         self.clock: Clock = clock or self.bus.clock or MonotonicClock()
-        self.windows = [target_window(*limits) for limits in joint_ranges(arm)]
+        stops = joint_ranges(arm)
+        self.windows = [target_window(*limits) for limits in stops]
         self.groups: tuple[Group, ...] = make_groups(arm, self.bus)
         """The drives by family and bus."""
         self.values = values_of(arm, self.groups)
+        self.turns = WholeTurns(arm, self.values, stops)
+        """Tells which joints cannot stand where they read, and corrects zeros."""
         self._loop = Loop(self.bus.open_port(), self.clock, self.groups, self.values, self.period, self._lock_step)
         self.commander = Commander(self._loop, self.clock, self.names, self.period, section.deadline, self._lock_step)
         self.ask = LinkAsk(self._loop, self.clock, self._pump)
@@ -194,11 +199,12 @@ class Link(Calibrations):
         }
         return [found[joint] for joint in range(self.n)]
 
-    def start(self) -> None:
+    def start(self, to_enable: bool = True) -> None:
         """Check the drives, set them up with the device's own limits, start them.
 
         The set-up takes their power: an arm that would fall is brought to its end first. Raises Refused for another
-        controller than the arm file states, BusFault, BadInput.
+        controller than the arm file states, and for a joint that cannot stand where it reads, unless nothing is
+        `to_enable`; BusFault, BadInput.
         """
         if self.falls:
             end(self, Cause.DONE, self._say)
@@ -216,6 +222,8 @@ class Link(Calibrations):
             log.warning("%s: %s", self.arm.name, self._overloaded)
         self.require_alone()
         self._set_up()
+        if to_enable:
+            self.turns.require(self.set_up_positions)
         loop = self._loop
         loop.drain()
         self._alone()
@@ -248,7 +256,8 @@ class Link(Calibrations):
 
     def _set_up(self) -> None:
         """Set every drive up; what the first cycle starts from."""
-        wanted = self._wanted_limits()
+        self.correct_turns()
+        wanted = self.wanted_limits()
         found: dict[int, Setup] = {}
         for group in self.groups:
             own = [self.values.limits(place, wanted[place]) for place in group.places]
@@ -262,7 +271,25 @@ class Link(Calibrations):
             passed.append(start_from(limit, torque, self.values.position_of(joint, setup.position)))
         self.commander.begin(limits, passed, [each.modes for each in self.setups])
 
-    def _wanted_limits(self) -> list[Limits]:
+    @property
+    def set_up_positions(self) -> Array:
+        """Position of each joint as its set-up found it (n,) [rad]."""
+        return self.values.position(np.array([each.position for each in self.setups]))
+
+    def read_positions(self) -> Array:
+        """Position of each joint as its drive tells it without being set up (n,) [rad]; NaN where it does not."""
+        raw = np.full(self.n, np.nan)
+        for group in self.groups:
+            if isinstance(group.drives, TellsPosition):
+                raw[list(group.places)] = group.drives.positions(self._ask(group))
+        return self.values.position(raw)
+
+    def correct_turns(self) -> None:
+        """Correct zeros by whole turns where the arm file has `turns: auto`, before limits are set in the drives."""
+        if self.turns.any_automatic and self.turns.correct(self.read_positions()):
+            self._loop.latest_position = [math.nan] * self.n  # by zeros of before
+
+    def wanted_limits(self) -> list[Limits]:
         """The arm file's limits of every joint."""
         pairs = zip(self.section.joints, self.windows, strict=True)
         return [drive_limits(row, window, self.period, self.section.deadline) for row, window in pairs]
@@ -273,7 +300,8 @@ class Link(Calibrations):
         Raises BusFault where a drive does not answer, BadInput for drives that no guard can check.
         """
         rules: dict[str, Any] = {"frames": {}, "stop": [], "restarts": {}}
-        wanted = self._wanted_limits()
+        self.correct_turns()
+        wanted = self.wanted_limits()
         for group in self.groups:
             name, family = self.names[group.places[0]], group.family.name
             if not isinstance(group.drives, Guarded):
@@ -309,6 +337,7 @@ class Link(Calibrations):
         require_deadman(self)
         self._forget()
         self.commander.settle()
+        self.turns.require(positions_before_power(self.commander, self.set_up_positions.tolist(), self._since))
         try:
             sample = self.commander.walk(Power.ON)
         except BusFault as fault:

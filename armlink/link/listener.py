@@ -26,6 +26,7 @@ from armlink.link.joints.calibrations import Calibrations
 from armlink.link.joints.foreign_host import Commands, ForeignHost
 from armlink.link.joints.groups import make_groups
 from armlink.link.joints.values import values_of
+from armlink.link.joints.whole_turns import PlaceWatch
 from armlink.link.types import Sample, Stats
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ class Listener(Calibrations):
         self.ask = LinkAsk(self._loop, self.clock, self._pump)
         self.calibrate_host(simulated=lock_step)
         self._host = ForeignHost(self.groups, self.values)
+        self._places = PlaceWatch(arm, self.values)
         self._ready: deque[tuple[Sample, Commands]] = deque()
         self._sent: Commands = ()
         self._sample: Sample | None = None
@@ -157,6 +159,7 @@ class Listener(Calibrations):
             self._since = now
         else:
             sample = self._loop.sample(self._sync)
+            sample.position = self._places.take(sample.position)
             sample.t = self._sync
             self._loop.stats.missed += sum([value != value for value in sample.position.tolist()])  # NaN
             self._loop.drop_readings()

@@ -18,6 +18,7 @@ from armlink.link.cyclic_exchange import Loop
 from armlink.link.joints.foreign_host import ForeignHost
 from armlink.link.joints.groups import make_groups
 from armlink.link.joints.values import values_of
+from armlink.link.joints.whole_turns import PlaceWatch
 from armlink.link.types import Sample
 from armlink.monitor.cycle_stats import CycleStats
 
@@ -54,6 +55,7 @@ class Monitor:
         self._loop = Loop(self._open_port(bus), self.clock, self._groups, values, self._period, lock_step)
         self._loop.on_unknown = self._count
         self._host = ForeignHost(self._groups, values)
+        self._places = PlaceWatch(arm, values, tell=lambda text: None)  # `describe` does
         self._syncs = 0
         if sync:
             silent = [group.family.name for group in self._groups if not group.drives.poll(first=False)]
@@ -88,6 +90,7 @@ class Monitor:
         """Listen for `seconds`; raises BusFault if the bus fails."""
         start, syncs, bits = self.clock.now(), self._syncs, self._loop.bits
         sample = self._send_syncs(seconds) if self._sync else self._loop.listen(seconds)
+        sample.position = self._places.take(sample.position)
         elapsed = self.clock.now() - start
         rate = (self._syncs - syncs) / elapsed
         return View(sample, rate, (self._loop.bits - bits) / (self.section.bus.bitrate * elapsed))
@@ -110,6 +113,7 @@ class Monitor:
         sends = math.isfinite(sample.position[joint])
         status = int(sample.status[joint])
         group = next(group for group in self._groups if joint in group.places)
+        misplaced = self._places.found.get(joint)
         return {
             "joint": self.names[joint],
             "family": self._families[joint],
@@ -119,6 +123,7 @@ class Monitor:
             "motor_torque": float(sample.motor_torque[joint]),
             "state": None if status == NO_STATUS else group.family.state_name(status),
             "age": float(sample.age[joint]),
+            "misplaced": None if misplaced is None else f"{misplaced.what}: {misplaced.remedy}",
             **group.drives.details(group.places.index(joint), sends),
         }
 

@@ -10,6 +10,7 @@ from armlink.link.cyclic_exchange import Loop
 from armlink.link.joints.foreign_host import ForeignHost
 from armlink.link.joints.groups import make_groups
 from armlink.link.joints.values import values_of
+from armlink.link.joints.whole_turns import PlaceWatch
 
 WAIT_SECONDS = 0.1
 Row = tuple[float, dict[str, Array]]
@@ -30,6 +31,8 @@ class Recorder:
         self._loop = Loop(bus.open_port(), self.clock, groups, values, 1.0 / section.rate, lock_step)
         self._loop.on_unknown = self._take
         self._host = ForeignHost(groups, values, forgets=True)
+        self.places = PlaceWatch(arm, values)
+        """Joints that cannot stand where they read."""
         self._start: float | None = None
         self._sync: float | None = None
         self._rows: list[Row] = []
@@ -49,6 +52,7 @@ class Recorder:
     def _complete(self, now: float) -> None:
         """A cycle that begins completes the row of the previous one."""
         sample = self._loop.sample(now)
+        sample.position = self.places.take(sample.position)
         self._loop.drop_readings()
         if self._sync is not None and self._start is not None:
             torque, position = self._host.decode(self._host.ended, sample)

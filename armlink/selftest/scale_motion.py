@@ -79,7 +79,7 @@ def by_hand(link: Link, tell: Tell, seconds: float) -> list[JointScales]:
 
     The link is open and not started. Raises BusFault.
     """
-    link.start()
+    link.start(to_enable=False)
     tracks, end, told = Tracks(link.values, link.n), link.clock.now() + seconds, -np.inf
     low, high = np.full(link.n, np.inf), np.full(link.n, -np.inf)
     while (now := link.clock.now()) < end:

@@ -13,13 +13,12 @@ from armlink.drives.orders import Power
 from armlink.drives.traits import Silence
 from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link.faults import bus_fault
-from armlink.link.gate_limits import drive_limits
 from armlink.link.joints.groups import traits_of
 from armlink.link.link import Link
 from armlink.link.park import falling, park, speeds, straight
 from armlink.link.types import Command, Sample, Tell
 
-CHECKS = ("set-up", "answers", "enables and holds", "silence", "park")
+CHECKS = ("set-up", "position", "answers", "enables and holds", "silence", "park")
 CYCLES = 50
 """Cycles without power, to see whether each is answered."""
 ANSWERED = 0.9
@@ -61,8 +60,8 @@ class SelfTest:
         link = self.link
         own = link.groups[0].family.self_test if len(link.groups) == 1 else None
         if own is not None:
-            pairs = zip(link.section.joints, link.windows, strict=True)
-            limits = [drive_limits(row, window, link.period, link.section.deadline) for row, window in pairs]
+            link.correct_turns()
+            limits = [link.values.limits(joint, limit) for joint, limit in enumerate(link.wanted_limits())]
             return own(link, link.groups[0].drives, limits, power, self.progress)
         reason = "not asked for"
         try:
@@ -118,11 +117,17 @@ class SelfTest:
             who = next((name for name in link.names if str(error).startswith(name)), link.names[0])
             self._add(who, "set-up", "failed", str(error))
             return False
+        except Refused as error:
+            if not link.setups or not self._places():
+                raise
+            self.progress(str(error))
+            return False
         for name, setup in zip(link.names, link.setups, strict=True):
             scales = ", ".join(f"{what} {value:.6g}" for what, value in setup.scales.items())
             self._add(name, "set-up", "passed", "; ".join((*setup.notes, scales)) or "read back")
             for lost in setup.lost:
                 self._add(name, f"lacks: {lost.partition(':')[0]}", "absent", lost)
+        self._places()
         self._calibrations()
         came = np.zeros(link.n, int)
         for _ in range(CYCLES):
@@ -131,6 +136,13 @@ class SelfTest:
             good = bool(came[joint] >= ANSWERED * CYCLES)
             self._add(name, "answers", "passed" if good else "failed", f"{came[joint]} of {CYCLES} cycles answered")
         return bool((came >= ANSWERED * CYCLES).all())
+
+    def _places(self) -> bool:
+        """Whether each joint can stand where it reads; returns whether one cannot."""
+        results = self.link.turns.results(self.link.set_up_positions)
+        for each in results:
+            self._add(each.joint, each.check, each.outcome, each.found)
+        return any(each.outcome == "failed" for each in results)
 
     def _calibrations(self) -> None:
         """Calibrations that the host keeps: which record is in force, or that there is none."""

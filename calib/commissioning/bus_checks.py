@@ -8,7 +8,10 @@ from armlink.bus.can_bus import CanBus
 from armlink.bus.open import open_link_bus, resolve_bus
 from armlink.errors import ArmlinkError
 from armlink.link.bus_load import HIGH_LOAD, bus_loads
+from armlink.link.gate_limits import joint_ranges
 from armlink.link.joints.groups import make_groups
+from armlink.link.joints.values import values_of
+from armlink.link.joints.whole_turns import WholeTurns
 from armlink.link.link import Link
 from calib.commissioning.finding import Level, SetupFinding
 
@@ -59,6 +62,24 @@ def _load(arm_file: ArmFile) -> Iterator[SetupFinding]:
             yield SetupFinding(level, load.what, f"{arm_file.path}: link.rate", load.remedy)
 
 
+def turn_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Joints of which nothing shows that their drive has lost a whole turn."""
+    link = arm_file.require_link()
+    try:
+        turns = WholeTurns(arm_file, values_of(arm_file, make_groups(arm_file)), joint_ranges(arm_file))
+    except ArmlinkError:  # told, with its remedy, by who needs the stops or the drives
+        return
+    found = [f"{link.joints[joint].name} ({turn:.3g} rad)" for joint, turn in turns.unnoticed()]
+    if found:
+        yield SetupFinding(
+            "hint",
+            f"a drive that wakes a whole turn of its output off may still read between the stops: {', '.join(found)}",
+            f"{arm_file.path}: link.joints",
+            "nothing here can tell it: such a joint needs an encoder that knows its turn, or a look at its position "
+            "before it moves",
+        )
+
+
 def _absent_interface(bus: Bus) -> SetupFinding | None:
     """A SocketCAN interface that is not there, or down, with the command that brings it up."""
     if bus.interface != "socketcan" or not INTERFACES.is_dir():
@@ -85,13 +106,35 @@ def _drives(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFindin
     groups = make_groups(arm_file, opened)
     kind = groups[0].family
     if len(groups) == 1 and kind.examine is not None:
-        for finding in kind.examine(arm_file, opened, bus):
-            yield SetupFinding(finding.level, finding.what, finding.where, finding.remedy)
+        found = [
+            SetupFinding(each.level, each.what, each.where, each.remedy) for each in kind.examine(arm_file, opened, bus)
+        ]
+        yield from found
+        if all(each.level != "error" for each in found):
+            yield from _places(Link(arm_file, opened))
         return
     link = Link(arm_file, opened)
+    good = True
     for each in link.scan():
         where = f"{link.names[each.joint]} ({each.address})"
         if not each.present:
             yield SetupFinding("error", f"no answer on {bus}", where, "check its power, wiring and id")
         elif each.mismatch:
             yield another_drive(each.mismatch, where)
+        good = good and each.present and not each.mismatch
+    if good:
+        yield from _places(link)
+
+
+def _places(link: Link) -> Iterator[SetupFinding]:
+    """Joints that cannot stand where their drives read them."""
+    positions = link.read_positions()
+    before = link.turns.misplaced(positions)
+    link.correct_turns()
+    after = {each.joint for each in link.turns.misplaced(link.read_positions())}
+    for each in before:
+        where = f"{each.name} ({link.section.joints[each.joint].settings.address})"
+        if each.joint in after:
+            yield SetupFinding("error", each.what, where, each.remedy)
+        else:
+            yield SetupFinding("hint", each.what, where, f"corrected at each start: {link.turns.note(each.joint)}")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from armlink.arm_file import ArmFile, BadKeys, bundled_arms, load_arm
 from armlink.errors import ArmlinkError
-from calib.commissioning.bus_checks import bus_findings
+from calib.commissioning.bus_checks import bus_findings, turn_findings
 from calib.commissioning.finding import ORDER, SetupFinding
 from calib.commissioning.model_checks import model_findings
 from calib.commissioning.motion_checks import motion_findings
@@ -43,8 +43,10 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
         yield SetupFinding(
             "error", "key link is missing: no bus and no joint controllers", arm, f"add the section link: {FORMATS}"
         )
-    elif not offline:
-        yield from bus_findings(arm_file, bus)
+    else:
+        yield from turn_findings(arm_file)
+        if not offline:
+            yield from bus_findings(arm_file, bus)
     yield from _assumed(arm, arm_file)
 
 

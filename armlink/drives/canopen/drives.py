@@ -25,7 +25,7 @@ from armlink.drives.canopen.units import assumed_units, read_units
 from armlink.drives.family import Ask
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
-from armlink.errors import BusFault
+from armlink.errors import ArmlinkError, BusFault
 from armlink.torque_calibration import Calibration
 
 SDO_RESPONSE_ID = 0x580
@@ -145,6 +145,19 @@ class CanopenDrives:
             serial = f"{told.vendor:x}:{told.product:x}:{told.revision:x}:{told.serial}"
             power = _POWERS.get(told.state, Power.UNKNOWN)
             found.append(DriveIdentity(joint, address, True, told.name, serial, power=power))
+        return found
+
+    def positions(self, ask: Ask) -> list[float]:
+        """See TellsPosition."""
+        found = []
+        for services, row in zip(self.services(ask), self.rows, strict=True):
+            try:
+                known = services.present()
+                found.append(
+                    services.read(objects.POSITION) * read_units(services, row).position if known else math.nan
+                )
+            except ArmlinkError:  # told, with its reason, by who checks the units
+                found.append(math.nan)
         return found
 
     # ---- set-up

@@ -99,6 +99,11 @@ class CubeMarsDrives(MitDrives):
             found.append(DriveIdentity(joint, settings.address, there, name, power=self.power(joint)))
         return found
 
+    def positions(self, ask: Ask) -> list[float]:
+        """See TellsPosition: asked as `identify` does."""
+        self.identify(ask)
+        return [known.position for known in self._known]
+
     def _exit(self, ask: Ask, joint: int) -> Reply | None:
         """Leave motor mode; the reply, None where there is none."""
         return ask((self._settings[joint].id, special(Special.DISABLE)), self._reply_of(joint))

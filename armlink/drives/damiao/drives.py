@@ -9,7 +9,7 @@ from armlink.bus.port import Frame
 from armlink.drives.damiao import frames
 from armlink.drives.damiao.frames import READ, WRITE, Register, State
 from armlink.drives.damiao.models import delivered
-from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_registers
+from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_position, read_registers
 from armlink.drives.family import Ask
 from armlink.drives.mit_drives import MitDrives, MitKnown
 from armlink.drives.mit_packing import Ranges, Special, feedback_in, special, unwrap
@@ -101,6 +101,10 @@ class DamiaoDrives(MitDrives):
                 )
             )
         return found
+
+    def positions(self, ask: Ask) -> list[float]:
+        """See TellsPosition: by the scales that each drive has at present."""
+        return [read_position(ask, self.names[joint], each) for joint, each in enumerate(self._settings)]
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
         """See Drives."""

@@ -72,13 +72,7 @@ def _set(ask: Ask, name: str, drive: int, register: Register, value: int, otherw
 
 
 def _result(ask: Ask, name: str, settings: DamiaoSettings, ranges: Ranges, known: dict[int, float]) -> Setup:
-    def state_of(can_id: int, data: bytes) -> frames.Reply | None:
-        if can_id != settings.reply or frames.register_answer(data, settings.id) is not None:
-            return None
-        reply = frames.unpack_reply(data, ranges)
-        return reply if reply is not None and reply.drive == settings.id & 0xF else None
-
-    reply = ask((frames.REGISTERS_ID, frames.refresh_request(settings.id)), state_of)
+    reply = _state(ask, settings, ranges)
     if reply is None:
         raise BusFault(f"{name}: {settings.address} answers registers, but sends no feedback")
     if reply.state == State.ENABLED:
@@ -92,6 +86,32 @@ def _result(ask: Ask, name: str, settings: DamiaoSettings, ranges: Ranges, known
         f"current limit {known[Register.OVER_CURRENT] * known[Register.LARGEST_CURRENT]:g} A",
     ]
     return mit_setup(reply.feedback.position, settings.kp, settings.kd, ranges, notes)
+
+
+def read_position(ask: Ask, name: str, settings: DamiaoSettings) -> float:
+    """Position of one drive by its own range [rad], NaN where it does not answer or has no usable range."""
+    values = read_registers(ask, settings.id, SCALES)
+    if None in values.values():
+        return math.nan
+    try:
+        reply = _state(
+            ask, settings, _ranges(name, {register: float(value or 0.0) for register, value in values.items()})
+        )
+    except BusFault:
+        return math.nan
+    return math.nan if reply is None else reply.feedback.position
+
+
+def _state(ask: Ask, settings: DamiaoSettings, ranges: Ranges) -> frames.Reply | None:
+    """Feedback that is asked for; None where none comes."""
+
+    def state_of(can_id: int, data: bytes) -> frames.Reply | None:
+        if can_id != settings.reply or frames.register_answer(data, settings.id) is not None:
+            return None
+        reply = frames.unpack_reply(data, ranges)
+        return reply if reply is not None and reply.drive == settings.id & 0xF else None
+
+    return ask((frames.REGISTERS_ID, frames.refresh_request(settings.id)), state_of)
 
 
 def _answer(drive: int, kind: int, register: int) -> Callable[[int, bytes], float | None]:

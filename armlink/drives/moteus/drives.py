@@ -125,6 +125,15 @@ class MoteusDrives(BasicDrives):
             )
         return found
 
+    def positions(self, ask: Ask) -> list[float]:
+        """See TellsPosition: only those of the output count."""
+        found = []
+        for joint in range(self.m):
+            values = self._ask(ask, joint, {}, (*QUERY, Register.HOME_STATE)) or {}
+            at_output = values.get(Register.HOME_STATE) == HOMED_AT_OUTPUT
+            found.append(values.get(Register.POSITION, math.nan) * TURN if at_output else math.nan)
+        return found
+
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
         """See Drives: stopped, and referenced to its output; torque and watchdog go with every command."""
         found = []

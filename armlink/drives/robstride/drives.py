@@ -12,8 +12,8 @@ from armlink.drives.mit_leash import damping, order_of, round_within
 from armlink.drives.mit_packing import MitCommand, Ranges, grid_of
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.robstride import frames
-from armlink.drives.robstride.frames import RANGES, Type, fault_names
-from armlink.drives.robstride.set_up import identify, prepare
+from armlink.drives.robstride.frames import RANGES, Parameter, Type, fault_names
+from armlink.drives.robstride.set_up import identify, prepare, read_parameter
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
 
@@ -92,6 +92,11 @@ class RobStrideDrives(BasicDrives):
                 )
             )
         return found
+
+    def positions(self, ask: Ask) -> list[float]:
+        """See TellsPosition."""
+        found = [read_parameter(ask, settings, Parameter.POSITION) for settings in self._settings]
+        return [math.nan if position is None else position for position in found]
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
         """See Drives."""

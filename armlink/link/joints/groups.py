@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -34,8 +35,17 @@ class Mounting:
     zero: Array
     """Drive's reading at joint position 0 [rad]."""
     gear: Array
-    plain: bool
-    """Whether every drive's output is the joint."""
+
+    @cached_property
+    def plain(self) -> bool:
+        """Whether every drive's output is the joint."""
+        return bool((self.direction == 1).all() and (self.zero == 0).all() and (self.gear == 1).all())
+
+    def with_zero(self, joint: int, zero: float) -> "Mounting":
+        """The same with another zero of one joint [rad]."""
+        zeros = self.zero.copy()
+        zeros[joint] = zero
+        return Mounting(self.direction, zeros, self.gear)
 
     @classmethod
     def of(cls, arm: ArmFile) -> "Mounting":
@@ -44,8 +54,7 @@ class Mounting:
         direction, zero, gear = (
             np.array([float(getattr(each, key)) for each in settings]) for key in ("direction", "zero", "gear")
         )
-        plain = bool((direction == 1).all() and (zero == 0).all() and (gear == 1).all())
-        return cls(direction, zero, gear, plain)
+        return cls(direction, zero, gear)
 
 
 def make_groups(arm: ArmFile, bus: CanBus | None = None) -> tuple[Group, ...]:

@@ -1,5 +1,6 @@
 """From values of drives to values of joints and back: direction, zero, gear, and calibration in the host."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -27,9 +28,9 @@ class JointValues:
         self.calibration = TorqueCalibration(np.ones(n), np.zeros(n))
         """In force in the host; 1 and 0 for joints without."""
         self._calibrated = False
-        self._signs, self._zeros, self._gears = (
-            each.tolist() for each in (mounting.direction, mounting.zero, mounting.gear)
-        )
+        self._signs: list[float] = mounting.direction.tolist()
+        self._zeros: list[float] = mounting.zero.tolist()
+        self._gears: list[float] = mounting.gear.tolist()
         self._corrections = [(1.0, 0.0)] * n
         """Gain and offset of each joint's command; 1 and 0 where the torque is not from current."""
 
@@ -104,6 +105,20 @@ class JointValues:
     def gear(self) -> Array:
         """(n,)."""
         return self._mounting.gear
+
+    @property
+    def direction(self) -> Array:
+        """1 or −1 (n,)."""
+        return self._mounting.direction
+
+    def zero_of(self, joint: int) -> float:
+        """Reading of one joint's drive at joint position 0 [rad], as it is in force."""
+        return self._zeros[joint]
+
+    def turn_zero(self, joint: int, turns: int) -> None:
+        """Change the zero of one joint's drive by whole turns of the drive's output."""
+        self._mounting = self._mounting.with_zero(joint, self._zeros[joint] + 2 * math.pi * turns)
+        self._zeros = self._mounting.zero.tolist()
 
     def gains(self, joint: int, gains: Gains | None) -> Gains | None:
         """Gains at the joint, of those at the output of its drive."""

@@ -23,9 +23,17 @@ from sim_bus.truth import Truth
 QUICK_STOP = 0x07
 
 
+RATING = {"rated_torque": 20.0, "max_torque": 20.0}
+DAMIAO = {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM8009", "kp": 50, "kd": 5.0}
+
+
 def two_joints(**joint):
-    row = {"rated_torque": 20.0, "max_torque": 20.0, **joint}
-    content = {
+    return parse_arm(content_of_two_joints(**joint), Path("pair.yaml"))
+
+
+def content_of_two_joints(**joint):
+    row = {**RATING, **joint}
+    return {
         "name": "pair",
         "kinematics": {
             "joints": [
@@ -42,7 +50,6 @@ def two_joints(**joint):
             "sensors": {"noise": [0.01, 0.01], "bits": 16},
         },
     }
-    return parse_arm(content, Path("pair.yaml"))
 
 
 @pytest.fixture
@@ -189,3 +196,27 @@ def test_an_arm_that_is_not_there_is_a_bus_fault(capsys):
     assert content
     assert run(["check", "sarcos", "--bus", "virtual:nobody", "--yes"]) == 3
     assert "no answer from joint_1" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("drive", [{"family": "canopen", "node": 12}, DAMIAO])
+@pytest.mark.parametrize("passive", [True, False])
+def test_a_drive_that_lost_a_turn_fails_without_power(tmp_path, capsys, drive, passive):
+    """The check of its position names the zero, and nothing that needs power is run."""
+    for name, zero in (("host", 0.0), ("lost", 0.0 if drive["family"] == "canopen" else 2 * np.pi)):
+        content = content_of_two_joints()
+        content["link"]["joints"][1] = {"name": "hinge_2", "drive": {**drive, "zero": zero}, **RATING}
+        if drive["family"] != "canopen":
+            content["link"]["joints"][0] = {"name": "hinge_1", "drive": {**drive, "id": 1, "reply": 0x11}, **RATING}
+        elif name == "lost":
+            content["sim"]["sensors"]["position_offset"] = [0.0, -2 * np.pi]
+        content["link"]["bus"] = {"interface": "armlink_sim", "channel": "lost.yaml"}
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    path = str(tmp_path / "host.yaml")
+    assert run(["check", path, "--json", "-", *(["--passive"] if passive else [])]) == 1
+    answer = json.loads(capsys.readouterr().out.partition("{")[2].join(["{", ""]))
+    checks = answer["checks"]
+    (failed,) = [each for each in checks if each["outcome"] == "failed"]
+    assert (failed["joint"], failed["check"]) == ("hinge_2", "position")
+    assert "set zero: 6.2832 (a whole turn more)" in failed["found"]
+    with_power = ("enables and holds", "quick stop", "silence")
+    assert {each["outcome"] for each in checks if each["check"] in with_power} == {"not run"}

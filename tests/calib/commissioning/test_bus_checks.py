@@ -22,6 +22,7 @@ def test_a_drive_that_is_silent_or_another_one_is_found(monkeypatch, present: bo
     monkeypatch.setattr(
         bus_checks, "Link", lambda arm, opened: SimpleNamespace(names=("joint_1",), scan=lambda: [drive])
     )
+    monkeypatch.setattr(bus_checks, "_places", lambda link: ())
     found = list(bus_checks._drives(None, None, "virtual:test"))
     assert [finding.what for finding in found] == said
     assert all(finding.level == "error" and "joint_1 (node 1)" in finding.where for finding in found)

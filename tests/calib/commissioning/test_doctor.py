@@ -170,3 +170,32 @@ def test_the_command_answers_with_findings_and_status(tmp_path, capsys):
     assert cli.run(["doctor", "sarocs", "--json", "-"]) == 1
     assert "did you mean sarcos?" in capsys.readouterr().out
     assert "sarcos" in bundled_arms()
+
+
+@pytest.mark.parametrize("turns", ["refuse", "auto"])
+def test_a_drive_that_lost_a_turn_is_named_with_the_zero_that_puts_it_right(tmp_path, turns):
+    lost = copy.deepcopy(PLANAR)
+    lost["kinematics"]["gravity"] = HORIZONTAL
+    lost["sim"]["sensors"] = {"position_offset": [0.0, -2 * math.pi]}
+    (tmp_path / "lost.yaml").write_text(yaml.safe_dump(lost))
+    elbow = {key: value for key, value in PLANAR["link"]["joints"][1].items() if key != "node"}
+    elbow["drive"] = {"family": "canopen", "node": 2, "turns": turns}
+    bus = {"interface": "armlink_sim", "channel": "lost.yaml"}
+    found = examine(written(tmp_path, (("link", "joints", 1), elbow), (("link", "bus"), bus)))
+    (named,) = [each for each in found if "beyond its stops" in each.what]
+    assert named.where == "elbow (node 2)"
+    if turns == "auto":
+        assert named.level == "hint"
+        assert "zero 6.2832 is used in place of 0, a whole turn more (turns: auto)" in named.remedy
+    else:
+        assert named.level == "error"
+        assert "set zero: 6.2832" in named.remedy
+
+
+def test_joints_of_which_no_reading_shows_a_lost_turn_are_listed(tmp_path):
+    (named,) = [each for each in examine("six-odrive", offline=True) if "wakes a whole turn" in each.what]
+    assert named.level == "hint"
+    assert "base (0.524 rad), shoulder (0.524 rad), elbow (0.628 rad)" in named.what
+    wide = written(tmp_path, (("kinematics", "joints", 0, "upper"), 4.4))
+    (named,) = [each for each in examine(wide, offline=True) if "wakes a whole turn" in each.what]
+    assert named.what.endswith("shoulder (6.28 rad)")

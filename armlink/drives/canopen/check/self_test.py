@@ -56,6 +56,7 @@ class SelfTest:
                 self._add(services.joint, "answers", "failed", f"no answer at node {services.node}")
             elif self._identity(services, row):
                 self._look_at(services, row)
+        self._places(missing)
         if all(each.outcome != "failed" for each in self.results):
             for node in self.drives.nmt_targets():
                 self.drives.send_nmt(link.ask, objects.NMT_PRE_OPERATIONAL, node)
@@ -63,6 +64,11 @@ class SelfTest:
                 self._settings(services, joint)
         self._with_power(power)
         return self.results
+
+    def _places(self, missing: Sequence[str]) -> None:
+        """Whether each joint can stand where it reads."""
+        if not missing:
+            self.results += self.link.turns.results(self.link.read_positions())
 
     def _look_at(self, services: NodeServices, row: LinkJoint) -> None:
         """Objects, modes and calibration of a device; of a stock one what it lacks, and what is lost by that."""
