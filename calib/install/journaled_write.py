@@ -9,12 +9,14 @@ step fails, every controller gets back what it held.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BusFault, Refused
 from armlink.link.types import Calibration
 from calib.install.plausibility import Admitted
+from calib.records.bounds import require_sound
 from calib.records.records import CalibrationRecord
 from calib.records.store import ControllerWrite, RecordStore
 
@@ -55,7 +57,7 @@ def install(
     """
     record, arm = admitted.record, admitted.arm
     recover(arm, store, controllers)
-    store.add(record.require(arm))
+    store.add(require_sound(record.require(arm), arm, datetime.now(UTC)))
     chosen = range(len(record.joints)) if joints is None else joints
     before = {j: controllers.read_calibration(j) for j in chosen}
     entries = [_entry(record.joints[j].name, j, before[j]) for j in chosen]

@@ -60,7 +60,7 @@ class Record(_Frozen):
     @property
     def id(self) -> str:
         """Eight hex digits of the content's SHA-256; as a number it fits 32 bits, as a controller keeps it."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:8]
+        return digest_id(self.model_dump_json())
 
     @property
     def number(self) -> int:
@@ -244,6 +244,11 @@ class GravityRecord(Record):
                 raise ValueError(f"{key}: {len(getattr(self, key))} values, expected {size} (two a joint)")
         _square(self.covariance, size, "twice the joints")
         return self
+
+
+def digest_id(body: str) -> str:
+    """Id of a record by its JSON, as it was stored."""
+    return hashlib.sha256(body.encode()).hexdigest()[:8]
 
 
 def provenance(arm: ArmFile, sources: dict[str, str] | None = None, created: datetime | None = None) -> dict[str, Any]:
