@@ -184,10 +184,15 @@ class RecordStore:
         return last
 
     def undo_write(self, line: ControllerWrite, arm: ArmFile, reason: str) -> None:
-        """Note that the controllers hold the calibrations from before that write again."""
+        """Note that the controllers hold the calibrations from before that write again.
+
+        A store that was exchanged for another since knows nothing of that write, and gets no line.
+        """
         with transaction(self._engine) as connection:
-            row = _write_row(line, arm, line.record, "undone", {"reason": reason})
-            connection.execute(WRITES.insert().values(row))
+            begun = sa.select(WRITES.c.record).where(WRITES.c.number == line.number)
+            if connection.execute(begun).scalar() == line.record:
+                row = _write_row(line, arm, line.record, "undone", {"reason": reason})
+                connection.execute(WRITES.insert().values(row))
 
     def unfinished_write(self, arm: ArmFile) -> ControllerWrite | None:
         """The write to this arm's controllers that was begun but not ended, as after a power loss; None if none is."""
