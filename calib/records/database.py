@@ -69,13 +69,15 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
 
     At its end it asks once more whether the file is still the store's: what is committed to another one is lost.
     """
-    _require_file(engine)
+    _file_of(engine)  # before SQLite would make an empty one
     try:
         with engine.execution_options(writing=True).begin() as connection:
             _require_same_file(engine, connection)
             _lock(connection)
             yield connection
             _require_same_file(engine, connection)
+    except _Replaced:
+        raise _replaced(engine) from None
     except sa.exc.IntegrityError:
         raise
     except sa.exc.SQLAlchemyError as error:
@@ -85,11 +87,13 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
 @contextmanager
 def reading(engine: sa.Engine) -> Iterator[sa.Connection]:
     """A connection that reads; raises StoreFault where the database fails, and the next one is opened anew."""
-    _require_file(engine)
+    _file_of(engine)  # before SQLite would make an empty one
     try:
         with engine.connect() as connection:
             _require_same_file(engine, connection)
             yield connection
+    except _Replaced:
+        raise _replaced(engine) from None
     except sa.exc.SQLAlchemyError as error:
         raise _fault(engine, "cannot be read", error) from None
 
@@ -97,7 +101,7 @@ def reading(engine: sa.Engine) -> Iterator[sa.Connection]:
 def _file_of(engine: sa.Engine) -> FileIdentity:
     """Device and inode of the file that has the store's name now; None for a store that is no file of its own.
 
-    Raises StoreFault where there is none: SQLite would make an empty one.
+    Raises StoreFault where there is none.
     """
     if not _is_file(engine):
         return None
@@ -117,25 +121,30 @@ def _is_file(engine: sa.Engine) -> bool:
     return engine.dialect.name == "sqlite" and name not in ("", ":memory:") and not name.startswith("file:")
 
 
-def _require_file(engine: sa.Engine) -> None:
-    """Raise StoreFault where the store's file is gone."""
-    _file_of(engine)
+class _Replaced(Exception):
+    """Another file has got the name of the one that a connection holds open."""
 
 
 def _require_same_file(engine: sa.Engine, connection: sa.Connection) -> None:
-    """Raise StoreFault where another file has got the name of the one that this connection holds open.
+    """Raise _Replaced where this connection holds another file than the one that has the store's name.
 
     A connection follows its file, not the name: what is written through it would be in a file that nobody opens again.
-    The file that has the name now is opened, and migrated, for the next call.
     """
-    if _file_of(engine) == connection.info.get(_FILE):
-        return
+    if _file_of(engine) != connection.info.get(_FILE):
+        raise _Replaced
+
+
+def _replaced(engine: sa.Engine) -> StoreFault:
+    """The refusal of what was under way; the file that has the name now is opened, and migrated, for the next call.
+
+    Called once the old file's transaction is over: its journal would be replayed into the new one.
+    """
     engine.dispose()
     try:
         _migrate(engine)
     except sa.exc.SQLAlchemyError as error:
-        raise _fault(engine, "was replaced by another file, which cannot be opened", error) from None
-    raise StoreFault(
+        return _fault(engine, "was replaced by another file, which cannot be opened", error)
+    return StoreFault(
         f"record store {engine.url.render_as_string(hide_password=True)}: was replaced by another file while it was in"
         " use: nothing was written; that one is used from now on"
     )

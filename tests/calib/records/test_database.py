@@ -273,7 +273,11 @@ def test_a_store_that_is_replaced_within_a_transaction_keeps_nothing_of_it(
     path = tmp_path / "records.db"
     store = RecordStore(str(path))
     copied(path, tmp_path / "backup.db")
-    monkeypatch.setattr(database, "_lock", lambda connection: (tmp_path / "backup.db").rename(path))
+
+    def replaced(connection: sa.Connection) -> None:
+        (tmp_path / "backup.db").rename(path)
+
+    monkeypatch.setattr(database, "_lock", replaced)
     with pytest.raises(StoreFault, match="was replaced"):
         store.add(calibration())
     assert store.history(ARM) == []
