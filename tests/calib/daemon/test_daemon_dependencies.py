@@ -365,7 +365,7 @@ def test_a_write_whose_outcome_the_journal_does_not_take_is_kept_later(tmp_path:
             raise BusFault("joint gone")
 
     daemon.on_write = written
-    daemon.view.decisions.approve(1, "ann")
+    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
     daemon.run(7)  # a look at the record store lies within
     daemon.service.journal._db = real
     assert daemon.view.proposals()[0].state == "approved"
@@ -393,7 +393,7 @@ def test_an_outcome_that_waited_for_a_journal_that_was_begun_anew_is_said_and_ho
         daemon.service.journal._db.execute("PRAGMA query_only=ON")
 
     daemon.on_write = written
-    daemon.view.decisions.approve(1, "ann")
+    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
     daemon.service.journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
     daemon.run(5)
     assert daemon.view.status().detail == ""
