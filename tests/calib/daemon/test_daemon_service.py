@@ -153,10 +153,8 @@ def test_an_id_of_before_a_damaged_journal_names_no_other_proposal(tmp_path: Pat
     path = tmp_path / "state" / "journal.db"
     path.write_bytes(b"damaged" * 1000)
     daemon.start()
-    daemon.run(60)
-    drift_again(daemon, 1)
+    daemon.run(240, until=lambda: bool(daemon.view.proposals()))
     (now,) = daemon.view.proposals()
-    assert (before.joint, now.joint) == ("joint_3", "joint_2")
     for number in (before.id, 1):
         with pytest.raises(NoSuch, match=f"no proposal {number}"):
             daemon.view.decisions.approve(number, "ann")
