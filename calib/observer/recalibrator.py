@@ -59,6 +59,7 @@ def recalibrated(
     return CalibrationRecord(
         **provenance(arm, record.sources),
         joints=tuple(joints),
+        drives=record.drives,
         covariance_of=record.covariance_of,
         covariance=matrix(_propagated(record, finding, installed.gain)),
         confirmed_by=by,

@@ -170,6 +170,9 @@ class CalibrationRecord(Record):
 
     kind: Literal["calibration"] = "calibration"
     joints: Annotated[tuple[JointCalibration, ...], Field(min_length=1)]
+    drives: Annotated[tuple[str, ...], Field(exclude_if=lambda value: not value)] = ()
+    """Serial numbers of the drives that it was measured on, joint by joint, empty for one that tells none; not written
+    in records made without them, so that these keep their id."""
     covariance_of: tuple[str, ...] = ()
     """Names of the rows and columns of `covariance`: "joint_1.gain", …; only parameters that were estimated."""
     covariance: Matrix = ()

@@ -43,7 +43,7 @@ class ControllerWrite:
     by: str
     stage: str
     body: dict[str, Any]
-    """begun: `before` (what each controller held), `reason`, `gates`; undone: `reason`."""
+    """begun: `before` (what each controller held), `reason`, `gates`, `drives`; undone: `reason`."""
 
 
 class RecordStore:
@@ -154,10 +154,21 @@ class RecordStore:
         return [self._record(*row) for row in found]
 
     def begin_write(
-        self, record_id: str, arm: ArmFile, by: str, before: Sequence[dict[str, Any]], *, reason: str, gates: str
+        self,
+        record_id: str,
+        arm: ArmFile,
+        by: str,
+        before: Sequence[dict[str, Any]],
+        *,
+        reason: str,
+        gates: str,
+        drives: Sequence[str] = (),
     ) -> ControllerWrite:
-        """Note what each controller holds, before any is written: from that an interrupted write is undone."""
-        body = {"before": list(before), "reason": reason, "gates": gates}
+        """Note what each controller holds, before any is written: from that an interrupted write is undone.
+
+        `drives`: serial numbers of the arm's drives, joint by joint; empty for one that tells none.
+        """
+        body = {"before": list(before), "reason": reason, "gates": gates, "drives": list(drives)}
         line = ControllerWrite(0, record_id, _now(), by, "begun", body)
         with transaction(self._engine) as connection:
             row = _write_row(line, arm, record_id, line.stage, line.body)
