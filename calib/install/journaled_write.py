@@ -1,10 +1,10 @@
 """The one door to the joint controllers: every write of a calibration goes through `install`.
 
-It must be the arm's own (`calib.install.own_arm`). In this order, so that a process killed at any moment leaves either the old record in force or the new one, and a
-journal of what the controllers held: the gates were passed (`Admitted`), the record is kept, the journal line is on
-disk, each controller's calibration is staged, read back bit for bit and made active, the check is made, flash is
-written if that was asked for, the record becomes current and the journal line ends, both in one transaction. If any
-step fails, every controller gets back what it held.
+The drives must be those of the record's arm (`calib.install.own_arm`). Then in this order, so that a process killed at
+any moment leaves either the old record in force or the new one, and a journal of what the controllers held: the gates
+were passed (`Admitted`), the record is kept, the journal line is on disk, each controller's calibration is staged, read
+back bit for bit and made active, the check is made, flash is written if that was asked for, the record becomes current
+and the journal line ends, both in one transaction. If any step fails, every controller gets back what it held.
 """
 
 from collections.abc import Callable, Mapping, Sequence
