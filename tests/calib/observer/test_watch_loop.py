@@ -54,6 +54,7 @@ def arm_file(gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)) -> ArmFile
     ]
     content = {
         "name": "three",
+        "serial": "3",
         "kinematics": {"gravity": list(gravity), "joints": joints},
         "link": {"joints": link},
         "sim": {"links": links, "effects": effects},
