@@ -227,6 +227,11 @@ class LinkSection(Section):
         return self
 
 
+def is_serial(text: str) -> bool:
+    """Whether a serial number is one, and not what stands in an arm file before anybody has given one."""
+    return text.strip().casefold() not in ("", "unknown", "fill-in")
+
+
 class ArmFile(Section):
     """A whole arm file. `sweep`, `sim`, `daemon` hold the models that packages registered in `armlink.sections`."""
 
@@ -258,6 +263,11 @@ class ArmFile(Section):
                     where = f"expected {joint.lower:g} to {joint.upper:g}"
                     raise ValueError(f"link.park.pose: {joint.name}: {position:g} rad, {where}")
         return self
+
+    @property
+    def has_serial(self) -> bool:
+        """Whether the file tells the arm from others of its name."""
+        return is_serial(self.serial)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

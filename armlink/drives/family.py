@@ -234,6 +234,15 @@ class KeepsCalibration(Protocol):
 
 
 @runtime_checkable
+class TellsSerialNumber(Protocol):
+    """Drives that can be asked for their serial number at any time, within cycles too."""
+
+    def serial_number(self, joint: int, ask: Ask) -> str:
+        """Vendor, product and serial number, which no other drive has; empty if this one has none. Raises BusFault."""
+        ...
+
+
+@runtime_checkable
 class TellsCurrent(Protocol):
     """Drives whose current can be asked for, where the arm file has its torque constant."""
 

@@ -14,6 +14,16 @@ from armlink.link.lateness import Lateness
 from armlink.torque_calibration import Calibration as Calibration
 
 
+@dataclass(frozen=True)
+class DriveSerial:
+    """What one drive is known by, whatever the arm file says."""
+
+    number: str = ""
+    """Vendor, product and serial number; empty for a drive that tells none, or keeps no calibration."""
+    simulated: bool = False
+    """It is simulated in this process, and ends with it."""
+
+
 @dataclass(eq=False)
 class Command:
     """One cycle's command for n joints; each joint uses the field that its mode needs, the other may be NaN."""

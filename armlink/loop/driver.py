@@ -6,7 +6,7 @@ from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.drives.orders import DriveIdentity
-from armlink.link.types import Calibration, Command, Controller, Sample, Samples, Setpoints, Stats, Tell
+from armlink.link.types import Calibration, Command, Controller, DriveSerial, Sample, Samples, Setpoints, Stats, Tell
 
 R = TypeVar("R")
 P = ParamSpec("P")
@@ -113,6 +113,10 @@ class ArmDriver(Protocol):
 
     def read_calibration(self, joint: int) -> Calibration:
         """The torque sensor record that joint 0 … n−1 works with; raises BusFault."""
+        ...
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        """What the drive of joint 0 … n−1 is known by; raises BusFault."""
         ...
 
     @property

@@ -19,7 +19,7 @@ from armlink.drives.orders import DriveIdentity
 from armlink.errors import BusFault
 from armlink.link.ends import Cause, cause_of
 from armlink.link.park import park
-from armlink.link.types import Calibration, Command, Controller, Sample, Samples, Setpoints, Stats, Tell
+from armlink.link.types import Calibration, Command, Controller, DriveSerial, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.ending import see_out
 from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, Told, unpack
@@ -160,6 +160,11 @@ class RemoteLink:
     def read_temperatures(self) -> Array:
         """As Link.read_temperatures."""
         found: Array = self._call("read_temperatures")
+        return found
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        """As Link.drive_serial."""
+        found: DriveSerial = self._call("drive_serial", joint)
         return found
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:

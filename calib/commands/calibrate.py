@@ -45,6 +45,7 @@ def calibrate(
     from calib.install.apply import Apply, apply_calibration
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore
+    from calib.sweep.dataset import drives_of
 
     data, arm_file = load_sweeps("calibrate", directories, arm)
     if all_creep(data):
@@ -52,10 +53,12 @@ def calibrate(
             raise BadInput("--apply: the host keeps the calibration of these drives: the record is in force without it")
         calibrate_creep(data, arm_file, store, json_file)
         return
+    drives = drives_of(data)
     fit = fit_sensors(arm_file, data)
     records = RecordStore(store)
     current = records.current(CalibrationRecord, arm_file)
-    record = fit.record(arm_file).model_copy(update={"parent": None if current is None else current.id})
+    parent = None if current is None else current.id
+    record = fit.record(arm_file).model_copy(update={"parent": parent, "drives": drives})
     felt = felt_mass(gcomp_arm(arm_file), fit.rows.readings)
     if felt is not None and felt.contradicts:
         records.add(record)

@@ -82,7 +82,7 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
 
     records = RecordStore(store)
     calibration = records.current(CalibrationRecord, arm_file)
-    kept = records.current(GravityRecord, arm_file) if record is None else records.get(record).require(arm_file)
+    kept = records.current(GravityRecord, arm_file) if record is None else records.usable(record, arm_file)
     if kept is None and arm_file.model_path is not None:
         return model_arm(arm_file).beta, calibration, f"the inertials of {arm_file.model_path.name}"
     if kept is None:

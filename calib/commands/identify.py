@@ -45,7 +45,7 @@ def identify(
         current = records.current(CalibrationRecord, arm_file)
         used = current if current is not None and current.sources == sensors.sources else None
     else:
-        kept = records.get(calibration)
+        kept = records.usable(calibration, arm_file)
         if not isinstance(kept, CalibrationRecord):
             raise BadInput(f"--calibration {calibration}: that is a {kept.kind} record, expected a calibration record")
         sensors = used = kept

@@ -52,7 +52,7 @@ def _apply(arm_file: "ArmFile", to: str, records: "RecordStore", how: "Apply", r
     from calib.install.apply import apply_rollback
     from calib.records.records import CalibrationRecord
 
-    record = records.get(to).require(arm_file)
+    record = records.usable(to, arm_file)
     if not isinstance(record, CalibrationRecord):
         raise BadInput(f"--apply: record {to} is a {record.kind} record; controllers hold calibrations only")
     if record != records.current(CalibrationRecord, arm_file):  # the current one may be written once more

@@ -78,7 +78,7 @@ def _model(
         model = model_arm(arm_file)
         return model.arm, model.beta, f"inertials of {arm_file.model_path.name}"
     records = RecordStore(store)
-    kept = records.current(GravityRecord, arm_file) if record is None else records.get(record).require(arm_file)
+    kept = records.current(GravityRecord, arm_file) if record is None else records.usable(record, arm_file)
     if kept is None:
         raise Refused(
             f"{arm_file.name} {arm_file.serial}: its description has no inertials, and there is no gravity record yet:"

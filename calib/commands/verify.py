@@ -76,7 +76,7 @@ def _records(store: Any, arm_file: Any, ids: list[str]) -> "tuple[GravityRecord,
     from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
 
-    named = [store.get(record).require(arm_file) for record in ids]
+    named = [store.usable(record, arm_file) for record in ids]
     gravity = next((each for each in named if isinstance(each, GravityRecord)), None)
     calibration = next((each for each in named if isinstance(each, CalibrationRecord)), None)
     gravity = gravity or store.current(GravityRecord, arm_file)

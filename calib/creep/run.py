@@ -49,7 +49,8 @@ def run_creep(
     the model shows beforehand that one would touch something, BusFault; every reading made is on disk.
     """
     installed = bridged(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
-    with DataWriter(out, Manifest.of(arm, reference_mass, installed), resume) as writer:
+    drives = bridged(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
+    with DataWriter(out, Manifest.of(arm, reference_mass, installed, drives), resume) as writer:
         data = load_data(out)
         mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))
         used = data.plan or plan or plan_creep(arm, seed=seed)

@@ -72,7 +72,7 @@ class Service:
         )
         self.storage = ObserverStorage(self.journal, environment)
         self.recalibrations = RecalibrationWorkflow(
-            self.configuration, store, self.arm_state, self.journal, self.events, self.jobs
+            self.configuration, store, self.arm_state, self.journal, self.events, self.jobs, monotonic
         )
         self.tours = PoseTours(self.configuration, self.events, environment, lambda: self.state)
         self.records = ActiveRecords(

@@ -27,6 +27,7 @@ def field_record(
     return CalibrationRecord(
         **provenance(arm, sources),
         joints=joints,
+        drives=() if before is None else before.drives,
         covariance_of=names,
         covariance=matrix(covariance) if names else (),
         parent=None if before is None else before.id,

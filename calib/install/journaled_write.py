@@ -1,20 +1,23 @@
 """The one door to the joint controllers: every write of a calibration goes through `install`.
 
-In this order, so that a process killed at any moment leaves either the old record in force or the new one, and a
-journal of what the controllers held: the gates were passed (`Admitted`), the record is kept, the journal line is on
-disk, each controller's calibration is staged, read back bit for bit and made active, the check is made, flash is
-written if that was asked for, the record becomes current and the journal line ends, both in one transaction. If any
-step fails, every controller gets back what it held.
+The drives must be those of the record's arm (`calib.install.own_arm`). Then in this order, so that a process killed at
+any moment leaves either the old record in force or the new one, and a journal of what the controllers held: the gates
+were passed (`Admitted`), the record is kept, the journal line is on disk, each controller's calibration is staged, read
+back bit for bit and made active, the check is made, flash is written if that was asked for, the record becomes current
+and the journal line ends, both in one transaction. If any step fails, every controller gets back what it held.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BusFault, Refused
-from armlink.link.types import Calibration
+from armlink.link.types import Calibration, DriveSerial
+from calib.install.own_arm import require_drives_of, require_own_arm
 from calib.install.plausibility import Admitted
+from calib.records.bounds import require_sound
 from calib.records.records import CalibrationRecord
 from calib.records.store import ControllerWrite, RecordStore
 
@@ -24,6 +27,10 @@ class Controllers(Protocol):
 
     def read_calibration(self, joint: int) -> Calibration:
         """The active calibration of joint j; raises BusFault."""
+        ...
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        """What the drive of joint j is known by; raises BusFault."""
         ...
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
@@ -50,16 +57,17 @@ def install(
 
     `joints` (default: all) are those that are written; a value that is not identifiable stays what the controller
     holds. `check` is None if the caller checks later, or does without. An earlier write that was cut off is undone
-    first. Raises Refused if the check fails, BusFault, BadInput; the controllers then hold what they held before, or,
-    if even that fails, the next `install` or `recover` puts it back.
+    first. Raises Refused if the arm on the bus may be another one or the check fails, BusFault, BadInput; the
+    controllers then hold what they held before, or, if even that fails, the next `install` or `recover` puts it back.
     """
     record, arm = admitted.record, admitted.arm
+    drives = require_own_arm(record, arm, store, _drives(controllers, record))
     recover(arm, store, controllers)
-    store.add(record.require(arm))
+    store.add(require_sound(record.require(arm), arm, datetime.now(UTC)))
     chosen = range(len(record.joints)) if joints is None else joints
     before = {j: controllers.read_calibration(j) for j in chosen}
     entries = [_entry(record.joints[j].name, j, before[j]) for j in chosen]
-    line = store.begin_write(record.id, arm, by, entries, reason=reason, gates=admitted.gates)
+    line = store.begin_write(record.id, arm, by, entries, reason=reason, gates=admitted.gates, drives=drives)
     stored = False
     try:
         _write(record, controllers, before)
@@ -82,13 +90,14 @@ def recover(arm: ArmFile, store: RecordStore, controllers: Controllers) -> Contr
     """Undo the last write to this arm's controllers if it was begun and never ended; returns it, None if all is well.
 
     A controller that holds what it held before, or what that write brought, gets the old calibration; one that was
-    given another one since is left as it is. Raises BusFault.
+    given another one since is left as it is. Raises Refused where it was begun on another arm, BusFault.
     """
     line = store.unfinished_write(arm)
     if line is None:
         return None
     record = store.get(line.record)
     assert isinstance(record, CalibrationRecord)
+    require_drives_of(line, arm, _drives(controllers, record))
     strangers = []
     for entry in line.body["before"]:
         held, old = controllers.read_calibration(int(entry["joint"])), _calibration(entry)
@@ -99,6 +108,10 @@ def recover(arm: ArmFile, store: RecordStore, controllers: Controllers) -> Contr
     left = f"; {', '.join(strangers)} held another calibration since, left as it is" if strangers else ""
     store.undo_write(line, arm, f"was cut off before it ended{left}")
     return line
+
+
+def _drives(controllers: Controllers, record: CalibrationRecord) -> list[DriveSerial]:
+    return [controllers.drive_serial(joint) for joint in range(len(record.joints))]
 
 
 def _write(

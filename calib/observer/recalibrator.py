@@ -59,6 +59,7 @@ def recalibrated(
     return CalibrationRecord(
         **provenance(arm, record.sources),
         joints=tuple(joints),
+        drives=record.drives,
         covariance_of=record.covariance_of,
         covariance=matrix(_propagated(record, finding, installed.gain)),
         confirmed_by=by,
@@ -124,6 +125,7 @@ class Recalibrator:
         """
         if new.parent != self.record.id:
             raise Refused(f"record {new.id} follows from {new.parent}, but {self.record.id} is current: superseded")
+        self._require_current()
         recover(self._arm, self._store, self._controllers)
         old = require_installed(self.record, self._controllers, j)
         admitted = admit_drift(new, self._reference, j, self._arm)
@@ -176,6 +178,16 @@ class Recalibrator:
         whole = len(joints) > 1
         name = parent.joints[j].name
         return Recalibration(name, parent, now.gain, now.offset, applied=True, undo=None if whole else undo)
+
+    def _require_current(self) -> None:
+        """Raise Refused where the store has another record current than the one that is followed: it was exchanged, or
+        somebody else has just made another one current."""
+        current = self._store.current(CalibrationRecord, self._arm)
+        if current is None or current.id != self.record.id:
+            now = "none" if current is None else current.id
+            raise Refused(
+                f"record {self.record.id} is not current in {self._store.url} any more ({now} is): superseded"
+            )
 
     def _install(
         self, admitted: Admitted, by: str, reason: str, joints: Sequence[int] | None = None

@@ -2,9 +2,8 @@
 
 import os
 import sqlite3
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,10 @@ _POSTGRESQL = {
 }
 """Of libpq: how long it waits for a connection, and how long the server may work [s, s, s, –, ms]."""
 _VERSION = "alembic_version"
+_FILE = "file"
+"""Key of a connection's notes: the identity of the file that it holds open."""
+FileIdentity = tuple[int, int] | None
+"""Device and inode; None for a database that is no file of its own."""
 _LOCK = 0x61726D6C
 """Advisory lock on PostgreSQL that serialises writers, as SQLite does by itself."""
 
@@ -62,11 +65,19 @@ def open_database(url: str) -> sa.Engine:
 
 @contextmanager
 def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
-    """One writing transaction: all of it is on disk when it returns, or nothing is. Raises StoreFault if it fails."""
+    """One writing transaction: all of it is on disk when it returns, or nothing is. Raises StoreFault if it fails.
+
+    At its end it asks once more whether the file is still the store's: what is committed to another one is lost.
+    """
+    _file_of(engine)  # before SQLite would make an empty one
     try:
         with engine.execution_options(writing=True).begin() as connection:
+            _require_same_file(engine, connection)
             _lock(connection)
             yield connection
+            _require_same_file(engine, connection)
+    except _Replaced:
+        raise _replaced(engine) from None
     except sa.exc.IntegrityError:
         raise
     except sa.exc.SQLAlchemyError as error:
@@ -76,11 +87,67 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
 @contextmanager
 def reading(engine: sa.Engine) -> Iterator[sa.Connection]:
     """A connection that reads; raises StoreFault where the database fails, and the next one is opened anew."""
+    _file_of(engine)  # before SQLite would make an empty one
     try:
         with engine.connect() as connection:
+            _require_same_file(engine, connection)
             yield connection
+    except _Replaced:
+        raise _replaced(engine) from None
     except sa.exc.SQLAlchemyError as error:
         raise _fault(engine, "cannot be read", error) from None
+
+
+def _file_of(engine: sa.Engine) -> FileIdentity:
+    """Device and inode of the file that has the store's name now; None for a store that is no file of its own.
+
+    Raises StoreFault where there is none.
+    """
+    if not _is_file(engine):
+        return None
+    try:
+        found = os.stat(str(engine.url.database))
+    except OSError as error:
+        engine.dispose()
+        raise StoreFault(
+            f"record store {engine.url.render_as_string(hide_password=True)}: its file is gone ({error.strerror}): put"
+            " it back"
+        ) from None
+    return found.st_dev, found.st_ino
+
+
+def _is_file(engine: sa.Engine) -> bool:
+    name = engine.url.database or ""
+    return engine.dialect.name == "sqlite" and name not in ("", ":memory:") and not name.startswith("file:")
+
+
+class _Replaced(Exception):
+    """Another file has got the name of the one that a connection holds open."""
+
+
+def _require_same_file(engine: sa.Engine, connection: sa.Connection) -> None:
+    """Raise _Replaced where this connection holds another file than the one that has the store's name.
+
+    A connection follows its file, not the name: what is written through it would be in a file that nobody opens again.
+    """
+    if _file_of(engine) != connection.info.get(_FILE):
+        raise _Replaced
+
+
+def _replaced(engine: sa.Engine) -> StoreFault:
+    """The refusal of what was under way; the file that has the name now is opened, and migrated, for the next call.
+
+    Called once the old file's transaction is over: its journal would be replayed into the new one.
+    """
+    engine.dispose()
+    try:
+        _migrate(engine)
+    except sa.exc.SQLAlchemyError as error:
+        return _fault(engine, "was replaced by another file, which cannot be opened", error)
+    return StoreFault(
+        f"record store {engine.url.render_as_string(hide_password=True)}: was replaced by another file while it was in"
+        " use: nothing was written; that one is used from now on"
+    )
 
 
 def _fault(engine: sa.Engine, what: str, error: sa.exc.SQLAlchemyError) -> StoreFault:
@@ -147,17 +214,18 @@ def _shown(url: str) -> str:
 
 
 def _prepare_sqlite(engine: sa.Engine) -> None:
-    """Write-ahead log, full synchronisation, transactions that take the write lock at their start."""
+    """Rollback journal, full synchronisation, transactions that take the write lock at their start."""
     if engine.url.database not in (None, "", ":memory:"):
         Path(str(engine.url.database)).parent.mkdir(parents=True, exist_ok=True)
 
     @sa.event.listens_for(engine, "connect")
-    def _on_connect(connection: Any, _: Any) -> None:
+    def _on_connect(connection: Any, pooled: Any) -> None:
         connection.isolation_level = None  # pysqlite would begin by itself, and too late
         connection.execute(f"PRAGMA busy_timeout={BUSY_SECONDS * 1000}")
-        _to_write_ahead_log(connection)
+        _to_one_file(connection)
         for pragma in ("synchronous=FULL", "foreign_keys=ON"):
             connection.execute(f"PRAGMA {pragma}")
+        pooled.info[_FILE] = _file_of(engine)
 
     @sa.event.listens_for(engine, "begin")
     def _on_begin(connection: sa.Connection) -> None:
@@ -165,17 +233,14 @@ def _prepare_sqlite(engine: sa.Engine) -> None:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
 
 
-def _to_write_ahead_log(connection: sqlite3.Connection) -> None:
-    """Switch the journal mode; if two processes do so at once, SQLite answers one "locked" without waiting."""
-    end = time.monotonic() + BUSY_SECONDS
-    while True:
-        try:
-            connection.execute("PRAGMA journal_mode=WAL")
-            return
-        except sqlite3.OperationalError as error:
-            if "locked" not in str(error) or time.monotonic() > end:
-                raise
-            time.sleep(0.01)
+def _to_one_file(connection: sqlite3.Connection) -> None:
+    """Keep everything in the store's own file between transactions, by a rollback journal.
+
+    A write-ahead log stays beside it: if another file gets the store's name, a copy put back say, SQLite would replay
+    the log of the file before into it. A store of an older armlink that is in use keeps its log until it is not.
+    """
+    with suppress(sqlite3.OperationalError):
+        connection.execute("PRAGMA journal_mode=DELETE")
 
 
 def first_line(error: BaseException) -> str:

@@ -60,7 +60,7 @@ class Record(_Frozen):
     @property
     def id(self) -> str:
         """Eight hex digits of the content's SHA-256; as a number it fits 32 bits, as a controller keeps it."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:8]
+        return digest_id(self.model_dump_json())
 
     @property
     def number(self) -> int:
@@ -170,6 +170,9 @@ class CalibrationRecord(Record):
 
     kind: Literal["calibration"] = "calibration"
     joints: Annotated[tuple[JointCalibration, ...], Field(min_length=1)]
+    drives: Annotated[tuple[str, ...], Field(exclude_if=lambda value: not value)] = ()
+    """Serial numbers of the drives that it was measured on, joint by joint, empty for one that tells none; not written
+    in records made without them, so that these keep their id."""
     covariance_of: tuple[str, ...] = ()
     """Names of the rows and columns of `covariance`: "joint_1.gain", …; only parameters that were estimated."""
     covariance: Matrix = ()
@@ -244,6 +247,11 @@ class GravityRecord(Record):
                 raise ValueError(f"{key}: {len(getattr(self, key))} values, expected {size} (two a joint)")
         _square(self.covariance, size, "twice the joints")
         return self
+
+
+def digest_id(body: str) -> str:
+    """Id of a record by its JSON, as it was stored."""
+    return hashlib.sha256(body.encode()).hexdigest()[:8]
 
 
 def provenance(arm: ArmFile, sources: dict[str, str] | None = None, created: datetime | None = None) -> dict[str, Any]:

@@ -12,8 +12,9 @@ import sqlalchemy as sa
 from armlink.arm_file import ArmFile, read_yaml
 from armlink.errors import BadInput, Refused
 from calib.records.atomic_file import write_whole
+from calib.records.bounds import require_sound
 from calib.records.database import StoreFault, default_url, first_line, open_database, reading, transaction
-from calib.records.records import CalibrationRecord, GravityRecord, Record, parse_record
+from calib.records.records import CalibrationRecord, GravityRecord, Record, digest_id, parse_record
 from calib.records.schema import ACTIVATIONS, RECORDS, WRITES
 
 R = TypeVar("R", CalibrationRecord, GravityRecord)
@@ -42,7 +43,7 @@ class ControllerWrite:
     by: str
     stage: str
     body: dict[str, Any]
-    """begun: `before` (what each controller held), `reason`, `gates`; undone: `reason`."""
+    """begun: `before` (what each controller held), `reason`, `gates`, `drives`; undone: `reason`."""
 
 
 class RecordStore:
@@ -75,22 +76,26 @@ class RecordStore:
             body = connection.execute(sa.select(RECORDS.c.body).where(RECORDS.c.id == record_id)).scalar()
         if body is None:
             raise Refused(f"no record {record_id} in {self.url}; the history of an arm lists its records")
-        return parse_record(self._parsed(body), f"record {record_id}")
+        return self._record(record_id, body)
+
+    def usable(self, record_id: str, arm: ArmFile) -> AnyRecord:
+        """The record of that id, to be used on this arm; raises Refused if it is of another, or of no working one."""
+        return require_sound(self.get(record_id).require(arm), arm)
 
     def activate(self, record_id: str, arm: ArmFile, by: str, reason: str) -> Activation:
-        """Make a kept record the current one of its kind; raises Refused if it is of another arm."""
-        record = self.get(record_id).require(arm)
+        """Make a kept record the current one of its kind; raises Refused if it is of another arm, or not sound."""
+        record = require_sound(self.get(record_id).require(arm), arm, datetime.now(UTC))
         with transaction(self._engine) as connection:
             return _activate(connection, record, arm, by, reason)
 
     def put(self, record: AnyRecord, arm: ArmFile, by: str, reason: str) -> str:
-        """Append a record and make it current; returns its id."""
+        """Append a record and make it current; returns its id. One that is not sound is kept, and Refused raised."""
         self.add(record.require(arm))
         return self.activate(record.id, arm, by, reason).record
 
     def former(self, arm: ArmFile, record_id: str) -> AnyRecord:
         """A record that was current before and is not now; raises Refused if there is none, or it is of another arm."""
-        record = self.get(record_id).require(arm)
+        record = self.usable(record_id, arm)
         log = [line.record for line in self.activations(arm) if line.kind == record.kind]
         if record_id not in log:
             raise Refused(f"record {record_id} was never current on {arm.name} {arm.serial}: nothing to go back to")
@@ -105,14 +110,21 @@ class RecordStore:
     def current(self, kind: type[R], arm: ArmFile) -> R | None:
         """The current record of a kind; None if there is none yet.
 
-        Raises Refused if it is of another description of this arm: a changed arm needs a new calibration.
+        Raises Refused if it is of another description of this arm (a changed arm needs a new calibration), or if a
+        number in it can be of no working arm.
         """
         found = self._current_id(kind.model_fields["kind"].default, arm)
         if found is None:
             return None
-        record = self.get(found).require(arm)
+        record = self.usable(found, arm)
         assert isinstance(record, kind)
         return record
+
+    def _record(self, record_id: str, body: str) -> AnyRecord:
+        """The record of a row; raises StoreFault where the row is not what was stored under its id."""
+        if digest_id(body) != record_id:
+            raise StoreFault(f"record store {self.url}: record {record_id} was changed: restore the store from a copy")
+        return parse_record(self._parsed(body), f"record {record_id}")
 
     def _parsed(self, body: str) -> Any:
         """The JSON of a row; raises StoreFault where it is damaged."""
@@ -139,13 +151,24 @@ class RecordStore:
         wanted = sa.select(rows.id, rows.body).where(rows.arm == arm.name, rows.serial == arm.serial)
         with reading(self._engine) as connection:
             found = connection.execute(wanted.order_by(rows.created, rows.id)).all()
-        return [parse_record(self._parsed(body), f"record {record_id}") for record_id, body in found]
+        return [self._record(*row) for row in found]
 
     def begin_write(
-        self, record_id: str, arm: ArmFile, by: str, before: Sequence[dict[str, Any]], *, reason: str, gates: str
+        self,
+        record_id: str,
+        arm: ArmFile,
+        by: str,
+        before: Sequence[dict[str, Any]],
+        *,
+        reason: str,
+        gates: str,
+        drives: Sequence[str] = (),
     ) -> ControllerWrite:
-        """Note what each controller holds, before any is written: from that an interrupted write is undone."""
-        body = {"before": list(before), "reason": reason, "gates": gates}
+        """Note what each controller holds, before any is written: from that an interrupted write is undone.
+
+        `drives`: serial numbers of the arm's drives, joint by joint; empty for one that tells none.
+        """
+        body = {"before": list(before), "reason": reason, "gates": gates, "drives": list(drives)}
         line = ControllerWrite(0, record_id, _now(), by, "begun", body)
         with transaction(self._engine) as connection:
             row = _write_row(line, arm, record_id, line.stage, line.body)
@@ -172,10 +195,15 @@ class RecordStore:
         return last
 
     def undo_write(self, line: ControllerWrite, arm: ArmFile, reason: str) -> None:
-        """Note that the controllers hold the calibrations from before that write again."""
+        """Note that the controllers hold the calibrations from before that write again.
+
+        A store that was exchanged for another since knows nothing of that write, and gets no line.
+        """
         with transaction(self._engine) as connection:
-            row = _write_row(line, arm, line.record, "undone", {"reason": reason})
-            connection.execute(WRITES.insert().values(row))
+            begun = sa.select(WRITES.c.record).where(WRITES.c.number == line.number)
+            if connection.execute(begun).scalar() == line.record:
+                row = _write_row(line, arm, line.record, "undone", {"reason": reason})
+                connection.execute(WRITES.insert().values(row))
 
     def unfinished_write(self, arm: ArmFile) -> ControllerWrite | None:
         """The write to this arm's controllers that was begun but not ended, as after a power loss; None if none is."""
@@ -193,9 +221,9 @@ class RecordStore:
     def import_yaml(self, path: Path, arm: ArmFile) -> str:
         """Append the record of a YAML file (as `Record.to_yaml` wrote it), not making it current; returns its id.
 
-        Raises BadInput if the file is no record or was changed, Refused if it is of another arm.
+        Raises BadInput if the file is no record or was changed, Refused if it is of another arm or not sound.
         """
-        return self.add(load_yaml(path).require(arm))
+        return self.add(require_sound(load_yaml(path).require(arm), arm, datetime.now(UTC)))
 
 
 def load_yaml(path: Path) -> AnyRecord:

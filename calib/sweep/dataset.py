@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from armlink.arm_file import ArmFile, load_arm
+from armlink.arm_file import ArmFile, is_serial, load_arm
 from armlink.errors import BadInput, Refused
 from armlink.key_errors import describe
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
@@ -49,12 +49,18 @@ class Manifest(_Model):
     """Torque gains that the controllers applied while it was taken: readings are (v − offset) / gain."""
     installed_offset: tuple[float, ...]
     """[N·m]"""
+    drives: Annotated[tuple[str, ...], Field(exclude_if=lambda value: not value)] = ()
+    """Serial numbers of the drives, joint by joint, empty for one that tells none; () if none does."""
     created: AwareDatetime
     software: str
 
     @classmethod
     def of(
-        cls, arm_file: ArmFile, reference_mass: float, installed: Sequence[TorqueCalibration[float]] | None = None
+        cls,
+        arm_file: ArmFile,
+        reference_mass: float,
+        installed: Sequence[TorqueCalibration[float]] | None = None,
+        drives: Sequence[str] = (),
     ) -> Self:
         """The manifest of a new data set of this arm; `installed` is what the controllers hold, by default nothing."""
         pairs = installed or [UNCALIBRATED] * len(arm_file.joint_names)
@@ -68,6 +74,7 @@ class Manifest(_Model):
             rated_torque=tuple(arm_file.require_link().rated_torques.tolist()),
             installed_gain=tuple(each.gain for each in pairs),
             installed_offset=tuple(each.offset for each in pairs),
+            drives=tuple(drives) if any(drives) else (),
             created=datetime.now(UTC).replace(microsecond=0),
             software=f"armlink {version('armlink')}",
         )
@@ -108,6 +115,17 @@ _LINE: TypeAdapter[Line] = TypeAdapter(
 )
 
 
+def drives_of(data: Sequence["SweepData"]) -> tuple[str, ...]:
+    """Serial numbers of the drives that data sets were taken on; raises Refused where they are of two arms."""
+    told = [each for each in data if each.manifest.drives]
+    for each in told[1:]:
+        if not {*each.manifest.drives} & {*told[0].manifest.drives} - {""}:
+            raise Refused(
+                f"{told[0].path} and {each.path}: no drive of one is a drive of the other: they are of two arms"
+            )
+    return told[-1].manifest.drives if told else ()
+
+
 def encoded(line: Line) -> bytes:
     """A line of a data set as in the file."""
     return _LINE.dump_json(line) + b"\n"
@@ -140,10 +158,15 @@ class SweepData:
         return tuple(reading for reading in self.readings if not reading.settled)
 
     def require(self, arm_file: ArmFile) -> Self:
-        """This data set; raises Refused, naming the difference, if it is of another arm."""
+        """This data set; raises Refused, naming the difference, if it is of another arm.
+
+        One that was taken before the arm's file had a serial number is of the arm that has one now; its drives tell
+        whether that is so when it is written.
+        """
+        named = is_serial(self.manifest.serial)
         differing = {
             "arm": (self.manifest.arm, arm_file.name),
-            "serial": (self.manifest.serial, arm_file.serial),
+            "serial": (self.manifest.serial if named else arm_file.serial, arm_file.serial),
             "description": (self.manifest.description_hash[:12], arm_file.description_hash[:12]),
         }
         for what, (ours, wanted) in differing.items():

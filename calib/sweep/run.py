@@ -47,7 +47,8 @@ def run_sweep(
     Raises BadInput, Refused if the arm cannot be swept, BusFault; every reading made is on disk.
     """
     installed = bridged(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
-    manifest = Manifest.of(arm, reference_mass, installed)
+    drives = bridged(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
+    manifest = Manifest.of(arm, reference_mass, installed, drives)
     with DataWriter(out, manifest, resume) as writer:
         data = load_data(out)
         mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))

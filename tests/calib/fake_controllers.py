@@ -8,7 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile, parse_arm
 from armlink.errors import BusFault
-from armlink.link.types import Calibration
+from armlink.link.types import Calibration, DriveSerial
 from calib.records.records import CalibrationRecord, JointCalibration, matrix, provenance
 
 NAMES = ("shoulder", "elbow")
@@ -52,6 +52,10 @@ class Controllers:
     def __init__(self, gain: float = 1.1, offset: float = -0.4) -> None:
         self.held = [as_real32(Calibration(gain, offset)) for _ in NAMES]
         self.broken = False
+        self.drives = ["1:1:a", "1:1:b"]
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        return DriveSerial(self.drives[joint])
 
     def read_calibration(self, joint: int) -> Calibration:
         return self.held[joint]

@@ -11,7 +11,7 @@ from fast_arm import PERIOD, FastArm
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BusFault
-from armlink.link.types import Calibration, Stats
+from armlink.link.types import Calibration, DriveSerial, Stats
 from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
 from calib.daemon.loop.loop_messages import Batch, Progress, Up
@@ -51,6 +51,7 @@ class FastDaemon:
         self.store = RecordStore(store or str(directory / "records.db"))
         self.controllers, self.port = self, self
         self.ids, self.dates = [0] * self.fast.n, [0] * self.fast.n
+        self.drives = [f"1:1:{k}" for k in range(self.fast.n)]
         self.sdo: list[str] = []
         self.run_aside = run_now
         self.on_write: Callable[[int], None] = lambda joint: None
@@ -93,6 +94,9 @@ class FastDaemon:
         return START + timedelta(seconds=self.fast.t) + self.wall_shift
 
     # ---- what the service asks of the bus loop
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        return DriveSerial(self.drives[joint])
 
     def read_calibration(self, joint: int) -> Calibration:
         self.sdo.append(f"read {joint}")

@@ -28,7 +28,7 @@ from fake_controllers import ARM, NAMES
 from postgres import server
 
 from armlink.errors import BadInput
-from armlink.link.types import Calibration
+from armlink.link.types import Calibration, DriveSerial
 from armlink.torque_calibration import UNCALIBRATED
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import admit_rollback
@@ -63,6 +63,10 @@ class Memory:
         self._path = path
         if not path.exists():
             self._save([{"active": dict(EMPTY), "staged": dict(EMPTY)} for _ in NAMES])
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        """Of the drive."""
+        return DriveSerial(f"1:1:{joint}")
 
     def read_calibration(self, joint: int) -> Calibration:
         """The active pair."""

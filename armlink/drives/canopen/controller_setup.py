@@ -94,6 +94,14 @@ def identify(services: NodeServices) -> Identity:
     )
 
 
+def serial_number(services: NodeServices) -> str:
+    """Vendor, product and serial number (1018h) in hex; empty for a device without a serial number of its own."""
+    if not services.has(objects.SERIAL):
+        return ""
+    vendor, product, serial = (int(services.read(entry)) for entry in (objects.VENDOR, objects.PRODUCT, objects.SERIAL))
+    return f"{vendor:x}:{product:x}:{serial:x}" if serial else ""
+
+
 IDENTITY_OBJECTS = {
     "vendor": objects.VENDOR,
     "product": objects.PRODUCT,

@@ -356,6 +356,10 @@ class CanopenDrives:
         """See Drives."""
         return device.read_temperature(self.services(ask)[joint])
 
+    def serial_number(self, joint: int, ask: Ask) -> str:
+        """See TellsSerialNumber."""
+        return device.serial_number(self.services(ask)[joint])
+
     # ---- calibration in the controller
 
     def read_calibration(self, joint: int, ask: Ask) -> Calibration:

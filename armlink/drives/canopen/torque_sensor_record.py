@@ -50,6 +50,9 @@ def write_record(services: NodeServices, calibration: Calibration, store: bool =
         raise BadInput(f"{services.joint}: gain {gain} for the controller: expected {GAIN_RANGE[0]} to {GAIN_RANGE[1]}")
     if not abs(offset) < 1e4:
         raise BadInput(f"{services.joint}: offset {offset} N·m for the controller: expected a finite number")
+    for what, number in (("record id", record_id), ("date", date)):
+        if not 0 <= number < 2**32:
+            raise BadInput(f"{services.joint}: {what} {number} for the controller: expected 0 to {2**32 - 1}")
     require_record(services)
     crc = calibration_crc(gain, offset, record_id, date)
     services.write_checked(objects.STAGED_GAIN, gain)

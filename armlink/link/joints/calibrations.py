@@ -12,11 +12,12 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.contributed import contributed
-from armlink.drives.family import KeepsCalibration
+from armlink.drives.family import KeepsCalibration, TellsSerialNumber
 from armlink.errors import BadInput
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.groups import Group, traits_of
 from armlink.link.joints.values import JointValues
+from armlink.link.types import DriveSerial
 from armlink.torque_calibration import GAIN_RANGE, Calibration, per_joint
 
 BLANK = Calibration(1.0, 0.0)
@@ -43,12 +44,14 @@ class Calibrations:
     values: JointValues
     ask: LinkAsk
     _in_host: dict[int, Calibration]
+    _simulated: bool
 
     def calibrate_host(self, simulated: bool) -> None:
         """Put the host's calibrations into force; of an arm that is simulated in this process, and new, there are none.
 
         Raises Refused where the record in force is of another arm.
         """
+        self._simulated = simulated
         traits = traits_of(self.groups, self.n)
         hosted = [joint for joint in range(self.n) if traits[joint].calibration == "host"]
         found = calibrations_by_record(self.arm) if hosted and not simulated else [None] * self.n
@@ -96,6 +99,13 @@ class Calibrations:
         group, drive = self._drive(joint)
         assert isinstance(group.drives, KeepsCalibration)
         return group.drives.read_calibration(drive, self._ask(group))
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        """What the drive of joint 0 … n−1 is known by, if it keeps its calibration itself; raises BusFault."""
+        group, drive = self._drive(joint)
+        if joint in self._in_host or not isinstance(group.drives, TellsSerialNumber):
+            return DriveSerial(simulated=self._simulated)
+        return DriveSerial(group.drives.serial_number(drive, self._ask(group)), self._simulated)
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         """Put a calibration into force for joint 0 … n−1 (`store`: in a drive's flash too); raises BadInput, BusFault.

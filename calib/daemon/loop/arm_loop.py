@@ -95,6 +95,8 @@ class ArmLoop:
         match call.what:
             case "read_calibration":
                 return source.read_calibration(*call.args)
+            case "drive_serial":
+                return source.drive_serial(*call.args)
             case "write_calibration":
                 return source.write_calibration(*call.args)
             case "sweep":

@@ -7,10 +7,11 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError
 from multiprocessing.process import BaseProcess
+from typing import TypeVar
 
 from armlink.errors import BusFault
 from armlink.link.ends import Cause
-from armlink.link.types import Calibration, Tell
+from armlink.link.types import Calibration, DriveSerial, Tell
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.ending import Ending, see_out, telling
 from armlink.loop.messages import Alive, Answer, Call, End
@@ -24,6 +25,7 @@ BATCHES = 100
 """Batches that wait for a busy service: 10 s; older ones are dropped."""
 ENDED = "the bus loop's process has ended"
 Ask = Callable[[Call], Answer]
+T = TypeVar("T")
 
 _numbers = itertools.count(1)
 
@@ -40,17 +42,21 @@ class LoopControllers:
 
     def read_calibration(self, joint: int) -> Calibration:
         """Active gain and offset [N·m] of joint j; raises BusFault."""
-        return self._call("read_calibration", joint)
+        return self._call("read_calibration", Calibration, joint)
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        """What the drive of joint j is known by; raises BusFault."""
+        return self._call("drive_serial", DriveSerial, joint)
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         """Stage, read back and make active; raises BadInput, BusFault."""
-        return self._call("write_calibration", joint, calibration, store)
+        return self._call("write_calibration", Calibration, joint, calibration, store)
 
-    def _call(self, what: str, *args: object) -> Calibration:
+    def _call(self, what: str, kind: type[T], *args: object) -> T:
         answer = self._ask(Call(next(_numbers), what, args))
         if answer.error is not None:
             raise answer.error
-        assert isinstance(answer.value, Calibration)
+        assert isinstance(answer.value, kind)
         return answer.value
 
 

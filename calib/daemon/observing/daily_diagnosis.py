@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ from calib.daemon.state.event_log import EventLog
 
 KEPT = 7
 """Number of diagnosed recordings that are kept to look at."""
-LONGEST = timedelta(minutes=30)
-"""A diagnosis that takes longer is ended."""
+LONGEST = 1800.0
+"""A diagnosis that takes longer is ended [s]."""
 TOLD, FOUND = "trend.json", "trend.new.json"
 """Changes that were told, and those of the diagnosis under way."""
 STAMP = "%Y%m%dT%H%M%SZ"
@@ -49,7 +49,9 @@ class DailyDiagnosis:
         self._busiest, self._directory = busiest, directory
         self._writing: Iterator[None] | None = None
         self._process: subprocess.Popen[str] | None = None
-        self._begun = self._last = max((_date(path) for path in directory.glob("*.mcap")), default=environment.wall())
+        now = environment.wall()
+        newest = max((_date(path) for path in directory.glob("*.mcap")), default=now)
+        self._begun = self._last = environment.monotonic() - max(0.0, (now - newest).total_seconds())
         self._failure = ""
 
     @property
@@ -58,14 +60,14 @@ class DailyDiagnosis:
 
     def tick(self) -> None:
         """Write the recording and start the diagnosis if it is due, or tell what came of it."""
-        now = self._environment.wall()
+        now = self._environment.monotonic()
         if self._process is not None:
             self._ended(now)
             return
         if self._writing is None:
             self._writing = self._due(now)
         if self._writing is not None:
-            self._write_on(self._writing, now)
+            self._write_on(self._writing)
 
     def close(self) -> None:
         """End a diagnosis under way; it is made again with the next recording."""
@@ -75,10 +77,10 @@ class DailyDiagnosis:
             process.kill()
             process.communicate()
 
-    def _due(self, now: datetime) -> Iterator[None] | None:
+    def _due(self, now: float) -> Iterator[None] | None:
         """The writing of the busiest minute, if a day has passed and the arm has moved."""
         settings = self._settings
-        if not settings.enabled or now - self._last < timedelta(hours=settings.hours):
+        if not settings.enabled or now - self._last < 3600.0 * settings.hours:
             return None
         minute = self._busiest.take(settings.travel)
         if minute is None:
@@ -86,18 +88,19 @@ class DailyDiagnosis:
         self._last = now
         return minute.write(self._directory / UNFINISHED, self._configuration.names)
 
-    def _write_on(self, writing: Iterator[None], now: datetime) -> None:
+    def _write_on(self, writing: Iterator[None]) -> None:
         """Write another part; after the last one, begin."""
         try:
             self._directory.mkdir(parents=True, exist_ok=True)
             if next(writing, WRITTEN) is WRITTEN:
                 self._writing = None
-                self._start(now)
+                self._start()
         except OSError as error:
             self._writing = None
             self._failed(str(error))
 
-    def _start(self, now: datetime) -> None:
+    def _start(self) -> None:
+        now = self._environment.wall()
         (self._directory / UNFINISHED).replace(self._directory / f"{now:{STAMP}}.mcap")
         for old in sorted(self._directory.glob("*.mcap"))[:-KEPT]:
             old.unlink(missing_ok=True)
@@ -105,7 +108,7 @@ class DailyDiagnosis:
         model = arm.parent / self._settings.sim if self._settings.sim else arm
         command = [sys.executable, "-m", "armlink.cli", "gap", "trend", str(self._directory), "--sim", str(model)]
         threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        self._begun = now
+        self._begun = self._environment.monotonic()
         (self._directory / FOUND).unlink(missing_ok=True)  # of a diagnosis that was ended: it is no answer of this one
         self._process = subprocess.Popen(
             [*command, "--json", str(self._directory / FOUND)],
@@ -119,12 +122,12 @@ class DailyDiagnosis:
             os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
             Path(f"/proc/{self._process.pid}/oom_score_adj").write_text(FIRST_TO_KILL)
 
-    def _ended(self, now: datetime) -> None:
+    def _ended(self, now: float) -> None:
         assert self._process is not None
         if self._process.poll() is None:
             if now - self._begun > LONGEST:
                 self.close()
-                self._failed(f"took longer than {LONGEST.total_seconds() / 60:.0f} min")
+                self._failed(f"took longer than {LONGEST / 60:.0f} min")
             return
         process, self._process = self._process, None
         said = process.communicate()[1].strip().splitlines()

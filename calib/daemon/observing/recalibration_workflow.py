@@ -3,7 +3,6 @@
 import sqlite3
 from collections import deque
 from collections.abc import Callable
-from datetime import datetime
 
 from armlink.errors import ArmlinkError, BusFault, Refused
 from calib.daemon.observing.observer_feed import Samples
@@ -40,13 +39,18 @@ class RecalibrationWorkflow:
         journal: Journal,
         events: EventLog,
         jobs: BusJobs,
+        monotonic: Callable[[], float],
     ) -> None:
+        """`monotonic`: the clock of the rate limits [s]. Raises sqlite3.Error if the disk fails."""
         self._configuration, self._names = configuration, configuration.names
         self._store, self._arm_state = store, arm_state
         self._journal, self._events, self._jobs = journal, events, jobs
         self._recalibrator: Recalibrator | None = None
         self._installed: Installed = lambda record, finding: None
         self._waiting: list[Finding] = []
+        self._monotonic = monotonic
+        self._written = _earlier_writes(journal, monotonic())
+        """Joint and time of every write, by the monotonic clock [s]."""
         self._unkept: deque[Callable[[], None]] = deque()
         """Outcomes of writes that the journal did not take."""
         self._checking: tuple[str, ...] = ()
@@ -71,6 +75,7 @@ class RecalibrationWorkflow:
             if row.state != "approved":
                 continue
             if row.record == current.id:
+                self._written.append((row.joint, self._monotonic()))
                 with self._journal.transaction():
                     self._applied(row, row.by or "daemon", current)
             else:
@@ -114,44 +119,57 @@ class RecalibrationWorkflow:
         with self._journal.transaction():
             number = self._journal.add_proposal(now, joint, record.id, record.parent or "", finding)
             std = dict(zip(("gain_std", "offset_std"), finding.std, strict=True))
-            evidence = {"proposal": number, "record": record.id, "gain": finding.gain, "offset": finding.offset, **std}
+            row = self._journal.proposal(number)
+            assert row is not None
+            evidence = {
+                "proposal": row.number,
+                "record": record.id,
+                "gain": finding.gain,
+                "offset": finding.offset,
+                **std,
+            }
             text = f"{joint}: record {record.id} proposed: gain {outcome.gain:.5f}, offset {outcome.offset:.3f} N·m"
             self._events.say("proposal", joint, text, evidence)
         if not automatic:
             return
-        limit = self._limit(joint, now)
+        evidence = {"proposal": row.number}
+        limit = self._limit(joint)
         if limit:
-            self._events.say("undecided", joint, f"{joint}: not written automatically: {limit}", {"proposal": number})
+            self._events.say("undecided", joint, f"{joint}: not written automatically: {limit}", evidence)
             return
         try:
-            self._write(self._row(number), APPLIED_BY)
+            self._write(row, APPLIED_BY)
         except NotPossible as error:
-            self._events.say("refused", joint, f"not recalibrated: {error}", {"proposal": number})
+            self._events.say("refused", joint, f"not recalibrated: {error}", evidence)
 
-    def _limit(self, joint: str, now: datetime) -> str:
-        """The rate limit that forbids a write now, empty if none does; a clock that was set back counts as no time."""
-        applied = [row for row in self._journal.proposals() if row.state == "applied" and row.decided is not None]
-        ages = [(row.joint, abs((now - row.decided).total_seconds())) for row in applied if row.decided is not None]
-        settings = self._configuration.settings
+    def _limit(self, joint: str) -> str:
+        """The rate limit that forbids a write now, empty if none does; by the monotonic clock, over restarts too."""
+        settings, now = self._configuration.settings, self._monotonic()
+        ages = [(name, now - t) for name, t in self._written]
         if any(name == joint and age < settings.rest_between_writes for name, age in ages):
             return f"at most one recalibration of a joint in {settings.rest_between_writes:g} s"
         if sum(age < DAY for _, age in ages) >= settings.writes_per_day:
             return f"{settings.writes_per_day} recalibrations within a day are the limit"
+        if any(name is None and age < DAY for name, age in ages):
+            return "a damaged journal was set aside within a day: what was written before is not known"
         return ""
 
     # ---- what a person decides
 
-    def approve(self, number: int, by: str) -> Proposal:
-        """Write a pending proposal and make its record current; raises NoSuch, NotPossible."""
-        row = self._row(number)
+    def approve(self, number: int, by: str, digest: str | None = None) -> Proposal:
+        """Write a pending proposal and make its record current; raises NoSuch, NotPossible.
+
+        `digest`, if given, must be that of the proposal: what was looked at is then what is decided.
+        """
+        row = self._named(number, digest)
         if not self._arm_state.connected:
             reason = self._arm_state.fault or "starting"
             raise NotPossible(f"the bus is not connected ({reason}): nothing can be written")
         self._write(row, by)
-        return self._row(number).answer()
+        return self._named(number).answer()
 
     def _write(self, row: ProposalRow, by: str) -> None:
-        recalibrator, number = self._active(), row.id
+        recalibrator, number = self._active(), row.number
         self._keep_outcomes()
         _require_pending(row)
         if self._jobs.busy:
@@ -160,7 +178,7 @@ class RecalibrationWorkflow:
         if row.base != current:
             raise NotPossible(f"proposal {number} follows from record {row.base}, but {current} is in force now")
         with self._journal.transaction():
-            self._journal.decide(number, self._events.now(), "approved", by)
+            self._journal.decide(row.id, self._events.now(), "approved", by)
             self._events.say("approved", row.joint, f"{row.joint}: approved by {by}", {"proposal": number, "by": by})
         joint = self._names.index(row.joint)
 
@@ -179,6 +197,7 @@ class RecalibrationWorkflow:
                 if again:
                     return
             else:
+                self._written.append((row.joint, self._monotonic()))
                 self._installed(outcome, row.finding)
                 self._forget(joint)
                 self._keep(lambda: self._applied(row, by, outcome))
@@ -186,15 +205,16 @@ class RecalibrationWorkflow:
 
         self._jobs.start(work, done)
 
-    def reject(self, number: int, by: str) -> Proposal:
-        """Drop a pending proposal; raises NoSuch, NotPossible."""
-        row = self._row(number)
+    def reject(self, number: int, by: str, digest: str | None = None) -> Proposal:
+        """Drop a pending proposal; raises NoSuch, NotPossible. `digest` as for `approve`."""
+        row = self._named(number, digest)
         self._active()
         _require_pending(row)
         with self._journal.transaction():
-            self._journal.decide(number, self._events.now(), "rejected", by)
-            self._events.say("rejected", row.joint, f"{row.joint}: rejected by {by}", {"proposal": number, "by": by})
-        return self._row(number).answer()
+            self._journal.decide(row.id, self._events.now(), "rejected", by)
+            evidence = {"proposal": number, "by": by}
+            self._events.say("rejected", row.joint, f"{row.joint}: rejected by {by}", evidence)
+        return self._named(number).answer()
 
     # ---- after a write
 
@@ -213,7 +233,7 @@ class RecalibrationWorkflow:
     def _failed(self, row: ProposalRow, error: ArmlinkError) -> None:
         """Keep and report that a proposal's record could not be written."""
         self._decided(row, "failed", "daemon", str(error))
-        self._refused(row.finding, error, row.id)
+        self._refused(row.finding, error, row.number)
 
     def _decided(self, row: ProposalRow, state: str, by: str, note: str = "") -> None:
         """Keep a decision, unless the journal was begun anew since and has no such proposal."""
@@ -227,7 +247,7 @@ class RecalibrationWorkflow:
         joint = record.joints[row.finding.joint]
         gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
         text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
-        evidence = {"proposal": row.id, "record": record.id, "replaces": row.base, "by": by, "applied": True}
+        evidence = {"proposal": row.number, "record": record.id, "replaces": row.base, "by": by, "applied": True}
         self._decided(row, "applied", by)
         self._events.say("recalibration", row.joint, text, evidence)
 
@@ -326,13 +346,30 @@ class RecalibrationWorkflow:
             raise NotPossible("no calibration and gravity records are in force yet: the status says what is missing")
         return self._recalibrator
 
-    def _row(self, number: int) -> ProposalRow:
-        row = self._journal.proposal(number)
+    def _named(self, number: int, digest: str | None = None) -> ProposalRow:
+        """The proposal of that number; raises NoSuch, and NotPossible where it is not the one of that digest."""
+        row = self._journal.proposal_of(f"{number:08x}")
         if row is None:
-            raise NoSuch(f"no proposal {number}")
+            raise NoSuch(f"no proposal {number}: the list of proposals has the numbers of now")
+        if digest is not None and digest != row.digest:
+            raise NotPossible(f"proposal {number} is not the one of hash {digest[:12]}…: look at it again, then decide")
         return row
+
+
+def _earlier_writes(journal: Journal, now: float) -> list[tuple[str | None, float]]:
+    """Joint and time [s] of the proposals that earlier processes wrote, as young as they may be.
+
+    Where a damaged journal was set aside nobody knows what was written before: that is an entry without a joint.
+    """
+    try:
+        written, faults = (journal.least_ages(kind, now) for kind in ("recalibration", "fault"))
+    except sqlite3.Error:
+        return [(None, now)]
+    found = [(joint, now - age) for joint, evidence, age in written if "proposal" in evidence]
+    unknown = [(None, now - age) for _, evidence, age in faults if "file" in evidence]
+    return [*found, *unknown, *([(None, now)] if journal.set_aside else [])]
 
 
 def _require_pending(row: ProposalRow) -> None:
     if row.state != "pending":
-        raise NotPossible(f"proposal {row.id} is {row.state} already")
+        raise NotPossible(f"proposal {row.number} is {row.state} already")

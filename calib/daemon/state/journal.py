@@ -31,6 +31,8 @@ RETRY_SECONDS = 1.0
 """After a failure nothing is written for this time, so that a lock does not hold the event loop at every write [s]."""
 CACHE_KB = 256
 """SQLite's page cache: the default 2 MB fills over days, which looks like a memory leak."""
+AGED_EVENTS = 20_000
+"""Events whose age is asked for: of a daemon that says 20 faults an hour, those of a month."""
 _TABLES = """
 CREATE TABLE IF NOT EXISTS events (
     id INTEGER PRIMARY KEY AUTOINCREMENT, time TEXT NOT NULL, t REAL NOT NULL, kind TEXT NOT NULL, joint TEXT,
@@ -242,6 +244,19 @@ class Journal:
             self._last_event = int(self._db.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()[0])
         return self._last_event
 
+    def least_ages(self, kind: str, now: float) -> list[tuple[str | None, dict[str, Any], float]]:
+        """Joint, evidence and least age [s] of the newest events of a kind, by the monotonic clock alone.
+
+        That clock stands at `now` [s]; where it began anew, as at a restart of the machine, no time is counted.
+        """
+        query = "SELECT t, joint, CASE WHEN kind = ? THEN evidence END FROM events ORDER BY id DESC LIMIT ?"
+        found, age, later = [], 0.0, now
+        for t, joint, evidence in self._read(_aged, query, (kind, AGED_EVENTS)):
+            age, later = age + max(later - t, 0.0), t
+            if evidence is not None:
+                found.append((joint, evidence, age))
+        return found
+
     # ---- proposals
 
     def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: Finding) -> int:
@@ -280,6 +295,11 @@ class Journal:
         if not 0 < number < 2**63:
             return None
         return next(iter(self._read(proposal_of, PROPOSALS + " WHERE p.id = ?", (number,))), None)
+
+    def proposal_of(self, record: str) -> ProposalRow | None:
+        """The newest proposal of that record."""
+        found = self._read(proposal_of, PROPOSALS + " WHERE p.record = ? ORDER BY p.id DESC LIMIT 1", (record,))
+        return next(iter(found), None)
 
     # ---- belief and history
 
@@ -320,6 +340,11 @@ def _is_damage(error: sqlite3.Error) -> bool:
 def _event(row: tuple[Any, ...]) -> EventRecord:
     number, time, t, kind, joint, text, evidence = row
     return EventRecord(id=number, time=time, t=t, kind=kind, joint=joint, text=text, evidence=json.loads(evidence))
+
+
+def _aged(row: tuple[Any, ...]) -> tuple[float, str | None, dict[str, Any] | None]:
+    t, joint, evidence = row
+    return float(t), joint, None if evidence is None else dict(json.loads(evidence))
 
 
 def _iso(time: datetime) -> str:

@@ -1,5 +1,6 @@
 """A proposal as the journal keeps it, with the newest decision on it."""
 
+import hashlib
 import json
 from dataclasses import dataclass
 from datetime import datetime
@@ -14,6 +15,7 @@ class ProposalRow:
     """One proposed recalibration."""
 
     id: int
+    """Its row in this journal; a journal that is begun anew counts from 1 again, so that nobody outside knows it."""
     time: datetime
     joint: str
     record: str
@@ -29,6 +31,18 @@ class ProposalRow:
     note: str
 
     @property
+    def number(self) -> int:
+        """What a person or a program names it by: its record's number, which is of what would be written and of
+        nothing else, in this journal and any other."""
+        return int(self.record, 16)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) of what a decision on it decides: joint, records and finding."""
+        content = json.dumps([self.joint, self.record, self.base, self.values], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()
+
+    @property
     def finding(self) -> Finding:
         """The drift that it was made from."""
         return Finding.from_json(self.values)
@@ -38,7 +52,8 @@ class ProposalRow:
         finding = self.finding
         gain_std, offset_std = finding.std
         return Proposal(
-            id=self.id,
+            id=self.number,
+            hash=self.digest,
             time=self.time,
             state=self.state,  # type: ignore[arg-type]
             joint=self.joint,

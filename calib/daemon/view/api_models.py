@@ -168,6 +168,9 @@ class Proposal(Answer):
     """One proposed recalibration."""
 
     id: int
+    """The number of its record, 32 bits of the SHA-256 of what would be written: it never names another proposal."""
+    hash: str = ""
+    """SHA-256 (hex) of what is decided, evidence included; an approval or rejection may name it."""
     time: AwareDatetime
     state: ProposalState
     joint: str

@@ -33,15 +33,15 @@ class NoSuch(Exception):
 class Decisions(Protocol):
     """Decisions that a person may take through the API. Raises NoSuch, NotPossible."""
 
-    def approve(self, number: int, by: str) -> Proposal:
-        """Write a pending proposal and make its record current.
+    def approve(self, number: int, by: str, digest: str | None = None) -> Proposal:
+        """Write a pending proposal and make its record current; `digest` is the `hash` of what was looked at.
 
         It is `approved` at once, and `applied` or `failed` a moment later (an event).
         """
         ...
 
-    def reject(self, number: int, by: str) -> Proposal:
-        """Drop a pending proposal."""
+    def reject(self, number: int, by: str, digest: str | None = None) -> Proposal:
+        """Drop a pending proposal; `digest` likewise."""
         ...
 
 

@@ -106,3 +106,5 @@ class Decision(BaseModel):
 
     by: Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]+$")] | None = None
     """Who decides, for the audit trail."""
+    hash: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """`hash` of the proposal as it was looked at: the decision is refused (409) where the proposal is another one."""

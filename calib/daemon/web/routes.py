@@ -163,17 +163,21 @@ def _add_proposals(router: APIRouter, view: DaemonView) -> None:
     @router.post("/api/proposals/{id}/approve", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def approve(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Write a pending proposal to the controller; `applied` or `failed` follows as an event."""
-        return view.decisions.approve(id, _who(decision, peer_of(request.scope)))
+        return view.decisions.approve(id, _who(decision, peer_of(request.scope)), _digest(decision))
 
     @router.post("/api/proposals/{id}/reject", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def reject(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Drop a pending proposal."""
-        return view.decisions.reject(id, _who(decision, peer_of(request.scope)))
+        return view.decisions.reject(id, _who(decision, peer_of(request.scope)), _digest(decision))
 
 
 def _who(decision: Decision | None, peer: Peer) -> str:
     """For the audit trail: the name given, and always the peer of the connection."""
     return peer.name if decision is None or decision.by is None else f"{decision.by} ({peer.name})"
+
+
+def _digest(decision: Decision | None) -> str | None:
+    return None if decision is None else decision.hash
 
 
 ERRORS: dict[type[Exception], int] = {NoSuch: 404, NotPossible: 409, TooMany: 429, sqlite3.Error: 503}

@@ -3,6 +3,7 @@
 import contextlib
 import shutil
 import sqlite3
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from calib.daemon.view.api_models import EventItem, State
 from calib.daemon.web.metrics import metrics_text
 from calib.daemon.web.stream import Streams
 from calib.records.records import CalibrationRecord
+from calib.records.store import RecordStore
 
 
 def settings(policy: str = "propose") -> DaemonSection:
@@ -353,6 +355,63 @@ def drifted(folder: Path) -> FastDaemon:
     return daemon
 
 
+def test_a_store_that_is_replaced_by_rename_is_shown_and_followed(tmp_path: Path) -> None:
+    """Controllers were written and their records lost: the daemon went on with the file that had lost its name."""
+    daemon, path = drifted(tmp_path), tmp_path / "records.db"
+    (proposal,) = daemon.view.proposals()
+    with (
+        contextlib.closing(sqlite3.connect(path)) as old,
+        contextlib.closing(sqlite3.connect(tmp_path / "copy")) as new,
+    ):
+        old.backup(new)
+    (tmp_path / "copy").rename(path)
+    refused = daemon.view.decisions.approve(proposal.id, "ann")
+    assert (refused.state, "was replaced by another file" in refused.note) == ("failed", True)
+    assert not any(call.startswith("write") for call in daemon.sdo)
+    (tmp_path / "away").write_bytes(path.read_bytes())
+    (tmp_path / "away").rename(path)
+    daemon.run(12)
+    faults = [event for event in daemon.of_kind("fault", "recovered") if "record store" in event.text]
+    assert [event.kind for event in faults][-2:] == ["fault", "recovered"]
+    assert "was replaced by another file while it was in use" in faults[-2].text
+    assert daemon.view.status().store_fault is None
+    assert daemon.view.status().state is State.OBSERVING
+    written = daemon.store.put(daemon.good_records()[0], daemon.arm, by="ann", reason="sweep")
+    assert written in [record.id for record in RecordStore(str(path)).history(daemon.arm)]
+
+
+def test_while_the_store_s_file_is_gone_nothing_is_written(tmp_path: Path) -> None:
+    daemon, path = drifted(tmp_path), tmp_path / "records.db"
+    path.rename(tmp_path / "away.db")
+    daemon.run(7)
+    assert "its file is gone" in (daemon.view.status().store_fault or "")
+    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    assert (answer.state, "its file is gone" in answer.note) == ("failed", True)
+    assert not any(call.startswith("write") for call in daemon.sdo)
+    assert not path.exists()
+    (tmp_path / "away.db").rename(path)
+    daemon.run(7)
+    assert daemon.view.status().store_fault is None
+
+
+def test_a_record_of_no_working_arm_that_is_current_is_told_and_not_observed_against(tmp_path: Path) -> None:
+    """A date of 2200 ended the bus process, under the policy apply."""
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
+    daemon.run(5)
+    current, wrong = daemon.good_records()[0], {"created": datetime(2200, 1, 1, tzinfo=UTC)}
+    record = current.model_copy(update=wrong)
+    daemon.store.add(record)
+    with contextlib.closing(sqlite3.connect(tmp_path / "records.db")) as db, db:
+        row = (record.id, "calibration", record.arm, record.serial, "", "", "")
+        db.execute(
+            "INSERT INTO activations(record, kind, arm, serial, at, by, reason) VALUES (?, ?, ?, ?, ?, ?, ?)", row
+        )
+    daemon.run(7)
+    assert f"record {record.id}: created is 2200-01-01, not 1984 to 2106" in daemon.view.status().detail
+    assert daemon.view.status().records.calibration != record.id
+    assert not any(call.startswith("write") for call in daemon.sdo)
+
+
 @pytest.mark.parametrize(("bus", "state"), [("fails too", "failed"), ("works", "applied")])
 def test_a_write_whose_outcome_the_journal_does_not_take_is_kept_later(tmp_path: Path, bus: str, state: str) -> None:
     daemon = drifted(tmp_path)
@@ -365,7 +424,7 @@ def test_a_write_whose_outcome_the_journal_does_not_take_is_kept_later(tmp_path:
             raise BusFault("joint gone")
 
     daemon.on_write = written
-    daemon.view.decisions.approve(1, "ann")
+    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
     daemon.run(7)  # a look at the record store lies within
     daemon.service.journal._db = real
     assert daemon.view.proposals()[0].state == "approved"
@@ -393,7 +452,7 @@ def test_an_outcome_that_waited_for_a_journal_that_was_begun_anew_is_said_and_ho
         daemon.service.journal._db.execute("PRAGMA query_only=ON")
 
     daemon.on_write = written
-    daemon.view.decisions.approve(1, "ann")
+    daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
     daemon.service.journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
     daemon.run(5)
     assert daemon.view.status().detail == ""

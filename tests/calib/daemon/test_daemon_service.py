@@ -113,6 +113,91 @@ def test_a_joint_is_recalibrated_by_itself_no_oftener_than_the_limit(tmp_path: P
     assert daemon.of_kind("clock")[0].evidence["seconds"] == pytest.approx(-18000, abs=1)
 
 
+def drift_again(daemon: FastDaemon, joint: int) -> None:
+    """Another joint drifts, and is watched until a record is proposed for it."""
+    before = len(daemon.view.proposals())
+    daemon.fast.offset[joint] += 0.5
+    daemon.run(240, until=lambda: len(daemon.view.proposals()) > before)
+    assert daemon.view.proposals()[0].joint == daemon.arm.joint_names[joint]
+
+
+def test_a_wall_clock_that_is_set_grants_no_further_write_and_neither_does_a_restart(tmp_path: Path) -> None:
+    """Six automatic writes came in 25 minutes: the limits counted by the wall clock."""
+    daemon = FastDaemon(tmp_path, 1, settings("apply", writes_per_day=1))
+    daemon.run(60)
+    drift_again(daemon, 2)
+    daemon.run(60)
+    assert daemon.view.proposals()[0].state == "applied"
+    daemon.wall_shift = timedelta(hours=25)
+    daemon.service.tick()
+    drift_again(daemon, 1)
+    assert daemon.view.proposals()[0].state == "pending"
+    assert "1 recalibrations within a day are the limit" in daemon.of_kind("undecided")[-1].text
+    assert len(daemon.of_kind("recalibration")) == 1
+    limit = daemon.service.recalibrations._limit("joint_5")
+    assert limit.startswith("1 recalibrations within a day")
+    for hours, back in ((50, 0.0), (-50, daemon.now())):  # the machine has restarted: its monotonic clock begins anew
+        daemon.kill()
+        daemon.wall_shift, daemon.clock_shift = timedelta(hours=hours), -back
+        daemon.start()
+        assert daemon.service.recalibrations._limit("joint_5") == limit
+    daemon.clock_shift += 86_400.0
+    assert daemon.service.recalibrations._limit("joint_5") == ""
+
+
+def test_an_id_of_before_a_damaged_journal_names_no_other_proposal(tmp_path: Path) -> None:
+    """ "approve 1" wrote another joint: ids began anew with the journal."""
+    daemon = drifted(tmp_path, "propose")
+    (before,) = daemon.view.proposals()
+    daemon.kill()
+    path = tmp_path / "state" / "journal.db"
+    path.write_bytes(b"damaged" * 1000)
+    daemon.start()
+    daemon.run(240, until=lambda: bool(daemon.view.proposals()))
+    (now,) = daemon.view.proposals()
+    for number in (before.id, 1):
+        with pytest.raises(NoSuch, match=f"no proposal {number}"):
+            daemon.view.decisions.approve(number, "ann")
+    assert daemon.view.proposals() == (now,)
+    assert now.id == int(now.record, 16)
+
+
+def test_a_decision_that_names_another_content_is_refused(tmp_path: Path) -> None:
+    daemon = drifted(tmp_path, "propose")
+    (proposal,) = daemon.view.proposals()
+    for decide in (daemon.view.decisions.approve, daemon.view.decisions.reject):
+        with pytest.raises(NotPossible, match=f"proposal {proposal.id} is not the one of hash 000000000000…: look at"):
+            decide(proposal.id, "ann", "0" * 64)
+    assert not any(call.startswith("write") for call in daemon.sdo)
+    daemon.kill()
+    daemon.start()
+    assert daemon.view.decisions.approve(proposal.id, "ann", proposal.hash).state == "applied"
+
+
+def test_after_a_damaged_journal_nothing_is_written_automatically_for_a_day(tmp_path: Path) -> None:
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
+    daemon.kill()
+    (tmp_path / "state" / "journal.db").write_bytes(b"damaged" * 1000)
+    for _ in range(2):  # by its own finding, then by the event that it kept of it
+        daemon.start()
+        assert "a damaged journal was set aside within a day" in daemon.service.recalibrations._limit("joint_1")
+        daemon.kill()
+    daemon.start()
+    daemon.clock_shift = 86_400.0
+    assert daemon.service.recalibrations._limit("joint_1") == ""
+
+
+def test_a_record_that_is_not_current_in_the_store_any_more_is_not_followed(tmp_path: Path) -> None:
+    """The store was replaced, or another command was quicker than the daemon's next look at it."""
+    daemon = drifted(tmp_path, "propose")
+    (calibration, _) = daemon.good_records()
+    other = daemon.store.put(calibration.model_copy(update={"note": "other"}), daemon.arm, by="ann", reason="sweep")
+    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    assert answer.state == "failed"
+    assert f"is not current in {daemon.store.url} any more ({other} is): superseded" in answer.note
+    assert not any(call.startswith("write") for call in daemon.sdo)
+
+
 def test_a_write_that_fails_is_said_and_the_old_record_stays(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     daemon.on_write = daemon.broken
@@ -198,7 +283,7 @@ def test_a_kill_loses_at_most_five_seconds_of_the_estimate(tmp_path: Path) -> No
 
 def test_an_approval_cut_off_before_the_write_is_said_to_have_failed(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
-    number = daemon.view.proposals()[0].id
+    number = daemon.service.journal.proposals()[0].id
     daemon.service.journal.decide(number, daemon.wall(), "approved", "ann")
     daemon.kill()
     daemon.start()
@@ -208,7 +293,7 @@ def test_an_approval_cut_off_before_the_write_is_said_to_have_failed(tmp_path: P
 def test_an_approval_cut_off_after_the_write_is_in_force(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     proposal = daemon.view.proposals()[0]
-    daemon.service.journal.decide(proposal.id, daemon.wall(), "approved", "ann")
+    daemon.service.journal.decide(daemon.service.journal.proposals()[0].id, daemon.wall(), "approved", "ann")
     daemon.service.save()
     recalibrator = Recalibrator(daemon.arm, daemon, daemon.store, "propose")
     recalibrator.apply(daemon.store.get(proposal.record), 2, "ann")
@@ -402,7 +487,7 @@ def test_events_proposals_and_decisions_cannot_be_changed(tmp_path: Path) -> Non
     import sqlite3
 
     daemon = drifted(tmp_path, "propose")
-    daemon.view.decisions.reject(1, "ann")
+    daemon.view.decisions.reject(daemon.view.proposals()[0].id, "ann")
     for statement in ("UPDATE events SET text = ''", "DELETE FROM proposals", "DELETE FROM decisions"):
         with pytest.raises(sqlite3.IntegrityError, match="append-only"):
             daemon.service.journal._db.execute(statement)

@@ -31,7 +31,10 @@ class Bench:
         settings = DaemonSection(diagnosis=DiagnosisSettings(sim=sim))
         configuration = Configuration(load_arm("sarcos"), settings, listen_only=True)
         nothing: Any = None
-        environment = Environment(time.monotonic, lambda: self.time, nothing, nothing)
+        begun, self.set_by = self.time, timedelta()
+        environment = Environment(
+            lambda: (self.time - begun).total_seconds(), lambda: self.time + self.set_by, nothing, nothing
+        )
         self.busiest, self.joints, self.now = BusiestMinute(250.0), len(configuration.names), 0.0
         self.daily = DailyDiagnosis(configuration, environment, self, self.busiest, directory)  # type: ignore[arg-type]
 
@@ -83,6 +86,19 @@ def test_the_minute_with_the_most_motion_is_taken_once_a_day(tmp_path: Path) -> 
     np.testing.assert_allclose(np.diff(found.t), 0.004, atol=1e-8)
     bench.due()
     assert bench.daily._process is None, "each minute is diagnosed once"
+
+
+def test_a_wall_clock_that_is_set_brings_no_diagnosis_and_puts_none_off(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "diagnosis")
+    bench.work(25.0)
+    bench.set_by = timedelta(days=3)
+    for _ in range(100):
+        bench.daily.tick()
+    assert not (tmp_path / "diagnosis").exists()
+    bench.set_by = timedelta(days=-3)
+    bench.due()
+    bench.daily.close()
+    assert len(list((tmp_path / "diagnosis").glob("*.mcap"))) == 1
 
 
 def test_a_pause_ends_a_minute(tmp_path: Path) -> None:

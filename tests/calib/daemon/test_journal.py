@@ -21,7 +21,7 @@ def journal(tmp_path: Path) -> Journal:
 def test_a_newer_proposal_supersedes_the_pending_one_of_its_joint_alone(journal: Journal) -> None:
     def propose(joint: str) -> int:
         finding = Finding(0, "gain", 1.02, 0.0, np.zeros((2, 2)), 40, 0.99)
-        return journal.add_proposal(NOW, joint, "new", "old", finding)
+        return journal.add_proposal(NOW, joint, "00c0ffee", "0ddba115", finding)
 
     decided, other, first = propose("j1"), propose("j2"), propose("j1")
     journal.decide(other, NOW, "rejected", "ann")
@@ -36,6 +36,20 @@ def test_a_newer_proposal_supersedes_the_pending_one_of_its_joint_alone(journal:
         second: "pending",
     }
     assert journal.pending() == 2
+
+
+def test_the_least_age_of_an_event_is_by_the_monotonic_clock_over_restarts_of_the_machine(journal: Journal) -> None:
+    def said(t: float, kind: str, days: int = 0) -> None:
+        journal.add_event(NOW + timedelta(days=days), t, kind, "j1", "", {"proposal": t})
+
+    for t, kind, days in ((100, "written", 0), (400, "other", 9), (10, "started", -9), (50, "written", 3)):
+        said(float(t), kind, days)
+    assert journal.least_ages("written", now=70.0) == [
+        ("j1", {"proposal": 50.0}, 20.0),
+        ("j1", {"proposal": 100.0}, 360.0),
+    ]
+    assert journal.least_ages("written", now=5.0)[0][2] == 0.0
+    assert journal.least_ages("none", now=70.0) == []
 
 
 @pytest.mark.parametrize(("most", "read"), [(1, [7]), (2, [3, 7]), (3, [1, 4, 7]), (7, list(range(1, 8))), (0, [7])])

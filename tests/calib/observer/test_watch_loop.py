@@ -9,7 +9,7 @@ from made_records import put_on
 
 from armlink.arm_file import ArmFile, parse_arm
 from armlink.link.link import Link
-from armlink.link.types import Calibration, Command, Sample
+from armlink.link.types import Calibration, Command, DriveSerial, Sample
 from calib.arm.kinematics import gcomp_arm
 from calib.motion.random_work import WorkMotion, work_targets
 from calib.observer.config import ObserverConfig
@@ -54,6 +54,7 @@ def arm_file(gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)) -> ArmFile
     ]
     content = {
         "name": "three",
+        "serial": "3",
         "kinematics": {"gravity": list(gravity), "joints": joints},
         "link": {"joints": link},
         "sim": {"links": links, "effects": effects},
@@ -99,6 +100,9 @@ class MadeUpLink:
         nothing = np.full(3, np.nan)
         sent = (reading - held[:, 1]) / held[:, 0]
         return Sample(self.t, command.position, nothing, sent, nothing, np.zeros(3, dtype=np.int64), np.zeros(3))
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        return DriveSerial(f"1:1:{joint}")
 
     def read_calibration(self, joint: int) -> Calibration:
         return self.held[joint]

@@ -1,18 +1,22 @@
 """The record store's database: PostgreSQL as SQLite, old schemas brought up to date, full disks named."""
 
 import resource
+import sqlite3
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import fake_controllers
 import pytest
 import sqlalchemy as sa
 from made_records import ARM, arm_file, calibration, gravity
 from postgres import NoServer, server, stoppable_server
 
 from armlink.errors import BadInput, Refused
+from calib.install.journaled_write import install
+from calib.install.plausibility import Admitted
 from calib.records import database
 from calib.records.database import StoreFault, open_database
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -227,3 +231,107 @@ def test_a_full_disk_is_said_and_nothing_is_lost(tmp_path: Path) -> None:
     kept = RecordStore(str(path)).history(ARM)
     assert calibration() in kept
     assert len(kept) - len(store.activations(ARM)) in (0, 1)  # a put is two transactions: kept, then current
+
+
+# ---- a store is its file, not its name
+
+
+def copied(path: Path, to: Path) -> Path:
+    """A copy of a store, as a backup makes it."""
+    source, target = sqlite3.connect(path), sqlite3.connect(to)
+    source.backup(target)
+    source.close()
+    target.close()
+    return to
+
+
+def test_a_store_that_was_replaced_by_rename_is_noticed_before_anything_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "records.db"
+    store = RecordStore(str(path))
+    store.put(calibration(), ARM, by="ann", reason="sweep")
+    copied(path, tmp_path / "backup.db").rename(path)
+    with pytest.raises(StoreFault, match="was replaced by another file while it was in use: nothing was written"):
+        store.put(calibration(1.05), ARM, by="ann", reason="sweep")
+    store.put(calibration(1.06), ARM, by="ann", reason="sweep")
+    assert {record.id for record in RecordStore(str(path)).history(ARM)} == {calibration().id, calibration(1.06).id}
+
+
+def test_a_store_that_was_replaced_is_noticed_by_whoever_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "records.db"
+    store = RecordStore(str(path))
+    store.put(calibration(), ARM, by="ann", reason="sweep")
+    RecordStore(str(tmp_path / "other.db")).close()
+    (tmp_path / "other.db").rename(path)
+    with pytest.raises(StoreFault, match="was replaced"):
+        store.current(CalibrationRecord, ARM)
+    assert store.current(CalibrationRecord, ARM) is None
+
+
+def test_a_store_that_is_replaced_within_a_transaction_keeps_nothing_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "records.db"
+    store = RecordStore(str(path))
+    copied(path, tmp_path / "backup.db")
+
+    def replaced(connection: sa.Connection) -> None:
+        (tmp_path / "backup.db").rename(path)
+
+    monkeypatch.setattr(database, "_lock", replaced)
+    with pytest.raises(StoreFault, match="nothing was written"):  # by SQLite itself, which has no log beside the file
+        store.add(calibration())
+    monkeypatch.undo()
+    assert store.history(ARM) == []
+    assert RecordStore(str(path)).history(ARM) == []
+
+
+def test_a_store_whose_file_is_gone_is_not_begun_anew(tmp_path: Path) -> None:
+    path = tmp_path / "records.db"
+    store = RecordStore(str(path))
+    store.put(calibration(), ARM, by="ann", reason="sweep")
+    path.rename(tmp_path / "away.db")
+    for _ in range(2):
+        with pytest.raises(StoreFault, match=r"its file is gone \(No such file or directory\): put it back"):
+            store.add(calibration(1.05))
+        with pytest.raises(StoreFault, match="its file is gone"):
+            store.history(ARM)
+    assert not path.exists()
+    (tmp_path / "away.db").rename(path)
+    assert store.current(CalibrationRecord, ARM) == calibration()
+
+
+def test_a_file_that_is_no_store_in_its_place_is_one_line_until_it_is_restored(tmp_path: Path) -> None:
+    path = tmp_path / "records.db"
+    store = RecordStore(str(path))
+    store.put(calibration(), ARM, by="ann", reason="sweep")
+    copied(path, tmp_path / "backup.db")
+    (tmp_path / "text").write_text("no database, but longer than the header of one, which has a hundred bytes" * 9)
+    (tmp_path / "text").rename(path)
+    for _ in range(2):
+        with pytest.raises(StoreFault):
+            store.current(CalibrationRecord, ARM)
+    (tmp_path / "backup.db").rename(path)
+    found = [None]
+    for _ in range(2):  # the first may say that it was replaced
+        try:
+            found.append(store.current(CalibrationRecord, ARM))
+        except StoreFault:
+            continue
+    assert found[-1] == calibration()
+
+
+def test_controllers_get_back_what_they_held_where_the_store_is_replaced_during_a_write(tmp_path: Path) -> None:
+    path = tmp_path / "records.db"
+    store, controllers = RecordStore(str(path)), fake_controllers.Controllers()
+    store.put(fake_controllers.record(), fake_controllers.ARM, by="ann", reason="sweep")
+    copied(path, tmp_path / "backup.db")
+
+    def replaced() -> None:
+        (tmp_path / "backup.db").rename(path)
+
+    joints = tuple(fake_controllers.joint(name, 1.15) for name in fake_controllers.NAMES)
+    admitted = Admitted(fake_controllers.record(joints=joints), fake_controllers.ARM, "none")
+    with pytest.raises(StoreFault, match="was replaced"):
+        install(admitted, store, controllers, by="ann", reason="x", check=replaced)  # type: ignore[arg-type]
+    assert [held.gain for held in controllers.held] == [pytest.approx(1.1)] * 2
+    assert RecordStore(str(path)).unfinished_write(fake_controllers.ARM) is None

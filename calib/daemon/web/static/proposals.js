@@ -56,7 +56,7 @@ function decide(one, verb) {
     const name = by("by").value.trim();
     if (name) localStorage.setItem(NAME, name);
     try {
-      await post(`/api/proposals/${one.id}/${verb}`, name ? { by: name } : {});
+      await post(`/api/proposals/${one.id}/${verb}`, { hash: one.hash, ...(name && { by: name }) });
       dialog.close();
       await fetchProposals();
     } catch (error) {

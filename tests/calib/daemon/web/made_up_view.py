@@ -49,6 +49,7 @@ class MadeUpView:
     def propose(self, joint: str = "joint_2") -> api_models.Proposal:
         proposal = api_models.Proposal(
             id=len(self.offered) + 1,
+            hash=f"{len(self.offered) + 1:064x}",
             time=self.time(),
             state="pending",
             joint=joint,
@@ -167,20 +168,22 @@ class MadeUpView:
     def proposals(self, limit: int = 200) -> tuple[api_models.Proposal, ...]:
         return tuple(self.offered[:limit])
 
-    def approve(self, proposal: int, by: str) -> api_models.Proposal:
-        return self._decide(proposal, "approved", by)
+    def approve(self, proposal: int, by: str, digest: str | None = None) -> api_models.Proposal:
+        return self._decide(proposal, "approved", by, digest)
 
-    def reject(self, proposal: int, by: str) -> api_models.Proposal:
-        return self._decide(proposal, "rejected", by)
+    def reject(self, proposal: int, by: str, digest: str | None = None) -> api_models.Proposal:
+        return self._decide(proposal, "rejected", by, digest)
 
     def subscribe(self) -> Client:
         client = self.hub.subscribe()
         client.put(self.item())
         return client
 
-    def _decide(self, number: int, state: str, by: str) -> api_models.Proposal:
+    def _decide(self, number: int, state: str, by: str, digest: str | None) -> api_models.Proposal:
         for place, proposal in enumerate(self.offered):
             if proposal.id == number:
+                if digest not in (None, proposal.hash):
+                    raise NotPossible(f"proposal {number} is not the one of hash {digest}")
                 if proposal.state != "pending":
                     raise NotPossible(f"proposal {number} is {proposal.state} already")
                 update = {"state": state, "decided_by": by, "decided_at": self.time()}

@@ -1,0 +1,56 @@
+"""Whether the arm on the bus is the one that a record is of: by its serial number, and by those of its drives.
+
+Records are kept under an arm's name and serial number, as its arm file has them. Two arms whose files have no serial
+number, or the same, would get each other's calibrations; what gives them away are the serial numbers of their drives,
+which a sweep notes in its records and every write in the journal.
+"""
+
+from collections.abc import Sequence
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Refused
+from armlink.link.types import DriveSerial
+from calib.records.records import CalibrationRecord
+from calib.records.store import ControllerWrite, RecordStore
+
+
+def require_own_arm(
+    record: CalibrationRecord, arm: ArmFile, store: RecordStore, found: Sequence[DriveSerial]
+) -> tuple[str, ...]:
+    """Raise Refused unless these drives are of the arm whose record this is; returns their serial numbers.
+
+    An arm without a serial number is nobody's own, unless it is simulated in this process and ends with it.
+    """
+    if not arm.has_serial and not all(drive.simulated for drive in found):
+        raise Refused(
+            f"{arm.name}: its serial is {arm.serial}: another arm of that name could be meant, so nothing is written"
+            f" to its drives: give it one in {arm.path.name} (serial: …), then calibrate its sweeps again"
+        )
+    drives = tuple(drive.number for drive in found)
+    _require_shared(arm, drives, record.drives, f"record {record.id} was measured on")
+    last = store.last_write(arm)
+    if last is not None:
+        _require_shared(arm, drives, drives_written(last), f"record {last.record} was written to on {last.at[:10]}")
+    return drives
+
+
+def require_drives_of(line: ControllerWrite, arm: ArmFile, found: Sequence[DriveSerial]) -> None:
+    """Raise Refused where a write that is to be undone was begun on the drives of another arm."""
+    drives = [drive.number for drive in found]
+    _require_shared(arm, drives, drives_written(line), f"a write was begun to on {line.at[:10]}")
+
+
+def drives_written(line: ControllerWrite) -> tuple[str, ...]:
+    """Serial numbers of the drives that a write was begun on; none in a journal of before they were noted."""
+    return tuple(str(each) for each in line.body.get("drives", ()))
+
+
+def _require_shared(arm: ArmFile, drives: Sequence[str], known: Sequence[str], what: str) -> None:
+    """Drives are exchanged one by one: an arm that has none of them any more is another one."""
+    here, there = sorted({*drives} - {""}), sorted({*known} - {""})
+    if here and there and not {*here} & {*there}:
+        raise Refused(
+            f"{arm.name} {arm.serial}: none of its drives ({here[0]} …) is one of those that {what} ({there[0]} …):"
+            f" another arm has this name and serial: give each its own serial in its arm file ({arm.path.name}) and"
+            " calibrate it; nothing was written"
+        )
