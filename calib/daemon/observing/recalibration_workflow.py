@@ -1,8 +1,8 @@
 """From findings to calibrations in the controllers: policy, rate limit, approval, write, check, roll-back."""
 
-import sqlite3
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from datetime import datetime
 
 from armlink.errors import ArmlinkError, BusFault, Refused
@@ -47,8 +47,8 @@ class RecalibrationWorkflow:
         self._recalibrator: Recalibrator | None = None
         self._installed: Installed = lambda record, finding: None
         self._waiting: list[Finding] = []
-        self._unkept: deque[Callable[[], None]] = deque()
-        """Outcomes of writes that the journal did not take."""
+        self._approved: deque[tuple[ProposalRow, str]] = deque()
+        """Proposals whose approval is on disk, by whom: written as soon as no other job is under way."""
         self._checking: tuple[str, ...] = ()
         self._worse: Checked | None = None
         """A write that made the readings worse and could not be taken back yet."""
@@ -58,9 +58,8 @@ class RecalibrationWorkflow:
         """Follow other records from now on; approvals that a kill interrupted are closed.
 
         `installed` is called with each record that becomes current, once its finding is written. Returns the finding
-        that led to the record now in force, if one did. Raises sqlite3.Error if the disk fails.
+        that led to the record now in force, if one did.
         """
-        self._keep_outcomes()
         self._recalibrator, self._installed = recalibrator, installed
         self._waiting, self._checking, self._unexplained = [], (), deque(maxlen=WAITING)
         self._worse = None
@@ -68,7 +67,7 @@ class RecalibrationWorkflow:
         for row in self._journal.proposals():
             if row.record == current.id and row.state in ("applied", "approved"):
                 last = row.finding
-            if row.state != "approved":
+            if row.state != "approved" or row.id in self._journal.deciding:
                 continue
             if row.record == current.id:
                 with self._journal.transaction():
@@ -85,7 +84,7 @@ class RecalibrationWorkflow:
         policy = self._configuration.settings.policy
         if policy == "observe":
             return
-        if self._jobs.busy or self._journal.trouble or self._unkept or self._worse is not None:
+        if self._jobs.busy or not self._may_propose:
             self._waiting.append(finding)
             return
         recalibrator, automatic = self._active(), policy == "apply"
@@ -95,15 +94,10 @@ class RecalibrationWorkflow:
             if isinstance(outcome, StoreFault):
                 self._waiting.append(finding)
                 return
-            try:
-                if isinstance(outcome, ArmlinkError):
-                    self._refused(finding, outcome)
-                else:
-                    self._proposed(finding, outcome, automatic)
-            except sqlite3.Error as error:
-                self._journal.failed(error)
-                self._waiting.append(finding)
-                return
+            if isinstance(outcome, ArmlinkError):
+                self._refused(finding, outcome)
+            else:
+                self._proposed(finding, outcome, automatic)
             self._next()
 
         self._jobs.start(lambda: recalibrator.propose(finding, by, ask), done)
@@ -117,15 +111,17 @@ class RecalibrationWorkflow:
             evidence = {"proposal": number, "record": record.id, "gain": finding.gain, "offset": finding.offset, **std}
             text = f"{joint}: record {record.id} proposed: gain {outcome.gain:.5f}, offset {outcome.offset:.3f} N·m"
             self._events.say("proposal", joint, text, evidence)
-        if not automatic:
-            return
-        limit = self._limit(joint, now)
+            if automatic:
+                self._journal.once_kept(lambda: self._write_automatically(number, joint))
+
+    def _write_automatically(self, number: int, joint: str) -> None:
+        limit = self._limit(joint, self._events.now())
         if limit:
             self._events.say("undecided", joint, f"{joint}: not written automatically: {limit}", {"proposal": number})
             return
         try:
             self._write(self._row(number), APPLIED_BY)
-        except NotPossible as error:
+        except (NoSuch, NotPossible) as error:
             self._events.say("refused", joint, f"not recalibrated: {error}", {"proposal": number})
 
     def _limit(self, joint: str, now: datetime) -> str:
@@ -141,28 +137,57 @@ class RecalibrationWorkflow:
 
     # ---- what a person decides
 
-    def approve(self, number: int, by: str) -> Proposal:
-        """Write a pending proposal and make its record current; raises NoSuch, NotPossible."""
+    def approve(self, number: int, by: str) -> Future[Proposal]:
+        """Write a pending proposal and make its record current; raises NoSuch, NotPossible, sqlite3.Error."""
         row = self._row(number)
         if not self._arm_state.connected:
             reason = self._arm_state.fault or "starting"
             raise NotPossible(f"the bus is not connected ({reason}): nothing can be written")
-        self._write(row, by)
-        return self._row(number).answer()
+        self._journal.require_writable()
+        return self._write(row, by)
 
-    def _write(self, row: ProposalRow, by: str) -> None:
+    def _write(self, row: ProposalRow, by: str) -> Future[Proposal]:
+        """Keep the approval on disk first, then write."""
         recalibrator, number = self._active(), row.id
-        self._keep_outcomes()
-        _require_pending(row)
-        if self._jobs.busy:
+        self._require_pending(row)
+        if self._jobs.busy or self._approved:
             raise NotPossible("another recalibration is under way: try again in a moment")
         current = recalibrator.record.id
         if row.base != current:
             raise NotPossible(f"proposal {number} follows from record {row.base}, but {current} is in force now")
+
+        def approved() -> None:
+            self._approved.append((row, by))
+            self._next()
+
+        return self._decide(row, "approved", by, approved)
+
+    def _decide(
+        self, row: ProposalRow, state: str, by: str, then: Callable[[], None] = lambda: None
+    ) -> Future[Proposal]:
+        """Keep a person's decision, then do what follows from it; the answer is there once it is on disk."""
+        answer: Future[Proposal] = Future()
+
+        def kept() -> None:
+            found = self._journal.proposal(row.id)
+            if found is None or found.record != row.record:
+                answer.set_exception(NoSuch(f"no proposal {row.id}: the journal was damaged and begun anew"))
+                return
+            then()
+            answer.set_result(self._row(row.id).answer())
+
         with self._journal.transaction():
-            self._journal.decide(number, self._events.now(), "approved", by)
-            self._events.say("approved", row.joint, f"{row.joint}: approved by {by}", {"proposal": number, "by": by})
-        joint = self._names.index(row.joint)
+            self._journal.decide(row.id, self._events.now(), state, by)
+            self._events.say(state, row.joint, f"{row.joint}: {state} by {by}", {"proposal": row.id, "by": by})
+            self._journal.once_kept(kept)
+        return answer
+
+    def _begin_write(self, row: ProposalRow, by: str) -> None:
+        recalibrator, joint = self._active(), self._names.index(row.joint)
+        current = recalibrator.record.id
+        if row.base != current:
+            self._keep_failure(row, Refused(f"record {current} came into force before it was written"))
+            return
 
         def work() -> CalibrationRecord:
             record = self._store.get(row.record)
@@ -175,45 +200,39 @@ class RecalibrationWorkflow:
                 again = isinstance(outcome, StoreFault) and by == APPLIED_BY
                 if again:
                     self._waiting.append(row.finding)  # to be proposed once the store answers
-                self._keep(lambda: self._failed(row, outcome))
+                self._keep_failure(row, outcome)
                 if again:
                     return
             else:
                 self._installed(outcome, row.finding)
                 self._forget(joint)
-                self._keep(lambda: self._applied(row, by, outcome))
+                with self._journal.transaction():
+                    self._applied(row, by, outcome)
             self._next()
 
         self._jobs.start(work, done)
 
-    def reject(self, number: int, by: str) -> Proposal:
-        """Drop a pending proposal; raises NoSuch, NotPossible."""
+    def reject(self, number: int, by: str) -> Future[Proposal]:
+        """Drop a pending proposal; raises NoSuch, NotPossible, sqlite3.Error."""
         row = self._row(number)
         self._active()
-        _require_pending(row)
-        with self._journal.transaction():
-            self._journal.decide(number, self._events.now(), "rejected", by)
-            self._events.say("rejected", row.joint, f"{row.joint}: rejected by {by}", {"proposal": number, "by": by})
-        return self._row(number).answer()
+        self._journal.require_writable()
+        self._require_pending(row)
+        return self._decide(row, "rejected", by)
+
+    def _require_pending(self, row: ProposalRow) -> None:
+        if row.state != "pending":
+            raise NotPossible(f"proposal {row.id} is {row.state} already")
+        if row.id in self._journal.deciding:
+            raise NotPossible(f"proposal {row.id} is decided already, which waits for the disk")
 
     # ---- after a write
 
-    def _keep(self, outcome: Callable[[], None]) -> None:
-        """Journal what came of a write now, or as soon as the journal can be written: no proposal stays open."""
-        self._unkept.append(outcome)
-        self._keep_outcomes()
-
-    def _keep_outcomes(self) -> None:
-        """Journal the outcomes that wait, in their order; raises sqlite3.Error if the disk still fails."""
-        while self._unkept:
-            with self._journal.transaction():
-                self._unkept[0]()
-            self._unkept.popleft()
-
-    def _failed(self, row: ProposalRow, error: ArmlinkError) -> None:
+    def _keep_failure(self, row: ProposalRow, error: ArmlinkError) -> None:
         """Keep and report that a proposal's record could not be written."""
-        self._decided(row, "failed", "daemon", str(error))
-        self._refused(row.finding, error, row.id)
+        with self._journal.transaction():
+            self._decided(row, "failed", "daemon", str(error))
+            self._refused(row.finding, error, row.id)
 
     def _decided(self, row: ProposalRow, state: str, by: str, note: str = "") -> None:
         """Keep a decision, unless the journal was begun anew since and has no such proposal."""
@@ -301,8 +320,7 @@ class RecalibrationWorkflow:
     # ---- inside
 
     def tick(self) -> None:
-        """Go on with outcomes, a roll-back and findings that waited for the journal or the record store."""
-        self._keep_outcomes()
+        """Go on with a roll-back, approvals and findings that waited for the journal, a job or the record store."""
         if self._worse is not None and self._arm_state.connected and not self._jobs.busy:
             self._take_back(self._worse)
         self._next()
@@ -311,8 +329,17 @@ class RecalibrationWorkflow:
         """Another pair is in force for a joint: findings about it that wait are of the pair before."""
         self._waiting = [finding for finding in self._waiting if finding.joint != joint]
 
+    @property
+    def _may_propose(self) -> bool:
+        """Nothing is proposed, and so nothing written, while something decided before is open or cannot be kept."""
+        return self._worse is None and not (self._approved or self._journal.trouble or self._journal.deciding)
+
     def _next(self) -> None:
-        if self._worse is None and self._waiting and not self._jobs.busy and not self._journal.trouble:
+        if self._jobs.busy:
+            return
+        if self._approved:
+            self._begin_write(*self._approved.popleft())
+        elif self._waiting and self._may_propose:
             self.found(self._waiting.pop(0))
 
     def _refused(self, finding: Finding, error: ArmlinkError, number: int | None = None) -> None:
@@ -331,8 +358,3 @@ class RecalibrationWorkflow:
         if row is None:
             raise NoSuch(f"no proposal {number}")
         return row
-
-
-def _require_pending(row: ProposalRow) -> None:
-    if row.state != "pending":
-        raise NotPossible(f"proposal {row.id} is {row.state} already")

@@ -1,6 +1,7 @@
-"""Answers that are long: read in a thread of their own, sent page by page as the client takes them."""
+"""Answers that are read from the disk: in threads of their own; long ones page by page as the client takes them."""
 
 import asyncio
+import sqlite3
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -14,6 +15,8 @@ from calib.daemon.web.parameters import HistoryQuery
 
 MOST_ANSWERS = 16
 """Long answers under way; each has one page in memory."""
+READ_SECONDS = 5.0
+"""A short answer that the disk has not given within this time is given up [s]."""
 _POINTS = TypeAdapter(tuple[HistoryPoint, ...])
 T = TypeVar("T")
 
@@ -28,6 +31,15 @@ class Histories:
     def __init__(self, view: DaemonView) -> None:
         self._view, self._under_way = view, 0
         self._thread = ThreadPoolExecutor(1, "history")
+        self._short = ThreadPoolExecutor(1, "events")
+
+    async def short(self, work: Callable[[], T]) -> T:
+        """The value of `work`, which reads little, not behind long answers; raises sqlite3.Error, also if it waits."""
+        try:
+            async with asyncio.timeout(READ_SECONDS):
+                return await asyncio.get_running_loop().run_in_executor(self._short, work)
+        except TimeoutError:
+            raise sqlite3.OperationalError(f"the disk has not answered for {READ_SECONDS:.0f} s") from None
 
     async def aside(self, work: Callable[[], T]) -> T:
         """The value of `work`, which reads history, from the thread; raises TooMany and what `work` raises."""

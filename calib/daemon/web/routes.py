@@ -1,7 +1,9 @@
 """The API's routes (docs/daemon-api.md). All read, except the two that decide on a proposal; none commands motion."""
 
+import asyncio
 import sqlite3
 from collections.abc import Callable
+from concurrent.futures import Future
 from datetime import timedelta
 from typing import Annotated, Any
 
@@ -18,7 +20,7 @@ from calib.daemon.view.api_models import (
     Proposal,
     Status,
 )
-from calib.daemon.view.view import DaemonView, NoSuch, NotPossible
+from calib.daemon.view.view import DaemonView, NoSuch, NotPossible, NotYet
 from calib.daemon.web.history import Histories, TooMany
 from calib.daemon.web.parameters import (
     LARGEST_ID,
@@ -41,7 +43,7 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
     413: {"model": ApiError, "description": "The body is too large"},
     422: {"model": ApiError, "description": "A parameter is not valid"},
     429: {"model": ApiError, "description": "Too many requests, long answers, or clients on the stream"},
-    503: {"model": ApiError, "description": "The journal cannot be read or written now, or too many clients"},
+    503: {"model": ApiError, "description": "The journal cannot be read or written now or yet, or too many clients"},
 }
 NO_SUCH: dict[int | str, dict[str, Any]] = {404: {"model": ApiError, "description": "Not found"}}
 NOT_NOW: dict[int | str, dict[str, Any]] = {
@@ -60,6 +62,9 @@ REPORT_CSP = (
 )
 """The report is one file with its scripts inside; it may not send requests to this daemon or anyone else."""
 
+DECISION_SECONDS = 5.0
+"""Wait for a decision to be on disk; after it the answer is "not yet" [s]."""
+
 ProposalId = Annotated[int, Path(ge=1, le=LARGEST_ID)]
 OptionalDecision = Annotated[Decision | None, Body()]
 
@@ -67,7 +72,7 @@ OptionalDecision = Annotated[Decision | None, Body()]
 def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes]) -> APIRouter:
     """Every route of the API on this view."""
     router = APIRouter(responses=REFUSALS)
-    histories = Histories(view)
+    histories = streams.histories
     _add_now(router, view, histories)
     _add_past(router, view, histories)
     add_window(router, view, histories)
@@ -121,12 +126,14 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
             joints=view.joints(),
             estimates=view.estimates(),
             proposals=view.proposals(),
-            events=view.events(after=max(0, status.last_event - query.events)),
+            events=(),
             history=(),
         )
 
         def encoded() -> str:
-            return answer.model_copy(update={"history": view.history(None, since, None, query.limit)}).model_dump_json()
+            events = view.events(after=max(0, status.last_event - query.events))
+            history = view.history(None, since, None, query.limit)
+            return answer.model_copy(update={"events": events, "history": history}).model_dump_json()
 
         return Response(await histories.aside(encoded), media_type="application/json")
 
@@ -135,7 +142,7 @@ def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None
     @router.get("/api/events", tags=["past"])
     async def events(query: Annotated[EventsQuery, Query()]) -> tuple[EventRecord, ...]:
         """Events after an id, oldest first."""
-        return view.events(after=query.after, limit=query.limit)
+        return await histories.short(lambda: view.events(after=query.after, limit=query.limit))
 
     @router.get("/api/history", response_model=tuple[HistoryPoint, ...], responses=NO_SUCH, tags=["past"])
     async def history(query: Annotated[HistoryQuery, Query()]) -> Response:
@@ -146,7 +153,7 @@ def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None
     async def report() -> FileResponse:
         """The newest report in the state directory, one HTML file."""
         path = view.status().report
-        if path is None or not path.is_file():
+        if path is None or not await histories.short(path.is_file):
             raise NoSuch("no report yet: the newest HTML file in the state directory (calibrate --report writes one)")
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
 
@@ -163,12 +170,24 @@ def _add_proposals(router: APIRouter, view: DaemonView) -> None:
     @router.post("/api/proposals/{id}/approve", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def approve(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Write a pending proposal to the controller; `applied` or `failed` follows as an event."""
-        return view.decisions.approve(id, _who(decision, peer_of(request.scope)))
+        return await _decided(id, view.decisions.approve(id, _who(decision, peer_of(request.scope))))
 
     @router.post("/api/proposals/{id}/reject", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def reject(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Drop a pending proposal."""
-        return view.decisions.reject(id, _who(decision, peer_of(request.scope)))
+        return await _decided(id, view.decisions.reject(id, _who(decision, peer_of(request.scope))))
+
+
+async def _decided(number: int, answer: Future[Proposal]) -> Proposal:
+    """The answer once the decision is on disk; raises NotYet where that takes long."""
+    try:
+        async with asyncio.timeout(DECISION_SECONDS):
+            return await asyncio.shield(asyncio.wrap_future(answer))
+    except TimeoutError:
+        raise NotYet(
+            f"not yet: the decision on proposal {number} waits for the disk, which has not answered for "
+            f"{DECISION_SECONDS:.0f} s, and is carried out once it does: do not repeat it, see /api/proposals"
+        ) from None
 
 
 def _who(decision: Decision | None, peer: Peer) -> str:
@@ -176,5 +195,5 @@ def _who(decision: Decision | None, peer: Peer) -> str:
     return peer.name if decision is None or decision.by is None else f"{decision.by} ({peer.name})"
 
 
-ERRORS: dict[type[Exception], int] = {NoSuch: 404, NotPossible: 409, TooMany: 429, sqlite3.Error: 503}
+ERRORS: dict[type[Exception], int] = {NoSuch: 404, NotPossible: 409, TooMany: 429, sqlite3.Error: 503, NotYet: 503}
 """HTTP status of what a route may raise."""

@@ -2,12 +2,14 @@
 
 import asyncio
 import logging
+import sqlite3
 from contextlib import suppress
 
 from fastapi.responses import StreamingResponse
 
-from calib.daemon.view.api_models import EventItem, JointsItem
+from calib.daemon.view.api_models import EventItem, EventRecord, JointsItem
 from calib.daemon.view.view import DaemonView
+from calib.daemon.web.history import Histories
 from calib.daemon.web.peer import Message, Receive, Scope, Send, peer_of
 
 SEND_SECONDS = 5.0
@@ -25,7 +27,7 @@ class Streams:
     """All clients of the stream."""
 
     def __init__(self, view: DaemonView) -> None:
-        self._view = view
+        self._view, self.histories = view, Histories(view)
         self._tasks: set[asyncio.Task[None]] = set()
         self._item: JointsItem | None = None
         self._bytes = b""
@@ -103,12 +105,18 @@ class Streams:
 
     async def _catch_up(self, send: Send, after: int) -> int:
         """Send every event after the id; returns the newest's id."""
-        while events := self._view.events(after=after):
+        while events := await self._events(after):
             for event in events:
                 data = EventItem(event=event).model_dump_json().encode()
                 await _send(send, b"event: event\nid: %d\ndata: %b\n\n" % (event.id, data))
                 after = event.id
         return after
+
+    async def _events(self, after: int) -> tuple[EventRecord, ...]:
+        """None where they cannot be read now: they come with the next one."""
+        with suppress(sqlite3.Error):
+            return await self.histories.short(lambda: self._view.events(after=after))
+        return ()
 
 
 class StreamResponse(StreamingResponse):
