@@ -46,6 +46,8 @@ from calib.records.store import RecordStore
 
 FLUSH_SECONDS = 15.0
 """Time that the disk has at the end for what is not written yet [s]: an fsync of 10 s and what follows on it."""
+CLOSING_SECONDS = 2.0
+"""Likewise for closing the journal, which SQLite tidies up for that; a file that was not closed is whole too [s]."""
 
 log = logging.getLogger("armlink.daemon")
 
@@ -170,16 +172,18 @@ class Service:
             self.storage.save(self.records.observation.feed, history)
 
     def close(self, why: str) -> None:
-        """Save everything and end, within FLUSH_SECONDS: what the disk has not taken by then is lost."""
+        """Save everything and end, within FLUSH_SECONDS and CLOSING_SECONDS: what is not on disk by then is lost."""
         self.save()
         self.events.say("stopped", None, why, {})
         self.recordings.close()
-        written = self.environment.disk.drain(FLUSH_SECONDS)
+        disk = self.environment.disk
+        written = disk.drain(FLUSH_SECONDS)
         if self.journal.waiting:
             log.error(f"ends with {self.journal.waiting} entries not in the journal: {self.journal.trouble}")
+        self.diagnosis.close()
         if written:
-            self.diagnosis.close()
-            self.journal.close()
+            disk(self.journal.close, lambda outcome: None)
+            disk.drain(CLOSING_SECONDS)
 
     def _say_set_aside(self) -> None:
         aside, self.journal.set_aside = self.journal.set_aside, ""

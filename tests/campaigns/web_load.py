@@ -231,8 +231,8 @@ def told(alone: dict[str, Any], busy: dict[str, Any]) -> None:
         f"{busy['median_ms']:.1f} ms, p99 {busy['p99_ms']:.1f} ms ({busy['p99_since_sent_ms']:.1f} ms since sent), "
         f"worst {busy['worst_ms']:.0f} ms; memory {first:g} MB, {most:g} at most, {last:g} at the end; the daemon used "
         f"{busy['cpu_share']:.2f} of a processor, {alone['cpu_share']:.2f} without, the client that asks "
-        f"{busy['client_cpu_share']:.2f}; the longest time without a sign of life {busy['sign_of_life_s']:.2f} s; ended within "
-        f"{busy['ended_s']:.1f} s."
+        f"{busy['client_cpu_share']:.2f}; the longest time without a sign of life {busy['sign_of_life_s']:.2f} s; "
+        f"ended within {busy['ended_s']:.1f} s."
     )
 
 

@@ -80,10 +80,10 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
 
     @router.get("/api/stream", response_class=Response, responses=STREAM, tags=["now"])
     async def stream(
-        query: Annotated[StreamQuery, Query()], last_event_id: Annotated[Id | None, Header()] = None
+        request: Request, query: Annotated[StreamQuery, Query()], last_event_id: Annotated[Id | None, Header()] = None
     ) -> Response:
         """Joints at 10 Hz, and events as they happen; a slow client still gets every event, in order."""
-        if streams.is_full:
+        if not streams.make_room(peer_of(request.scope).owner):
             raise TooMany(f"{streams.clients} clients are on the stream already")
         return StreamResponse(streams, query.after if last_event_id is None else last_event_id)
 
@@ -107,9 +107,9 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
         return view.joints()
 
     @router.get("/api/arm", responses=NO_SUCH, tags=["now"])
-    async def arm() -> DrawnArm:
+    async def arm(request: Request) -> DrawnArm:
         """The arm's shape, to draw it at any joint positions."""
-        return await histories.aside(view.arm)
+        return await histories.aside(peer_of(request.scope).owner, view.arm)
 
     @router.get("/api/estimates", tags=["now"])
     async def estimates() -> tuple[JointEstimate, ...]:
@@ -117,7 +117,7 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
         return view.estimates()
 
     @router.get("/api/overview", response_model=Overview, tags=["now"])
-    async def overview(query: Annotated[OverviewQuery, Query()]) -> Response:
+    async def overview(request: Request, query: Annotated[OverviewQuery, Query()]) -> Response:
         """Everything that the page shows, in one answer, with the newest events and history."""
         status = view.status()
         since = status.time - timedelta(seconds=query.seconds) if query.seconds else None
@@ -135,7 +135,8 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
             history = view.history(None, since, None, query.limit)
             return answer.model_copy(update={"events": events, "history": history}).model_dump_json()
 
-        return Response(await histories.aside(encoded), media_type="application/json")
+        content = await histories.aside(peer_of(request.scope).owner, encoded)
+        return Response(content, media_type="application/json")
 
 
 def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None:
@@ -145,9 +146,9 @@ def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None
         return await histories.short(lambda: view.events(after=query.after, limit=query.limit))
 
     @router.get("/api/history", response_model=tuple[HistoryPoint, ...], responses=NO_SUCH, tags=["past"])
-    async def history(query: Annotated[HistoryQuery, Query()]) -> Response:
+    async def history(request: Request, query: Annotated[HistoryQuery, Query()]) -> Response:
         """Gain and offset over time, oldest first; without a joint, one joint after the other."""
-        return await histories.answer(query)
+        return await histories.answer(peer_of(request.scope).owner, query)
 
     @router.get("/api/report", response_class=FileResponse, responses=NO_SUCH | _HTML, tags=["past"])
     async def report() -> FileResponse:
