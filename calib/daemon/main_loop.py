@@ -19,7 +19,7 @@ from calib.daemon.loop.loop_messages import Down, Started
 from calib.daemon.loop.loop_process import LoopControllers, LoopProcess
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.options import Options
-from calib.daemon.service import Service
+from calib.daemon.service import CLOSING_SECONDS, Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection
 from calib.daemon.state.worker import Worker
@@ -53,10 +53,10 @@ class Daemon:
         self._notify, self._watchdog = Notifier(), watchdog_seconds()
         port = _CurrentProcess(lambda: self.process)
         self._disk = Worker(self._loop, "disk")
-        records_and_bus = Worker(self._loop, "records and bus")
-        environment = Environment(time.monotonic, lambda: datetime.now(UTC), records_and_bus, port, self._disk)
+        self._store, self._records_and_bus = RecordStore(options.store), Worker(self._loop, "records and bus")
+        environment = Environment(time.monotonic, lambda: datetime.now(UTC), self._records_and_bus, port, self._disk)
         settings = options.settings(arm)
-        self.service = Service(arm, settings, options.listen_only, state, RecordStore(options.store), environment)
+        self.service = Service(arm, settings, options.listen_only, state, self._store, environment)
         self.view = ServiceView(self.service)
         self._why = "stopped"
         self._ticked = self._kept_alive = -math.inf
@@ -89,6 +89,8 @@ class Daemon:
                 task.cancel()
             await asyncio.gather(web, timer, ended, return_exceptions=True)
             self.service.close(self._why)
+            self._records_and_bus(self._store.close, lambda outcome: None)
+            self._records_and_bus.drain(CLOSING_SECONDS)
 
     async def _serve(self) -> None:
         """API and page; their modules are loaded in a thread, while the arm is observed already."""

@@ -44,8 +44,8 @@ from calib.observer.recalibrator import Recalibrator
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 
-FLUSH_SECONDS = 15.0
-"""Time that the disk has at the end for what is not written yet [s]: an fsync of 10 s and what follows on it."""
+FLUSH_SECONDS = 25.0
+"""Time that the disk has at the end for what is not written yet [s]: an fsync of 10 s under way, another one for the rest."""
 CLOSING_SECONDS = 2.0
 """Likewise for closing the journal, which SQLite tidies up for that; a file that was not closed is whole too [s]."""
 
