@@ -45,7 +45,7 @@ from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 
 FLUSH_SECONDS = 25.0
-"""Time that the disk has at the end for what is not written yet [s]: an fsync of 10 s under way, another one for the rest."""
+"""Time that the disk has at the end for what is not written yet [s]: one fsync of 10 s under way, one more."""
 CLOSING_SECONDS = 2.0
 """Likewise for closing the journal, which SQLite tidies up for that; a file that was not closed is whole too [s]."""
 
