@@ -351,15 +351,12 @@ class Journal:
     def _read_proposals(self) -> None:
         """The newest, newest first; raises sqlite3.Error, also for rows that are damaged and still rows."""
         query = PROPOSALS + " ORDER BY p.id DESC LIMIT ?"
-        self._rows = {row.id: row for row in self._read(proposal_of, self._db.execute(query, (MOST_PROPOSALS,)))}
+        self._rows = {row.id: row for row in self._read(proposal_of, query, (MOST_PROPOSALS,))}
         self._unread = False
 
-    def _read(self, take: Callable[[tuple[Any, ...]], R], rows: Iterable[tuple[Any, ...]]) -> list[R]:
-        """Rows as `take` makes them; raises sqlite3.Error where one is damaged."""
-        try:
-            return [take(row) for row in rows]
-        except (ValueError, TypeError, KeyError, IndexError) as error:
-            raise sqlite3.DatabaseError(f"a malformed row ({type(error).__name__})") from None
+    def _read(self, take: Callable[[tuple[Any, ...]], R], query: str, values: tuple[Any, ...]) -> list[R]:
+        """Rows as `take` makes them; on the thread, or before there is work for it."""
+        return _made(take, self._db.execute(query, values))
 
     # ---- events
 
@@ -377,7 +374,7 @@ class Journal:
     def events(self, after: int = 0, limit: int = 500) -> list[EventRecord]:
         """Events on disk with a larger id, oldest first; raises sqlite3.Error. From any thread."""
         try:
-            return self._read(_event, self._reader.events(max(-(2**63), min(after, 2**63 - 1)), limit))
+            return _made(_event, self._reader.events(max(-(2**63), min(after, 2**63 - 1)), limit))
         except sqlite3.Error as error:
             if _is_damage(error):
                 self.failed(error)
@@ -447,6 +444,14 @@ class Journal:
     def thin_history(self, before: datetime, keep_every: int) -> None:
         """Keep one in `keep_every` of the estimates before a time."""
         self._write("DELETE FROM history WHERE time < ? AND id % ? != 0", _iso(before), keep_every)
+
+
+def _made(take: Callable[[tuple[Any, ...]], R], rows: Iterable[tuple[Any, ...]]) -> list[R]:
+    """Rows as `take` makes them; raises sqlite3.Error where one is damaged."""
+    try:
+        return [take(row) for row in rows]
+    except (ValueError, TypeError, KeyError, IndexError) as error:
+        raise sqlite3.DatabaseError(f"a malformed row ({type(error).__name__})") from None
 
 
 def _is_damage(error: sqlite3.Error) -> bool:
