@@ -9,10 +9,6 @@ import threading
 from datetime import UTC, datetime
 from typing import TextIO
 
-MOST_LINES = 10_000
-"""Lines that wait for a reader of stderr that takes none; further ones are dropped."""
-LAST_SECONDS = 2.0
-"""Time at the end for the lines that wait [s]."""
 _KNOWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 
 
@@ -31,6 +27,12 @@ class JsonFormatter(logging.Formatter):
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return json.dumps(line, default=str, ensure_ascii=False)
+
+
+MOST_LINES = 10_000
+"""Lines that wait for a reader of stderr that takes none; further ones are dropped."""
+LAST_SECONDS = 2.0
+"""Time at the end for the lines that wait [s]."""
 
 
 class LineQueue:
@@ -94,7 +96,7 @@ class LineLimit(logging.Filter):
 
 def log_as_json(level: int = logging.INFO) -> None:
     """Send everything that is logged to stderr as JSON."""
-    handler = logging.StreamHandler(LineQueue(sys.stderr))
+    handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
     handler.addFilter(LineLimit())
     root = logging.getLogger()
@@ -102,3 +104,10 @@ def log_as_json(level: int = logging.INFO) -> None:
     root.setLevel(level)
     for chatty in ("can", "canopen"):  # they log every socket that they open, and every SDO
         logging.getLogger(chatty).setLevel(max(level, logging.WARNING))
+
+
+def log_in_thread() -> None:
+    """From now on a thread writes what is logged; not before a fork, which takes no threads along."""
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.StreamHandler) and isinstance(handler.formatter, JsonFormatter):
+            handler.setStream(LineQueue(handler.stream))

@@ -15,6 +15,7 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
 from armlink.loop.messages import Answer
 from calib.daemon.environment import Environment
+from calib.daemon.logs import log_in_thread
 from calib.daemon.loop.loop_messages import Down, Started
 from calib.daemon.loop.loop_process import LoopControllers, LoopProcess
 from calib.daemon.notify import Notifier, watchdog_seconds
@@ -216,6 +217,7 @@ def run_daemon(options: Options, arm: ArmFile, state: Path, process: LoopProcess
     """Run until a signal to stop, with a bus process already started; it has ended when this returns."""
 
     sys.setswitchinterval(SWITCH_SECONDS)
+    log_in_thread()
 
     async def main() -> None:
         try:

@@ -27,6 +27,7 @@ def root() -> Iterator[logging.Logger]:
 
 def test_what_is_logged_is_json_on_standard_error(root: logging.Logger, capsys: pytest.CaptureFixture[str]) -> None:
     log_as_json()
+    logs.log_in_thread()
     logging.getLogger("calib.test").info("hello %s", "you")
     logging.getLogger("calib.test").debug("not this")
     logging.getLogger("canopen.sdo").info("nor this")
