@@ -42,6 +42,8 @@ allows a card for one."""
 MOST_WAITING = 10_000
 """Transactions that wait for the disk; beyond it the oldest that hold nothing but events, which the process's log has
 too, and history give way."""
+LARGEST_ROW = 2**53 - 1
+"""The largest whole number that JSON carries everywhere (RFC 8259, section 6)."""
 MOST_PROPOSALS = 1000
 """Proposals in memory, the newest; of an older one nothing can be decided any more."""
 CACHE_KB = 256
@@ -202,9 +204,13 @@ class Journal:
         self._db.execute(f"PRAGMA busy_timeout={int(LOCK_SECONDS * 1000)}")
         self._read_proposals()
         if not self._next_event:  # ids go on where a file is begun anew under way
-            found = dict(self._db.execute("SELECT name, seq FROM sqlite_sequence").fetchall())
-            self._last_event = found.get("events", 0)
-            self._next_event, self._next_proposal = self._last_event + 1, found.get("proposals", 0) + 1
+            newest = "SELECT COALESCE(MAX(id), 0) FROM "
+            self._last_event, proposal = (
+                int(self._db.execute(newest + table).fetchone()[0]) for table in ("events", "proposals")
+            )
+            if max(self._last_event, proposal) > LARGEST_ROW:
+                raise sqlite3.DatabaseError("malformed: an id that nobody gave")
+            self._next_event, self._next_proposal = self._last_event + 1, proposal + 1
             self._belief = self._db.execute("SELECT calibration, gravity, state FROM belief").fetchone()
 
     def close(self) -> None:
