@@ -1,7 +1,7 @@
-"""The surroundings that the service is given: clocks, a thread for work that waits for the bus, the bus loop."""
+"""The surroundings that the service is given: clocks, threads for work that waits for bus or disk, the bus loop."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Protocol, TypeVar
 
@@ -12,11 +12,35 @@ T = TypeVar("T")
 
 
 class RunAside(Protocol):
-    """Runs work that waits for the bus in another thread."""
+    """Runs work that waits in another thread, in the order in which it is given."""
 
     def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
         """Call `done` on the service's own thread with the value that `work` returned, or the error it raised."""
         ...
+
+
+class Disk(RunAside, Protocol):
+    """Likewise all work on the state directory: the only thread that writes there."""
+
+    def drain(self, seconds: float, /) -> bool:
+        """Wait until all work is done, at most so long [s]; whether it is."""
+        ...
+
+
+class Immediate:
+    """`Disk` for one thread alone: work is done, and its outcome given, before the call returns."""
+
+    def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
+        """Do it."""
+        try:
+            outcome: T | Exception = work()
+        except Exception as error:
+            outcome = error
+        done(outcome)
+
+    def drain(self, seconds: float, /) -> bool:
+        """Nothing ever waits."""
+        return True
 
 
 class Port(Protocol):
@@ -41,4 +65,6 @@ class Environment:
     wall: Callable[[], datetime]
     """With time zone."""
     run: RunAside
+    """For bus and record store."""
     port: Port
+    disk: Disk = field(default_factory=Immediate)

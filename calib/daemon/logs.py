@@ -1,9 +1,13 @@
 """Structured logs: one JSON object per line on stderr, for systemd's journal or any log collector."""
 
+import atexit
 import json
 import logging
+import queue
 import sys
+import threading
 from datetime import UTC, datetime
+from typing import TextIO
 
 _KNOWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 
@@ -23,6 +27,50 @@ class JsonFormatter(logging.Formatter):
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return json.dumps(line, default=str, ensure_ascii=False)
+
+
+MOST_LINES = 10_000
+"""Lines that wait for a reader of stderr that takes none; further ones are dropped."""
+LAST_SECONDS = 2.0
+"""Time at the end for the lines that wait [s]."""
+
+
+class LineQueue:
+    """A text stream before another, which a thread writes: systemd's journal waits for a disk, nobody here for it."""
+
+    def __init__(self, to: TextIO) -> None:
+        self._to = to
+        self._lines = queue.Queue[str](MOST_LINES)
+        self._idle = threading.Condition()
+        threading.Thread(target=self._run, name="log", daemon=True).start()
+        atexit.register(self.drain, LAST_SECONDS)
+
+    def write(self, text: str) -> None:
+        """Returns at once."""
+        try:
+            self._lines.put_nowait(text)
+        except queue.Full:
+            return
+
+    def flush(self) -> None:
+        """The thread does."""
+
+    def drain(self, seconds: float) -> None:
+        """Wait until everything is written, at most so long [s]."""
+        with self._idle:
+            self._idle.wait_for(lambda: not self._lines.unfinished_tasks, seconds)
+
+    def _run(self) -> None:
+        while True:
+            text = self._lines.get()
+            try:
+                self._to.write(text)
+                self._to.flush()
+            except (OSError, ValueError):  # nobody reads, or it is closed
+                pass
+            self._lines.task_done()
+            with self._idle:
+                self._idle.notify_all()
 
 
 class LineLimit(logging.Filter):
@@ -56,3 +104,10 @@ def log_as_json(level: int = logging.INFO) -> None:
     root.setLevel(level)
     for chatty in ("can", "canopen"):  # they log every socket that they open, and every SDO
         logging.getLogger(chatty).setLevel(max(level, logging.WARNING))
+
+
+def log_in_thread() -> None:
+    """From now on a thread writes what is logged; not before a fork, which takes no threads along."""
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.StreamHandler) and isinstance(handler.formatter, JsonFormatter):
+            handler.setStream(LineQueue(handler.stream))

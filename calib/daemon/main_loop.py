@@ -18,13 +18,15 @@ from armlink.link.types import Tell
 from armlink.loop.messages import Answer, Told
 from armlink.termination import Presses, said
 from calib.daemon.environment import Environment
+from calib.daemon.logs import log_in_thread
 from calib.daemon.loop.loop_messages import Down, Started
 from calib.daemon.loop.loop_process import LoopControllers, LoopProcess
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.options import Options
-from calib.daemon.service import Service
+from calib.daemon.service import CLOSING_SECONDS, Service
 from calib.daemon.service_view import ServiceView
-from calib.daemon.state.bus_jobs import InThread
+from calib.daemon.settings import DaemonSection
+from calib.daemon.state.worker import Worker
 from calib.records.store import RecordStore
 
 SNAPSHOT_SECONDS = 0.1
@@ -36,6 +38,8 @@ AGAIN_SECONDS = 5.0
 """Time to the next attempt where the system gives no process [s]."""
 BEGIN_SECONDS = 30.0
 """Time for a new bus process to send its first message [s]."""
+SIGN_OF_LIFE_SECONDS = 1.0
+"""Between two signs of life to systemd, unless its watchdog wants them sooner [s]."""
 SWITCH_SECONDS = 0.001
 """A thread at work (reading history, say) lets the event loop go on after this time; Python's default is five times
 that, and an answer waits for it several times [s]."""
@@ -52,9 +56,11 @@ class Daemon:
         self._heard = time.monotonic() + BEGIN_SECONDS
         self._notify, self._watchdog = Notifier(), watchdog_seconds()
         port = _CurrentProcess(lambda: self.process)
-        environment = Environment(time.monotonic, lambda: datetime.now(UTC), InThread(self._loop), port)
+        self._disk = Worker(self._loop, "disk")
+        self._store, self._records_and_bus = RecordStore(options.store), Worker(self._loop, "records and bus")
+        environment = Environment(time.monotonic, lambda: datetime.now(UTC), self._records_and_bus, port, self._disk)
         settings = options.settings(arm)
-        self.service = Service(arm, settings, options.listen_only, state, RecordStore(options.store), environment)
+        self.service = Service(arm, settings, options.listen_only, state, self._store, environment)
         self.view = ServiceView(self.service)
         self._why = "stopped"
         self._ticked = self._kept_alive = -math.inf
@@ -94,6 +100,8 @@ class Daemon:
                 task.cancel()
             await asyncio.gather(web, timer, ended, return_exceptions=True)
             self.service.close(self._why)
+            self._records_and_bus(self._store.close, lambda outcome: None)
+            self._records_and_bus.drain(CLOSING_SECONDS)
 
     async def _serve(self) -> None:
         """API and page; their modules are loaded in a thread, while the arm is observed already."""
@@ -141,7 +149,7 @@ class Daemon:
             self._ticked = now
             self.service.tick()
             self._judge(now, stood_still)
-        if self._watchdog is not None and now - self._kept_alive >= self._watchdog / 3:
+        if self._watchdog is not None and now - self._kept_alive >= min(SIGN_OF_LIFE_SECONDS, self._watchdog / 3):
             self._kept_alive = now
             self._notify("WATCHDOG=1")
 
@@ -195,14 +203,17 @@ class Daemon:
     def _reload(self) -> None:
         """SIGHUP: read the arm file and the records again; a file that cannot be used whole changes nothing."""
         self._notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        self._disk(self._tried, self._reloaded)
+
+    def _reloaded(self, read: tuple[ArmFile, DaemonSection] | Exception) -> None:
         try:
             before = self.service.configuration.settings
-            arm = self._tried()
-            settings = self.options.settings(arm)
+            if isinstance(read, Exception):
+                raise read
+            arm, settings = read
             self.service.reload(arm, settings)
         except (ArmlinkError, OSError, ValueError, ArithmeticError) as error:
-            text = f"configuration not reloaded: {error}"
-            self.service.journal.guard(lambda: self.service.events.say("refused", None, text, {}))
+            self.service.events.say("refused", None, f"configuration not reloaded: {error}", {})
         else:
             bus_changed = arm.link != self.arm.link or settings.work != before.work
             self.arm = arm
@@ -211,8 +222,8 @@ class Daemon:
         finally:
             self._notify("READY=1")
 
-    def _tried(self) -> ArmFile:
-        """The arm file, with all that the bus process will need of it tried; raises BadInput, OSError."""
+    def _tried(self) -> tuple[ArmFile, DaemonSection]:
+        """Arm file and settings, with all that the bus process will need of them tried; raises BadInput, OSError."""
         from armlink.bus.open import resolve_bus  # for a reload alone: they take memory
         from armlink.link.joints.values import try_limits
 
@@ -221,7 +232,7 @@ class Daemon:
             raise BadInput(f"{arm.path}: another arm, serial or kinematics: restart the daemon for that")
         resolve_bus(self.options.bus, arm.require_link().bus)
         try_limits(arm)
-        return arm
+        return arm, self.options.settings(arm)
 
 
 class _CurrentProcess:
@@ -240,6 +251,7 @@ def run_daemon(options: Options, arm: ArmFile, state: Path, process: LoopProcess
     """Run until a signal to stop, with a bus process already started; it has ended when this returns."""
 
     sys.setswitchinterval(SWITCH_SECONDS)
+    log_in_thread()
 
     async def main() -> None:
         try:

@@ -7,11 +7,14 @@ Each part holds its own state and calls only parts further down:
     RecalibrationWorkflow  proposals, decisions, writes, the check after a write
     DailyDiagnosis         the day's busiest minute, diagnosed by a process of its own; what wears
     PoseTours, ObserverStorage, ArmState, LiveWindow, Recordings, BusiestMinute
-    BusJobs                work that waits for the bus, one job at a time
+    BusJobs                work that waits for bus or record store, one job at a time
     EventLog               events to the journal, the stream's Hub and the process's log
-    Journal                the file; Configuration and Environment are given
+    Journal                what waits for the disk, and the file; Configuration and Environment are given
+
+What touches a disk, a database or the bus goes to the two threads of Environment.
 """
 
+import logging
 from importlib.metadata import version
 from pathlib import Path
 
@@ -41,6 +44,13 @@ from calib.observer.recalibrator import Recalibrator
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 
+FLUSH_SECONDS = 25.0
+"""Time that the disk has at the end for what is not written yet [s]: one fsync of 10 s under way, one more."""
+CLOSING_SECONDS = 2.0
+"""Likewise for closing the journal, which SQLite tidies up for that; a file that was not closed is whole too [s]."""
+
+log = logging.getLogger("armlink.daemon")
+
 
 class Service:
     """`take` a message of the bus loop; `tick` once a second or more often. All else is asked through `ServiceView`."""
@@ -59,14 +69,18 @@ class Service:
         self.configuration = Configuration(arm, settings, listen_only)
         self.environment, self.directory, self._store = environment, directory, store
         self.started = monotonic()
-        self.journal = Journal(directory / "journal.db", monotonic)
+        disk = environment.disk
+        self.journal = Journal(directory / "journal.db", monotonic, disk)
         self.hub = Hub()
         self.events = EventLog(self.journal, self.hub, monotonic, wall)
-        self.jobs = BusJobs(environment.run, self.journal)
+        self.jobs = BusJobs(environment.run)
         self.arm_state = ArmState(arm, self.events, monotonic)
         self.window = LiveWindow(len(arm.joint_names))
         self.busiest = BusiestMinute(arm.require_link().rate)
-        self.recordings = Recordings(directory / "recordings", self.configuration)
+        self.recordings = Recordings(directory / "recordings", self.configuration, disk)
+        self.report: Path | None = None
+        """The newest report in the state directory, as of the last tick."""
+        self._looks_for_report = False
         self.diagnosis = DailyDiagnosis(
             self.configuration, environment, self.events, self.busiest, directory / "diagnosis"
         )
@@ -101,49 +115,7 @@ class Service:
         return self.journal.trouble or self.records.store_fault
 
     def take(self, message: Message) -> None:
-        """Route one message of the bus loop; a disk that fails is shown in the status and stops nothing."""
-        self.journal.guard(lambda: self._take(message))
-
-    def tick(self) -> None:
-        """Do what is due; what fails on its part does not keep the rest from being done."""
-        self.journal.probe()
-        self._say_set_aside()
-        parts = (self.events, self.arm_state, self.records, self.recalibrations, self.tours, self.diagnosis)
-        for act in (*(part.tick for part in parts), self._save_due):
-            self.journal.guard(act)
-
-    def reload(self, arm: ArmFile, settings: DaemonSection) -> None:
-        """Use another configuration of the same arm from now on; the observer's state is kept.
-
-        Where an observer cannot be made with it, that error is raised and the configuration before stays in use.
-        """
-        configuration = self.configuration
-        before = configuration.arm, configuration.settings
-        configuration.arm, configuration.settings = arm, settings
-        try:
-            if settings.observer != before[1].observer:
-                self.journal.guard(self._renew)
-        except Exception:
-            configuration.arm, configuration.settings = before
-            raise
-        evidence = {"policy": settings.policy}
-        self.journal.guard(lambda: self.events.say("configuration", None, "configuration reloaded", evidence))
-        self.journal.guard(self.records.load)
-
-    def save(self, history: bool = False) -> None:
-        """Save the observer's state now and, if asked for, a point of history."""
-        if self.records.observation is not None:
-            self.storage.save(self.records.observation.feed, history)
-
-    def close(self, why: str) -> None:
-        """Save everything and end."""
-        self.journal.guard(self.save)
-        self.journal.guard(lambda: self.events.say("stopped", None, why, {}))
-        self.recordings.close()
-        self.diagnosis.close()
-        self.journal.close()
-
-    def _take(self, message: Message) -> None:
+        """Route one message of the bus loop."""
         if isinstance(message, Batch):
             self.arm_state.heard(message)
             self.window.append(message)
@@ -164,15 +136,66 @@ class Service:
         elif isinstance(message, Answer) and message.error is not None:
             self.tours.refused(str(message.error))
 
+    def tick(self) -> None:
+        """Do what is due."""
+        self.journal.probe()
+        self._say_set_aside()
+        for part in (self.events, self.arm_state, self.records, self.recalibrations, self.tours, self.diagnosis):
+            part.tick()
+        observation = self.records.observation
+        self.storage.tick(None if observation is None else observation.feed)
+        if not self._looks_for_report:
+            self._looks_for_report = True
+            self.environment.disk(lambda: _newest_report(self.directory), self._report_found)
+
+    def reload(self, arm: ArmFile, settings: DaemonSection) -> None:
+        """Use another configuration of the same arm from now on; the observer's state is kept.
+
+        Where an observer cannot be made with it, that error is raised and the configuration before stays in use.
+        """
+        configuration = self.configuration
+        before = configuration.arm, configuration.settings
+        configuration.arm, configuration.settings = arm, settings
+        try:
+            if settings.observer != before[1].observer:
+                self._renew()
+        except Exception:
+            configuration.arm, configuration.settings = before
+            raise
+        evidence = {"policy": settings.policy}
+        self.events.say("configuration", None, "configuration reloaded", evidence)
+        self.records.load()
+
+    def save(self, history: bool = False) -> None:
+        """Save the observer's state now and, if asked for, a point of history."""
+        if self.records.observation is not None:
+            self.storage.save(self.records.observation.feed, history)
+
+    def close(self, why: str) -> None:
+        """Save everything and end, within FLUSH_SECONDS and CLOSING_SECONDS: what is not on disk by then is lost."""
+        self.save()
+        self.events.say("stopped", None, why, {})
+        self.recordings.close()
+        disk = self.environment.disk
+        written = disk.drain(FLUSH_SECONDS)
+        if self.journal.waiting:
+            log.error(f"ends with {self.journal.waiting} entries not in the journal: {self.journal.trouble}")
+        self.diagnosis.close()
+        if written:
+            disk(self.journal.close, lambda outcome: None)
+            disk.drain(CLOSING_SECONDS)
+
     def _say_set_aside(self) -> None:
         aside, self.journal.set_aside = self.journal.set_aside, ""
         if aside:
             text = f"the journal was damaged: it is kept as {aside}, and a new one was begun"
             self.events.say("fault", None, text, {"file": aside})
 
-    def _save_due(self) -> None:
-        observation = self.records.observation
-        self.storage.tick(None if observation is None else observation.feed)
+    def _report_found(self, found: Path | Exception | None) -> None:
+        self._looks_for_report = False
+        if isinstance(found, Exception):
+            raise found
+        self.report = found
 
     def _renew(self) -> None:
         self.save()
@@ -187,10 +210,20 @@ class Service:
 
         def installed(record: CalibrationRecord, finding: Finding) -> None:
             feed.install(record, finding)
-            self.journal.guard(lambda: self.storage.save(feed, history=True))
+            self.storage.save(feed, history=True)
 
         self.storage.restore(feed, self.recalibrations.begin(recalibrator, installed))
-        observation = Observation(feed, self.recalibrations, self.storage, self.events, self.jobs, self.tours.wish)
+        observation = Observation(
+            feed, self.recalibrations, self.storage, self.journal, self.events, self.jobs, self.tours.wish
+        )
         if before is not None:
             observation.last_accepted = before.last_accepted
         return observation
+
+
+def _newest_report(directory: Path) -> Path | None:
+    try:
+        reports = [path for path in directory.glob("*.html") if path.is_file()]
+        return max(reports, key=lambda path: path.stat().st_mtime, default=None)
+    except OSError:  # removed meanwhile, or the disk fails
+        return None

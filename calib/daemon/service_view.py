@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator
 from datetime import datetime, timedelta
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,7 +61,7 @@ class ServiceView:
             store_fault=service.records.store_fault or None,
             journal_fault=service.journal.trouble or None,
             last_event=service.journal.last_event,
-            report=_newest_report(service.directory),
+            report=service.report,
         )
 
     def joints(self) -> tuple[api_models.JointNow, ...]:
@@ -140,7 +139,7 @@ class ServiceView:
         )
 
     def events(self, after: int = 0, limit: int = 500) -> tuple[api_models.EventRecord, ...]:
-        """Events with a larger id, oldest first."""
+        """Events with a larger id, oldest first; raises sqlite3.Error."""
         return tuple(self._service.journal.events(after, limit))
 
     def history(
@@ -198,14 +197,6 @@ class ServiceView:
                 counted |= {"rate_hz": 0.0, "load": 0.0}
         fault = arm_state.fault or arm_state.silent or None
         return api_models.BusHealth(connected=bool(arm_state.connected), fault=fault, **counted)
-
-
-def _newest_report(directory: Path) -> Path | None:
-    try:
-        reports = [path for path in directory.glob("*.html") if path.is_file()]
-        return max(reports, key=lambda path: path.stat().st_mtime, default=None)
-    except OSError:  # removed meanwhile, or the disk fails
-        return None
 
 
 def _number(value: float) -> float | None:

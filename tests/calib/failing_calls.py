@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
-from daemon_bench import run_now
 from fast_daemon import FastDaemon
 
 from armlink.errors import BusFault
@@ -26,6 +25,7 @@ from armlink.loop.channel import Channel, Closed
 from armlink.loop.messages import Answer, Call
 from armlink.recording.mcap import RecordingWriter
 from calib.daemon import main_loop, notify
+from calib.daemon.environment import Immediate
 from calib.daemon.loop.loop_messages import Message, Progress, Up
 from calib.daemon.loop.loop_process import LoopProcess
 from calib.daemon.main_loop import Daemon
@@ -195,7 +195,7 @@ class FailingDaemon(FastDaemon):
         patch.setattr(main_loop, "datetime", now)
         readers = SimpleNamespace(add_reader=nothing, remove_reader=nothing)
         patch.setattr(main_loop, "asyncio", SimpleNamespace(get_running_loop=lambda: readers, Event=asyncio.Event))
-        patch.setattr(main_loop, "InThread", lambda loop: run_now)
+        patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
         patch.setattr(main_loop, "LoopProcess", lambda options: BusProcess(self))
         patch.setattr(main_loop, "watchdog_seconds", lambda: WATCHDOG)
         patch.setattr(main_loop, "Notifier", lambda: notify.Notifier("systemd"))
@@ -228,7 +228,7 @@ class FailingDaemon(FastDaemon):
 
         def note(log: EventLog, kind: str, joint: str | None, text: str, evidence: dict[str, Any]) -> Any:
             said = logged(log, kind, joint, text, evidence)
-            daemon.said.add((said.kind, said.joint, said.text))
+            daemon.said.add((said["kind"], said["joint"], said["text"]))
             return said
 
         patch.setattr(engine.dialect, "do_commit", do_commit)

@@ -13,7 +13,7 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BusFault
 from armlink.link.types import Calibration, DriveSerial, Stats
 from armlink.loop.messages import Answer
-from calib.daemon.environment import Environment
+from calib.daemon.environment import Environment, Immediate
 from calib.daemon.loop.loop_messages import Batch, Progress, Up
 from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
@@ -28,6 +28,31 @@ QUIET = {"enabled": False}
 def slow(arm: ArmFile) -> ArmFile:
     """The same arm at the rate of the fast arm's samples, so that the service takes them as they are."""
     return arm.model_copy(update={"link": arm.require_link().model_copy(update={"rate": 1 / PERIOD})})
+
+
+class HeldDisk(Immediate):
+    """A disk that answers at once or, while it is `held`, not at all."""
+
+    def __init__(self) -> None:
+        self.held = False
+        self.waiting: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
+
+    def __call__(self, work: Callable[[], Any], done: Callable[[Any], None]) -> None:
+        if self.held:
+            self.waiting.append((work, done))
+        else:
+            super().__call__(work, done)
+
+    def release(self) -> None:
+        """It answers again."""
+        self.held = False
+        waiting, self.waiting = self.waiting, []
+        for work, done in waiting:
+            super().__call__(work, done)
+
+    def drain(self, seconds: float, /) -> bool:
+        """Held, it does not come to an end."""
+        return not self.waiting
 
 
 class FastDaemon:
@@ -54,6 +79,7 @@ class FastDaemon:
         self.drives = [f"1:1:{k}" for k in range(self.fast.n)]
         self.sdo: list[str] = []
         self.run_aside = run_now
+        self.disk = HeldDisk()
         self.on_write: Callable[[int], None] = lambda joint: None
         self.touring, self.job_after = 0, self.fast.job
         if records:
@@ -77,7 +103,7 @@ class FastDaemon:
         return CalibrationRecord(**provenance(self.arm, created=START), joints=joints), gravity
 
     def start(self, up: bool = True) -> None:
-        environment = Environment(self.now, self.wall, lambda work, done: self.run_aside(work, done), self)
+        environment = Environment(self.now, self.wall, lambda work, done: self.run_aside(work, done), self, self.disk)
         state = self.directory / "state"
         self.service = Service(self.arm, self.settings, self.listen_only, state, self.store, environment)
         self.view = ServiceView(self.service)
@@ -150,3 +176,22 @@ class FastDaemon:
     def broken(self, joint: int) -> None:
         """For on_write: the bus fails."""
         raise BusFault("joint gone")
+
+
+def drifted(folder: Path) -> FastDaemon:
+    """Joint 3 has drifted, and its recalibration waits for an approval."""
+    daemon = FastDaemon(folder, 1, DaemonSection.model_validate({"policy": "propose", "recording": QUIET}))
+    daemon.run(40)
+    daemon.fast.gain[2] *= 1.03
+    daemon.fast.offset[2] += 0.3
+    daemon.run(80)
+    return daemon
+
+
+def metric(daemon: FastDaemon, name: str) -> str:
+    """A value of GET /metrics."""
+    from calib.daemon.web.metrics import metrics_text
+    from calib.daemon.web.stream import Streams
+
+    text = metrics_text(daemon.view, Streams(daemon.view))().decode()
+    return next(line.split()[1] for line in text.splitlines() if line.startswith(f"armlink_{name} "))

@@ -16,8 +16,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import httpx
@@ -40,8 +41,18 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def start(arm: str, bus: str, folder: Path, port: int, work: bool = True) -> "subprocess.Popen[bytes]":
-    """`armlink daemon` with records of a good sweep, on the Unix socket and on TCP; returns when it observes."""
+def start(
+    arm: str,
+    bus: str,
+    folder: Path,
+    port: int,
+    work: bool = True,
+    environment: Mapping[str, str] = MappingProxyType({}),
+) -> "subprocess.Popen[bytes]":
+    """`armlink daemon` with records of a good sweep, on the Unix socket and on TCP; returns when it observes.
+
+    `environment` comes on top of this process's own.
+    """
     from daemon_bench import good_records
 
     from armlink.arm_file import load_arm
@@ -57,7 +68,7 @@ def start(arm: str, bus: str, folder: Path, port: int, work: bool = True) -> "su
     options += ["--bus", bus, "--state", str(folder), "--store", str(folder / "records.db")]
     options += ["--tcp", f"127.0.0.1:{port}", "--token-file", str(folder / "token")]
     command = [str(Path(sys.executable).with_name("armlink")), "daemon", arm, *options]
-    daemon = subprocess.Popen(command, stderr=(folder / "log").open("wb"))
+    daemon = subprocess.Popen(command, stderr=(folder / "log").open("wb"), env={**os.environ, **environment})
     with client(folder) as asking:
         while daemon.poll() is None:
             try:

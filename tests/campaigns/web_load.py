@@ -1,11 +1,12 @@
 """Campaign: the real daemon under every kind of client at once, beside the same time without any.
 
-python tests/campaigns/web_load.py [--arm sarcos] [--bus armlink_sim:sarcos] [--seconds 600] [--alone 120]
+python tests/campaigns/web_load.py [--arm sarcos] [--bus armlink_sim:sarcos] [--seconds 600] [--alone 120] [--fsync 10]
 
 50 clients on the stream, 100 requests a second on the Unix socket, 10 readers that ask for the whole history and never
-read (a new one for each that is cut), and 500 idle strangers on TCP (likewise). Exit status 1 if cycles are late or
-lost beyond the rate without clients, if one local answer in a hundred takes longer than 100 ms, or if the daemon's
-processes grow by more than 50 MB.
+read (a new one for each that is cut), and 500 idle strangers on TCP (likewise). With --fsync each fsync of the daemon
+takes so many seconds meanwhile (a C compiler is needed). Exit status 1 if cycles are late or lost beyond the rate
+without clients, if one local answer in a hundred takes longer than 100 ms (500 ms with --fsync), if systemd waits
+longer than 3 s of its 10 s for a sign of life, or if the daemon's processes grow by more than 50 MB.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import asyncio
 import contextlib
 import json
 import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -21,6 +23,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from slow_disk import SlowDisk, SystemdSocket
 from web import counters, cpu_seconds, free_port, start
 
 from armlink.arm_file import load_arm
@@ -30,8 +33,12 @@ STREAMS, READERS, STRANGERS = 50, 10, 500
 REQUESTS, WORKERS = 100.0, 20
 """Requests a second, on this many connections."""
 DAYS = 30
-P99, GROWTH = 0.1, 50e6
-"""Bounds: of a local answer [s], of the memory [bytes]."""
+P99, P99_OF_A_SLOW_DISK, GROWTH, SIGN_OF_LIFE = 0.1, 0.5, 50e6, 3.0
+"""Bounds: of a local answer [s], likewise with --fsync, of the memory [bytes], between two signs of life [s]."""
+ENDING = 60.0
+"""A daemon that has not ended this long after SIGTERM is killed [s]."""
+LATEST = 5.0
+"""A client that is further behind at the end gives up [s]."""
 AGAIN = 10.0
 """After this a stranger that was cut comes back [s]."""
 SPREAD = 3.0
@@ -61,7 +68,7 @@ async def ask(socket: Path, end: float, took: list[tuple[float, float]], answers
     """Requests in their turn until the end, each at its time; how long each took since it was due, and was sent [s]."""
     every, number = WORKERS / REQUESTS, 0
     due, reader, writer = time.monotonic(), None, None
-    while (due := due + every) < end:
+    while (due := due + every) < end and time.monotonic() < end + LATEST:
         await asyncio.sleep(max(0.0, due - time.monotonic()))
         number += 1
         path = PATHS[number % len(PATHS)]
@@ -224,7 +231,8 @@ def told(alone: dict[str, Any], busy: dict[str, Any]) -> None:
         f"{busy['median_ms']:.1f} ms, p99 {busy['p99_ms']:.1f} ms ({busy['p99_since_sent_ms']:.1f} ms since sent), "
         f"worst {busy['worst_ms']:.0f} ms; memory {first:g} MB, {most:g} at most, {last:g} at the end; the daemon used "
         f"{busy['cpu_share']:.2f} of a processor, {alone['cpu_share']:.2f} without, the client that asks "
-        f"{busy['client_cpu_share']:.2f}."
+        f"{busy['client_cpu_share']:.2f}; the longest time without a sign of life {busy['sign_of_life_s']:.2f} s; "
+        f"ended within {busy['ended_s']:.1f} s."
     )
 
 
@@ -235,6 +243,7 @@ def main() -> int:
     parser.add_argument("--bus", default="armlink_sim:sarcos")
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--alone", type=float, default=120.0)
+    parser.add_argument("--fsync", type=float, default=0.0, help="what each fsync takes longer under load [s]")
     parser.add_argument("--ask", type=Path, metavar="SOCKET", help="only the requests; their times as JSON")
     given = parser.parse_args()
     if given.ask:
@@ -244,18 +253,32 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder, port = Path(name), free_port()
         month_of_history(folder)
-        daemon = start(given.arm, given.bus, folder, port)
+        systemd, disk = SystemdSocket(folder), SlowDisk(folder) if given.fsync else None
+        environment = systemd.environment | (disk.environment if disk else {})
+        daemon = start(given.arm, given.bus, folder, port, environment=environment)
         try:
             time.sleep(10.0)
             alone = counted(folder, daemon.pid, lambda: time.sleep(given.alone))
+            if disk is not None:
+                disk.seconds(given.fsync)
+            begun = time.monotonic()
             busy = counted(folder, daemon.pid, lambda: asyncio.run(crowd(folder, port, given.seconds, daemon.pid)))
+            busy["sign_of_life_s"] = systemd.longest_gap(begun, time.monotonic())
         finally:
+            ending = time.monotonic()
             daemon.terminate()
-            daemon.wait(30)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                daemon.wait(ENDING)
+            ended_s = time.monotonic() - ending
+            daemon.kill()
+    busy["ended_s"] = ended_s
     print(json.dumps({"alone": alone, "busy": busy}, indent=1))
     first, most, _ = busy["memory_mb"]
     wrong = [key for key in ("missed", "late", "errors") if beyond(alone, busy, key)]
-    wrong += ["p99"] * (busy["p99_ms"] > 1e3 * P99) + ["memory"] * ((most - first) * 1e6 > GROWTH)
+    wrong += ["p99"] * (busy["p99_ms"] > 1e3 * (P99_OF_A_SLOW_DISK if given.fsync else P99))
+    wrong += ["sign of life"] * (busy["sign_of_life_s"] > SIGN_OF_LIFE)
+    wrong += ["end"] * (busy["ended_s"] >= ENDING)
+    wrong += ["memory"] * ((most - first) * 1e6 > GROWTH)
     wrong += ["answers"] * (not set(busy["answers"]) <= {"200", "again"})
     told(alone, busy)
     print("out of bounds:", ", ".join(wrong) or "nothing", file=sys.stderr)

@@ -24,6 +24,9 @@ RECORDS_SECONDS = 5.0
 STORE_SECONDS = 1.0
 """Likewise while it fails [s]."""
 
+STORE_SILENT_SECONDS = 5.0
+"""A look that takes longer shows as a fault [s]: what a new connection to a PostgreSQL may take (`database.py`)."""
+
 Found = tuple[CalibrationRecord | None, GravityRecord | None]
 Held = tuple[tuple[float, float, int], ...] | None
 """Gain, offset [N·m] and record id of every controller; None if the daemon only listens."""
@@ -52,8 +55,15 @@ class ActiveRecords:
         self._held: Held = None
         self._unchecked = False
         self._looked, self._looking = -float("inf"), False
-        self.store_fault = ""
+        self._store_fault = ""
+
+    @property
+    def store_fault(self) -> str:
         """Why the record store cannot be read; empty while it can."""
+        waited = self._environment.monotonic() - self._looked if self._looking else 0.0
+        if self._store_fault or waited <= STORE_SILENT_SECONDS:
+            return self._store_fault
+        return f"record store {self._store.url}: has not answered for {waited:.0f} s"
 
     def tick(self) -> None:
         """Look at the record store when it is time."""
@@ -91,8 +101,8 @@ class ActiveRecords:
         if isinstance(found, StoreFault):
             self._store_failed(found)
             return
-        if self.store_fault:
-            self.store_fault = ""
+        if self._store_fault:
+            self._store_fault = ""
             self._events.say("recovered", None, "the record store answers again", {})
         if self._jobs.busy:
             return
@@ -105,10 +115,10 @@ class ActiveRecords:
 
     def _store_failed(self, fault: StoreFault) -> None:
         self._looked = self._environment.monotonic() - RECORDS_SECONDS + STORE_SECONDS
-        if not self.store_fault:
+        if not self._store_fault:
             kept = "" if self.observation is None else "; the records in force stay in force"
             self._events.say("fault", None, f"{fault}{kept}", {})
-        self.store_fault = str(fault)
+        self._store_fault = str(fault)
 
     def _take_over(self, calibration: CalibrationRecord | None, gravity: GravityRecord | None) -> None:
         """Observe against these records, if they are other ones; raises Refused if they are of another arm."""

@@ -34,7 +34,8 @@ NICE, FIRST_TO_KILL = 10, "1000"
 
 
 class DailyDiagnosis:
-    """Writes the recording, starts the process, tells its answer and what changes."""
+    """Writes the recording, starts the process, tells its answer and what changes; `_go_on` and what it calls are for
+    the disk's thread."""
 
     def __init__(
         self,
@@ -53,6 +54,9 @@ class DailyDiagnosis:
         newest = max((_date(path) for path in directory.glob("*.mcap")), default=now)
         self._begun = self._last = environment.monotonic() - max(0.0, (now - newest).total_seconds())
         self._failure = ""
+        self._under_way = False
+        self._told: list[tuple[str, str | None, str, dict[str, Any]]] = []
+        """Events of the step under way."""
 
     @property
     def _settings(self) -> DiagnosisSettings:
@@ -60,14 +64,14 @@ class DailyDiagnosis:
 
     def tick(self) -> None:
         """Write the recording and start the diagnosis if it is due, or tell what came of it."""
-        now = self._environment.monotonic()
-        if self._process is not None:
-            self._ended(now)
+        if self._under_way:
             return
-        if self._writing is None:
+        now = self._environment.monotonic()
+        if self._process is None and self._writing is None:
             self._writing = self._due(now)
-        if self._writing is not None:
-            self._write_on(self._writing)
+        if self._process is not None or self._writing is not None:
+            self._under_way = True
+            self._environment.disk(lambda: self._go_on(now), self._went_on)
 
     def close(self) -> None:
         """End a diagnosis under way; it is made again with the next recording."""
@@ -76,6 +80,20 @@ class DailyDiagnosis:
         if process is not None:
             process.kill()
             process.communicate()
+
+    def _go_on(self, now: float) -> None:
+        if self._process is not None:
+            self._ended(now)
+        elif self._writing is not None:
+            self._write_on(self._writing)
+
+    def _went_on(self, outcome: Exception | None) -> None:
+        self._under_way = False
+        told, self._told = self._told, []
+        for event in told:
+            self._events.say(*event)
+        if outcome is not None:
+            raise outcome
 
     def _due(self, now: float) -> Iterator[None] | None:
         """The writing of the busiest minute, if a day has passed and the arm has moved."""
@@ -148,18 +166,19 @@ class DailyDiagnosis:
         self._failure = ""
         causes = ", ".join(f"{cause['effect']} of {' and '.join(cause['joints'])}" for cause in answer["causes"])
         text = f"diagnosis of the day: {answer['verdict'].replace('_', ' ')}" + (f": {causes}" if causes else "")
-        self._events.say("diagnosis", None, text, {"recording": found["newest"]["case"], "causes": answer["causes"]})
+        evidence = {"recording": found["newest"]["case"], "causes": answer["causes"]}
+        self._told.append(("diagnosis", None, text, evidence))
         told = {_key(trend) for trend in _trends(self._directory / TOLD)}
         for trend in found["trends"]:
             if _key(trend) not in told:
                 change = f"{trend['before']:.3g} to {trend['now']:.3g} {trend['unit']}"
                 text = f"{trend['joint']}: wear: {trend['parameter']} of {trend['effect']} went from {change}"
-                self._events.say("wear", trend["joint"], f"{text} since {trend['since']}", trend)
+                self._told.append(("wear", trend["joint"], f"{text} since {trend['since']}", trend))
 
     def _failed(self, why: str) -> None:
         """Say why there is no diagnosis, once for the same reason."""
         if why != self._failure:
-            self._events.say("diagnosis", None, f"no diagnosis of the day: {why}", {})
+            self._told.append(("diagnosis", None, f"no diagnosis of the day: {why}", {}))
         self._failure = why
 
 

@@ -9,6 +9,7 @@ from calib.daemon.observing.observer_storage import ObserverStorage
 from calib.daemon.observing.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
+from calib.daemon.state.journal import Journal
 from calib.daemon.view.event_text import describe, one_alarm_a_joint
 from calib.observer.events import Event
 
@@ -21,13 +22,15 @@ class Observation:
         feed: ObserverFeed,
         recalibrations: RecalibrationWorkflow,
         storage: ObserverStorage,
+        journal: Journal,
         events: EventLog,
         jobs: BusJobs,
         more_poses: Callable[[str], None],
     ) -> None:
         """`more_poses` asks for a tour of poses, with the reason, if the observer cannot decide."""
         self.feed, self.recalibrations = feed, recalibrations
-        self._storage, self._events, self._jobs, self._more_poses = storage, events, jobs, more_poses
+        self._storage, self._journal, self._events = storage, journal, events
+        self._jobs, self._more_poses = jobs, more_poses
         self.last_accepted: dict[str, datetime] = {}
         """Time of the newest row that went into each joint's estimate."""
         self._accepted = feed.observer.accepted
@@ -56,7 +59,10 @@ class Observation:
         described = [describe(event) for event in told]
         rows = zip(told, described, strict=True)
         said = [(kind, event.joint, text, evidence) for event, (kind, text, evidence) in rows]
-        self._events.say_all(said, lambda: self._storage.save(self.feed, history=True))
+        with self._journal.transaction():
+            for event_said in said:
+                self._events.say(*event_said)
+            self._storage.save(self.feed, history=True)
         for event, (kind, _, _) in zip(told, described, strict=True):
             if event.kind == "verdict":
                 self.recalibrations.explained(kind, event.joint)

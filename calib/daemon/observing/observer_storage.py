@@ -33,7 +33,7 @@ class ObserverStorage:
         if now - self._thinned_at >= THIN_SECONDS:
             self._journal.thin_history(self._environment.wall() - HISTORY_WHOLE, THINNED)
             self._thinned_at = now
-        if feed is None or feed.observer.rows == self._rows:
+        if feed is None or feed.observer.rows == self._rows or self._journal.waiting:
             return
         due = now - self._history_at >= HISTORY_SECONDS
         if due or now - self._saved_at >= SAVE_SECONDS:

@@ -3,6 +3,7 @@
 import sqlite3
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 
 from armlink.errors import ArmlinkError, BusFault, Refused
 from calib.daemon.observing.observer_feed import Samples
@@ -41,7 +42,7 @@ class RecalibrationWorkflow:
         jobs: BusJobs,
         monotonic: Callable[[], float],
     ) -> None:
-        """`monotonic`: the clock of the rate limits [s]. Raises sqlite3.Error if the disk fails."""
+        """`monotonic`: the clock of the rate limits [s]."""
         self._configuration, self._names = configuration, configuration.names
         self._store, self._arm_state = store, arm_state
         self._journal, self._events, self._jobs = journal, events, jobs
@@ -51,8 +52,8 @@ class RecalibrationWorkflow:
         self._monotonic = monotonic
         self._written = _earlier_writes(journal, monotonic())
         """Joint and time of every write, by the monotonic clock [s]."""
-        self._unkept: deque[Callable[[], None]] = deque()
-        """Outcomes of writes that the journal did not take."""
+        self._approved: deque[tuple[ProposalRow, str]] = deque()
+        """Proposals whose approval is on disk, by whom: written as soon as no other job is under way."""
         self._checking: tuple[str, ...] = ()
         self._worse: Checked | None = None
         """A write that made the readings worse and could not be taken back yet."""
@@ -62,9 +63,8 @@ class RecalibrationWorkflow:
         """Follow other records from now on; approvals that a kill interrupted are closed.
 
         `installed` is called with each record that becomes current, once its finding is written. Returns the finding
-        that led to the record now in force, if one did. Raises sqlite3.Error if the disk fails.
+        that led to the record now in force, if one did.
         """
-        self._keep_outcomes()
         self._recalibrator, self._installed = recalibrator, installed
         self._waiting, self._checking, self._unexplained = [], (), deque(maxlen=WAITING)
         self._worse = None
@@ -72,7 +72,7 @@ class RecalibrationWorkflow:
         for row in self._journal.proposals():
             if row.record == current.id and row.state in ("applied", "approved"):
                 last = row.finding
-            if row.state != "approved":
+            if row.state != "approved" or row.id in self._journal.deciding:
                 continue
             if row.record == current.id:
                 self._written.append((row.joint, self._monotonic()))
@@ -90,7 +90,7 @@ class RecalibrationWorkflow:
         policy = self._configuration.settings.policy
         if policy == "observe":
             return
-        if self._jobs.busy or self._journal.trouble or self._unkept or self._worse is not None:
+        if self._jobs.busy or not self._may_propose:
             self._waiting.append(finding)
             return
         recalibrator, automatic = self._active(), policy == "apply"
@@ -100,15 +100,10 @@ class RecalibrationWorkflow:
             if isinstance(outcome, StoreFault):
                 self._waiting.append(finding)
                 return
-            try:
-                if isinstance(outcome, ArmlinkError):
-                    self._refused(finding, outcome)
-                else:
-                    self._proposed(finding, outcome, automatic)
-            except sqlite3.Error as error:
-                self._journal.failed(error)
-                self._waiting.append(finding)
-                return
+            if isinstance(outcome, ArmlinkError):
+                self._refused(finding, outcome)
+            else:
+                self._proposed(finding, outcome, automatic)
             self._next()
 
         self._jobs.start(lambda: recalibrator.propose(finding, by, ask), done)
@@ -117,12 +112,10 @@ class RecalibrationWorkflow:
         joint, record = outcome.joint, outcome.record
         now = self._events.now()
         with self._journal.transaction():
-            number = self._journal.add_proposal(now, joint, record.id, record.parent or "", finding)
+            added = self._journal.add_proposal(now, joint, record.id, record.parent or "", finding)
             std = dict(zip(("gain_std", "offset_std"), finding.std, strict=True))
-            row = self._journal.proposal(number)
-            assert row is not None
             evidence = {
-                "proposal": row.number,
+                "proposal": int(record.id, 16),
                 "record": record.id,
                 "gain": finding.gain,
                 "offset": finding.offset,
@@ -130,9 +123,14 @@ class RecalibrationWorkflow:
             }
             text = f"{joint}: record {record.id} proposed: gain {outcome.gain:.5f}, offset {outcome.offset:.3f} N·m"
             self._events.say("proposal", joint, text, evidence)
-        if not automatic:
+            if automatic:
+                self._journal.once_kept(lambda: self._write_automatically(added))
+
+    def _write_automatically(self, added: int) -> None:
+        row = self._journal.proposal(added)
+        if row is None:  # the journal was begun anew meanwhile
             return
-        evidence = {"proposal": row.number}
+        joint, evidence = row.joint, {"proposal": row.number}
         limit = self._limit(joint)
         if limit:
             self._events.say("undecided", joint, f"{joint}: not written automatically: {limit}", evidence)
@@ -156,8 +154,8 @@ class RecalibrationWorkflow:
 
     # ---- what a person decides
 
-    def approve(self, number: int, by: str, digest: str | None = None) -> Proposal:
-        """Write a pending proposal and make its record current; raises NoSuch, NotPossible.
+    def approve(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
+        """Write a pending proposal and make its record current; raises NoSuch, NotPossible, sqlite3.Error.
 
         `digest`, if given, must be that of the proposal: what was looked at is then what is decided.
         """
@@ -165,22 +163,52 @@ class RecalibrationWorkflow:
         if not self._arm_state.connected:
             reason = self._arm_state.fault or "starting"
             raise NotPossible(f"the bus is not connected ({reason}): nothing can be written")
-        self._write(row, by)
-        return self._named(number).answer()
+        self._journal.require_writable()
+        return self._write(row, by)
 
-    def _write(self, row: ProposalRow, by: str) -> None:
+    def _write(self, row: ProposalRow, by: str) -> Future[Proposal]:
+        """Keep the approval on disk first, then write."""
         recalibrator, number = self._active(), row.number
-        self._keep_outcomes()
-        _require_pending(row)
-        if self._jobs.busy:
+        self._require_pending(row)
+        if self._jobs.busy or self._approved:
             raise NotPossible("another recalibration is under way: try again in a moment")
         current = recalibrator.record.id
         if row.base != current:
             raise NotPossible(f"proposal {number} follows from record {row.base}, but {current} is in force now")
+
+        def approved() -> None:
+            self._approved.append((row, by))
+            self._next()
+
+        return self._decide(row, "approved", by, approved)
+
+    def _decide(
+        self, row: ProposalRow, state: str, by: str, then: Callable[[], None] = lambda: None
+    ) -> Future[Proposal]:
+        """Keep a person's decision, then do what follows from it; the answer is there once it is on disk."""
+        answer: Future[Proposal] = Future()
+
+        def kept() -> None:
+            found = self._journal.proposal(row.id)
+            if found is None or found.record != row.record:
+                answer.set_exception(NoSuch(f"no proposal {row.number}: the journal was damaged and begun anew"))
+                return
+            then()
+            answer.set_result(self._named(row.number).answer())
+
         with self._journal.transaction():
-            self._journal.decide(row.id, self._events.now(), "approved", by)
-            self._events.say("approved", row.joint, f"{row.joint}: approved by {by}", {"proposal": number, "by": by})
-        joint = self._names.index(row.joint)
+            self._journal.decide(row.id, self._events.now(), state, by)
+            evidence = {"proposal": row.number, "by": by}
+            self._events.say(state, row.joint, f"{row.joint}: {state} by {by}", evidence)
+            self._journal.once_kept(kept)
+        return answer
+
+    def _begin_write(self, row: ProposalRow, by: str) -> None:
+        recalibrator, joint = self._active(), self._names.index(row.joint)
+        current = recalibrator.record.id
+        if row.base != current:
+            self._keep_failure(row, Refused(f"record {current} came into force before it was written"))
+            return
 
         def work() -> CalibrationRecord:
             record = self._store.get(row.record)
@@ -193,47 +221,40 @@ class RecalibrationWorkflow:
                 again = isinstance(outcome, StoreFault) and by == APPLIED_BY
                 if again:
                     self._waiting.append(row.finding)  # to be proposed once the store answers
-                self._keep(lambda: self._failed(row, outcome))
+                self._keep_failure(row, outcome)
                 if again:
                     return
             else:
                 self._written.append((row.joint, self._monotonic()))
                 self._installed(outcome, row.finding)
                 self._forget(joint)
-                self._keep(lambda: self._applied(row, by, outcome))
+                with self._journal.transaction():
+                    self._applied(row, by, outcome)
             self._next()
 
         self._jobs.start(work, done)
 
-    def reject(self, number: int, by: str, digest: str | None = None) -> Proposal:
-        """Drop a pending proposal; raises NoSuch, NotPossible. `digest` as for `approve`."""
+    def reject(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
+        """Drop a pending proposal; raises NoSuch, NotPossible, sqlite3.Error. `digest` as for `approve`."""
         row = self._named(number, digest)
         self._active()
-        _require_pending(row)
-        with self._journal.transaction():
-            self._journal.decide(row.id, self._events.now(), "rejected", by)
-            evidence = {"proposal": number, "by": by}
-            self._events.say("rejected", row.joint, f"{row.joint}: rejected by {by}", evidence)
-        return self._named(number).answer()
+        self._journal.require_writable()
+        self._require_pending(row)
+        return self._decide(row, "rejected", by)
+
+    def _require_pending(self, row: ProposalRow) -> None:
+        if row.state != "pending":
+            raise NotPossible(f"proposal {row.number} is {row.state} already")
+        if row.id in self._journal.deciding:
+            raise NotPossible(f"proposal {row.number} is decided already, which waits for the disk")
 
     # ---- after a write
 
-    def _keep(self, outcome: Callable[[], None]) -> None:
-        """Journal what came of a write now, or as soon as the journal can be written: no proposal stays open."""
-        self._unkept.append(outcome)
-        self._keep_outcomes()
-
-    def _keep_outcomes(self) -> None:
-        """Journal the outcomes that wait, in their order; raises sqlite3.Error if the disk still fails."""
-        while self._unkept:
-            with self._journal.transaction():
-                self._unkept[0]()
-            self._unkept.popleft()
-
-    def _failed(self, row: ProposalRow, error: ArmlinkError) -> None:
+    def _keep_failure(self, row: ProposalRow, error: ArmlinkError) -> None:
         """Keep and report that a proposal's record could not be written."""
-        self._decided(row, "failed", "daemon", str(error))
-        self._refused(row.finding, error, row.number)
+        with self._journal.transaction():
+            self._decided(row, "failed", "daemon", str(error))
+            self._refused(row.finding, error, row.number)
 
     def _decided(self, row: ProposalRow, state: str, by: str, note: str = "") -> None:
         """Keep a decision, unless the journal was begun anew since and has no such proposal."""
@@ -321,8 +342,7 @@ class RecalibrationWorkflow:
     # ---- inside
 
     def tick(self) -> None:
-        """Go on with outcomes, a roll-back and findings that waited for the journal or the record store."""
-        self._keep_outcomes()
+        """Go on with a roll-back, approvals and findings that waited for the journal, a job or the record store."""
         if self._worse is not None and self._arm_state.connected and not self._jobs.busy:
             self._take_back(self._worse)
         self._next()
@@ -331,8 +351,17 @@ class RecalibrationWorkflow:
         """Another pair is in force for a joint: findings about it that wait are of the pair before."""
         self._waiting = [finding for finding in self._waiting if finding.joint != joint]
 
+    @property
+    def _may_propose(self) -> bool:
+        """Nothing is proposed, and so nothing written, while something decided before is open or cannot be kept."""
+        return self._worse is None and not (self._approved or self._journal.trouble or self._journal.deciding)
+
     def _next(self) -> None:
-        if self._worse is None and self._waiting and not self._jobs.busy and not self._journal.trouble:
+        if self._jobs.busy:
+            return
+        if self._approved:
+            self._begin_write(*self._approved.popleft())
+        elif self._waiting and self._may_propose:
             self.found(self._waiting.pop(0))
 
     def _refused(self, finding: Finding, error: ArmlinkError, number: int | None = None) -> None:
@@ -368,8 +397,3 @@ def _earlier_writes(journal: Journal, now: float) -> list[tuple[str | None, floa
     found = [(joint, now - age) for joint, evidence, age in written if "proposal" in evidence]
     unknown = [(None, now - age) for _, evidence, age in faults if "file" in evidence]
     return [*found, *unknown, *([(None, now)] if journal.set_aside else [])]
-
-
-def _require_pending(row: ProposalRow) -> None:
-    if row.state != "pending":
-        raise NotPossible(f"proposal {row.number} is {row.state} already")

@@ -1,4 +1,4 @@
-"""Reads the journal's history from any thread, on connections of its own: a long answer holds nobody up."""
+"""Reads the journal's events and history from any thread, on connections of its own: no answer holds anybody up."""
 
 import json
 import sqlite3
@@ -28,6 +28,11 @@ class HistoryReader:
         found = self._rows("SELECT id FROM history WHERE time >= ? AND time <= ? ORDER BY id DESC", span)
         step = max(1, -(-len(found) // max(most, 1)))
         return [number for (number,) in found[::step]][::-1]
+
+    def events(self, after: int, limit: int) -> list[tuple[Any, ...]]:
+        """Rows (id, time, t, kind, joint, text, evidence) with a larger id, oldest first."""
+        query = "SELECT id, time, t, kind, joint, text, evidence FROM events WHERE id > ? ORDER BY id LIMIT ?"
+        return self._rows(query, (after, limit))
 
     def pages(self, ids: Sequence[int]) -> Iterator[list[HistoryRow]]:
         """The rows of these ids, in their order, PAGE at a time; those thinned out or damaged are left out."""

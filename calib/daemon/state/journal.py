@@ -2,20 +2,27 @@
 
 Events, proposals and decisions are append-only (SQLite triggers refuse changes). Rows that belong together are written
 in one transaction: a kill at any moment leaves all of them or none.
+
+Nobody waits for the disk: transactions queue, in their order, for a thread that owns the file. What they say counts,
+for proposals and the API, once they are on disk; a write that fails is tried again, and a disk that does not answer
+shows in `trouble`.
 """
 
 import json
 import logging
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from armlink.errors import BadInput
+from calib.daemon.environment import Immediate, RunAside
+from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.state.proposal_row import PROPOSALS, ProposalRow, proposal_of
 from calib.daemon.view.api_models import EventRecord
 from calib.observer.decision import Finding
@@ -24,11 +31,21 @@ R = TypeVar("R")
 
 SCHEMA = 1
 LOCK_SECONDS = 0.05
-"""Wait for another program's lock, on the event loop [s]; events that cannot be kept now are kept later."""
+"""Wait for another program's lock [s]; what cannot be kept now is kept later."""
 OPEN_SECONDS = 10.0
 """Likewise at the start [s]."""
 RETRY_SECONDS = 1.0
-"""After a failure nothing is written for this time, so that a lock does not hold the event loop at every write [s]."""
+"""Time from a failure to the next attempt [s]."""
+SILENT_SECONDS = 2.0
+"""A disk that takes longer for a write is said to be in trouble [s]: four times what the SD specification (4.6.2.2)
+allows a card for one."""
+MOST_WAITING = 10_000
+"""Transactions that wait for the disk; beyond it the oldest that hold nothing but events, which the process's log has
+too, and history give way."""
+LARGEST_ROW = 2**53 - 1
+"""The largest whole number that JSON carries everywhere (RFC 8259, section 6)."""
+MOST_PROPOSALS = 1000
+"""Proposals in memory, the newest; of an older one nothing can be decided any more."""
 CACHE_KB = 256
 """SQLite's page cache: the default 2 MB fills over days, which looks like a memory leak."""
 AGED_EVENTS = 20_000
@@ -50,6 +67,7 @@ CREATE TABLE IF NOT EXISTS belief (
 CREATE INDEX IF NOT EXISTS history_time ON history(time);
 CREATE INDEX IF NOT EXISTS decisions_proposal ON decisions(proposal);
 """
+_BELIEF = "INSERT OR REPLACE INTO belief(one, time, calibration, gravity, state) VALUES (1, ?, ?, ?, ?)"
 _APPEND_ONLY = ("events", "proposals", "decisions")
 
 log = logging.getLogger("armlink.daemon")
@@ -64,20 +82,44 @@ class Belief:
     state: dict[str, Any]
 
 
-class Journal:
-    """One process writes it; any other may read it. Raises sqlite3.Error if the disk fails."""
+@dataclass
+class Transaction:
+    """Rows that are on disk together or not at all."""
 
-    def __init__(self, path: Path, monotonic: Callable[[], float] = time.monotonic) -> None:
+    statements: list[tuple[str, tuple[Any, ...]]] = field(default_factory=list)
+    kept: list[Callable[[], object]] = field(default_factory=list)
+    """To be called once it is on disk."""
+    proposals: set[int] = field(default_factory=set)
+    """Those that it adds or decides."""
+
+
+class Journal:
+    """One process writes it; any other may read it. `_db` is for the thread that `run` gives work to."""
+
+    def __init__(
+        self, path: Path, monotonic: Callable[[], float] = time.monotonic, run: RunAside | None = None
+    ) -> None:
         """Open or create it; raises BadInput if that is not possible. `monotonic` is the clock of retries [s].
 
         One that is damaged is set aside, under another name, and a new one is begun.
         """
-        self.path, self._monotonic = path, monotonic
-        self._failed_at = -float("inf")
-        self._last_event = self._pending = 0
-        self._after_commit: list[Callable[[], object]] = []
-        self.trouble = ""
-        """Why nothing can be written, in one line; empty while it can."""
+        self.path, self._monotonic, self._run = path, monotonic, run or Immediate()
+        self._reader = HistoryReader(path)
+        self._failed_at, self._asked_at = -float("inf"), float("inf")
+        self._took = 0.0
+        """What the last write took [s]."""
+        self._failure = ""
+        self._queue: deque[Transaction] = deque()
+        self._asked = 0
+        """Transactions, the first of the queue, that are being written."""
+        self._open_one: Transaction | None = None
+        self._refused = False
+        """The schema refuses a row of the queue: transactions are written one by one, to find out which."""
+        self._rows: dict[int, ProposalRow] = {}
+        self._unread = True
+        """Something was written since the proposals were read."""
+        self._last_event = self._next_event = self._next_proposal = 0
+        self._belief: tuple[str | None, str | None, str] | None = None
         self.set_aside = ""
         """Name of a damaged journal that was set aside; empty if none was."""
         self._damaged = False
@@ -93,6 +135,33 @@ class Journal:
         except OSError as error:
             raise self._not_opened(error) from None
 
+    @property
+    def trouble(self) -> str:
+        """Why nothing is kept, in one line; empty while it is."""
+        if self._failure:
+            return self._failure
+        waited = self._monotonic() - self._asked_at if self._asked else 0.0
+        if waited > SILENT_SECONDS:
+            return f"the journal cannot be written: the disk has not answered for {waited:.0f} s"
+        if self._took > SILENT_SECONDS:
+            return f"the journal can hardly be written: the disk took {self._took:.0f} s for the last write"
+        return ""
+
+    def require_writable(self) -> None:
+        """Raise sqlite3.OperationalError after a write that failed; a disk that takes long may be waited for."""
+        if self._failure:
+            raise sqlite3.OperationalError(self._failure)
+
+    @property
+    def waiting(self) -> int:
+        """Number of transactions that are not on disk yet."""
+        return len(self._queue)
+
+    @property
+    def deciding(self) -> set[int]:
+        """Proposals of which something is not on disk yet."""
+        return {number for each in self._queue for number in each.proposals}
+
     def _not_opened(self, error: Exception) -> BadInput:
         return BadInput(f"{self.path}: the journal cannot be opened: {error}")
 
@@ -100,7 +169,7 @@ class Journal:
         """Set the damaged file aside and begin another; raises BadInput if that is not possible."""
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         aside = self.path.with_name(f"{self.path.name}.damaged-{stamp}")
-        self._damaged, self.trouble = False, ""
+        self._damaged = False
         try:
             if self._db is not None:
                 self._db.close()
@@ -115,7 +184,7 @@ class Journal:
     def _open(self) -> None:
         path = self.path
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._db = sqlite3.connect(path, isolation_level=None, timeout=OPEN_SECONDS)
+        self._db = sqlite3.connect(path, isolation_level=None, timeout=OPEN_SECONDS, check_same_thread=False)
         for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"cache_size=-{CACHE_KB}"):
             self._db.execute(f"PRAGMA {pragma}")
         found = self._db.execute("PRAGMA quick_check(1)").fetchone()[0]
@@ -124,7 +193,7 @@ class Journal:
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
         if version not in (0, SCHEMA):
             raise BadInput(f"{path}: journal of schema {version}, this program has {SCHEMA}: use its own version")
-        with self.transaction():
+        with self._committed():
             for statement in filter(str.strip, _TABLES.split(";")):
                 self._db.execute(statement)
             for table in _APPEND_ONLY:
@@ -135,88 +204,167 @@ class Journal:
                     )
             self._db.execute(f"PRAGMA user_version={SCHEMA}")
         self._db.execute(f"PRAGMA busy_timeout={int(LOCK_SECONDS * 1000)}")
+        self._read_proposals()
+        if not self._next_event:  # ids go on where a file is begun anew under way
+            newest = "SELECT COALESCE(MAX(id), 0) FROM "
+            self._last_event, proposal = (
+                int(self._db.execute(newest + table).fetchone()[0]) for table in ("events", "proposals")
+            )
+            if max(self._last_event, proposal) > LARGEST_ROW:
+                raise sqlite3.DatabaseError("malformed: an id that nobody gave")
+            self._next_event, self._next_proposal = self._last_event + 1, proposal + 1
+            self._belief = self._db.execute("SELECT calibration, gravity, state FROM belief").fetchone()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; what still waits is lost."""
         self._db.close()
+
+    # ---- transactions
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Everything inside is on disk at its end, or nothing is; transactions may be nested.
-
-        Raises sqlite3.Error, at once for RETRY_SECONDS after a failure.
-        """
-        if self._db.in_transaction:
+        """Everything inside is kept together, soon; transactions may be nested. An exception drops all of it."""
+        if self._open_one is not None:
             yield
             return
-        if self.trouble and self._monotonic() - self._failed_at < RETRY_SECONDS:
-            raise sqlite3.OperationalError(self.trouble)
+        self._open_one = made = Transaction()
+        try:
+            yield
+        finally:
+            self._open_one = None
+        if not made.statements and not made.kept:
+            return
+        self._queue.append(made)
+        self._make_room()
+        self._write_on()
+
+    def once_kept(self, act: Callable[[], object]) -> None:
+        """Call `act` once the transaction under way is on disk; at once without one."""
+        if self._open_one is None:
+            act()
+        else:
+            self._open_one.kept.append(act)
+
+    def failed(self, error: sqlite3.Error) -> None:
+        """Note a failure, for the status; from any thread."""
+        self._damaged = self._damaged or _is_damage(error)
+        if not self._failure:
+            log.error("journal: %s", error)
+        self._failure = f"the journal cannot be written: {error}"
+        self._failed_at = self._monotonic()
+
+    def probe(self) -> None:
+        """Try again what has failed, begin another file where it is damaged, and find out whether trouble is over."""
+        if self._asked:
+            return
+        if self._damaged:
+            self._ask(self._begin_anew, self._begun_anew)
+        elif self._queue:
+            self._write_on()
+        elif self.trouble and self._monotonic() - self._failed_at >= RETRY_SECONDS:
+            with self.transaction():
+                self._write(f"PRAGMA user_version={SCHEMA}")
+
+    def _write(self, statement: str, *values: Any, proposal: int | None = None) -> None:
+        """Add a row to the transaction under way, or make one of it."""
+        with self.transaction():
+            transaction = cast(Transaction, self._open_one)
+            transaction.statements.append((statement, values))
+            if proposal is not None:
+                transaction.proposals.add(proposal)
+
+    def _make_room(self) -> None:
+        if len(self._queue) <= MOST_WAITING:
+            return
+        for number in range(self._asked, len(self._queue)):
+            if not self._queue[number].proposals:
+                del self._queue[number]
+                return
+
+    def _write_on(self) -> None:
+        """Write all that waits, in one go: a slow disk takes as long for one row as for a thousand."""
+        if self._asked or not self._queue or self._damaged:
+            return
+        if self._failure and self._monotonic() - self._failed_at < RETRY_SECONDS:
+            return
+        batch = tuple(self._queue)[: 1 if self._refused else None]
+        self._ask(lambda: self._commit(batch), self._committed_or_not, len(batch))
+
+    def _ask(self, work: Callable[[], R], done: Callable[[R | Exception], None], asked: int = 1) -> None:
+        """Give the thread work: for `asked` transactions of the queue, or another one."""
+
+        def back(outcome: R | Exception) -> None:
+            self._asked, self._took = 0, self._monotonic() - self._asked_at
+            if isinstance(outcome, Exception) and not isinstance(outcome, sqlite3.Error | BadInput):
+                raise outcome
+            done(outcome)
+
+        self._asked, self._asked_at = asked, self._monotonic()
+        self._run(work, back)
+
+    def _commit(self, batch: tuple[Transaction, ...]) -> tuple[int, sqlite3.Error | None]:
+        """On the thread: everything is on disk, or nothing is and sqlite3.Error is raised.
+
+        Returns the number of transactions, and the error where the proposals could not be read afterwards.
+        """
+        with self._committed():
+            for transaction in batch:
+                for statement, values in transaction.statements:
+                    self._db.execute(statement, values)
+        self._unread = self._unread or any(transaction.proposals for transaction in batch)
+        try:
+            if self._unread:
+                self._read_proposals()
+        except sqlite3.Error as error:
+            return len(batch), error
+        return len(batch), None
+
+    @contextmanager
+    def _committed(self) -> Iterator[None]:
         try:
             self._db.execute("BEGIN IMMEDIATE")
             yield
             self._db.execute("COMMIT")
-        except BaseException as error:
-            self._after_commit.clear()
+        except BaseException:
             with suppress(sqlite3.Error):
                 self._db.rollback()
-            if isinstance(error, sqlite3.Error):
-                self.failed(error)
             raise
-        self.trouble = ""
-        acts, self._after_commit = self._after_commit, []
+
+    def _committed_or_not(self, outcome: tuple[int, sqlite3.Error | None] | Exception) -> None:
+        if isinstance(outcome, sqlite3.IntegrityError):
+            if self._refused:
+                log.error("journal: %s: not kept: %s", outcome, self._queue.popleft().statements)
+            self._refused = not self._refused
+            self._write_on()
+            return
+        if isinstance(outcome, Exception):
+            self.failed(cast(sqlite3.Error, outcome))
+            return
+        count, unread = outcome
+        self._failure = ""
+        if unread is not None:
+            self.failed(unread)
+        acts = [act for _ in range(count) for act in self._queue.popleft().kept]
         for act in acts:
             act()
+        self._write_on()
 
-    def once_kept(self, act: Callable[[], object]) -> None:
-        """Call `act` once what is written now is on disk: at once, or at the end of the transaction; else never."""
-        if self.in_transaction:
-            self._after_commit.append(act)
-        else:
-            act()
+    def _begun_anew(self, outcome: Exception | None) -> None:
+        self._failure = ""
+        if isinstance(outcome, Exception):
+            self._damaged = True
+            self.failed(sqlite3.OperationalError(str(outcome)))
+        self._write_on()
 
-    @property
-    def in_transaction(self) -> bool:
-        """Whether what is written now is on disk only with the rest of a transaction."""
-        return self._db.in_transaction
-
-    def failed(self, error: sqlite3.Error) -> None:
-        """Note a failure, for the status."""
-        self._damaged = self._damaged or _is_damage(error)
-        if not self.trouble:
-            log.error("journal: %s", error)
-            self.trouble = f"the journal cannot be written: {error}"
-            self._failed_at = self._monotonic()
-        elif str(error) != self.trouble:
-            self._failed_at = self._monotonic()
-
-    def probe(self) -> None:
-        """After a failure: find out whether it can be written again, or begin another where it is damaged."""
-        if self._damaged:
-            with suppress(BadInput):
-                self._begin_anew()
-        if self.trouble:
-            with suppress(sqlite3.Error), self.transaction():
-                self._db.execute(f"PRAGMA user_version={SCHEMA}")
-
-    def guard(self, act: Callable[[], object]) -> None:
-        """Call `act`, which writes; a failing disk is logged and shown in the status, and stops nothing."""
-        try:
-            act()
-        except sqlite3.Error as error:
-            self.failed(error)
+    def _read_proposals(self) -> None:
+        """The newest, newest first; raises sqlite3.Error, also for rows that are damaged and still rows."""
+        query = PROPOSALS + " ORDER BY p.id DESC LIMIT ?"
+        self._rows = {row.id: row for row in self._read(proposal_of, query, (MOST_PROPOSALS,))}
+        self._unread = False
 
     def _read(self, take: Callable[[tuple[Any, ...]], R], query: str, values: tuple[Any, ...]) -> list[R]:
-        """Rows as `take` makes them; raises sqlite3.Error, and remembers damage: a page may be damaged unseen."""
-        try:
-            return [take(row) for row in self._db.execute(query, values)]
-        except (ValueError, TypeError, KeyError, IndexError) as error:
-            damage = sqlite3.DatabaseError(f"a malformed row ({type(error).__name__})")
-            self.failed(damage)
-            raise damage from None
-        except sqlite3.Error as error:
-            if _is_damage(error):
-                self.failed(error)
-            raise
+        """Rows as `take` makes them; on the thread, or before there is work for it."""
+        return _made(take, self._db.execute(query, values))
 
     # ---- events
 
@@ -224,24 +372,25 @@ class Journal:
         self, time: datetime, t: float, kind: str, joint: str | None, text: str, evidence: dict[str, Any]
     ) -> int:
         """Append an event and return its id."""
-        row = (_iso(time), t, kind, joint, text, json.dumps(evidence))
+        number, self._next_event = self._next_event, self._next_event + 1
+        statement = "INSERT INTO events(id, time, t, kind, joint, text, evidence) VALUES (?, ?, ?, ?, ?, ?, ?)"
         with self.transaction():
-            cursor = self._db.execute(
-                "INSERT INTO events(time, t, kind, joint, text, evidence) VALUES (?, ?, ?, ?, ?, ?)", row
-            )
-        assert cursor.lastrowid is not None
-        return cursor.lastrowid
+            self._write(statement, number, _iso(time), t, kind, joint, text, json.dumps(evidence))
+            self.once_kept(lambda: setattr(self, "_last_event", max(self._last_event, number)))
+        return number
 
     def events(self, after: int = 0, limit: int = 500) -> list[EventRecord]:
-        """Events with a larger id, oldest first."""
-        query = "SELECT id, time, t, kind, joint, text, evidence FROM events WHERE id > ? ORDER BY id LIMIT ?"
-        return self._read(_event, query, (max(-(2**63), min(after, 2**63 - 1)), limit))
+        """Events on disk with a larger id, oldest first; raises sqlite3.Error. From any thread."""
+        try:
+            return _made(_event, self._reader.events(max(-(2**63), min(after, 2**63 - 1)), limit))
+        except sqlite3.Error as error:
+            if _is_damage(error):
+                self.failed(error)
+            raise
 
     @property
     def last_event(self) -> int:
-        """Id of the newest event, as last read where it cannot be read now; 0 if there is none."""
-        with suppress(sqlite3.Error):
-            self._last_event = int(self._db.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()[0])
+        """Id of the newest event on disk; 0 if there is none."""
         return self._last_event
 
     def least_ages(self, kind: str, now: float) -> list[tuple[str | None, dict[str, Any], float]]:
@@ -261,76 +410,73 @@ class Journal:
 
     def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: Finding) -> int:
         """Append a pending proposal and return its id; earlier pending ones of the joint are superseded."""
+        number, self._next_proposal = self._next_proposal, self._next_proposal + 1
+        statement = "INSERT INTO proposals(id, time, joint, record, base, finding) VALUES (?, ?, ?, ?, ?, ?)"
+        values = _iso(time), joint, record, base, json.dumps(finding.as_json())
         with self.transaction():
             for earlier in self.proposals():
                 if earlier.joint == joint and earlier.state == "pending":
                     self.decide(earlier.id, time, "superseded", "daemon", "a newer proposal")
-            cursor = self._db.execute(
-                "INSERT INTO proposals(time, joint, record, base, finding) VALUES (?, ?, ?, ?, ?)",
-                (_iso(time), joint, record, base, json.dumps(finding.as_json())),
-            )
-        assert cursor.lastrowid is not None
-        return cursor.lastrowid
+            self._write(statement, number, *values, proposal=number)
+        return number
 
     def decide(self, proposal: int, time: datetime, state: str, by: str, note: str = "") -> None:
-        """Append a decision: the newest one is the proposal's state."""
-        with self.transaction():
-            self._db.execute(
-                "INSERT INTO decisions(proposal, time, state, by, note) VALUES (?, ?, ?, ?, ?)",
-                (proposal, _iso(time), state, by, note),
-            )
+        """Append a decision: the newest one is the proposal's state. None where a new journal lacks the proposal."""
+        statement = (
+            "INSERT INTO decisions(proposal, time, state, by, note) SELECT ?, ?, ?, ?, ? "
+            "WHERE EXISTS (SELECT 1 FROM proposals WHERE id = ?)"
+        )
+        self._write(statement, proposal, _iso(time), state, by, note, proposal, proposal=proposal)
 
     def proposals(self, limit: int = 200) -> list[ProposalRow]:
-        """Newest first."""
-        return self._read(proposal_of, PROPOSALS + " ORDER BY p.id DESC LIMIT ?", (limit,))
+        """Those on disk, newest first."""
+        return list(self._rows.values())[:limit]
 
     def pending(self) -> int:
-        """Number of pending proposals, as last read where they cannot be read now."""
-        with suppress(sqlite3.Error):
-            self._pending = sum(row.state == "pending" for row in self.proposals())
-        return self._pending
+        """Number of pending proposals."""
+        return sum(row.state == "pending" for row in self.proposals())
 
     def proposal(self, number: int) -> ProposalRow | None:
         """The proposal of that id."""
-        if not 0 < number < 2**63:
-            return None
-        return next(iter(self._read(proposal_of, PROPOSALS + " WHERE p.id = ?", (number,))), None)
+        return self._rows.get(number)
 
     def proposal_of(self, record: str) -> ProposalRow | None:
         """The newest proposal of that record."""
-        found = self._read(proposal_of, PROPOSALS + " WHERE p.record = ? ORDER BY p.id DESC LIMIT 1", (record,))
-        return next(iter(found), None)
+        return next((row for row in self._rows.values() if row.record == record), None)
 
     # ---- belief and history
 
     def save_belief(self, time: datetime, calibration: str | None, gravity: str | None, state: dict[str, Any]) -> None:
         """Replace the observer's saved state, whole or not at all."""
-        with self.transaction():
-            self._db.execute(
-                "INSERT OR REPLACE INTO belief(one, time, calibration, gravity, state) VALUES (1, ?, ?, ?, ?)",
-                (_iso(time), calibration, gravity, json.dumps(state)),
-            )
+        self._belief = calibration, gravity, json.dumps(state)
+        for waits in list(self._queue)[self._asked :]:  # this one takes their place
+            waits.statements = [each for each in waits.statements if each[0] is not _BELIEF]
+        self._write(_BELIEF, _iso(time), *self._belief)
 
     def belief(self) -> Belief | None:
         """The observer's saved state; None if there is none or it cannot be read."""
-        row = self._db.execute("SELECT calibration, gravity, state FROM belief").fetchone()
+        row = self._belief
         try:
             return None if row is None else Belief(row[0], row[1], json.loads(row[2]))
-        except ValueError:
+        except (ValueError, TypeError):
             return None
 
     def add_history(self, time: datetime, t: float, record: str | None, estimate: dict[str, Any]) -> None:
         """Append the estimates of all joints."""
-        with self.transaction():
-            self._db.execute(
-                "INSERT INTO history(time, t, record, estimate) VALUES (?, ?, ?, ?)",
-                (_iso(time), t, record, json.dumps(estimate)),
-            )
+        statement = "INSERT INTO history(time, t, record, estimate) VALUES (?, ?, ?, ?)"
+        self._write(statement, _iso(time), t, record, json.dumps(estimate))
 
     def thin_history(self, before: datetime, keep_every: int) -> None:
         """Keep one in `keep_every` of the estimates before a time."""
-        with self.transaction():
-            self._db.execute("DELETE FROM history WHERE time < ? AND id % ? != 0", (_iso(before), keep_every))
+        self._write("DELETE FROM history WHERE time < ? AND id % ? != 0", _iso(before), keep_every)
+
+
+def _made(take: Callable[[tuple[Any, ...]], R], rows: Iterable[tuple[Any, ...]]) -> list[R]:
+    """Rows as `take` makes them; raises sqlite3.Error where one is damaged."""
+    try:
+        return [take(row) for row in rows]
+    except (ValueError, TypeError, KeyError, IndexError) as error:
+        raise sqlite3.DatabaseError(f"a malformed row ({type(error).__name__})") from None
 
 
 def _is_damage(error: sqlite3.Error) -> bool:

@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from armlink.recording.mcap import RecordingWriter
+from calib.daemon.environment import RunAside
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.settings import Configuration, RecordingSettings
 
@@ -15,15 +16,21 @@ RETRY_SECONDS = 60.0
 """After a failure nothing is written for this time [s]."""
 
 
+MOST_WAITING = 300
+"""Batches that wait for the disk: those of 30 s; further ones are left out."""
+
+
 class Recordings:
     """Writes samples at the configured rate; a disk that is full or fails is logged and never stops the daemon.
 
-    Files are numbered, because the clock that stamps their names may be set back.
+    Files are numbered, because the clock that stamps their names may be set back. `_write` and what it calls are for
+    the thread that `run` gives work to.
     """
 
-    def __init__(self, directory: Path, configuration: Configuration) -> None:
+    def __init__(self, directory: Path, configuration: Configuration, run: RunAside) -> None:
         """Files go to `directory`, which is made with the first one."""
-        self._directory, self._configuration = directory, configuration
+        self._directory, self._configuration, self._run = directory, configuration, run
+        self._waiting, self._full = 0, False
         self._writer: RecordingWriter | None = None
         self._begun = self._last = self._due = -float("inf")
         self._failed_at = -float("inf")
@@ -33,8 +40,29 @@ class Recordings:
         return self._configuration.settings.recording
 
     def append(self, batch: Batch) -> None:
-        """Write the samples of a batch that are due."""
-        if not self._settings.enabled or batch.t[-1] - self._failed_at < RETRY_SECONDS:
+        """Have the samples of a batch that are due written."""
+        if not self._settings.enabled:
+            return
+        full, self._full = self._full, self._waiting >= MOST_WAITING
+        if self._full:
+            if not full:
+                log.error("recordings: the disk is too slow: samples are left out")
+            return
+        self._waiting += 1
+        self._run(lambda: self._append(batch), self._done)
+
+    def close(self) -> None:
+        """End the file that is open, once it is written."""
+        self._waiting += 1
+        self._run(self._end, self._done)
+
+    def _done(self, outcome: Exception | None) -> None:
+        self._waiting -= 1
+        if outcome is not None:
+            raise outcome
+
+    def _append(self, batch: Batch) -> None:
+        if batch.t[-1] - self._failed_at < RETRY_SECONDS:
             return
         try:
             if batch.t[0] - self._last > GAP or batch.t[0] < self._last or self._old(float(batch.t[0])):
@@ -43,11 +71,10 @@ class Recordings:
         except OSError as error:
             log.error("recordings: %s", error)
             self._failed_at = float(batch.t[-1])
-            self.close()
+            self._end()
         self._last = float(batch.t[-1])
 
-    def close(self) -> None:
-        """End the file that is open."""
+    def _end(self) -> None:
         writer, self._writer = self._writer, None
         if writer is not None:
             try:
@@ -67,7 +94,7 @@ class Recordings:
             self._writer.append(t - self._begun, {name: values[k] for name, values in batch.channels.items()})
 
     def _rotate(self, t: float) -> None:
-        self.close()
+        self._end()
         self._directory.mkdir(parents=True, exist_ok=True)
         self._keep_quota()
         last = max((path.name for path in self._directory.glob("*.mcap")), default="0")

@@ -1,10 +1,11 @@
 """The interface of the service to the web layer, and its refusals.
 
-All calls but those for the history and the arm's shape are made on the service's event loop (asyncio, the same thread);
-no answer waits for the bus.
+All calls but those for events, history and the arm's shape are made on the service's event loop (asyncio, the same
+thread); no answer waits for bus or disk.
 """
 
 from collections.abc import Iterator
+from concurrent.futures import Future
 from datetime import datetime
 from typing import Protocol
 
@@ -30,17 +31,24 @@ class NoSuch(Exception):
     """No proposal or joint of that id or name (HTTP 404)."""
 
 
-class Decisions(Protocol):
-    """Decisions that a person may take through the API. Raises NoSuch, NotPossible."""
+class NotYet(Exception):
+    """A decision that is taken, but not on disk yet; the message says so (HTTP 503)."""
 
-    def approve(self, number: int, by: str, digest: str | None = None) -> Proposal:
+
+class Decisions(Protocol):
+    """Decisions that a person may take through the API. Raises NoSuch, NotPossible.
+
+    The answer is there once the decision is on disk; it stands even if nobody waits for that.
+    """
+
+    def approve(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
         """Write a pending proposal and make its record current; `digest` is the `hash` of what was looked at.
 
-        It is `approved` at once, and `applied` or `failed` a moment later (an event).
+        It is `approved` once that is on disk, and `applied` or `failed` a moment later (an event).
         """
         ...
 
-    def reject(self, number: int, by: str, digest: str | None = None) -> Proposal:
+    def reject(self, number: int, by: str, digest: str | None = None) -> Future[Proposal]:
         """Drop a pending proposal; `digest` likewise."""
         ...
 
@@ -86,7 +94,10 @@ class DaemonView(Protocol):
         ...
 
     def events(self, after: int = 0, limit: int = 500) -> tuple[EventRecord, ...]:
-        """At most `limit` events with an id above `after`, oldest first; ask again after the last id for more."""
+        """At most `limit` events with an id above `after`, oldest first; ask again after the last id for more.
+
+        May be called in any thread.
+        """
         ...
 
     def history(

@@ -1,6 +1,8 @@
-"""Answers that are long: read in a thread of their own, sent page by page as the client takes them."""
+"""Answers that are read from the disk: in threads of their own; long ones page by page as the client takes them."""
 
 import asyncio
+import sqlite3
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -12,8 +14,10 @@ from calib.daemon.view.api_models import HistoryPoint
 from calib.daemon.view.view import DaemonView
 from calib.daemon.web.parameters import HistoryQuery
 
-MOST_ANSWERS = 16
-"""Long answers under way; each has one page in memory."""
+MOST_ANSWERS, MOST_OF_AN_OWNER = 16, 12
+"""Long answers under way, in all and of one process or address; each has one page in memory."""
+READ_SECONDS = 5.0
+"""A short answer that the disk has not given within this time is given up [s]."""
 _POINTS = TypeAdapter(tuple[HistoryPoint, ...])
 T = TypeVar("T")
 
@@ -26,43 +30,58 @@ class Histories:
     """GET /api/history, and whatever else reads the history."""
 
     def __init__(self, view: DaemonView) -> None:
-        self._view, self._under_way = view, 0
+        self._view, self._under_way = view, Counter[str]()
         self._thread = ThreadPoolExecutor(1, "history")
+        self._short = ThreadPoolExecutor(1, "events")
 
-    async def aside(self, work: Callable[[], T]) -> T:
+    async def short(self, work: Callable[[], T]) -> T:
+        """The value of `work`, which reads little, not behind long answers; raises sqlite3.Error, also if it waits."""
+        try:
+            async with asyncio.timeout(READ_SECONDS):
+                return await asyncio.get_running_loop().run_in_executor(self._short, work)
+        except TimeoutError:
+            raise sqlite3.OperationalError(f"the disk has not answered for {READ_SECONDS:.0f} s") from None
+
+    async def aside(self, owner: str, work: Callable[[], T]) -> T:
         """The value of `work`, which reads history, from the thread; raises TooMany and what `work` raises."""
-        self._enter()
+        self._enter(owner)
         try:
             return await asyncio.get_running_loop().run_in_executor(self._thread, work)
         finally:
-            self._under_way -= 1
+            self._under_way[owner] -= 1
 
-    async def answer(self, query: HistoryQuery) -> StreamingResponse:
+    async def answer(self, owner: str, query: HistoryQuery) -> StreamingResponse:
         """The points that a query asks for; raises NoSuch, TooMany."""
         pages = self._view.history_pages(query.joint or None, query.since, query.until, query.limit)
-        return await self.send(_as_json(pages), bytes, "application/json")
+        return await self.send(owner, _as_json(pages), bytes, "application/json")
 
     async def send(
-        self, pages: Iterator[T], encode: Callable[[T], bytes], media_type: str, headers: dict[str, str] | None = None
+        self,
+        owner: str,
+        pages: Iterator[T],
+        encode: Callable[[T], bytes],
+        media_type: str,
+        headers: dict[str, str] | None = None,
     ) -> StreamingResponse:
         """Pages as they are encoded, in the thread, one at a time; raises TooMany and what the first one raises."""
         pieces = (encode(page) for page in pages)
-        first = await self.aside(lambda: next(pieces, None))
-        return StreamingResponse(self._body(first, pieces), media_type=media_type, headers=headers)
+        first = await self.aside(owner, lambda: next(pieces, None))
+        return StreamingResponse(self._body(owner, first, pieces), media_type=media_type, headers=headers)
 
-    async def _body(self, piece: bytes | None, pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
-        self._under_way += 1
+    async def _body(self, owner: str, piece: bytes | None, pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
+        self._under_way[owner] += 1
         try:
             while piece is not None:
                 yield piece
                 piece = await asyncio.get_running_loop().run_in_executor(self._thread, next, pieces, None)
         finally:
-            self._under_way -= 1
+            self._under_way[owner] -= 1
 
-    def _enter(self) -> None:
-        if self._under_way >= MOST_ANSWERS:
-            raise TooMany(f"{self._under_way} long answers are under way already: ask again in a moment")
-        self._under_way += 1
+    def _enter(self, owner: str) -> None:
+        self._under_way = +self._under_way
+        if self._under_way.total() >= MOST_ANSWERS or self._under_way[owner] >= MOST_OF_AN_OWNER:
+            raise TooMany(f"{self._under_way.total()} long answers are under way already: ask again in a moment")
+        self._under_way[owner] += 1
 
 
 def _as_json(pages: Iterator[tuple[HistoryPoint, ...]]) -> Iterator[bytes]:

@@ -8,12 +8,13 @@ import socket
 import struct
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, cast
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from calib.daemon.web.admission import Admission
+from calib.daemon.web.admission import FIRST_SECONDS, Admission
 from calib.daemon.web.linger import LingeringTransport
 
 Scope = MutableMapping[str, Any]
@@ -46,6 +47,8 @@ class Peer:
     address: str
     """Key of the rate limit: the address on TCP, empty on the Unix socket."""
     tcp: bool
+    owner: str = ""
+    """Whose connection it is, where room is scarce: a process on the Unix socket, an address on TCP."""
     local: str = ""
     """Local address of this connection (TCP), a valid Host for it."""
     abort: Callable[[], None] = lambda: None
@@ -70,9 +73,9 @@ def describe_peer(transport: asyncio.Transport) -> Peer:
     if sock is None or sock.family != socket.AF_UNIX:
         address = str((transport.get_extra_info("peername") or ("unknown",))[0])
         local = str((transport.get_extra_info("sockname") or ("",))[0])
-        return Peer(f"tcp {address}", address, tcp=True, local=local, abort=transport.abort)
-    _, uid, _ = _UCRED.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
-    return Peer(f"{_user(uid)} on the socket", "", tcp=False, abort=transport.abort)
+        return Peer(f"tcp {address}", address, tcp=True, owner=address, local=local, abort=transport.abort)
+    process, uid, _ = _UCRED.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
+    return Peer(f"{_user(uid)} on the socket", "", tcp=False, owner=f"process {process}", abort=transport.abort)
 
 
 class BoundedProtocol(H11Protocol):
@@ -80,7 +83,7 @@ class BoundedProtocol(H11Protocol):
 
     admission = Admission()
     """Of all connections of a server, which has a class of its own (`protocol_of`)."""
-    address = ""
+    address = owner = ""
     _deadline: asyncio.TimerHandle | None = None
     _taking: asyncio.TimerHandle | None = None
 
@@ -89,20 +92,37 @@ class BoundedProtocol(H11Protocol):
         super().connection_made(cast(asyncio.Transport, LingeringTransport(transport)))
         transport.set_write_buffer_limits(high=WRITE_BUFFER)
         peer, app = replace(describe_peer(transport), trust=lambda: self.admission.trust(self)), self.app
-        self.address = peer.address
-        if not self.admission.enter(self):
-            transport.abort()
-            return
+        self.address, self.owner = peer.address, peer.owner
 
         async def with_peer(scope: Any, receive: Any, send: Any) -> None:
             scope[PEER] = peer
             await app(scope, receive, send)
 
         self.app = with_peer
+        transport.pause_reading()
         self._mind_the_clock()
+        self.admission.enter(self)
+        if self.admission.queue:
+            self.loop.call_later(FIRST_SECONDS, self.admission.admit)
+
+    def begin(self) -> None:
+        """It is this connection's turn."""
+        self.transport.resume_reading()
+
+    def give_way(self) -> None:
+        """End it in good order: nothing is being answered."""
+        self._stop_the_clock()
+        self.transport.close()
+
+    def on_response_complete(self) -> None:
+        """As uvicorn's; then others may have their turn."""
+        super().on_response_complete()
+        if self._awaits_head() and not self.conn.trailing_data[0] and not self.transport.is_closing():
+            self.admission.answered(self)
 
     def data_received(self, data: bytes) -> None:
         """As uvicorn's, with a deadline for the rest of the head."""
+        self.admission.asked(self)
         super().data_received(data)
         self._mind_the_clock()
 
@@ -194,6 +214,7 @@ def protocol_of(admission: Admission) -> type[BoundedProtocol]:
     return type("BoundedProtocol", (BoundedProtocol,), {"admission": admission})
 
 
+@lru_cache(maxsize=64)
 def _user(uid: int) -> str:
     try:
         return f"{pwd.getpwuid(uid).pw_name} (uid {uid})"

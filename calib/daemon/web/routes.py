@@ -1,7 +1,9 @@
 """The API's routes (docs/daemon-api.md). All read, except the two that decide on a proposal; none commands motion."""
 
+import asyncio
 import sqlite3
 from collections.abc import Callable
+from concurrent.futures import Future
 from datetime import timedelta
 from typing import Annotated, Any
 
@@ -18,7 +20,7 @@ from calib.daemon.view.api_models import (
     Proposal,
     Status,
 )
-from calib.daemon.view.view import DaemonView, NoSuch, NotPossible
+from calib.daemon.view.view import DaemonView, NoSuch, NotPossible, NotYet
 from calib.daemon.web.history import Histories, TooMany
 from calib.daemon.web.parameters import (
     LARGEST_ID,
@@ -41,7 +43,7 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
     413: {"model": ApiError, "description": "The body is too large"},
     422: {"model": ApiError, "description": "A parameter is not valid"},
     429: {"model": ApiError, "description": "Too many requests, long answers, or clients on the stream"},
-    503: {"model": ApiError, "description": "The journal cannot be read or written now, or too many clients"},
+    503: {"model": ApiError, "description": "The journal cannot be read or written now or yet, or too many clients"},
 }
 NO_SUCH: dict[int | str, dict[str, Any]] = {404: {"model": ApiError, "description": "Not found"}}
 NOT_NOW: dict[int | str, dict[str, Any]] = {
@@ -60,6 +62,9 @@ REPORT_CSP = (
 )
 """The report is one file with its scripts inside; it may not send requests to this daemon or anyone else."""
 
+DECISION_SECONDS = 5.0
+"""Wait for a decision to be on disk; after it the answer is "not yet" [s]."""
+
 ProposalId = Annotated[int, Path(ge=1, le=LARGEST_ID)]
 OptionalDecision = Annotated[Decision | None, Body()]
 
@@ -67,7 +72,7 @@ OptionalDecision = Annotated[Decision | None, Body()]
 def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes]) -> APIRouter:
     """Every route of the API on this view."""
     router = APIRouter(responses=REFUSALS)
-    histories = Histories(view)
+    histories = streams.histories
     _add_now(router, view, histories)
     _add_past(router, view, histories)
     add_window(router, view, histories)
@@ -75,10 +80,10 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
 
     @router.get("/api/stream", response_class=Response, responses=STREAM, tags=["now"])
     async def stream(
-        query: Annotated[StreamQuery, Query()], last_event_id: Annotated[Id | None, Header()] = None
+        request: Request, query: Annotated[StreamQuery, Query()], last_event_id: Annotated[Id | None, Header()] = None
     ) -> Response:
         """Joints at 10 Hz, and events as they happen; a slow client still gets every event, in order."""
-        if streams.is_full:
+        if not streams.make_room(peer_of(request.scope).owner):
             raise TooMany(f"{streams.clients} clients are on the stream already")
         return StreamResponse(streams, query.after if last_event_id is None else last_event_id)
 
@@ -102,9 +107,9 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
         return view.joints()
 
     @router.get("/api/arm", responses=NO_SUCH, tags=["now"])
-    async def arm() -> DrawnArm:
+    async def arm(request: Request) -> DrawnArm:
         """The arm's shape, to draw it at any joint positions."""
-        return await histories.aside(view.arm)
+        return await histories.aside(peer_of(request.scope).owner, view.arm)
 
     @router.get("/api/estimates", tags=["now"])
     async def estimates() -> tuple[JointEstimate, ...]:
@@ -112,7 +117,7 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
         return view.estimates()
 
     @router.get("/api/overview", response_model=Overview, tags=["now"])
-    async def overview(query: Annotated[OverviewQuery, Query()]) -> Response:
+    async def overview(request: Request, query: Annotated[OverviewQuery, Query()]) -> Response:
         """Everything that the page shows, in one answer, with the newest events and history."""
         status = view.status()
         since = status.time - timedelta(seconds=query.seconds) if query.seconds else None
@@ -121,32 +126,35 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
             joints=view.joints(),
             estimates=view.estimates(),
             proposals=view.proposals(),
-            events=view.events(after=max(0, status.last_event - query.events)),
+            events=(),
             history=(),
         )
 
         def encoded() -> str:
-            return answer.model_copy(update={"history": view.history(None, since, None, query.limit)}).model_dump_json()
+            events = view.events(after=max(0, status.last_event - query.events))
+            history = view.history(None, since, None, query.limit)
+            return answer.model_copy(update={"events": events, "history": history}).model_dump_json()
 
-        return Response(await histories.aside(encoded), media_type="application/json")
+        content = await histories.aside(peer_of(request.scope).owner, encoded)
+        return Response(content, media_type="application/json")
 
 
 def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None:
     @router.get("/api/events", tags=["past"])
     async def events(query: Annotated[EventsQuery, Query()]) -> tuple[EventRecord, ...]:
         """Events after an id, oldest first."""
-        return view.events(after=query.after, limit=query.limit)
+        return await histories.short(lambda: view.events(after=query.after, limit=query.limit))
 
     @router.get("/api/history", response_model=tuple[HistoryPoint, ...], responses=NO_SUCH, tags=["past"])
-    async def history(query: Annotated[HistoryQuery, Query()]) -> Response:
+    async def history(request: Request, query: Annotated[HistoryQuery, Query()]) -> Response:
         """Gain and offset over time, oldest first; without a joint, one joint after the other."""
-        return await histories.answer(query)
+        return await histories.answer(peer_of(request.scope).owner, query)
 
     @router.get("/api/report", response_class=FileResponse, responses=NO_SUCH | _HTML, tags=["past"])
     async def report() -> FileResponse:
         """The newest report in the state directory, one HTML file."""
         path = view.status().report
-        if path is None or not path.is_file():
+        if path is None or not await histories.short(path.is_file):
             raise NoSuch("no report yet: the newest HTML file in the state directory (calibrate --report writes one)")
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
 
@@ -163,12 +171,24 @@ def _add_proposals(router: APIRouter, view: DaemonView) -> None:
     @router.post("/api/proposals/{id}/approve", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def approve(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Write a pending proposal to the controller; `applied` or `failed` follows as an event."""
-        return view.decisions.approve(id, _who(decision, peer_of(request.scope)), _digest(decision))
+        return await _decided(id, view.decisions.approve(id, _who(decision, peer_of(request.scope)), _digest(decision)))
 
     @router.post("/api/proposals/{id}/reject", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def reject(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Drop a pending proposal."""
-        return view.decisions.reject(id, _who(decision, peer_of(request.scope)), _digest(decision))
+        return await _decided(id, view.decisions.reject(id, _who(decision, peer_of(request.scope)), _digest(decision)))
+
+
+async def _decided(number: int, answer: Future[Proposal]) -> Proposal:
+    """The answer once the decision is on disk; raises NotYet where that takes long."""
+    try:
+        async with asyncio.timeout(DECISION_SECONDS):
+            return await asyncio.shield(asyncio.wrap_future(answer))
+    except TimeoutError:
+        raise NotYet(
+            f"not yet: the decision on proposal {number} waits for the disk, which has not answered for "
+            f"{DECISION_SECONDS:.0f} s, and is carried out once it does: do not repeat it, see /api/proposals"
+        ) from None
 
 
 def _who(decision: Decision | None, peer: Peer) -> str:
@@ -180,5 +200,5 @@ def _digest(decision: Decision | None) -> str | None:
     return None if decision is None else decision.hash
 
 
-ERRORS: dict[type[Exception], int] = {NoSuch: 404, NotPossible: 409, TooMany: 429, sqlite3.Error: 503}
+ERRORS: dict[type[Exception], int] = {NoSuch: 404, NotPossible: 409, TooMany: 429, sqlite3.Error: 503, NotYet: 503}
 """HTTP status of what a route may raise."""

@@ -22,7 +22,7 @@ from calib.daemon.web.peer import protocol_of
 SOCKET_MODE = 0o660
 """Access for owner and group only."""
 SHORTEST_TOKEN = 16
-MOST_CONNECTIONS = 640
+MOST_CONNECTIONS = 1280
 """More than all that `admission` lets in together."""
 ACCEPTED_AT_ONCE = 32
 """Connections accepted in one go: those that find no room are closed before the next go."""

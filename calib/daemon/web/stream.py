@@ -2,12 +2,15 @@
 
 import asyncio
 import logging
+import sqlite3
+from collections import Counter
 from contextlib import suppress
 
 from fastapi.responses import StreamingResponse
 
-from calib.daemon.view.api_models import EventItem, JointsItem
+from calib.daemon.view.api_models import EventItem, EventRecord, JointsItem
 from calib.daemon.view.view import DaemonView
+from calib.daemon.web.history import Histories
 from calib.daemon.web.peer import Message, Receive, Scope, Send, peer_of
 
 SEND_SECONDS = 5.0
@@ -25,8 +28,9 @@ class Streams:
     """All clients of the stream."""
 
     def __init__(self, view: DaemonView) -> None:
-        self._view = view
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._view, self.histories = view, Histories(view)
+        self._tasks: dict[asyncio.Task[None], str] = {}
+        """Whose each is, the oldest first."""
         self._item: JointsItem | None = None
         self._bytes = b""
         self._closed = False
@@ -38,10 +42,18 @@ class Streams:
         """Number of clients connected."""
         return len(self._tasks)
 
-    @property
-    def is_full(self) -> bool:
-        """Whether no further client is accepted."""
-        return self.clients >= MOST_CLIENTS
+    def make_room(self, owner: str) -> bool:
+        """Whether there is room for one more of this process or address; the oldest of who holds most gives way."""
+        if self.clients < MOST_CLIENTS:
+            return True
+        held = Counter(self._tasks.values())
+        most, number = held.most_common(1)[0]
+        if number <= held[owner] + 1:
+            return False
+        task = next(task for task, each in self._tasks.items() if each == most)
+        del self._tasks[task]
+        task.cancel()
+        return True
 
     def close(self) -> None:
         """End every stream, and each that is asked for later as soon as it has begun."""
@@ -58,14 +70,14 @@ class Streams:
     async def run(self, scope: Scope, receive: Receive, send: Send, after: int | None) -> None:
         """Serve one client until it leaves: all events after id `after` (None: only new ones), then new items."""
         client = asyncio.create_task(self._send_all(send, after))
-        self._tasks.add(client)
+        self._tasks[client] = peer_of(scope).owner
         if self._closed:
             client.cancel()
         gone = asyncio.create_task(_until_gone(receive))
         try:
             await asyncio.wait({client, gone}, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            self._tasks.discard(client)
+            self._tasks.pop(client, None)
             for task in (client, gone):
                 task.cancel()
             results = await asyncio.gather(client, gone, return_exceptions=True)
@@ -103,12 +115,18 @@ class Streams:
 
     async def _catch_up(self, send: Send, after: int) -> int:
         """Send every event after the id; returns the newest's id."""
-        while events := self._view.events(after=after):
+        while events := await self._events(after):
             for event in events:
                 data = EventItem(event=event).model_dump_json().encode()
                 await _send(send, b"event: event\nid: %d\ndata: %b\n\n" % (event.id, data))
                 after = event.id
         return after
+
+    async def _events(self, after: int) -> tuple[EventRecord, ...]:
+        """None where they cannot be read now: they come with the next one."""
+        with suppress(sqlite3.Error):
+            return await self.histories.short(lambda: self._view.events(after=after))
+        return ()
 
 
 class StreamResponse(StreamingResponse):

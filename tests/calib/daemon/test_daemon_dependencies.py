@@ -9,15 +9,13 @@ from typing import Any
 
 import pytest
 from failing_calls import DEPENDENCIES, events, watched_drift
-from fast_daemon import QUIET, FastDaemon
+from fast_daemon import QUIET, FastDaemon, drifted, metric
 from postgres import NoServer, stoppable_server
 
 from armlink.errors import BadInput, BusFault
 from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.api_models import EventItem, State
-from calib.daemon.web.metrics import metrics_text
-from calib.daemon.web.stream import Streams
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 
@@ -64,11 +62,6 @@ def test_single_failures_of_all_at_once_are_right_again_within_seconds(
     assert min(daemon.failing.failed.values()) >= 1
     assert (daemon.lost(), daemon.wrong) == ([], [])
     assert [event for event in undisturbed if event not in events(daemon)] == []
-
-
-def metric(daemon: FastDaemon, name: str) -> str:
-    text = metrics_text(daemon.view, Streams(daemon.view))().decode()
-    return next(line.split()[1] for line in text.splitlines() if line.startswith(f"armlink_{name} "))
 
 
 def test_a_truncated_store_is_said_and_the_records_stay_in_force(tmp_path: Path) -> None:
@@ -127,6 +120,8 @@ def test_a_store_that_does_not_answer_holds_nobody_up(tmp_path: Path) -> None:
     daemon.run(30)
     assert len(later) == 1
     assert daemon.view.status().state is State.OBSERVING
+    assert "records.db: has not answered for 2" in (daemon.view.status().store_fault or "")
+    assert metric(daemon, "record_store_up") == "0.0"
     daemon.run_aside = lambda work, done: done(work())
     work, done = later.pop()
     done(work())
@@ -142,7 +137,7 @@ def test_a_lock_of_another_program_holds_the_daemon_for_a_moment_only(tmp_path: 
     daemon.run(5)
     other = sqlite3.connect(tmp_path / "state" / "journal.db", isolation_level=None)
     other.execute("BEGIN EXCLUSIVE")
-    assert daemon.service.journal._db.execute("PRAGMA busy_timeout").fetchone() == (50,)  # [ms], on the event loop
+    assert daemon.service.journal._db.execute("PRAGMA busy_timeout").fetchone() == (50,)  # [ms]
     tried = []
     daemon.service.journal._db.set_trace_callback(tried.append)
     for number in range(100):
@@ -204,24 +199,22 @@ def test_what_cannot_be_committed_is_not_half_kept(tmp_path: Path) -> None:
     real = journal._db
 
     journal._db = NoCommit(real)  # type: ignore[assignment]
-    with pytest.raises(sqlite3.OperationalError), journal.transaction():
-        real.execute("INSERT INTO history(time, t, record, estimate) VALUES ('a', 0, 'b', '{}')")
+    journal.add_history(datetime(2026, 1, 1, tzinfo=UTC), 0.0, None, {})
     assert not real.in_transaction
     assert real.execute("SELECT COUNT(*) FROM history").fetchone() == (0,)
     assert "disk is full" in journal.trouble
+    assert journal.waiting == 1
 
 
 def test_a_disk_that_is_full_at_the_start_is_said_and_the_start_is_kept_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    add = Journal.add_event
-    monkeypatch.setattr(
-        Journal, "add_event", lambda *_: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full"))
-    )
+    commit = Journal._commit
+    monkeypatch.setattr(Journal, "_commit", lambda *_: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full")))
     daemon = FastDaemon(tmp_path, 1, settings())
     daemon.run(3)
     assert "disk is full" in daemon.view.status().detail
-    monkeypatch.setattr(Journal, "add_event", add)
+    monkeypatch.setattr(Journal, "_commit", commit)
     daemon.run(3)
     assert daemon.view.status().detail == ""
     assert daemon.view.events()[0].kind == "started"
@@ -345,16 +338,6 @@ def test_a_journal_that_is_no_database_is_set_aside(tmp_path: Path) -> None:
 # ---- store, bus and journal at once
 
 
-def drifted(folder: Path) -> FastDaemon:
-    """Joint 3 has drifted, and its recalibration waits for an approval."""
-    daemon = FastDaemon(folder, 1, settings())
-    daemon.run(40)
-    daemon.fast.gain[2] *= 1.03
-    daemon.fast.offset[2] += 0.3
-    daemon.run(80)
-    return daemon
-
-
 def test_a_store_that_is_replaced_by_rename_is_shown_and_followed(tmp_path: Path) -> None:
     """Controllers were written and their records lost: the daemon went on with the file that had lost its name."""
     daemon, path = drifted(tmp_path), tmp_path / "records.db"
@@ -365,7 +348,7 @@ def test_a_store_that_is_replaced_by_rename_is_shown_and_followed(tmp_path: Path
     ):
         old.backup(new)
     (tmp_path / "copy").rename(path)
-    refused = daemon.view.decisions.approve(proposal.id, "ann")
+    refused = daemon.view.decisions.approve(proposal.id, "ann").result(0)
     assert (refused.state, "was replaced by another file" in refused.note) == ("failed", True)
     assert not any(call.startswith("write") for call in daemon.sdo)
     (tmp_path / "away").write_bytes(path.read_bytes())
@@ -385,7 +368,7 @@ def test_while_the_store_s_file_is_gone_nothing_is_written(tmp_path: Path) -> No
     path.rename(tmp_path / "away.db")
     daemon.run(7)
     assert "its file is gone" in (daemon.view.status().store_fault or "")
-    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
     assert (answer.state, "its file is gone" in answer.note) == ("failed", True)
     assert not any(call.startswith("write") for call in daemon.sdo)
     assert not path.exists()

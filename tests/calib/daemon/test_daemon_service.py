@@ -70,18 +70,18 @@ def test_under_propose_nothing_is_written_until_a_person_approves(tmp_path: Path
     assert proposal.state == "pending"
     assert daemon.view.status().pending_proposals == 1
     assert not any(call.startswith("write") for call in daemon.sdo)
-    approved = daemon.view.decisions.approve(proposal.id, "ann")
+    approved = daemon.view.decisions.approve(proposal.id, "ann").result(0)
     assert (approved.state, approved.decided_by) == ("applied", "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
     assert daemon.store.activations(daemon.arm)[-1].by == "ann"
     with pytest.raises(NotPossible, match="applied already"):
-        daemon.view.decisions.approve(proposal.id, "ann")
+        daemon.view.decisions.approve(proposal.id, "ann").result(0)
 
 
 def test_a_rejected_proposal_changes_nothing(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     before = daemon.store.current(CalibrationRecord, daemon.arm)
-    assert daemon.view.decisions.reject(daemon.view.proposals()[0].id, "ann").state == "rejected"
+    assert daemon.view.decisions.reject(daemon.view.proposals()[0].id, "ann").result(0).state == "rejected"
     assert daemon.store.current(CalibrationRecord, daemon.arm) == before
     assert daemon.of_kind("rejected")[0].evidence["by"] == "ann"
 
@@ -201,7 +201,7 @@ def test_a_record_that_is_not_current_in_the_store_any_more_is_not_followed(tmp_
 def test_a_write_that_fails_is_said_and_the_old_record_stays(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "propose")
     daemon.on_write = daemon.broken
-    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
     assert answer.state == "failed"
     assert "joint gone" in answer.note
     assert daemon.store.current(CalibrationRecord, daemon.arm).id == answer.base

@@ -1,5 +1,6 @@
 """The daemon's journal: what supersedes what, and how much of a history is read."""
 
+import sqlite3
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -61,3 +62,27 @@ def test_a_history_is_thinned_evenly_to_what_is_asked_for_and_keeps_the_newest(
     reader = HistoryReader(journal.path)
     assert reader.chosen(None, None, most) == read
     assert reader.chosen(NOW + timedelta(minutes=2), NOW + timedelta(minutes=3), 9) == [3, 4]
+
+
+def test_ids_that_leave_no_room_for_more_are_damage(tmp_path: Path) -> None:
+    first = Journal(tmp_path / "journal.db")
+    first._db.execute(
+        "INSERT INTO events(id, time, t, kind, text, evidence) VALUES (?, '', 0, '', '', '{}')", (2**63 - 1,)
+    )
+    first.close()
+    second = Journal(tmp_path / "journal.db")
+    assert second.set_aside.startswith("journal.db.damaged-")
+    assert second.add_event(NOW, 0.0, "clock", None, "", {}) == 1
+
+
+def test_ids_go_on_over_a_restart_and_where_a_file_is_begun_anew_under_way(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.db", lambda: 0.0)
+    finding = Finding(0, "gain", 1.02, 0.0, np.zeros((2, 2)), 40, 0.99)
+    assert [journal.add_proposal(NOW, "j1", "new", "old", finding) for _ in range(2)] == [1, 2]
+    journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
+    journal.probe()
+    assert journal.proposals() == []
+    journal.decide(2, NOW, "approved", "ann")
+    assert journal.add_proposal(NOW, "j1", "new", "old", finding) == 3
+    journal.close()
+    assert [row.state for row in Journal(tmp_path / "journal.db").proposals()] == ["pending"]

@@ -1,11 +1,14 @@
 """The daemon's log: one JSON object a line on standard error."""
 
+import io
 import json
 import logging
+import threading
 from collections.abc import Iterator
 
 import pytest
 
+from calib.daemon import logs
 from calib.daemon.logs import log_as_json
 
 
@@ -24,9 +27,38 @@ def root() -> Iterator[logging.Logger]:
 
 def test_what_is_logged_is_json_on_standard_error(root: logging.Logger, capsys: pytest.CaptureFixture[str]) -> None:
     log_as_json()
+    logs.log_in_thread()
     logging.getLogger("calib.test").info("hello %s", "you")
     logging.getLogger("calib.test").debug("not this")
     logging.getLogger("canopen.sdo").info("nor this")
+    (handler,) = root.handlers
+    handler.stream.drain(60.0)  # type: ignore[attr-defined]
     (line,) = capsys.readouterr().err.splitlines()
     assert "hello you" in json.loads(line).values()
-    assert len(root.handlers) == 1
+
+
+class NobodyReads(io.StringIO):
+    """As a pipe to a journal whose disk hangs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.may = threading.Event()
+
+    def write(self, text: str) -> int:
+        self.may.wait(60)
+        return super().write(text)
+
+
+def test_a_reader_of_the_log_that_takes_nothing_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "MOST_LINES", 10)
+    reader = NobodyReads()
+    lines = logs.LineQueue(reader)
+    for number in range(100):
+        lines.write(f"{number}\n")
+    assert reader.getvalue() == ""
+    lines.drain(0.0)
+    reader.may.set()
+    lines.drain(60.0)
+    written = reader.getvalue().split()
+    assert written == [str(number) for number in range(len(written))]
+    assert len(written) in (10, 11)

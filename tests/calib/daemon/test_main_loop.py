@@ -17,6 +17,7 @@ from armlink.link.ends import Cause
 from armlink.link.types import Tell
 from armlink.loop.messages import Alive
 from calib.daemon import main_loop
+from calib.daemon.environment import Immediate
 from calib.daemon.loop.loop_messages import Message
 from calib.daemon.main_loop import BEGIN_SECONDS, SILENT_SECONDS, Daemon
 from calib.daemon.notify import Notifier
@@ -56,6 +57,7 @@ class Running:
         self.write(lambda content: None)
         self.started: list[NoProcess] = []
         patch.setattr(main_loop, "LoopProcess", self._start)
+        patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
         options = Options(arm=str(self.arm_file), store=str(folder / "records.db"))
         self.process = NoProcess()
         self.daemon = Daemon(options, load_arm(self.arm_file), self.process, folder / "state")  # type: ignore[arg-type]

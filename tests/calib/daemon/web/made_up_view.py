@@ -1,6 +1,7 @@
 """A daemon's view that tests fill by hand: what the web layer does must not depend on a bus."""
 
 import math
+from concurrent.futures import Future
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -28,6 +29,7 @@ class MadeUpView:
         """As it is at the start."""
         self.state, self.fault, self.t = api_models.State.OBSERVING, None, 0.0
         self.report = None
+        self.disk_hangs = False
         self.log: list[api_models.EventRecord] = []
         self.points: list[api_models.HistoryPoint] = []
         self.offered: list[api_models.Proposal] = []
@@ -168,10 +170,10 @@ class MadeUpView:
     def proposals(self, limit: int = 200) -> tuple[api_models.Proposal, ...]:
         return tuple(self.offered[:limit])
 
-    def approve(self, proposal: int, by: str, digest: str | None = None) -> api_models.Proposal:
+    def approve(self, proposal: int, by: str, digest: str | None = None) -> Future[api_models.Proposal]:
         return self._decide(proposal, "approved", by, digest)
 
-    def reject(self, proposal: int, by: str, digest: str | None = None) -> api_models.Proposal:
+    def reject(self, proposal: int, by: str, digest: str | None = None) -> Future[api_models.Proposal]:
         return self._decide(proposal, "rejected", by, digest)
 
     def subscribe(self) -> Client:
@@ -179,7 +181,8 @@ class MadeUpView:
         client.put(self.item())
         return client
 
-    def _decide(self, number: int, state: str, by: str, digest: str | None) -> api_models.Proposal:
+    def _decide(self, number: int, state: str, by: str, digest: str | None) -> Future[api_models.Proposal]:
+        answer: Future[api_models.Proposal] = Future()
         for place, proposal in enumerate(self.offered):
             if proposal.id == number:
                 if digest not in (None, proposal.hash):
@@ -188,5 +191,7 @@ class MadeUpView:
                     raise NotPossible(f"proposal {number} is {proposal.state} already")
                 update = {"state": state, "decided_by": by, "decided_at": self.time()}
                 self.offered[place] = proposal.model_copy(update=update)
-                return self.offered[place]
+                if not self.disk_hangs:
+                    answer.set_result(self.offered[place])
+                return answer
         raise NoSuch(f"no proposal {number}")

@@ -3,6 +3,7 @@
 import json
 import re
 import sqlite3
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -15,6 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from served_page import Served
 
 from calib.daemon.view.api_models import HistoryPoint
+from calib.daemon.web import history, routes
 from calib.daemon.web import page as page_module
 from calib.daemon.web.page import page_files
 from calib.daemon.web.parameters import LARGEST_ID, Id
@@ -103,6 +105,30 @@ def test_a_decision_may_name_the_content_and_is_then_of_that_alone(server: Serve
     assert "is not the one of hash" in other.json()["error"]
     assert client.post("/api/proposals/1/approve", json={"hash": "1"}).status_code == 422
     assert client.post("/api/proposals/1/approve", json={"hash": shown["hash"], "by": "ann"}).status_code == 200
+
+
+def test_a_decision_that_is_not_on_disk_in_time_is_not_yet_and_stands(
+    server: Served, view: MadeUpView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(routes, "DECISION_SECONDS", 0.05)
+    server.do(view.propose)
+    view.disk_hangs = True
+    answer = server.client().post("/api/proposals/1/approve")
+    assert answer.status_code == 503
+    assert answer.json()["error"].startswith("not yet: the decision on proposal 1 waits for the disk")
+    assert server.client().post("/api/proposals/1/approve").status_code == 409
+
+
+def test_events_that_the_disk_does_not_give_are_given_up(
+    server: Served, view: MadeUpView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    may = threading.Event()
+    monkeypatch.setattr(history, "READ_SECONDS", 0.05)
+    monkeypatch.setattr(view, "events", lambda after=0, limit=500: may.wait(60) and ())
+    answer = server.client().get("/api/events")
+    assert (answer.status_code, server.client().get("/api/status").status_code) == (503, 200)
+    assert "the disk has not answered" in answer.json()["error"]
+    may.set()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Clients that take what they can get: strangers on TCP, readers that do not read. Nobody else is held up."""
 
+import asyncio
 import contextlib
 import json
 import resource
@@ -18,7 +19,8 @@ from made_up_view import MadeUpView
 from served_page import Served, served
 
 from calib.daemon import service_view
-from calib.daemon.web import admission, peer
+from calib.daemon.web import admission, peer, stream
+from calib.daemon.web.stream import Streams
 
 ROWS = 3000
 STRANGERS = 1100
@@ -79,33 +81,41 @@ def test_idle_strangers_on_tcp_lock_nobody_out(
     assert len(caplog.records) < 100
 
 
+class Connection:
+    def __init__(self, room: admission.Admission, address: str, owner: str = "") -> None:
+        self.room, self.address, self.owner = room, address, owner or address
+        self.is_cut = self.begun = self.gave_way = False
+
+    def begin(self) -> None:
+        self.begun = True
+
+    def give_way(self) -> None:
+        self.gave_way = True
+
+    def cut(self) -> None:
+        self.is_cut = True
+        self.room.leave(self)
+
+    def unsent(self) -> int:
+        return 1 << 20
+
+
 def test_of_one_address_only_the_newest_strangers_stay() -> None:
-    class Connection:
-        def __init__(self, address: str) -> None:
-            self.address, self.is_cut = address, False
-
-        def cut(self) -> None:
-            self.is_cut = True
-            room.leave(self)
-
-        def unsent(self) -> int:
-            return 1 << 20
-
     room = admission.Admission()
-    first = [Connection("192.0.2.1") for _ in range(admission.MOST_OF_AN_ADDRESS + 3)]
-    others = [Connection(f"192.0.2.{number}") for number in range(2, 40)]
-    assert all(room.enter(each) for each in first + others)
+    first = [Connection(room, "192.0.2.1") for _ in range(admission.MOST_OF_AN_ADDRESS + 3)]
+    others = [Connection(room, f"192.0.2.{number}") for number in range(2, 40)]
+    for each in first + others:
+        room.enter(each)
     assert [each.is_cut for each in first[:3]] == [True] * 3
     kept = [each for each in first + others if not each.is_cut]
     assert len(kept) == admission.MOST_STRANGERS
     assert others[-1] in kept
     trusted = kept[0]
     assert room.trust(trusted)
-    assert all(room.enter(Connection(f"198.51.100.{number}")) for number in range(200))
+    for number in range(200):
+        room.enter(Connection(room, f"198.51.100.{number}"))
     assert not trusted.is_cut
-    local = [Connection("") for _ in range(admission.MOST_LOCAL + 1)]
-    assert [room.enter(each) for each in local].count(False) == 1
-    stuck = [Connection("") for _ in range(20)]
+    stuck = [Connection(room, "") for _ in range(20)]
     for each in stuck:
         room.stuck(each)
     assert [each.is_cut for each in stuck] == [True] * 4 + [False] * 16  # 16 MB of answers nobody takes
@@ -158,3 +168,89 @@ def test_a_reader_that_does_not_read_is_cut_on_every_route(
         assert answer.status_code == 200
     wait_until_cut([reader])
     assert len(rest_of(reader)) < 20_000_000
+
+
+def test_on_the_socket_the_process_that_holds_most_makes_room_and_nobody_is_cut_off_from_an_answer() -> None:
+    now = [0.0]
+    room = admission.Admission(lambda: now[0])
+    crowd = [Connection(room, "", "process 1") for _ in range(admission.MOST_LOCAL + 10)]
+    for each in crowd:
+        room.enter(each)
+    assert [each.begun for each in crowd].count(True) == admission.MOST_LOCAL
+    new = Connection(room, "", "process 2")
+    room.enter(new)
+    assert not new.begun  # all others may still send their first request
+    for each in crowd[:5]:
+        room.asked(each)
+    now[0] = admission.FIRST_SECONDS
+    room.admit()
+    assert new.begun
+    assert crowd[5].gave_way  # the oldest that has asked for nothing
+    assert all(each.begun for each in crowd)
+    assert not any(each.is_cut or each.gave_way for each in crowd[:5])
+    for each in crowd[16:]:
+        room.asked(each)
+    busy = Connection(room, "", "process 3")
+    room.asked(new)
+    room.enter(busy)
+    assert not busy.begun
+    room.answered(crowd[0])
+    assert busy.begun
+    assert crowd[0].gave_way
+    assert room.turned_away == 0
+
+
+def test_a_full_queue_of_one_process_does_not_keep_others_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(admission, "MOST_LOCAL", 4)
+    monkeypatch.setattr(admission, "MOST_QUEUED", 8)
+    room = admission.Admission(lambda: 0.0)
+    crowd = [Connection(room, "", "process 1") for _ in range(12)]
+    for each in crowd:
+        room.enter(each)
+        room.asked(each)
+    new = Connection(room, "", "process 2")
+    room.enter(new)
+    assert [each.is_cut for each in crowd] == [False] * 4 + [True] + [False] * 7
+    assert not new.is_cut
+    room.answered(crowd[0])
+    assert new.begun
+    assert not crowd[5].begun
+
+
+CROWD = 600
+
+
+def test_six_hundred_on_the_socket_are_all_answered_and_so_is_who_comes_later(server: Served, many_files: None) -> None:
+    with contextlib.ExitStack() as open_ones:
+        answers = []
+        for _ in range(CROWD):
+            client = open_ones.enter_context(asks(server, "/api/status"))
+            client.settimeout(60)
+            answers.append(client.recv(1 << 16)[:12])
+        assert answers == [b"HTTP/1.1 200"] * CROWD
+        assert server.client().get("/api/status").status_code == 200
+
+
+def test_six_hundred_that_ask_at_once_all_get_their_turn(server: Served, many_files: None) -> None:
+    with contextlib.ExitStack() as open_ones:
+        clients = [open_ones.enter_context(asks(server, "/api/status")) for _ in range(CROWD)]
+        for client in clients:
+            client.settimeout(60)
+        assert {client.recv(1 << 16)[:12] for client in clients} == {b"HTTP/1.1 200"}
+
+
+def test_of_two_that_hold_streams_the_one_with_more_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "MOST_CLIENTS", 4)
+
+    async def main() -> None:
+        streams = Streams(MadeUpView())
+        tasks = [asyncio.create_task(asyncio.sleep(60)) for _ in range(4)]
+        streams._tasks = dict.fromkeys(tasks, "process 1")
+        assert not streams.make_room("process 1")
+        assert streams.make_room("process 2")
+        await asyncio.gather(*tasks[:1], return_exceptions=True)
+        assert [task.cancelled() for task in tasks] == [True, False, False, False]
+        for task in tasks:
+            task.cancel()
+
+    asyncio.run(main())
