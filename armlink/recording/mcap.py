@@ -24,6 +24,7 @@ from mcap.writer import Writer
 from zstandard import ZstdDecompressor, ZstdError
 
 from armlink.arrays import Array
+from armlink.atomic_file import open_whole
 from armlink.errors import BadInput
 from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
 from armlink.recording.recording import MOST_BYTES, MOST_JOINTS, Recording, require_size
@@ -98,7 +99,7 @@ class RecordingWriter:
 def save_mcap(recording: Recording, path: Path) -> None:
     """Write a whole recording; times are kept to the nanosecond."""
     channels = recording.channels()
-    with RecordingWriter(path, recording.names) as writer:
+    with open_whole(path) as stream, RecordingWriter(stream, recording.names) as writer:
         for row, t in enumerate(recording.t.tolist()):
             writer.append(t, {name: values[row] for name, values in channels.items()})
 

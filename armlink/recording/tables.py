@@ -5,10 +5,11 @@ import json
 import math
 import zlib
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +18,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
+from armlink.atomic_file import open_whole
 from armlink.errors import BadInput
 from armlink.recording.column_names import joint_names, suggested_map
 from armlink.recording.csv_text import Layout, is_number, layout_of
@@ -165,7 +167,7 @@ def save_csv(recording: Recording, path: Path) -> None:
     table = _table(recording)
     options = pa_csv.WriteOptions(include_header=False, quoting_style="none")
     packed = path.name.lower().endswith(".gz")
-    with gzip.open(path, "wb", compresslevel=6) if packed else open(path, "wb") as stream:
+    with open_whole(path) as file, _gzipped(file) if packed else nullcontext(file) as stream:
         stream.write(f"{','.join(table.column_names)}\n".encode())
         pa_csv.write_csv(table, stream, options)
 
@@ -173,7 +175,12 @@ def save_csv(recording: Recording, path: Path) -> None:
 def save_parquet(recording: Recording, path: Path) -> None:
     """Write Parquet with the joint names in the schema's metadata."""
     names = {NAMES_KEY: json.dumps(recording.names).encode()}
-    pa_parquet.write_table(_table(recording).replace_schema_metadata(names), path, compression="zstd")
+    with open_whole(path) as stream:
+        pa_parquet.write_table(_table(recording).replace_schema_metadata(names), stream, compression="zstd")
+
+
+def _gzipped(stream: IO[bytes]) -> gzip.GzipFile:
+    return gzip.GzipFile("", "wb", compresslevel=6, fileobj=stream)
 
 
 def _recording(table: Any, header: list[str], source: str, names: tuple[str, ...]) -> Recording:

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import yaml
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
+from armlink.atomic_file import write_whole
 from armlink.drives.found import FoundDrives
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
@@ -56,7 +57,7 @@ class NewArm:
         """Write the file; raises BadInput."""
         try:
             self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text(self.text, encoding="utf-8")
+            write_whole(self.out, self.text)
         except OSError as error:
             raise BadInput(f"{self.out}: cannot be written: {error.strerror}") from None
 

@@ -12,6 +12,7 @@ from armlink.bus.can_bus import CanBus
 from armlink.drives.registry import family
 from armlink.errors import BusFault
 from armlink.link.link import Link
+from calib.commissioning.arm_yaml import yaml_block, yaml_comment, yaml_entry
 from calib.commissioning.bus_checks import another_drive
 from calib.commissioning.finding import SetupFinding
 
@@ -55,10 +56,12 @@ def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus,
     if arm.model_path is not None:
         content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
     parse_arm(dict(content), out)
-    text = f"# {arm.name} with the drives on {opened.channel_info}, from {arm.path.name}, by the command new.\n"
+    title = f"{arm.name} with the drives on {opened.channel_info}, from {arm.path.name}, by the command new."
+    text = yaml_comment(title) + "\n"
     for key, value in content.items():
-        part = yaml.safe_dump({key: value}, sort_keys=False, allow_unicode=True, width=160)
-        assumed = "  # assumed: that of the first drive" if key == "serial" and new_serial else ""
-        text += part.rstrip("\n") + assumed + "\n"
+        if key == "serial" and new_serial:
+            text += yaml_entry(key, value, note="assumed: that of the first drive") + "\n"
+        else:
+            text += yaml_block(key, value)
     drives = [(there.names[each.joint], each.address, each.serial) for each in found]
     return OwnCopy(text, drives, wrong)

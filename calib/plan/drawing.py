@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.atomic_file import write_whole
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
@@ -110,7 +111,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
         updatemenus=[{"buttons": _choices(plan), "x": 0.0, "xanchor": "left", "y": 1.0}],
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.write_html(path, include_plotlyjs=True, full_html=True)
+    write_whole(path, figure.to_html(include_plotlyjs=True, full_html=True))
 
 
 def _camera(down: Array) -> dict[str, dict[str, float]]:

@@ -7,6 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from armlink.atomic_file import open_whole
+
 SCREEN = {"responsive": True, "displayModeBar": False}
 FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"}
 COLOURS = ["#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248"]
@@ -52,7 +54,7 @@ def render(path: Path, title: str, sections: Sequence[Section], subtitle: str = 
     page = environment.get_template("page.html.j2").stream(
         title=escape(title), subtitle=escape(subtitle), sections=numbered, plotly=get_plotlyjs()
     )
-    with path.open("wb") as file:  # piece by piece: a page has ten megabytes
+    with open_whole(path) as file:  # piece by piece: a page has ten megabytes
         page.dump(file, encoding="utf-8")
 
 

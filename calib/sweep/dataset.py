@@ -15,12 +15,12 @@ import numpy as np
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from armlink.arm_file import ArmFile, load_arm
+from armlink.atomic_file import part_of, write_whole
 from armlink.errors import BadInput, Refused
 from armlink.key_errors import describe
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.types import SweepPlan
-from calib.records.atomic_file import part_of, write_whole
 from calib.records.file_lock import lock_file
 from gcomp.arrays import Array
 

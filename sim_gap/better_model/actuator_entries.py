@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armlink.atomic_file import write_whole
 from armlink.errors import BadInput
 from gcomp.arrays import Array
 
@@ -64,7 +65,7 @@ def write_entries(
         + f"    return (\n{mjlab}\n    )\n"
     )
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text)
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
 

@@ -4,6 +4,8 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from armlink.atomic_file import write_whole
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -30,7 +32,7 @@ def begin_with_drives(
     finally:
         opened.shutdown()
     parse_arm(yaml.safe_load(made.text), out)
-    out.write_text(made.text, encoding="utf-8")
+    write_whole(out, made.text)
     nodes = ", ".join(str(match.drive.node) for match in made.matches)
     told = f"{len(made.matches)} joints, nodes {nodes}; the geometry is not known, and says so in the file"
     return _tell(console, out, told, "check", name or out.stem, _matched(made.matches), [], json_file)
@@ -43,6 +45,7 @@ def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", js
     from armlink.arm_file import load_arm, parse_arm
     from armlink.drives.registry import found_drives
     from calib.arm.kinematics import gcomp_arm
+    from calib.commissioning.arm_yaml import yaml_block, yaml_comment
     from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
     from calib.commissioning.new_arm import rewired
 
@@ -66,8 +69,8 @@ def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", js
 
         content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
     parse_arm(dict(content), out)
-    text = f"# {arm.name} with the drives on {channel}, from {model.name}, by the command new.\n"
-    out.write_text(text + yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    title = yaml_comment(f"{arm.name} with the drives on {channel}, from {model.name}, by the command new.")
+    write_whole(out, title + "\n" + "".join(yaml_block(key, value) for key, value in content.items()))
     told = f"nodes {', '.join(str(match.drive.node) for match in matches)}"
     return _tell(console, out, told, "check", arm.name, _matched(matches), findings, json_file)
 
@@ -90,7 +93,7 @@ def copy(console: Any, model: Path, out: Path, bus: str, new_serial: bool, json_
         copied = own_copy(arm, out, bus_keys(bus, out), opened, new_serial=new_serial)
     finally:
         opened.shutdown()
-    out.write_text(copied.text, encoding="utf-8")
+    write_whole(out, copied.text)
     told = f"{', '.join(address for _, address, _ in copied.drives)} answer; limits are those of {model}"
     joints = [{"name": name, "address": address, "serial": serial} for name, address, serial in copied.drives]
     return _tell(console, out, told, "doctor", arm.name, joints, copied.findings, json_file)
