@@ -6,6 +6,7 @@ Cf, Cs, Co, Cn, Zl, Zp, and spaces other than U+0020).
 """
 
 import json
+import logging
 import unicodedata
 from typing import Any
 
@@ -26,6 +27,14 @@ def printable_json(value: Any, **options: Any) -> str:
     if text.isprintable():
         return text
     return "".join(each if _is_harmless(each) or each == "\n" else json.dumps(each)[1:-1] for each in text)
+
+
+class PrintableFormatter(logging.Formatter):
+    """Lines of a log that go to a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """As logging has it; lines of a traceback stay lines."""
+        return printable_text(super().format(record), keep="\n" if record.exc_info else "")
 
 
 def _is_harmless(character: str) -> bool:

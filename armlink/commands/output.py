@@ -14,11 +14,16 @@ def write_json(path: Path | None, answer: Any) -> None:
         return
     text = printable_json(_finite(answer), indent=1, allow_nan=False) + "\n"
     if str(path) == "-":
-        import typer
-
-        typer.echo(text, nl=False)
+        write_out(text)
     else:
         write_whole(path, text)
+
+
+def write_out(text: str) -> None:
+    """Write text for machines, printable already, to standard output."""
+    import typer
+
+    typer.echo(text, nl=False)
 
 
 def _finite(value: Any) -> Any:

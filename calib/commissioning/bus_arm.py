@@ -7,7 +7,7 @@ from typing import Any
 
 from armlink.drives.found import FoundDrives
 from armlink.errors import BusFault
-from calib.commissioning.arm_yaml import yaml_comment, yaml_entry, yaml_item
+from armlink.yaml_text import yaml_comment, yaml_entry, yaml_item
 from calib.commissioning.drive_match import Ask, Match, moved_node
 
 SLOW = 0.5

@@ -12,7 +12,7 @@ from armlink.bus.can_bus import CanBus
 from armlink.drives.registry import family
 from armlink.errors import BusFault
 from armlink.link.link import Link
-from calib.commissioning.arm_yaml import yaml_block, yaml_comment, yaml_entry
+from armlink.yaml_text import yaml_comment, yaml_document, yaml_entry
 from calib.commissioning.bus_checks import another_drive
 from calib.commissioning.finding import SetupFinding
 
@@ -62,6 +62,6 @@ def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus,
         if key == "serial" and new_serial:
             text += yaml_entry(key, value, note="assumed: that of the first drive") + "\n"
         else:
-            text += yaml_block(key, value)
+            text += yaml_document({key: value})
     drives = [(there.names[each.joint], each.address, each.serial) for each in found]
     return OwnCopy(text, drives, wrong)

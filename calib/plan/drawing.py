@@ -8,6 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.atomic_file import write_whole
+from armlink.printable_text import printable_text
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
@@ -84,7 +85,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
             y=points[:, 1],
             z=points[:, 2],
             mode="lines+markers",
-            name=sweep.name,
+            name=escape(printable_text(sweep.name)),
             line=line,
             marker={"size": 3, "color": line["color"]},
         )
@@ -104,7 +105,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
         x=arrow[:, 0], y=arrow[:, 1], z=arrow[:, 2], mode="lines", name="gravity", line={"width": 8, "color": "grey"}
     )
     figure.update_layout(
-        title=f"{escape(arm_file.name)}: poses of the plan (base frame, m)",
+        title=f"{escape(printable_text(arm_file.name))}: poses of the plan (base frame, m)",
         scene={"aspectmode": "data", "camera": _camera(down)},
         height=800,
         margin={"l": 0, "r": 0, "b": 0},

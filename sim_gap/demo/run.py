@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
 from armlink.commands.output import write_json
@@ -52,7 +51,7 @@ def run_demo(
         arm = with_realism(arm, realism, seed)
     arm.require_link()
     data_folder = _fresh(out)
-    teller.say(f"arm [bold]{arm.name}[/bold], hidden truth of seed {seed}, results in {escape(str(out))}")
+    teller.say(f"arm {arm.name}, hidden truth of seed {seed}, results in {out}")
     creeping = sweep_motion(arm) == "creep"
     arm = quick(arm) if creeping else arm
     result: DemoResult | CreepDemo
@@ -68,8 +67,7 @@ def run_demo(
     content = _told(result, out / "report.html", teller)
     write_json(out / "summary.json", content)
     write_json(json_path, content)
-    report, numbers = (escape(str(out / name)) for name in ("report.html", "summary.json"))
-    teller.say(f"done: open [bold]{report}[/bold]; numbers in {numbers}")
+    teller.say(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}")
     return result
 
 

@@ -44,8 +44,8 @@ def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", js
 
     from armlink.arm_file import load_arm, parse_arm
     from armlink.drives.registry import found_drives
+    from armlink.yaml_text import yaml_comment, yaml_document
     from calib.arm.kinematics import gcomp_arm
-    from calib.commissioning.arm_yaml import yaml_block, yaml_comment
     from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
     from calib.commissioning.new_arm import rewired
 
@@ -70,7 +70,7 @@ def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", js
         content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
     parse_arm(dict(content), out)
     title = yaml_comment(f"{arm.name} with the drives on {channel}, from {model.name}, by the command new.")
-    write_whole(out, title + "\n" + "".join(yaml_block(key, value) for key, value in content.items()))
+    write_whole(out, title + "\n" + yaml_document(content))
     told = f"nodes {', '.join(str(match.drive.node) for match in matches)}"
     return _tell(console, out, told, "check", arm.name, _matched(matches), findings, json_file)
 

@@ -28,5 +28,5 @@ def test_a_table_fits_the_width(capsys):
 
 
 def test_units_in_the_heads_of_tables_stay(capsys):
-    PlainConsole(markup=False).print(Table("joint", "stops [rad]"))
+    PlainConsole().print(Table("joint", "stops [rad]"))
     assert "[rad]" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The lines of an arm file: values through the YAML dumper, comments on one line each.
+"""Text of YAML files: values through the dumper, comments on one line each.
 
 Names come from models and drives, so no line is put together from them by hand.
 """
@@ -9,6 +9,9 @@ from typing import Any
 import yaml
 
 from armlink.printable_text import printable_text
+
+WIDTH = 160
+"""Characters after which the dumper breaks lines in block style; a choice."""
 
 
 class _Dumper(yaml.SafeDumper):
@@ -49,7 +52,7 @@ def yaml_comment(text: str) -> str:
     return f"# {printable_text(text)}"
 
 
-def yaml_block(key: str, value: Any) -> str:
-    """Lines of a key and its value in block style."""
-    text: str = yaml.dump({key: value}, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=160)
+def yaml_document(content: Any) -> str:
+    """Lines in block style."""
+    text: str = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=WIDTH)
     return text
