@@ -131,4 +131,7 @@ def _choices(plan: SweepPlan) -> list[dict[str, Any]]:
     count = len(plan.sweeps)
     shown = {"all sweeps": [True] * (count + 2)}
     shown |= {one.name: [*(one is other for other in plan.sweeps), False, True] for one in plan.sweeps}
-    return [{"label": label, "method": "update", "args": [{"visible": seen}]} for label, seen in shown.items()]
+    return [
+        {"label": escape(printable_text(label)), "method": "update", "args": [{"visible": seen}]}
+        for label, seen in shown.items()
+    ]
