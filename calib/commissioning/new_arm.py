@@ -5,12 +5,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import yaml
-
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
 from armlink.atomic_file import write_whole
 from armlink.drives.found import FoundDrives
 from armlink.errors import BadInput
+from armlink.file_content import parse_yaml
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.chain import Chain, find_chains
@@ -51,7 +50,7 @@ class NewArm:
 
     def parsed(self) -> ArmFile:
         """The arm file, validated as if it lay there already."""
-        return parse_arm(yaml.safe_load(self.text), self.out)
+        return parse_arm(parse_yaml(self.text, self.out), self.out)
 
     def write(self) -> None:
         """Write the file; raises BadInput."""

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from armlink.arm_file import ArmFile, Bus, parse_arm
+from armlink.arm_file import ArmFile, Bus, parse_arm, read_yaml
 from armlink.bus.can_bus import CanBus
 from armlink.drives.registry import family
 from armlink.errors import BusFault
@@ -48,7 +46,7 @@ def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus,
     wrong = [
         another_drive(each.mismatch, f"{there.names[each.joint]} ({each.address})") for each in found if each.mismatch
     ]
-    content: dict[str, Any] = yaml.safe_load(arm.path.read_text(encoding="utf-8"))
+    content: dict[str, Any] = read_yaml(arm.path)
     content = {key: value for key, value in content.items() if key != "sim"}
     content["link"] = {**content["link"], "bus": bus}
     if new_serial:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from armlink.atomic_file import write_whole
+from armlink.file_content import parse_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,8 +21,6 @@ def begin_with_drives(
     console: Any, out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None
 ) -> int:
     """An arm file of nothing but a bus: its drives, and no geometry."""
-    import yaml
-
     from armlink.arm_file import parse_arm
     from armlink.drives.registry import found_drives
     from calib.commissioning.bus_arm import arm_of_bus
@@ -31,7 +30,7 @@ def begin_with_drives(
         made = arm_of_bus(found_drives(opened), str(opened.channel_info), bus_keys(bus, out), name or out.stem, ask)
     finally:
         opened.shutdown()
-    parse_arm(yaml.safe_load(made.text), out)
+    parse_arm(parse_yaml(made.text, out), out)
     write_whole(out, made.text)
     nodes = ", ".join(str(match.drive.node) for match in made.matches)
     told = f"{len(made.matches)} joints, nodes {nodes}; the geometry is not known, and says so in the file"
@@ -40,9 +39,7 @@ def begin_with_drives(
 
 def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
     """An arm file with the drives of a bus."""
-    import yaml
-
-    from armlink.arm_file import load_arm, parse_arm
+    from armlink.arm_file import load_arm, parse_arm, read_yaml
     from armlink.drives.registry import found_drives
     from armlink.yaml_text import yaml_comment, yaml_document
     from calib.arm.kinematics import gcomp_arm
@@ -63,7 +60,7 @@ def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", js
             matches, findings = match_by_hand(turned, drives, channel, ask)
     finally:
         opened.shutdown()
-    content = rewired(yaml.safe_load(arm.path.read_text(encoding="utf-8")), matches, bus_keys(bus, out))
+    content = rewired(read_yaml(arm.path), matches, bus_keys(bus, out))
     if arm.model_path is not None:
         import os
 
