@@ -8,7 +8,7 @@ import numpy as np
 
 from armlink.atomic_file import write_whole
 from armlink.errors import BadInput
-from armlink.printable_text import printable_json, printable_text
+from armlink.printable_text import printable_text
 from gcomp.arrays import Array
 
 ISAAC_LAB = {
@@ -98,8 +98,8 @@ def _in_docstring(text: str) -> str:
 
 
 def _literal(text: str) -> str:
-    """A text as Python source, in double quotes: a literal of JSON is one of Python too."""
-    return printable_json(text)
+    """A text as Python source, in double quotes."""
+    return '"' + printable_text(text.replace("\\", "\\\\").replace('"', '\\"')) + '"'
 
 
 def _pattern(name: str) -> str:

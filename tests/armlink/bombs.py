@@ -68,25 +68,6 @@ def lerobot(folder: Path, kind: str) -> Path:
     return path
 
 
-def mcap_of_small_messages(folder: Path) -> Path:
-    """Millions of tiny messages, which as objects take a hundred times as much."""
-    from mcap.writer import CompressionType, Writer
-
-    from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, joint_state_encoder
-
-    path = folder / "run.mcap"
-    message = joint_state_encoder(("a",), (True, False, True))(1, [0.0, 0.0])
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=32 << 20, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2")
-        schema = writer.register_schema(SCHEMA_NAME, "ros2msg", SCHEMA.encode())
-        channel = writer.register_channel("/joint_states", "cdr", schema)
-        for k in range(1_500_000):
-            writer.add_message(channel, k, message, k)
-        writer.finish()
-    return path
-
-
 def packed_bag(folder: Path) -> Path:
     """A bag that its recorder has packed as a whole: a small file that fills the disk."""
     path = folder / "bag"
@@ -220,7 +201,6 @@ BOMBS: dict[str, tuple[str, Callable[[Path], Path]]] = {
 LARGE: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "gzipped CSV": ("recording", gzipped_csv),
     "LeRobot of lists": ("recording", lambda folder: lerobot(folder, "lists")),
-    "MCAP of small messages": ("recording", mcap_of_small_messages),
 }
 """Bombs that take some ten seconds to make."""
 
