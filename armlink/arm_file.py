@@ -13,11 +13,11 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
+from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
+from armlink.content.model_sizes import MOST_TEXT
 from armlink.contributed import contributed, named
 from armlink.errors import BadInput
-from armlink.file_content import MOST_YAML, parse_yaml, read_whole
 from armlink.key_errors import describe, describe_all, meant
-from armlink.model_sizes import MOST_TEXT
 from armlink.names import JointName, Name
 
 SIMULATED = "armlink_sim"

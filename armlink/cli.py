@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from armlink import completion
+from armlink.content.printable_text import PrintableFormatter, printable_text
 from armlink.contributed import contributed
-from armlink.printable_text import PrintableFormatter, printable_text
 from armlink.termination import terminate_as_interrupt
 
 PURPOSE = (

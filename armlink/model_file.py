@@ -8,9 +8,9 @@ from os.path import isfile
 from pathlib import Path
 from typing import Any
 
+from armlink.content.memory_budget import memory_budget
+from armlink.content.model_sizes import MOST_TEXT, model_budget
 from armlink.errors import BadInput
-from armlink.memory_budget import memory_budget
-from armlink.model_sizes import MOST_TEXT, model_budget
 
 log = logging.getLogger(__name__)
 READABLE_MESHES = (".stl", ".obj", ".msh")

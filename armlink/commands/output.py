@@ -4,8 +4,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from armlink.atomic_file import write_whole
-from armlink.printable_text import printable_json
+from armlink.content.atomic_file import write_whole
+from armlink.content.printable_text import printable_json
 
 
 def write_json(path: Path | None, answer: Any) -> None:

@@ -14,7 +14,7 @@ from rich.segment import Segment
 from rich.status import Status
 from rich.text import Text
 
-from armlink.printable_text import printable_text
+from armlink.content.printable_text import printable_text
 
 
 class PlainConsole(Console):

@@ -6,8 +6,8 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from zstandard import ZstdDecompressor, ZstdError
 
+from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
 from armlink.errors import BadInput
-from armlink.file_content import MOST_YAML, parse_yaml, read_whole
 from armlink.recording.mcap import DAMAGED, MOST_CHUNK, most_record
 from armlink.recording.recording import require_size
 

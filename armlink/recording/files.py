@@ -3,8 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
-from armlink.memory_budget import memory_budget
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, take_joints
 

@@ -14,8 +14,8 @@ import pyarrow.compute as pa_compute
 import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
+from armlink.content.file_content import MOST_JSON, read_whole
 from armlink.errors import BadInput
-from armlink.file_content import MOST_JSON, read_whole
 from armlink.recording.recording import MOST_JOINTS, Recording, require_size
 from armlink.recording.tables import THREADS, numbers, require_numbers
 

@@ -24,7 +24,7 @@ from mcap.writer import Writer
 from zstandard import ZstdDecompressor, ZstdError
 
 from armlink.arrays import Array
-from armlink.atomic_file import open_whole
+from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
 from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
 from armlink.recording.recording import MOST_BYTES, MOST_JOINTS, Recording, require_size

@@ -18,7 +18,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
-from armlink.atomic_file import open_whole
+from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
 from armlink.recording.column_names import joint_names, suggested_map
 from armlink.recording.csv_text import Layout, is_number, layout_of

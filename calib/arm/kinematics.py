@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
-from armlink.model_sizes import model_budget
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import ModelArm, load_model
 from gcomp.errors import GcompError

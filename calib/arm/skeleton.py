@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.model_sizes import model_budget
+from armlink.content.model_sizes import model_budget
 from calib.arm.kinematics import gcomp_arm
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import PlacedChain, place_chain

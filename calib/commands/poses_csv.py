@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
-from armlink.memory_budget import memory_budget
 from gcomp.arrays import Array
 
 

@@ -57,8 +57,8 @@ def _model(
     import numpy as np
 
     from armlink.arm_file import MODEL_SUFFIXES, load_arm
+    from armlink.content.model_sizes import model_budget
     from armlink.errors import BadInput, Refused
-    from armlink.model_sizes import model_budget
     from calib.arm.kinematics import gcomp_arm, model_arm
     from calib.records.missing import way_to
     from calib.records.records import GravityRecord

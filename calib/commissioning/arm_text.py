@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from armlink.yaml_text import yaml_comment, yaml_entry, yaml_item
+from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from calib.commissioning.draft import FRICTION, Draft, JointDraft
 
 

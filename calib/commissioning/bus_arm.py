@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from math import pi
 from typing import Any
 
+from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from armlink.drives.found import FoundDrives
 from armlink.errors import BusFault
-from armlink.yaml_text import yaml_comment, yaml_entry, yaml_item
 from calib.commissioning.drive_match import Ask, Match, moved_node
 
 SLOW = 0.5

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armlink.model_sizes import model_budget
+from armlink.content.model_sizes import model_budget
 from calib.commissioning.chain import Chain
 from calib.commissioning.clear_range import ClearRange
 from gcomp.arm.load import compile_model

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
-from armlink.model_sizes import model_budget
 from gcomp.arm.load import compile_model
 from gcomp.arm.model_tree import coupled_joints, upwards
 from gcomp.arm.model_xml import parse_xml

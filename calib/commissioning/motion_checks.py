@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.model_sizes import model_budget
+from armlink.content.model_sizes import model_budget
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.arm.sweep_section import sweep_section

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
-from armlink.atomic_file import write_whole
+from armlink.content.atomic_file import write_whole
+from armlink.content.file_content import parse_yaml
 from armlink.drives.found import FoundDrives
 from armlink.errors import BadInput
-from armlink.file_content import parse_yaml
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.chain import Chain, find_chains

@@ -4,7 +4,7 @@ import logging
 import sys
 from datetime import UTC, datetime
 
-from armlink.printable_text import printable_json
+from armlink.content.printable_text import printable_json
 
 _KNOWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 

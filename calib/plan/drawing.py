@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.atomic_file import write_whole
-from armlink.printable_text import printable_text
+from armlink.content.atomic_file import write_whole
+from armlink.content.printable_text import printable_text
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section

@@ -20,10 +20,10 @@ from pydantic import (
 )
 
 from armlink.arm_file import ArmFile
+from armlink.content.yaml_text import yaml_document
 from armlink.errors import BadInput, Refused
 from armlink.key_errors import describe
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
-from armlink.yaml_text import yaml_document
 from gcomp.arrays import Array
 
 Matrix = tuple[tuple[FiniteFloat, ...], ...]

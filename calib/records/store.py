@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import sqlalchemy as sa
 
 from armlink.arm_file import ArmFile, read_yaml
-from armlink.atomic_file import write_whole
+from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput, Refused
 from calib.records.database import StoreFault, default_url, first_line, open_database, reading, transaction
 from calib.records.records import CalibrationRecord, GravityRecord, Record, parse_record

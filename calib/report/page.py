@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from armlink.atomic_file import open_whole
-from armlink.printable_text import printable_text
+from armlink.content.atomic_file import open_whole
+from armlink.content.printable_text import printable_text
 
 SCREEN = {"responsive": True, "displayModeBar": False}
 FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"}

@@ -15,11 +15,11 @@ import numpy as np
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from armlink.arm_file import ArmFile, load_arm
-from armlink.atomic_file import part_of, write_whole
+from armlink.content.atomic_file import part_of, write_whole
+from armlink.content.file_content import MOST_JSON, read_whole
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput, Refused
-from armlink.file_content import MOST_JSON, read_whole
 from armlink.key_errors import describe
-from armlink.memory_budget import memory_budget
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.types import SweepPlan

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
-from armlink.memory_budget import memory_budget
 from armlink.model_file import read_model
 from sim_bus.effects.state import Imperfections
 from sim_bus.physics.transmission import rotor_name, tendon_name

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from armlink.atomic_file import write_whole
+from armlink.content.atomic_file import write_whole
+from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
-from armlink.printable_text import printable_text
 from gcomp.arrays import Array
 
 ISAAC_LAB = {

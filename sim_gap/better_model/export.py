@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from armlink.atomic_file import write_whole
+from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
 from sim_gap.better_model.coupled_motors import add_to, coupled_motors
 from sim_gap.better_model.effects_module import joint_effects, module_path, module_text

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armlink.atomic_file import open_whole, write_whole
+from armlink.content.atomic_file import open_whole, write_whole
 from armlink.errors import BadInput
 from sim_bus.effects.registry import effects as simulated
 from sim_gap.search.estimate import Estimate

@@ -1,6 +1,6 @@
 """Comments in XML files."""
 
-from armlink.printable_text import printable_text
+from armlink.content.printable_text import printable_text
 
 
 def xml_comment(lines: list[str]) -> str:

@@ -104,7 +104,7 @@ def _write_table(rows: list[dict[str, Any]], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    from armlink.atomic_file import open_whole
+    from armlink.content.atomic_file import open_whole
     from armlink.errors import BadInput
 
     try:

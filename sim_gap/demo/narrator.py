@@ -9,7 +9,7 @@ from rich.progress import BarColumn, Progress, TimeElapsedColumn
 from rich.text import Text
 
 from armlink.commands.plain_console import PlainColumn
-from armlink.printable_text import printable_text
+from armlink.content.printable_text import printable_text
 
 QUIET_SECONDS = 5.0
 """Without a terminal, a line at most this often [s]."""

@@ -7,9 +7,9 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from armlink.arm_file import ArmFile
-from armlink.atomic_file import open_whole
+from armlink.content.atomic_file import open_whole
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
-from armlink.memory_budget import memory_budget
 from armlink.recording.tables import THREADS
 from calib.arm.kinematics import gcomp_arm
 from gcomp.arrays import Array

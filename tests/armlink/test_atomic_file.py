@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armlink.atomic_file import open_whole, write_whole
 from armlink.cli import run
 from armlink.commands.output import write_json
+from armlink.content.atomic_file import open_whole, write_whole
 from armlink.recording.files import load_recording, save_recording
 from armlink.recording.recording import Recording
 from calib.report.page import Section, paragraph, render

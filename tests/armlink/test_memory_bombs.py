@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from bombs import BOMBS, LARGE
 
+from armlink.content.file_content import MOST_NODES, parse_yaml, read_whole
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
-from armlink.file_content import MOST_NODES, parse_yaml, read_whole
-from armlink.memory_budget import memory_budget
 from armlink.model_file import compile_model
 
 HERE = Path(__file__).parent
@@ -56,7 +56,7 @@ def test_larger_files_take_no_more_than_their_budget(name, tmp_path):
 def test_what_takes_more_than_the_budget_is_bad_input_and_the_limit_is_gone_after_it(tmp_path, monkeypatch):
     path = tmp_path / "small"
     path.touch()
-    monkeypatch.setattr("armlink.memory_budget.LEAST_BUDGET", 64 << 20)
+    monkeypatch.setattr("armlink.content.memory_budget.LEAST_BUDGET", 64 << 20)
     with pytest.raises(BadInput, match=r"takes more than 0\.1 GB of memory"), memory_budget(path):
         bytearray(256 << 20)
     assert len(bytearray(256 << 20)) == 256 << 20

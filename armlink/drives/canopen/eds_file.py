@@ -9,11 +9,11 @@ from typing import Any
 import canopen
 
 from armlink.arm_file import ArmFile, DeviceIdentity, LinkJoint
+from armlink.content.file_content import read_whole
 from armlink.drives.canopen import object_dictionary
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import LINK_PDOS
 from armlink.errors import BadInput
-from armlink.file_content import read_whole
 
 SUFFIXES = (".eds", ".dcf")
 MOST_SHEET = 4 << 20

@@ -4,8 +4,8 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from armlink.atomic_file import write_whole
-from armlink.file_content import parse_yaml
+from armlink.content.atomic_file import write_whole
+from armlink.content.file_content import parse_yaml
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,8 +40,8 @@ def begin_with_drives(
 def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
     """An arm file with the drives of a bus."""
     from armlink.arm_file import load_arm, parse_arm, read_yaml
+    from armlink.content.yaml_text import yaml_comment, yaml_document
     from armlink.drives.registry import found_drives
-    from armlink.yaml_text import yaml_comment, yaml_document
     from calib.arm.kinematics import gcomp_arm
     from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
     from calib.commissioning.new_arm import rewired

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from armlink.atomic_file import write_whole
+from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
 from sim_gap.better_model.effects_module import module_path, module_text
 from sim_gap.better_model.samples import write_rows

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from armlink import cli
 from armlink.commands.plain_console import PlainColumn, PlainConsole
-from armlink.printable_text import PrintableFormatter, printable_json, printable_text
+from armlink.content.printable_text import PrintableFormatter, printable_json, printable_text
 from calib.daemon.logs import JsonFormatter
 
 COMMAND = (

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from armlink.arm_file import load_arm
 from armlink.cli import run
+from armlink.content.file_content import parse_yaml
+from armlink.content.yaml_text import yaml_comment, yaml_document, yaml_entry, yaml_item
 from armlink.drives.found import FoundDrive
 from armlink.errors import BadInput
-from armlink.file_content import parse_yaml
-from armlink.yaml_text import yaml_comment, yaml_document, yaml_entry, yaml_item
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.bus_arm import _text as bus_text
 from calib.commissioning.draft import Draft, JointDraft

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from armlink.printable_text import printable_text
+from armlink.content.printable_text import printable_text
 
 WIDTH = 160
 """Characters after which the dumper breaks lines in block style; a choice."""

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
-from armlink.memory_budget import memory_budget
 
 MOST_TEXT = 64 << 20
 """Size of a URDF or MJCF file, and of an OBJ or MSH mesh [bytes]: a hundred times that of published arms' files."""
