@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from armlink.arrays import Array
+from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
+from armlink.content.model_sizes import MOST_TEXT
 from armlink.contributed import contributed, named
 from armlink.errors import BadInput
 from armlink.key_errors import describe, describe_all, meant
@@ -294,7 +295,7 @@ class ArmFile(Section):
         unset = set() if self.kinematics.stops else {"stops"}  # results of before the key existed keep their hash
         content = json.dumps(self.kinematics.model_dump(mode="json", exclude=unset), sort_keys=True).encode()
         if self.model_path is not None:
-            content += self.model_path.read_bytes()
+            content += read_whole(self.model_path, MOST_TEXT)
         return hashlib.sha256(content).hexdigest()
 
     def require_link(self) -> LinkSection:
@@ -344,12 +345,7 @@ def load_arm(arm: str | Path) -> ArmFile:
 
 def read_yaml(path: Path) -> Any:
     """Content of a YAML file; raises BadInput, in one line, where it is none, OSError where it cannot be read."""
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except RecursionError:
-        raise BadInput(f"{path}: not YAML that can be used: nested too deeply") from None
-    except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date or number that does not exist, for example
-        raise BadInput(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    return parse_yaml(read_whole(path, MOST_YAML), path)
 
 
 def _no_arm_file(path: Path) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from armlink import completion
+from armlink.content.printable_text import PrintableFormatter, printable_text
 from armlink.contributed import contributed
 from armlink.termination import terminate_as_interrupt
 
@@ -123,8 +124,12 @@ def _usage(error: Any) -> str:
 
 
 def _invoke(point: EntryPoint, arguments: list[str]) -> int:
+    import logging
+
     import typer
 
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(PrintableFormatter())
     target = point.load()
     if isinstance(target, typer.Typer):
         app = target
@@ -142,7 +147,7 @@ def _invoke(point: EntryPoint, arguments: list[str]) -> int:
 
 
 def _fail(message: str, status: int) -> int:
-    sys.stderr.write(f"armlink: {' '.join(message.split())}\n")
+    sys.stderr.write(f"armlink: {printable_text(' '.join(message.split()))}\n")
     return status
 
 

@@ -8,6 +8,8 @@ from os.path import isfile
 from pathlib import Path
 from typing import Any
 
+from armlink.content.memory_budget import memory_budget
+from armlink.content.model_sizes import MOST_TEXT, model_budget
 from armlink.errors import BadInput
 
 log = logging.getLogger(__name__)
@@ -61,7 +63,10 @@ class ModelFile:
     @property
     def left_out(self) -> str:
         """The meshes that are left out, with the reason; nothing if none is."""
-        reasons = {"not found": self.absent, "not binary STL, OBJ or MSH, which MuJoCo reads": self.unreadable}
+        reasons = {
+            "not found": self.absent,
+            "not binary STL, OBJ or MSH, which MuJoCo reads": self.unreadable,
+        }
         return " and ".join(
             f"{len(files)} {'mesh' if len(files) == 1 else 'meshes'} {reason}, such as {files[0]}"
             for reason, files in reasons.items()
@@ -86,8 +91,9 @@ def read_model(path: Path) -> ModelFile:
     warned: list[str] = []
     mujoco.set_mju_user_warning(warned.append)
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
+        with model_budget(path):
+            spec = mujoco.MjSpec.from_file(str(path))
+    except (ValueError, RuntimeError) as error:  # the latter where it gets no memory
         raise BadInput(f"{path}: not a model that MuJoCo reads: {one_line(error)}") from None
     finally:
         mujoco.set_mju_user_warning(log.info)
@@ -115,7 +121,7 @@ def read_model(path: Path) -> ModelFile:
             continue
         (absent if file is None else unreadable).append(mesh.file)
         if weighed and kind == "MJCF":
-            trouble = "is not there" if file is None else "is in a format that MuJoCo does not read"
+            trouble = "is not there" if file is None else "is too large, or in a format that MuJoCo does not read"
             raise BadInput(
                 f"{path}: mesh {mesh.file} {trouble}, and body {weighed[0]!r} has its mass from it alone: put a mesh "
                 "that MuJoCo reads beside the model, or give the body an inertial"
@@ -141,11 +147,15 @@ def compile_model(path: Path, beside: Sequence[Beside] = ()) -> Any:
 
 def compile_spec(spec: Any, path: Path, hint: str = "") -> Any:
     """A parsed model as `mujoco.MjModel`; raises BadInput with the file's name."""
+    import mujoco
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are in the log
-            model = spec.compile()
-    except ValueError as error:
+            with memory_budget(path):
+                model = spec.compile()
+                mujoco.MjData(model)  # has an arena of a size that the file may state
+    except (ValueError, RuntimeError) as error:  # the latter where it gets no memory
         raise BadInput(f"{path}: MuJoCo cannot compile it{hint}: {one_line(error)}") from None
     _refuse_what_is_no_number(model, path)
     return model
@@ -180,7 +190,7 @@ def _quaternion(turned: tuple[float, float, float]) -> Any:
     return found
 
 
-def one_line(error: ValueError) -> str:
+def one_line(error: Exception) -> str:
     """MuJoCo's message, which spans several lines, in one."""
     return " ".join(str(error).split())
 
@@ -214,9 +224,9 @@ def _find(name: str, *folders: Path) -> Path | None:
 def _is_readable(mesh: Path) -> bool:
     """Whether MuJoCo reads this mesh: not the text form of STL, which exporters write under the same suffix."""
     suffix = mesh.suffix.lower()
-    if suffix != ".stl":
-        return suffix in READABLE_MESHES
     try:
+        if suffix != ".stl":
+            return suffix in READABLE_MESHES and mesh.stat().st_size <= MOST_TEXT
         with mesh.open("rb") as file:
             faces = int.from_bytes(file.read(STL_HEADER)[STL_HEADER - 4 :], "little")
         return faces in STL_FACES and mesh.stat().st_size == STL_HEADER + STL_FACE * faces

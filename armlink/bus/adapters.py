@@ -1,5 +1,6 @@
 """Adapters of python-can's buses: SocketCAN and udp_multicast through their sockets, others through messages."""
 
+import logging
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, cast
 
@@ -7,12 +8,14 @@ import can
 
 from armlink.bus.can_bus import CanBus, MessageBus
 from armlink.bus.in_process import InProcessBus
-from armlink.bus.message_port import MessagePort
+from armlink.bus.interface_fault import interface_fault
+from armlink.bus.message_port import MessagePort, receive_message
 from armlink.bus.port import Port
 from armlink.bus.sockets.socket_port import SocketPort
 from armlink.bus.sockets.stamped_port import StampedSocketPort
 from armlink.clock import Clock
 
+log = logging.getLogger(__name__)
 if TYPE_CHECKING:
     from armlink.bus.sockets.multicast_port import MulticastPort
 
@@ -49,12 +52,15 @@ class PythonCanBus:
         return self.open_port()
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """See MessageSource; raises python-can's errors."""
-        return self.bus.recv(timeout)
+        """See MessageSource; raises BusFault."""
+        return receive_message(self.bus, self.channel_info, timeout)
 
     def shutdown(self) -> None:
-        """Close the bus."""
-        self.bus.shutdown()
+        """Close the bus; what its driver says of that is logged: there is nothing that anybody could do."""
+        try:
+            self.bus.shutdown()
+        except Exception as error:
+            log.info("%s", interface_fault(error, self.channel_info, "close it"))
 
 
 class SocketCanBus(PythonCanBus):

@@ -13,7 +13,14 @@ from types import TracebackType
 from typing import Any, Self
 
 import can
-from can.io.blf import BLFParseError
+from can.io.blf import (
+    FILE_HEADER_STRUCT,
+    LOG_CONTAINER,
+    LOG_CONTAINER_STRUCT,
+    OBJ_HEADER_BASE_STRUCT,
+    ZLIB_DEFLATE,
+    BLFParseError,
+)
 
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.message_port import as_frame, is_data
@@ -23,6 +30,10 @@ from armlink.errors import BadInput, BusFault
 LOG_SUFFIXES = (".asc", ".blf", ".log")
 FLUSH_MICROSECONDS = 500_000
 """Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
+MOST_LINE = 1 << 16
+"""Characters of a line; one of a CAN FD frame has some hundreds."""
+MOST_CONTAINER = 1 << 26
+"""Bytes that a container of a BLF file holds at most; Vector's and python-can's writers put 128 kB into one."""
 _CONTAINER = 8192  # bytes that the BLF writer buffers
 _ASC_END = "end triggerblock"
 _BLF_SIZE = struct.Struct("<16xQ")  # file size as stated in the header
@@ -159,6 +170,7 @@ class LogReader:
         size = self._path.stat().st_size
         with self._path.open("rb") as stream:
             stated = stream.read(_BLF_SIZE.size)
+            _require_containers(stream, self._path)
             stream.seek(0)
             yield from can.BLFReader(stream)
         return "" if _BLF_SIZE.unpack(stated)[0] == size else "the file ends early"
@@ -174,6 +186,35 @@ class LogReader:
         return ""
 
 
+def _require_containers(stream: Any, path: Path) -> None:
+    """Raise BadInput where a container of a BLF file unpacks to more than any writer's; python-can unpacks it whole."""
+    head = _at(stream, 0, FILE_HEADER_STRUCT.size)
+    place = FILE_HEADER_STRUCT.unpack(head)[1] if len(head) == FILE_HEADER_STRUCT.size else 0
+    while head := _at(stream, place, OBJ_HEADER_BASE_STRUCT.size):
+        if len(head) < OBJ_HEADER_BASE_STRUCT.size or head[:4] != b"LOBJ":
+            return  # said by python-can
+        _, _, _, length, kind = OBJ_HEADER_BASE_STRUCT.unpack(head)
+        if length > MOST_CONTAINER:
+            raise BadInput(f"{path}: an object of {length} bytes, expected at most {MOST_CONTAINER}")
+        if kind == LOG_CONTAINER and _unpacks_to_more(_at(stream, place, length)[OBJ_HEADER_BASE_STRUCT.size :]):
+            raise BadInput(f"{path}: a container unpacks to more than {MOST_CONTAINER} bytes")
+        place += max(length + length % 4, OBJ_HEADER_BASE_STRUCT.size)
+
+
+def _unpacks_to_more(container: bytes) -> bool:
+    try:
+        method, _ = LOG_CONTAINER_STRUCT.unpack_from(container)
+        packed = container[LOG_CONTAINER_STRUCT.size :]
+        return method == ZLIB_DEFLATE and len(zlib.decompressobj().decompress(packed, MOST_CONTAINER)) == MOST_CONTAINER
+    except (struct.error, zlib.error):
+        return False  # said by python-can
+
+
+def _at(stream: Any, place: int, count: int) -> bytes:
+    stream.seek(place)
+    return bytes(stream.read(count))
+
+
 class _WholeLines:
     """Lines of a text file up to the first one without newline, as python-can's readers expect them."""
 
@@ -185,7 +226,9 @@ class _WholeLines:
         return self
 
     def __next__(self) -> str:
-        line = next(self._stream)
+        line = self._stream.readline(MOST_LINE)
+        if not line:
+            raise StopIteration
         if not line.endswith("\n"):
             self.cut = True
             raise StopIteration

@@ -1,12 +1,11 @@
 """Port for any interface of python-can, by message objects."""
 
-import errno
 from collections.abc import Sequence
 
 import can
 
-from armlink.bus.port import CLASSICAL, ERROR, EXTENDED, REMOTE, Frame, InterfaceDown
-from armlink.errors import BusFault
+from armlink.bus.interface_fault import interface_fault
+from armlink.bus.port import CLASSICAL, ERROR, EXTENDED, REMOTE, Frame
 
 
 class MessagePort:
@@ -19,11 +18,10 @@ class MessagePort:
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame; raises BusFault if python-can cannot."""
-        message = as_message(can_id, data, self._fd)
         try:
-            self._bus.send(message)
-        except (can.CanError, OSError) as error:
-            raise BusFault(f"bus {self._name}: cannot send: {error}") from None
+            self._bus.send(as_message(can_id, data, self._fd))
+        except Exception as error:
+            raise interface_fault(error, self._name, "send") from None
 
     def send_all(self, frames: Sequence[Frame]) -> None:
         """Send the frames in this order; raises BusFault as send."""
@@ -71,11 +69,9 @@ def is_data(message: can.Message) -> bool:
     return not (message.is_error_frame or message.is_remote_frame)
 
 
-def receive_message(bus: can.BusABC, name: str, timeout: float) -> can.Message | None:
+def receive_message(bus: can.BusABC, name: str, timeout: float | None) -> can.Message | None:
     """The next message of a python-can bus, or None after `timeout` seconds; raises BusFault, InterfaceDown."""
     try:
         return bus.recv(timeout=timeout)
-    except (can.CanError, OSError) as error:
-        down = errno.ENETDOWN in (getattr(error, "error_code", None), getattr(error, "errno", None))
-        fault = InterfaceDown if down else BusFault
-        raise fault(f"bus {name}: cannot receive: {error}") from None
+    except Exception as error:
+        raise interface_fault(error, name, "receive") from None

@@ -5,7 +5,8 @@ from typing import Any
 from armlink.arm_file import Bus, LinkSection
 from armlink.bus.bus_group import BusGroup
 from armlink.bus.can_bus import MessageBus
-from armlink.errors import BadInput, BusFault
+from armlink.bus.interface_fault import interface_fault
+from armlink.errors import BadInput
 
 VIRTUAL_INTERFACES = ("virtual", "udp_multicast")
 FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0 or socketcan:can0@1000000"
@@ -57,14 +58,15 @@ def open_bus(spec: str | None, section: Bus) -> MessageBus:
     except CanInterfaceNotImplementedError as error:
         if "msgpack" in str(error):  # python-can finds the interface, which lacks what it is made of
             raise BadInput(f"bus {name}: msgpack is not installed: pip install 'armlink[simulator]'") from None
-        raise BadInput(f"bus {name}: {error}: unknown interface of python-can") from None
+        known = bus.interface in can.VALID_INTERFACES
+        hint = "is its driver installed?" if known else "unknown interface of python-can"
+        raise BadInput(f"bus {name}: {error}: {hint}") from None
     except TypeError as error:
         raise BadInput(
             f"bus {name}: link.bus.options has an option that the interface does not accept: {error}"
         ) from None
-    except (can.CanError, OSError, ValueError, ImportError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise BusFault(f"bus {name}: cannot open it: {reason}") from None
+    except Exception as error:
+        raise interface_fault(error, name, "open it") from None
 
 
 def open_link_bus(spec: str | None, section: LinkSection) -> MessageBus:

@@ -10,6 +10,7 @@ from armlink.commands.options import Arm, Json, OtherBus
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from armlink.arm_file import ArmFile
     from armlink.drives.findings import Result
@@ -60,7 +61,7 @@ def check(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, confirm
     from armlink.errors import BadInput, BusFault, Refused
     from armlink.link.link import Link
     from armlink.loop.open import open_arm
@@ -80,7 +81,7 @@ def check(
             console.print(WARNING.format(arm=described.name, **times))
             if not console.is_terminal:
                 raise BadInput("check: nobody to ask: give --yes, or --passive for what needs no power")
-            typer.confirm("Go on?", abort=True, err=True)
+            confirm("Go on?")
         with console.status("check") as status:
             results, channel = link.inside(self_test, status.update, not passive)
     console.print(_table(f"{described.name} on {channel}", link.names, results))
@@ -105,6 +106,7 @@ def _check_scales(
     console: "Console", arm: "ArmFile", bus: str | None, how: str, seconds: float, yes: bool, json: Path | None
 ) -> int:
     """Scales of the drives' readings; asks before this host moves the arm."""
+    from armlink.commands.plain_console import confirm
     from armlink.commands.scale_report import check_scales
     from armlink.errors import BadInput
     from armlink.loop.open import is_in_process
@@ -114,9 +116,7 @@ def _check_scales(
     if how == "move" and not yes and not is_in_process(arm, bus):
         if not console.is_terminal:
             raise BadInput("check --scales move: nobody to ask: give --yes, or --scales hand")
-        typer.confirm(
-            f"All joints of {arm.name} will turn by 0.35 rad to both sides. Is it clear?", abort=True, err=True
-        )
+        confirm(f"All joints of {arm.name} will turn by 0.35 rad to both sides. Is it clear?")
     return check_scales(console, arm, bus, how, seconds, json)  # type: ignore[arg-type]
 
 
@@ -185,11 +185,13 @@ def _table(title: str, names: tuple[str, ...], results: "list[Result]") -> "Tabl
     return table
 
 
-def _cell(results: "list[Result]") -> str:
+def _cell(results: "list[Result]") -> "Text":
+    from rich.text import Text
+
     outcomes = {each.outcome for each in results}
     if "failed" in outcomes:
-        return "[red]FAILED[/red]"
+        return Text("FAILED", style="red")
     times = [each.seconds for each in results if each.seconds is not None]
     if times:
-        return f"[green]{max(times) * 1e3:.0f} ms[/green]"
-    return "[green]ok[/green]" if "passed" in outcomes else "–"
+        return Text(f"{max(times) * 1e3:.0f} ms", style="green")
+    return Text("ok", style="green") if "passed" in outcomes else Text("–")

@@ -22,14 +22,14 @@ def guard(
     Example: armlink guard sarcos --bus socketcan:vcan0 --out sarcos.guard.json
     """
     from armlink.arm_file import load_arm
-    from armlink.commands.output import write_json
+    from armlink.commands.output import write_json, write_out
     from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from armlink.guard import bus_guard
     from armlink.link.link import Link
 
     if path:
-        typer.echo(bus_guard.__file__)
+        write_out(f"{bus_guard.__file__}\n")
         return 0
     if arm is None or out is None:
         raise BadInput("guard: give an arm file and --out POLICY, or --path")
@@ -37,8 +37,8 @@ def guard(
     with Link.open(described, bus) as link:
         rules = link.guard_rules()
     write_json(out, {"schema": bus_guard.SCHEMA, "arm": described.name, "serial": described.serial, **rules})
-    PlainConsole().print(
-        f"{len(rules['frames'])} identifiers; start the guard with\n  python3 -I {bus_guard.__file__} {out} arm0 can0\n"
-        "where arm0 is an interface of the programs' own (ip link add arm0 type vcan) and can0 is the arm's",
-    )
+    console = PlainConsole()
+    console.print(f"{len(rules['frames'])} identifiers; start the guard with")
+    console.print(f"  python3 -I {bus_guard.__file__} {out} arm0 can0")
+    console.print("where arm0 is an interface of the programs' own (ip link add arm0 type vcan) and can0 is the arm's")
     return 0

@@ -1,22 +1,29 @@
 """Answers for machines and messages for people: JSON to a file or standard output, tables to standard error."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
+
+from armlink.content.atomic_file import write_whole
+from armlink.content.printable_text import printable_json
 
 
 def write_json(path: Path | None, answer: Any) -> None:
     """Write `answer` as JSON to `path` (`-`: standard output, None: nowhere); what is not finite becomes null."""
     if path is None:
         return
-    text = json.dumps(_finite(answer), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    text = printable_json(_finite(answer), indent=1, allow_nan=False) + "\n"
     if str(path) == "-":
-        import typer
-
-        typer.echo(text, nl=False)
+        write_out(text)
     else:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text)
+
+
+def write_out(text: str) -> None:
+    """Write text for machines, printable already, to standard output."""
+    import typer
+
+    typer.echo(text, nl=False)
 
 
 def _finite(value: Any) -> Any:

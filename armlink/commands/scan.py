@@ -27,6 +27,7 @@ def scan(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from armlink.drives.registry import family
     from armlink.errors import BadInput
 
@@ -36,7 +37,7 @@ def scan(
     kinds = set() if described is None else {joint.settings.family for joint in described.require_link().joints}
     search = family(kinds.pop() if len(kinds) == 1 else SEARCHED).search if len(kinds) < 2 else None
     if search is not None:
-        return search(described, bus, json, write_json)
+        return search(described, bus, json, write_json, PlainConsole().print)
     assert described is not None
     return _ask_all(described, bus, json)
 
@@ -45,6 +46,7 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     """The drives of an arm, each asked for its identity."""
     from rich.box import SIMPLE
     from rich.table import Column, Table
+    from rich.text import Text
 
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole
@@ -69,7 +71,7 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     nodes = []
     for each in found:
         name, kind = link.names[each.joint], link.section.joints[each.joint].settings.family
-        state = each.power.value if each.present else "[red]no answer[/red]"
+        state = each.power.value if each.present else Text("no answer", style="red")
         table.add_row(name, kind, each.address, state, each.name, each.serial, each.firmware)
         node = {**vars(each), "joint": name, "family": kind, "power": each.power.value}
         nodes.append(node | {"traits": traits[each.joint].as_json()})

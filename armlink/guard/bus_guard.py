@@ -353,7 +353,9 @@ def _bound(found: dict[str, Any], key: str, default: float) -> float:
 
 
 def _say(text: str) -> None:
-    sys.stderr.write(text + "\n")
+    """One line; names come from the policy and the system, and nothing in them acts on a terminal."""
+    shown = (each if each.isprintable() else each.encode("unicode_escape").decode("ascii") for each in text)
+    sys.stderr.write("".join(shown) + "\n")
     sys.stderr.flush()
 
 

@@ -27,7 +27,7 @@ class Layout:
         return self.first[column] if column < len(self.first) else ""
 
 
-def layout_of(content: bytes, source: str) -> Layout:
+def layout_of(content: bytes | bytearray, source: str) -> Layout:
     """Layout of a file's content, of which the first lines are looked at. Raises BadInput where it has no header row.
 
     Lines of comment (`#`) may stand above the header row, or the last of them is it.

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, take_joints
@@ -26,7 +27,9 @@ def load_recordings(path: str | Path, stated: Corrections | None = None) -> dict
     """All recordings of a file or folder, by label; `FOLDER#2` is episode 2 of a LeRobot data set."""
     stated = stated or AS_IT_IS
     folder, _, episode = str(path).rpartition("#")
-    found = _loaded(Path(folder) if episode.isdigit() and folder else Path(path), stated)
+    place = Path(folder) if episode.isdigit() and folder else Path(path)
+    with memory_budget(place):
+        found = _loaded(place, stated)
     if episode.isdigit() and folder:
         if str(path) not in found:
             raise BadInput(f"{path}: no such episode: {folder} has {len(found)}, counted from 0")

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pa_compute
 import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
+from armlink.content.file_content import MOST_JSON, read_whole
 from armlink.errors import BadInput
 from armlink.recording.recording import MOST_JOINTS, Recording, require_size
-from armlink.recording.tables import THREADS
+from armlink.recording.tables import THREADS, numbers, require_numbers
 
 STATE, ACTION = "observation.state", "action"
 _COLUMNS = ("episode_index", "timestamp", STATE, ACTION)
@@ -29,9 +31,11 @@ def load_lerobot(path: Path) -> dict[str, Recording]:
     size, parts = 0, []
     for file in sorted((path / "data").rglob("*.parquet")):
         try:
-            size += 8 * (2 * len(names) + 2) * pa_parquet.read_metadata(file).num_rows
-            require_size(size, str(path))
-            table = pa_parquet.read_table(file, columns=list(_COLUMNS), use_threads=THREADS)
+            with pa_parquet.ParquetFile(file) as content:
+                size += 8 * (2 * len(names) + 2) * content.metadata.num_rows
+                require_size(size, str(path))
+                require_numbers(content, _COLUMNS, str(file))
+                table = content.read(columns=list(_COLUMNS), use_threads=THREADS)
         except (pa.ArrowException, KeyError, ValueError, OSError) as error:
             raise BadInput(f"{file}: not the data of a LeRobot data set: {str(error).partition(chr(10))[0]}") from None
         missing = [column for column in _COLUMNS if column not in table.column_names]
@@ -54,26 +58,39 @@ def load_lerobot(path: Path) -> dict[str, Recording]:
 def _names(path: Path) -> tuple[str, ...]:
     """Joint names of the state, without the suffix `.pos`."""
     try:
-        info = json.loads((path / "meta" / "info.json").read_text())
+        info = json.loads(read_whole(path / "meta" / "info.json", MOST_JSON))
         names: Any = info["features"][STATE]["names"]
     except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
         raise BadInput(f"{path}/meta/info.json: no names of {STATE} ({type(error).__name__} {error})") from None
     while isinstance(names, dict):
         names = next(iter(names.values()), [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise BadInput(f"{path}/meta/info.json: names of {STATE} are {names!r}: expected a list of joint names")
+        raise BadInput(
+            f"{path}/meta/info.json: names of {STATE} are {str(names)[:100]!r}: expected a list of joint names"
+        )
     return tuple(name.removesuffix(".pos") for name in names)
+
+
+def _lengths(column: pa.ChunkedArray) -> Array:
+    """Number of values in each row of a column of lists; 0 where a row has none or the column holds no lists."""
+    kind = column.type
+    if not (pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)):
+        return np.zeros(len(column))
+    return numbers(pa_compute.list_value_length(column).fill_null(0).cast(pa.float64()))
 
 
 def _values(column: pa.ChunkedArray, file: Path, name: str, joints: int) -> Array:
     """The numbers of a column (K,), for state and action (K, joints)."""
     width = joints if name in (STATE, ACTION) else 0
-    rows = column.to_pylist()
-    if width and (wrong := {len(row) if isinstance(row, list) else 0 for row in rows} - {width}):
-        raise BadInput(f"{file}: {name} has rows of {min(wrong)} values for {width} names: expected one a joint")
+    if width:
+        lengths = _lengths(column)
+        if (lengths != width).any():
+            wrong = lengths[lengths != width].min()
+            raise BadInput(f"{file}: {name} has rows of {wrong:.0f} values for {width} names: expected one a joint")
+        column = pa.chunked_array([chunk.flatten() for chunk in column.chunks], column.type.value_type)
     try:
-        values = np.asarray(rows, dtype=float).reshape(len(rows), *([width] if width else []))
-    except (TypeError, ValueError):
+        values = numbers(column.cast(pa.float64())).reshape(-1, *([width] if width else []))
+    except (pa.ArrowException, ValueError):
         raise BadInput(f"{file}: {name} holds {column.type}: expected numbers") from None
     if name == "episode_index" and not (values == np.round(values)).all():
         raise BadInput(f"{file}: {name} is not a whole number in every row")

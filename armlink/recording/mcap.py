@@ -16,7 +16,7 @@ from typing import IO, Any, Self
 import numpy as np
 from lz4.frame import LZ4FrameDecompressor
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
+from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Footer, Message, Schema
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
@@ -24,6 +24,7 @@ from mcap.writer import Writer
 from zstandard import ZstdDecompressor, ZstdError
 
 from armlink.arrays import Array
+from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
 from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
 from armlink.recording.recording import MOST_BYTES, MOST_JOINTS, Recording, require_size
@@ -42,7 +43,7 @@ FLUSH_SECONDS = 0.5
 MOST_CHUNK = 1 << 28
 """A chunk that unpacks to more bytes is refused; rosbag2 writes less than a thousandth of it."""
 _NANO = 1_000_000_000
-_DAMAGED = (McapError, ValueError, OverflowError, MemoryError, OSError, struct.error, ZstdError)
+DAMAGED = (McapError, ValueError, OverflowError, OSError, struct.error, ZstdError)
 """What reading a damaged file raises."""
 
 
@@ -98,7 +99,7 @@ class RecordingWriter:
 def save_mcap(recording: Recording, path: Path) -> None:
     """Write a whole recording; times are kept to the nanosecond."""
     channels = recording.channels()
-    with RecordingWriter(path, recording.names) as writer:
+    with open_whole(path) as stream, RecordingWriter(stream, recording.names) as writer:
         for row, t in enumerate(recording.t.tolist()):
             writer.append(t, {name: values[row] for name, values in channels.items()})
 
@@ -136,8 +137,8 @@ def has_our_topics(path: Path) -> bool:
     """Whether a file's joint states are where this module looks, or cannot be told because it is cut."""
     try:
         with path.open("rb") as stream:
-            summary = make_reader(stream).get_summary()
-    except _DAMAGED:
+            summary = SeekingReader(stream, record_size_limit=most_record(path)).get_summary()
+    except DAMAGED:
         return True
     if summary is None or not summary.channels:
         return True
@@ -173,7 +174,7 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
             why = str(error)
         except RuntimeError as error:  # of LZ4
             why = f"a chunk cannot be unpacked ({error})"
-        except _DAMAGED:
+        except DAMAGED:
             pass
         position = stream.tell()
     if complete:
@@ -184,13 +185,19 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
 
 def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:
     """Records of the file; raises BadInput where a chunk unpacks to more than a recording may hold."""
-    for record in StreamReader(stream, validate_crcs=True, emit_chunks=True, record_size_limit=MOST_BYTES).records:
+    most = most_record(path)
+    for record in StreamReader(stream, validate_crcs=True, emit_chunks=True, record_size_limit=most).records:
         if isinstance(record, Chunk):
             if record.uncompressed_size > MOST_CHUNK:
                 raise BadInput(f"{path}: a chunk of {record.uncompressed_size} bytes, expected at most {MOST_CHUNK}")
             yield from breakup_chunk(_unpacked(record), validate_crc=True)
         else:
             yield record
+
+
+def most_record(path: Path) -> int:
+    """Bytes that a record may have: what is stated beyond the file's own size is damage."""
+    return min(path.stat().st_size, MOST_BYTES)
 
 
 def _unpacked(chunk: Chunk) -> Chunk:

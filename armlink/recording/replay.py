@@ -127,10 +127,11 @@ def _play(frames: Iterator[Stamped], port: Port, clock: Clock, speed: float) -> 
 
 def _table(recording: Recording, row: int) -> Any:
     from rich.box import SIMPLE
-    from rich.table import Table
+    from rich.table import Column, Table
+    from rich.text import Text
 
     channels = recording.channels()
-    table = Table("joint", *(name.replace("_", "\n") for name in channels), box=SIMPLE)
+    table = Table("joint", *(Column(Text(name.replace("_", "\n"))) for name in channels), box=SIMPLE)
     table.title = f"t = {recording.t[row]:.2f} s of {recording.t[-1]:.2f} s"
     for joint, name in enumerate(recording.names):
         table.add_row(name, *(f"{values[row, joint]:+.4f}" for values in channels.values()))

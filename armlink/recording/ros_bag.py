@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from armlink.arrays import Array
 from armlink.errors import ArmlinkError, BadInput
+from armlink.recording.bag_sizes import require_bag_sizes
 from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
 from armlink.recording.recording import MOST_JOINTS, Recording, require_size
 
@@ -44,6 +45,8 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
     """
     files = [path] if isinstance(path, Path) else list(path)
     path = files[0] if len(files) == 1 else files[0].parent
+    for each in files:
+        require_bag_sizes(each)
     try:
         with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             readable = [c for c in reader.connections if isinstance(c.topic, str) and _short(c.msgtype) in _READERS]
@@ -56,7 +59,7 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
                 require_size(size, str(path))
                 message = reader.deserialize(raw, connection.msgtype)
                 samples[connection.topic].append(_READERS[_short(connection.msgtype)](message, receipt))
-    except ArmlinkError:
+    except (ArmlinkError, MemoryError):
         raise
     except Exception as error:  # damaged files raise many kinds, those of each compression too
         raise BadInput(f"{path}: cannot read the bag: {str(error).partition(chr(10))[0]}") from None

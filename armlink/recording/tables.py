@@ -4,11 +4,12 @@ import gzip
 import json
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +18,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 
 from armlink.arrays import Array
+from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
 from armlink.recording.column_names import joint_names, suggested_map
 from armlink.recording.csv_text import Layout, is_number, layout_of
@@ -55,6 +57,7 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> R
     require_width(layout.header, str(path))
     header = _renamed(list(layout.header), columns, path)
     wanted = [column for column in header if is_channel(column)]
+    require_size(8 * len(wanted) * content.count(b"\n"), str(path))
     kinds = dict.fromkeys(wanted, pa.float64())
     first = layout.first_value(header.index("t")).replace(layout.decimal, ".") if "t" in kinds else ""
     if first and not is_number(first):
@@ -89,9 +92,10 @@ def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) 
             require_width(schema.names, str(path))
             require_size(8 * file.metadata.num_columns * file.metadata.num_rows, str(path))
             _require_each_once(schema.names, path, "")
-            apart = columns_of_lists(file)
+            apart = columns_of_lists(file, str(path))
             header = _renamed(list(apart), columns, path)
             wanted = {column: apart[name] for column, name in zip(header, apart, strict=True) if is_channel(column)}
+            require_numbers(file, {name for name, _ in wanted.values()}, str(path))
             table = file.read(columns=sorted({name for name, _ in wanted.values()}), use_threads=THREADS)
         taken = {
             column: table[name] if k is None else pa_compute.list_element(table[name], k)
@@ -104,7 +108,27 @@ def load_parquet(path: Path, columns: Mapping[str, str] = MappingProxyType({})) 
     return _recording(made, header, str(path), names)
 
 
-def columns_of_lists(file: Any) -> dict[str, tuple[str, int | None]]:
+def require_numbers(file: Any, columns: Collection[str], source: str) -> None:
+    """Raise BadInput where columns of a Parquet file hold texts, or with their lists more than a recording may.
+
+    A text that a dictionary repeats has any size; a number has at most eight bytes.
+    """
+    count = 0
+    for group in range(file.metadata.num_row_groups):
+        row_group = file.metadata.row_group(group)
+        for place in range(row_group.num_columns):
+            chunk = row_group.column(place)
+            if chunk.path_in_schema.partition(".")[0] not in columns:
+                continue
+            if chunk.physical_type == "BYTE_ARRAY":
+                raise BadInput(
+                    f"{source}: column {chunk.path_in_schema.partition('.')[0]} holds texts, expected numbers"
+                )
+            count += chunk.num_values
+    require_size(8 * count, source)
+
+
+def columns_of_lists(file: Any, source: str) -> dict[str, tuple[str, int | None]]:
     """Name → column and place in it, of a Parquet file; a column of lists `q` counts as columns `q_1`, `q_2` …"""
     found: dict[str, tuple[str, int | None]] = {}
     for field in file.schema_arrow:
@@ -112,6 +136,7 @@ def columns_of_lists(file: Any) -> dict[str, tuple[str, int | None]]:
         if not (pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)):
             found[field.name] = field.name, None
             continue
+        require_numbers(file, [field.name], source)
         first = next(file.iter_batches(1, columns=[field.name]), None)
         width = 0 if first is None or not len(first) else len(first.column(0)[0].as_py() or ())
         found |= {f"{field.name}_{k + 1}": (field.name, k) for k in range(width)}
@@ -165,7 +190,7 @@ def save_csv(recording: Recording, path: Path) -> None:
     table = _table(recording)
     options = pa_csv.WriteOptions(include_header=False, quoting_style="none")
     packed = path.name.lower().endswith(".gz")
-    with gzip.open(path, "wb", compresslevel=6) if packed else open(path, "wb") as stream:
+    with open_whole(path) as file, _gzipped(file) if packed else nullcontext(file) as stream:
         stream.write(f"{','.join(table.column_names)}\n".encode())
         pa_csv.write_csv(table, stream, options)
 
@@ -173,7 +198,12 @@ def save_csv(recording: Recording, path: Path) -> None:
 def save_parquet(recording: Recording, path: Path) -> None:
     """Write Parquet with the joint names in the schema's metadata."""
     names = {NAMES_KEY: json.dumps(recording.names).encode()}
-    pa_parquet.write_table(_table(recording).replace_schema_metadata(names), path, compression="zstd")
+    with open_whole(path) as stream:
+        pa_parquet.write_table(_table(recording).replace_schema_metadata(names), stream, compression="zstd")
+
+
+def _gzipped(stream: IO[bytes]) -> gzip.GzipFile:
+    return gzip.GzipFile("", "wb", compresslevel=6, fileobj=stream)
 
 
 def _recording(table: Any, header: list[str], source: str, names: tuple[str, ...]) -> Recording:
@@ -223,15 +253,17 @@ def _table(recording: Recording) -> Any:
     return pa.table({name: pa.array(values, from_pandas=True) for name, values in columns_of(recording).items()})
 
 
-def _content(path: Path) -> tuple[bytes, str, Layout]:
+def _content(path: Path) -> tuple[bytearray, str, Layout]:
     """Complete lines of the file, uncompressed, why it is truncated (empty if it is not), and how it is written."""
     try:
         require_size(path.stat().st_size, str(path))
-        content = path.read_bytes()
-        cut = ""
+        packed, cut = path.read_bytes(), ""
         if path.name.lower().endswith(".gz"):
-            content, ended = _unpacked(content, str(path))
+            content, ended = _unpacked(packed, str(path))
             cut = "" if ended else "the file ends early"
+        else:
+            content = bytearray(packed)
+        del packed
     except (OSError, zlib.error) as error:
         raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
     layout = layout_of(content, str(path))
@@ -240,28 +272,28 @@ def _content(path: Path) -> tuple[bytes, str, Layout]:
     whole = content.rfind(b"\n") + 1
     if not cut and _looks_whole(content, layout):
         return content, "", layout
-    return content[:whole], cut or "its last line is not complete", layout
+    del content[whole:]
+    return content, cut or "its last line is not complete", layout
 
 
-def _unpacked(packed: bytes, source: str) -> tuple[bytes, bool]:
+def _unpacked(packed: bytes, source: str) -> tuple[bytearray, bool]:
     """Content of the gzip members as far as it goes, and whether the last member is complete; raises BadInput."""
-    parts, ended, size, whole = [], False, 0, len(packed)
+    content, ended, whole = bytearray(), False, len(packed)
     while packed:
         member = zlib.decompressobj(wbits=31)
         while packed and not member.eof:
-            parts.append(member.decompress(packed, _PIECE))
+            content += member.decompress(packed, _PIECE)
             packed = member.unconsumed_tail
-            size += len(parts[-1])
-            require_size(size, source)
-            if size > _SURELY_MUCH and size > _MOST_RATIO * whole:
+            require_size(len(content), source)
+            if len(content) > _SURELY_MUCH and len(content) > _MOST_RATIO * whole:
                 raise BadInput(f"{source}: unpacks to more than {_MOST_RATIO} times its size: not a recording")
         ended, packed = member.eof, member.unused_data.lstrip(b"\0")
         if not ended:
             break
-    return b"".join(parts), ended
+    return content, ended
 
 
-def _looks_whole(content: bytes, layout: Layout) -> bool:
+def _looks_whole(content: bytearray, layout: Layout) -> bool:
     """Whether a last line without newline is complete: all columns, its last number as long as any above it.
 
     A truncated number has fewer decimals than the others of its column, or is shorter.

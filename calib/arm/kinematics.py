@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import ModelArm, load_model
@@ -45,7 +46,8 @@ def model_arm(arm_file: ArmFile) -> ModelArm:
         raise BadInput(f"{arm_file.path}: key kinematics.model is missing: this needs a URDF or MJCF file")
     gravity = kinematics.gravity if "gravity" in kinematics.model_fields_set else None
     try:
-        model = load_model(path, base=kinematics.base, tip=kinematics.tip, gravity=gravity)
+        with model_budget(path):
+            model = load_model(path, base=kinematics.base, tip=kinematics.tip, gravity=gravity)
     except GcompError as error:
         raise BadInput(f"{arm_file.path}: key kinematics.model: {error}") from None
     if arm_file.link is not None and arm_file.joint_names != model.arm.names:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.content.model_sizes import model_budget
 from calib.arm.kinematics import gcomp_arm
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import PlacedChain, place_chain
@@ -41,7 +42,8 @@ def skeleton(arm_file: ArmFile) -> Skeleton:
         return _of_rows(arm)
     kinematics = arm_file.kinematics
     gravity = kinematics.gravity if "gravity" in kinematics.model_fields_set else None
-    placed = place_chain(arm_file.model_path, base=kinematics.base, tip=kinematics.tip, gravity=gravity)
+    with model_budget(arm_file.model_path):
+        placed = place_chain(arm_file.model_path, base=kinematics.base, tip=kinematics.tip, gravity=gravity)
     return _of_model(placed, gravity)
 
 

@@ -28,7 +28,7 @@ def history(
     Example: armlink history sarcos --json -
     """
     from armlink.arm_file import load_arm
-    from armlink.commands.output import write_json
+    from armlink.commands.output import write_json, write_out
     from armlink.errors import BadInput
     from calib.records.store import RecordStore
 
@@ -40,7 +40,7 @@ def history(
         if activate:
             records.activate(imported, arm_file, by=getpass.getuser(), reason=f"imported from {import_file.name}")
     if record is not None:
-        typer.echo(records.get(record).require(arm_file).to_yaml(), nl=False)
+        write_out(records.get(record).require(arm_file).to_yaml())
         return
     log, writes = records.activations(arm_file), records.writes(arm_file)
     current = {line.kind: line.record for line in log}

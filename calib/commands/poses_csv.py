@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
 from gcomp.arrays import Array
 
@@ -17,7 +18,7 @@ def load_poses(path: Path, n: int) -> Array:
     if not path.is_file():
         raise BadInput(f"no file {path}: give a CSV file with columns q_1 … q_{n} [rad]")
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with memory_budget(path), path.open(encoding="utf-8-sig", newline="") as file:
             rows = [row for row in csv.reader(file) if row]
     except (UnicodeDecodeError, csv.Error) as error:
         raise BadInput(f"{path}: not a CSV file: {error}") from None

@@ -41,6 +41,7 @@ def recalibrate(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole
     from calib.field.field_fit import fit_field
     from calib.field.field_record import field_record
     from calib.records.missing import no_record
@@ -66,7 +67,7 @@ def recalibrate(
         apply_field(record, arm_file, records, rows, fit, np.array(gravity.beta), how)
     else:
         records.add(record)
-        typer.echo(f"record {record.id} is kept, not written to the controllers (--apply does that)", err=True)
+        PlainConsole().print(f"record {record.id} is kept, not written to the controllers (--apply does that)")
     write_json(json_file, _answer(fit, record, gravity.id, apply))
 
 

@@ -31,6 +31,7 @@ def rollback(
     Example: armlink rollback sarcos --to 1f0c9a2b --reason "sensor exchanged" --apply
     """
     from armlink.arm_file import load_arm
+    from armlink.commands.plain_console import PlainConsole
     from calib.records.store import RecordStore
 
     arm_file, records, user = load_arm(arm), RecordStore(store), getpass.getuser()
@@ -41,13 +42,15 @@ def rollback(
     else:
         records.rollback(arm_file, to, by=user, reason=reason)
     line = [each for each in records.activations(arm_file) if each.record == to][-1]
-    typer.echo(f"{line.kind} record {to} is current on {arm_file.name} {arm_file.serial} since {line.at}", err=True)
+    say = PlainConsole().print
+    say(f"{line.kind} record {to} is current on {arm_file.name} {arm_file.serial} since {line.at}")
     if line.kind == "calibration" and not apply:
         keep = "the joint controllers keep what they hold: --apply writes it to them now;"
-        typer.echo(f"{keep} a daemon with policy apply writes it by itself within seconds", err=True)
+        say(f"{keep} a daemon with policy apply writes it by itself within seconds")
 
 
 def _apply(arm_file: "ArmFile", to: str, records: "RecordStore", how: "Apply", reason: str) -> None:
+    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from calib.install.apply import apply_rollback
     from calib.records.records import CalibrationRecord
@@ -58,8 +61,7 @@ def _apply(arm_file: "ArmFile", to: str, records: "RecordStore", how: "Apply", r
     if record != records.current(CalibrationRecord, arm_file):  # the current one may be written once more
         records.former(arm_file, to)
     written = apply_rollback(record, arm_file, records, how, reason)
-    typer.echo(
+    PlainConsole().print(
         f"written to {len(written)} controllers and read back; the only gate of a roll-back is the distance from what"
-        " they held",
-        err=True,
+        " they held"
     )

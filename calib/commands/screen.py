@@ -6,13 +6,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-import typer
 from rich.box import SIMPLE_HEAD
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress
 from rich.table import Column, Table
 
 from armlink.arm_file import ArmFile
-from armlink.commands.plain_console import PlainConsole
+from armlink.commands.plain_console import PlainColumn, PlainConsole
+from armlink.commands.plain_console import confirm as ask_to_confirm
 from armlink.errors import Stall
 from armlink.link.lateness import Lateness
 from calib.plan.types import SweepPlan
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from calib.sweep.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
-_CONSOLE = PlainConsole(markup=False)  # units stand in brackets
+_CONSOLE = PlainConsole()
 
 
 class SweepScreen:
@@ -30,10 +30,10 @@ class SweepScreen:
     def __init__(self, title: str) -> None:
         """With `title` before the bar."""
         columns = (
-            TextColumn("{task.description}"),
+            PlainColumn("{task.description}"),
             BarColumn(),
-            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-            TextColumn("{task.fields[left]} left  {task.fields[text]}"),
+            PlainColumn("{task.completed:.0f}/{task.total:.0f}"),
+            PlainColumn("{task.fields[left]} left  {task.fields[text]}"),
         )
         self._progress = Progress(*columns, console=_CONSOLE, transient=False)
         self._task = self._progress.add_task(title, total=1, left="?", text="connecting")
@@ -61,7 +61,7 @@ class SweepScreen:
             if sys.stdin is None or not sys.stdin.isatty():
                 return False
             self._progress.stop()
-            again = typer.confirm("Enable the joints again and repeat the reading?", err=True)
+            again = ask_to_confirm("Enable the joints again and repeat the reading?", abort=False)
             self._progress.start()
             return again
 
@@ -84,7 +84,7 @@ class SweepScreen:
 def confirm(question: str) -> None:
     """Ask a person at the terminal; without a terminal nobody is asked. Raises typer.Abort where the answer is no."""
     if sys.stdin is not None and sys.stdin.isatty():
-        typer.confirm(question, abort=True, err=True)
+        ask_to_confirm(question)
 
 
 def print_preflight(found: "Preflight") -> None:

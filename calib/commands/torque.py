@@ -57,6 +57,7 @@ def _model(
     import numpy as np
 
     from armlink.arm_file import MODEL_SUFFIXES, load_arm
+    from armlink.content.model_sizes import model_budget
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm, model_arm
     from calib.records.missing import way_to
@@ -69,7 +70,8 @@ def _model(
             raise BadInput(f"--record {record}: only with an arm file; {arm} is a model file")
         if not Path(arm).is_file():
             raise BadInput(f"no model file {arm}: give the path of a URDF or MJCF file, or of an arm file")
-        model = load_model(Path(arm), base=base, tip=tip)
+        with model_budget(Path(arm)):
+            model = load_model(Path(arm), base=base, tip=tip)
         return model.arm, model.beta, f"inertials of {arm}"
     if base is not None or tip is not None:
         raise BadInput("--base, --tip: only with a URDF or MJCF file; an arm file has its chain under kinematics")

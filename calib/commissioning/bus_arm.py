@@ -1,10 +1,11 @@
 """The arm file of an arm of which only the bus is known: drives, ratings and stops, and no geometry yet."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
+from typing import Any
 
+from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from armlink.drives.found import FoundDrives
 from armlink.errors import BusFault
 from calib.commissioning.drive_match import Ask, Match, moved_node
@@ -61,30 +62,35 @@ def _text(
 ) -> str:
     known = matches[0].by_hand
     lines = [
-        f"# {name}: the drives on {channel}, by the command new, without a model.",
-        "# Comments mark what was guessed: check it before a real arm moves, then remove the comment.",
-        f"name: {json.dumps(name)}",
-        "serial: unknown  # assumed",
+        yaml_comment(f"{name}: the drives on {channel}, by the command new, without a model."),
+        yaml_comment("Comments mark what was guessed: check it before a real arm moves, then remove the comment."),
+        yaml_entry("name", name),
+        yaml_entry("serial", "unknown", note="assumed"),
         "kinematics:",
-        "  gravity: [0.0, 0.0, -9.80665]  # m/s² in the base frame, assumed: the arm stands upright",
+        yaml_entry("gravity", [0.0, 0.0, -9.80665], 2, "m/s² in the base frame, assumed: the arm stands upright"),
         "  joints:  # a, alpha, d assumed: unknown; give them, or make the file of the arm's URDF or MJCF",
     ]
     for match, (lower, upper) in zip(matches, stops, strict=True):
         stop = "stops found by hand" if known else "stops assumed: a full turn"
-        row = f"name: {match.joint}, a: 0.0, alpha: 0.0, d: 0.0, lower: {lower:.4f}, upper: {upper:.4f}"
-        lines.append(f"    - {{{row}}}  # {stop}")
-    lines += [
-        "link:",
-        "  bus: {" + ", ".join(f"{key}: {json.dumps(value)}" for key, value in bus.items()) + "}",
-        "  rate: 250  # Hz, assumed",
-        "  joints:",
-    ]
+        row = {"name": match.joint, "a": 0.0, "alpha": 0.0, "d": 0.0}
+        lines.append(yaml_item({**row, "lower": round(lower, 4), "upper": round(upper, 4)}, 4, stop))
+    lines += ["link:", yaml_entry("bus", dict(bus), 2), yaml_entry("rate", 250, 2, "Hz, assumed"), "  joints:"]
     for match in matches:
-        drive, place = match.drive, "by turning the joint by hand" if known else "assumed: in the order of node ids"
-        row = f"name: {match.joint}, node: {drive.node}, rated_torque: {drive.rated_torque:g}"
-        row += f", max_torque: {drive.max_torque:g}, max_torque_rate: {2.5 * drive.max_torque:.3g}"
-        row += f", max_velocity: {SLOW}, identity: {{vendor: {drive.vendor}, product: {drive.product}}}"
-        lines += [f"    - {{{row}}}", f"      # node {place}; max_velocity assumed"]
+        place = "by turning the joint by hand" if known else "assumed: in the order of node ids"
+        lines += [yaml_item(_joint(match), 4), "      " + yaml_comment(f"node {place}; max_velocity assumed")]
     if not known:
-        lines += ["sweep:", "  hold: servo  # assumed: the stops are not known"]
+        lines += ["sweep:", yaml_entry("hold", "servo", 2, "assumed: the stops are not known")]
     return "\n".join(lines) + "\n"
+
+
+def _joint(match: Match) -> dict[str, Any]:
+    drive = match.drive
+    return {
+        "name": match.joint,
+        "node": drive.node,
+        "rated_torque": float(f"{drive.rated_torque:g}"),
+        "max_torque": float(f"{drive.max_torque:g}"),
+        "max_torque_rate": float(f"{2.5 * drive.max_torque:.3g}"),
+        "max_velocity": SLOW,
+        "identity": {"vendor": drive.vendor, "product": drive.product},
+    }

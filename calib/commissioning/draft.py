@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armlink.content.model_sizes import model_budget
 from calib.commissioning.chain import Chain
 from calib.commissioning.clear_range import ClearRange
 from gcomp.arm.load import compile_model
@@ -144,7 +145,8 @@ def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float]) -> 
     """Largest torque (n,) [N·m] against gravity and for ACCELERATION of the joint alone, at random poses."""
     import mujoco
 
-    model = compile_model(path)
+    with model_budget(path):
+        model = compile_model(path)
     model.opt.gravity[:] = gravity
     data = mujoco.MjData(model)
     joints = [model.joint(name).id for name in names]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
 from gcomp.arm.load import compile_model
 from gcomp.arm.model_tree import coupled_joints, upwards
@@ -42,7 +43,8 @@ def model_joints(path: Path) -> tuple[list[ModelJoint], tuple[float, float, floa
     """All joints of a model in its order, and gravity in its world frame [m/s²]; raises BadModel, BadInput."""
     import mujoco
 
-    model = compile_model(path)
+    with model_budget(path):
+        model = compile_model(path)
     kinds = {
         mujoco.mjtJoint.mjJNT_HINGE: "revolute",
         mujoco.mjtJoint.mjJNT_SLIDE: "prismatic",

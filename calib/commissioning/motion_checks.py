@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.content.model_sizes import model_budget
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.arm.sweep_section import sweep_section
@@ -92,7 +93,8 @@ def _damping(arm_file: ArmFile, model: Path) -> Iterator[SetupFinding]:
     joints = [joint for joint in arm_file.link.joints if getattr(joint.settings, "kp", 0.0) > 0]
     if not joints:
         return
-    placed = place_chain(model, base=arm_file.kinematics.base, tip=arm_file.kinematics.tip)
+    with model_budget(model):
+        placed = place_chain(model, base=arm_file.kinematics.base, tip=arm_file.kinematics.tip)
     arm = placed.arm.arm
     low, high = np.nan_to_num([arm.lower, arm.upper], posinf=np.pi, neginf=-np.pi)
     poses = np.random.default_rng(0).uniform(low, high, (DAMPED_POSES, arm.n))

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import yaml
-
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
+from armlink.content.atomic_file import write_whole
+from armlink.content.file_content import parse_yaml
 from armlink.drives.found import FoundDrives
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
@@ -50,13 +50,13 @@ class NewArm:
 
     def parsed(self) -> ArmFile:
         """The arm file, validated as if it lay there already."""
-        return parse_arm(yaml.safe_load(self.text), self.out)
+        return parse_arm(parse_yaml(self.text, self.out), self.out)
 
     def write(self) -> None:
         """Write the file; raises BadInput."""
         try:
             self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text(self.text, encoding="utf-8")
+            write_whole(self.out, self.text)
         except OSError as error:
             raise BadInput(f"{self.out}: cannot be written: {error.strerror}") from None
 

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from armlink.arm_file import ArmFile, Bus, parse_arm
+from armlink.arm_file import ArmFile, Bus, parse_arm, read_yaml
 from armlink.bus.can_bus import CanBus
+from armlink.content.yaml_text import yaml_comment, yaml_document, yaml_entry
 from armlink.drives.registry import family
 from armlink.errors import BusFault
 from armlink.link.link import Link
@@ -47,7 +46,7 @@ def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus,
     wrong = [
         another_drive(each.mismatch, f"{there.names[each.joint]} ({each.address})") for each in found if each.mismatch
     ]
-    content: dict[str, Any] = yaml.safe_load(arm.path.read_text(encoding="utf-8"))
+    content: dict[str, Any] = read_yaml(arm.path)
     content = {key: value for key, value in content.items() if key != "sim"}
     content["link"] = {**content["link"], "bus": bus}
     if new_serial:
@@ -55,10 +54,12 @@ def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus,
     if arm.model_path is not None:
         content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
     parse_arm(dict(content), out)
-    text = f"# {arm.name} with the drives on {opened.channel_info}, from {arm.path.name}, by the command new.\n"
+    title = f"{arm.name} with the drives on {opened.channel_info}, from {arm.path.name}, by the command new."
+    text = yaml_comment(title) + "\n"
     for key, value in content.items():
-        part = yaml.safe_dump({key: value}, sort_keys=False, allow_unicode=True, width=160)
-        assumed = "  # assumed: that of the first drive" if key == "serial" and new_serial else ""
-        text += part.rstrip("\n") + assumed + "\n"
+        if key == "serial" and new_serial:
+            text += yaml_entry(key, value, note="assumed: that of the first drive") + "\n"
+        else:
+            text += yaml_document({key: value})
     drives = [(there.names[each.joint], each.address, each.serial) for each in found]
     return OwnCopy(text, drives, wrong)

@@ -1,5 +1,6 @@
 """Plan of a pass of creep sweeps, tip to base: free of collisions, within the drives' torque."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from calib.creep.design import Candidate, choose
 from calib.creep.parameters import Doubt
 from calib.plan.choices import POINTS
 from calib.plan.collisions import Geometry
+from calib.plan.plan_limits import ROUNDING, Bounds, refuse_unfit, require_bounds
 from calib.plan.poses import require_range
 from calib.plan.types import Side, Sweep, SweepPlan
 from gcomp.arm.arm import Arm
@@ -31,6 +33,8 @@ BLIND_SHARE = 0.15
 """The same where no model file tells what the arm itself weighs."""
 WORST_CONSTANT = 1.6
 """A drive may have to be asked for so many times the true torque."""
+TRAVEL_ACCELERATION = 1.5
+"""Largest acceleration from one creep to the next [rad/s²]; a choice: the arm hangs in soft position loops."""
 HAND = 0.12
 """Distance of the mass from the flange that the plan allows for [m]."""
 
@@ -118,10 +122,34 @@ def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
         scout=(tuple(home.tolist()),),
         reference_mass=mass,
         standard_error=ground.section.standard_error,
-        travel_acceleration=min(ground.section.acceleration, 1.5),
+        travel_acceleration=min(ground.section.acceleration, TRAVEL_ACCELERATION),
         gain_std=float(promised[[j for j in range(n) if ground.arm.names[j] not in blind]].max(initial=0.0)),
         notes=notes,
     )
+
+
+def check_creep_limits(ground: CreepGround, arm_file: ArmFile, plan: SweepPlan) -> None:
+    """Raise Refused, naming sweep, joint and value, where a plan of creeps leaves what this one would plan within."""
+    ends = np.array([ground.range(joint) for joint in range(ground.arm.n)]).T
+    bounds = (ends[0], ends[1])
+    require_bounds(arm_file, plan, Bounds(bounds, bounds, bounds))
+    refuse_unfit(arm_file, _unfit(ground, plan, ends))
+
+
+def _unfit(ground: CreepGround, plan: SweepPlan, ends: Array) -> Iterator[str]:
+    mass, fastest = ground.mass(), max(ground.section.creep.speeds)
+    most = min(ground.section.acceleration, TRAVEL_ACCELERATION)
+    if not 0 < plan.travel_acceleration <= most * (1 + ROUNDING):
+        yield f"travel_acceleration is {plan.travel_acceleration:g} rad/s², expected at most {most:g}"
+    for sweep in plan.sweeps:
+        speed, (lower, upper) = creep_speed(sweep), creep_ends(sweep)
+        if speed > min(fastest, ground.limits.speed[sweep.joint]) * (1 + ROUNDING):
+            yield f"sweep {sweep.name}: speed {speed:g} rad/s, expected at most {fastest:g}"
+        low, high = ends[:, sweep.joint]
+        if lower < low - ROUNDING or upper > high + ROUNDING:
+            yield f"sweep {sweep.name}: from {lower:.4g} to {upper:.4g} rad, expected {low:.4g} to {high:.4g}"
+        if not ground.bearable(Candidate(sweep.joint, np.array(sweep.rest), lower, upper), mass):
+            yield f"sweep {sweep.name}: a drive cannot hold its joint there within max_torque, with {mass:g} kg"
 
 
 TRAVEL_SECONDS = 6.0
@@ -154,6 +182,13 @@ def creep_speed(sweep: Sweep) -> float:
 def lead_way(speed: float) -> float:
     """Way at either end of a creep that does not count [rad]."""
     return speed * (RAMP / 2 + SETTLE)
+
+
+def creep_ends(sweep: Sweep) -> tuple[float, float]:
+    """Both ends of a planned creep's way, with the lead at either [rad]."""
+    middles = sweep.steps
+    half = (middles[1] - middles[0]) / 2 + lead_way(creep_speed(sweep))
+    return middles[0] - half, middles[-1] + half
 
 
 RESTING: Side = 0

@@ -12,7 +12,7 @@ from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import sweep_section
 from calib.creep.bins import bin_readings
-from calib.creep.plan import RAMP, CreepGround, creep_speed, lead_way, plan_creep
+from calib.creep.plan import RAMP, CreepGround, check_creep_limits, creep_ends, creep_speed, plan_creep
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.collisions import check_creeps
@@ -55,6 +55,7 @@ def run_creep(
         mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))
         used = data.plan or plan or plan_creep(arm, seed=seed)
         ground = CreepGround.of(arm)
+        check_creep_limits(ground, arm, used)
         if ground.geometry is not None:
             check_creeps(arm, ground.geometry, used, mover.command.position)
         if data.plan is None:
@@ -114,10 +115,8 @@ class _Pass:
 
     def _both_ways(self, sweep: Sweep) -> list[StaticReading]:
         mover, joint = self._mover, sweep.joint
-        middles = np.array(sweep.steps)
-        speed = creep_speed(sweep)
-        half = (middles[1] - middles[0]) / 2 + lead_way(speed)
-        low, high = middles[0] - half, middles[-1] + half
+        middles, speed = np.array(sweep.steps), creep_speed(sweep)
+        low, high = creep_ends(sweep)
         goal = np.array(sweep.rest)
         goal[joint] = low
         mover.hold_all()

@@ -1,13 +1,14 @@
 """Structured logs: one JSON object per line on stderr, for systemd's journal or any log collector."""
 
 import atexit
-import json
 import logging
 import queue
 import sys
 import threading
 from datetime import UTC, datetime
 from typing import TextIO
+
+from armlink.content.printable_text import printable_json
 
 _KNOWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 
@@ -26,7 +27,7 @@ class JsonFormatter(logging.Formatter):
         line |= {name: value for name, value in vars(record).items() if name not in _KNOWN and value is not None}
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line, default=str, ensure_ascii=False)
+        return printable_json(line, default=str)
 
 
 MOST_LINES = 10_000

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.content.atomic_file import write_whole
+from armlink.content.printable_text import printable_text
 from calib.arm.drive_limits import Limits
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
@@ -83,7 +85,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
             y=points[:, 1],
             z=points[:, 2],
             mode="lines+markers",
-            name=sweep.name,
+            name=escape(printable_text(sweep.name)),
             line=line,
             marker={"size": 3, "color": line["color"]},
         )
@@ -103,14 +105,14 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
         x=arrow[:, 0], y=arrow[:, 1], z=arrow[:, 2], mode="lines", name="gravity", line={"width": 8, "color": "grey"}
     )
     figure.update_layout(
-        title=f"{escape(arm_file.name)}: poses of the plan (base frame, m)",
+        title=f"{escape(printable_text(arm_file.name))}: poses of the plan (base frame, m)",
         scene={"aspectmode": "data", "camera": _camera(down)},
         height=800,
         margin={"l": 0, "r": 0, "b": 0},
         updatemenus=[{"buttons": _choices(plan), "x": 0.0, "xanchor": "left", "y": 1.0}],
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.write_html(path, include_plotlyjs=True, full_html=True)
+    write_whole(path, figure.to_html(include_plotlyjs=True, full_html=True))
 
 
 def _camera(down: Array) -> dict[str, dict[str, float]]:
@@ -129,4 +131,7 @@ def _choices(plan: SweepPlan) -> list[dict[str, Any]]:
     count = len(plan.sweeps)
     shown = {"all sweeps": [True] * (count + 2)}
     shown |= {one.name: [*(one is other for other in plan.sweeps), False, True] for one in plan.sweeps}
-    return [{"label": label, "method": "update", "args": [{"visible": seen}]} for label, seen in shown.items()]
+    return [
+        {"label": escape(printable_text(label)), "method": "update", "args": [{"visible": seen}]}
+        for label, seen in shown.items()
+    ]

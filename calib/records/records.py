@@ -8,7 +8,6 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 from pydantic import (
     AwareDatetime,
     BaseModel,
@@ -21,6 +20,7 @@ from pydantic import (
 )
 
 from armlink.arm_file import ArmFile
+from armlink.content.yaml_text import yaml_document
 from armlink.errors import BadInput, Refused
 from armlink.key_errors import describe
 from armlink.torque_calibration import UNKNOWN, TorqueCalibration
@@ -84,7 +84,7 @@ class Record(_Frozen):
 
     def to_yaml(self) -> str:
         """The record as YAML, with its id as check sum."""
-        return yaml.safe_dump({"id": self.id, **self.model_dump(mode="json")}, sort_keys=False, allow_unicode=True)
+        return yaml_document({"id": self.id, **self.model_dump(mode="json")})
 
 
 class Discrepancy(_Frozen):

@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 import sqlalchemy as sa
 
 from armlink.arm_file import ArmFile, read_yaml
+from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput, Refused
-from calib.records.atomic_file import write_whole
 from calib.records.bounds import require_sound
 from calib.records.database import StoreFault, default_url, first_line, open_database, reading, transaction
 from calib.records.records import CalibrationRecord, GravityRecord, Record, digest_id, parse_record

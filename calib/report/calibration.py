@@ -3,10 +3,10 @@
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
@@ -16,7 +16,7 @@ from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, Parameter
 from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
-from calib.report.page import ReportTable, Section, paragraph, render
+from calib.report.page import ReportTable, Section, html_of, paragraph, paragraphs, render, verdict_line
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
@@ -52,13 +52,13 @@ def _identity(done: Calibrated) -> Section:
     record, findings = done.record, done.fit.goodness.findings
     broken = sorted({each.joint for each in findings if each.breaks_model})
     verdict = f"the model does not hold: {', '.join(broken)}" if broken else "the model holds"
-    html = f'<p><span class="verdict">{escape(verdict)}</span></p>' + _advice(done, broken)
-    html += "".join(paragraph(each.text) for each in findings)
+    html = verdict_line(verdict) + _advice(done, broken)
+    html += paragraphs(each.text for each in findings)
     rows = [
-        ["arm", escape(f"{record.arm}, serial {record.serial}")],
-        ["description (SHA-256)", f"<small>{record.description_hash}</small>"],
+        ["arm", f"{record.arm}, serial {record.serial}"],
+        ["description (SHA-256)", html_of("<small>{}</small>", record.description_hash)],
         ["record", record.id + (f", replaces {record.parent}" if record.parent else ", the first of this arm")],
-        ["confirmed by", escape(record.confirmed_by or "not confirmed: kept, not written to controllers")],
+        ["confirmed by", record.confirmed_by or "not confirmed: kept, not written to controllers"],
         [
             "readings",
             f"{len(done.fit.rows.swept)}, χ² {done.fit.fit.chi2:.0f} at {done.fit.fit.dof} degrees of freedom",
@@ -67,11 +67,13 @@ def _identity(done: Calibrated) -> Section:
     for data in done.data:
         load = f"{data.manifest.reference_mass:g} kg attached" if data.manifest.reference_mass else "no mass"
         when = f"{data.manifest.created:%Y-%m-%d %H:%M} UTC"
-        rows.append([f"sweeps {escape(data.path.name)}", f"{load}, {when}<br><small>SHA-256 {data.digest}</small>"])
+        rows.append(
+            [f"sweeps {data.path.name}", html_of("{}<br><small>SHA-256 {}</small>", f"{load}, {when}", data.digest)]
+        )
     return Section("Calibration", html, (), [ReportTable((), rows, texts=2)])
 
 
-def _advice(done: Calibrated, broken: list[str]) -> str:
+def _advice(done: Calibrated, broken: list[str]) -> Markup:
     """What a person does with this calibration, in a few sentences and a command, as HTML."""
     fit = done.fit
     half = fit.half95("gain")
@@ -92,7 +94,7 @@ def _advice(done: Calibrated, broken: list[str]) -> str:
     else:
         sweeps = shlex.join(str(data.path) for data in done.data)
         next_step, command = "It can be written to the controllers:", f"armlink calibrate {sweeps} --apply"
-    return paragraph(f"{exactly}{without}. {next_step}") + f"<p><code>{escape(command)}</code></p>"
+    return paragraph(f"{exactly}{without}. {next_step}") + html_of("<p><code>{}</code></p>", command)
 
 
 def _sensors(done: Calibrated) -> Section:
@@ -106,13 +108,13 @@ def _sensors(done: Calibrated) -> Section:
     rows = []
     for j, name in enumerate(fit.names):
         cells = [_interval(fit.value(key)[j], fit.half95(key)[j]) for key, _, _ in PARAMETERS]
-        rows.append([escape(name), *cells, f"{fit.residual_rms[j]:.4f}", f"{fit.hysteresis[j]:.4f}"])
+        rows.append([name, *cells, f"{fit.residual_rms[j]:.4f}", f"{fit.hysteresis[j]:.4f}"])
     table = ReportTable(header, rows, "Estimates ± half of the 95 % interval; reading = gain · torque + offset.")
     reasons = [f"{joint}, {parameter.replace('_', ' ')}: {why}." for (joint, parameter), why in fit.reasons.items()]
     reasons += [f"{why}." for why in fit.imprecise.values()]
     if fit.attachment is not None:
         reasons.append(f"{fit.attachment_text[0].upper()}{fit.attachment_text[1:]}.")
-    return Section("Sensors", "".join(paragraph(each) for each in reasons), (), [table])
+    return Section("Sensors", paragraphs(reasons), (), [table])
 
 
 def _comparison(done: Calibrated) -> Section:
@@ -134,7 +136,7 @@ def _comparison(done: Calibrated) -> Section:
     if shown.any():
         figures.append(before_after_figure(tuple(np.array(names)[shown].tolist()), rms[0][shown], rms[1][shown], label))
     header = ("joint", f"RMS with {label} [N·m]", "RMS now [N·m]")
-    rows = [[escape(names[j]), _number(rms[0][j], ".4f"), _number(rms[1][j], ".4f")] for j in range(n)]
+    rows = [[names[j], _number(rms[0][j], ".4f"), _number(rms[1][j], ".4f")] for j in range(n)]
     tables = [ReportTable(header, rows)]
     if before is not None:
         tables.append(_changes(before, record))
@@ -146,7 +148,7 @@ def _comparison(done: Calibrated) -> Section:
 def _changes(before: CalibrationRecord, record: CalibrationRecord) -> ReportTable:
     rows = [
         [
-            escape(each.joint),
+            each.joint,
             each.parameter.replace("_", " ") + f" [{each.unit}]",
             _number(each.before, ".5f"),
             _number(each.after, ".5f"),
@@ -190,7 +192,7 @@ def _sweeps(done: Calibrated) -> list[Section]:
             angle = fit.rows.readings.position[at, joint]
             rows.append(
                 [
-                    escape(sweep),
+                    sweep,
                     f"{fit.rows.readings.load[at[0]]:g}",
                     str(len(at)),
                     f"{angle.min():.2f}\u202f…\u202f{angle.max():.2f}".replace("-", "\u2212"),

@@ -1,25 +1,33 @@
 """One self-contained HTML page from sections: text, tables and plotly figures, for screen and paper."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from html import escape
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from markupsafe import Markup, escape
+
+from armlink.content.atomic_file import open_whole
+from armlink.content.printable_text import printable_text
 
 SCREEN = {"responsive": True, "displayModeBar": False}
 FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"}
 COLOURS = ["#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248"]
 MARGIN = {"l": 60, "r": 20, "b": 48}
+FIGURE_TEXTS = ("name", "text", "label", "ticktext", "x", "y")
+"""Keys of plotly's figures whose texts have tags for plotly; none of ours has any."""
 GRID = {"gridcolor": "#e8ecf0", "zerolinecolor": "#c6ced6", "automargin": True}
 
 
 @dataclass(frozen=True)
 class Section:
-    """One part of a report. `html` and table cells are trusted; use `escape` on text from outside."""
+    """One part of a report. Text is escaped by the template, all but what is Markup."""
 
     title: str
     html: str = ""
+    """Markup, see `html_of`."""
     figures: Sequence[Any] = ()
     """plotly figures, shown below one another."""
     tables: Sequence["ReportTable"] = ()
@@ -37,9 +45,34 @@ class ReportTable:
     """Number of text columns, from the left; the others are numbers, aligned right."""
 
 
-def paragraph(text: str) -> str:
-    """Plain text as an HTML paragraph, escaped."""
-    return f"<p>{escape(text)}</p>"
+def paragraph(text: str) -> Markup:
+    """Text as an HTML paragraph."""
+    return html_of("<p>{}</p>", text)
+
+
+def paragraphs(texts: Iterable[str]) -> Markup:
+    """Texts as HTML paragraphs."""
+    return Markup().join(paragraph(text) for text in texts)
+
+
+def bullets(texts: Iterable[str]) -> Markup:
+    """Texts as an HTML list."""
+    return html_of("<ul>{}</ul>", Markup().join(html_of("<li>{}</li>", text) for text in texts))
+
+
+def verdict_line(verdict: str, sentence: str = "") -> Markup:
+    """A verdict, and a sentence on it, as an HTML paragraph."""
+    return html_of('<p><span class="verdict">{}</span>{}</p>', verdict, sentence and f" {sentence}.")
+
+
+def html_of(form: str, *texts: str) -> Markup:
+    """Our own HTML with texts in it, which are escaped unless they are Markup."""
+    return Markup(form).format(*(_shown(text) for text in texts))
+
+
+def _shown(value: Any) -> Any:
+    """Text without what acts on the direction of reading; anything else as it is."""
+    return printable_text(value, keep="\n") if type(value) is str else value
 
 
 def render(path: Path, title: str, sections: Sequence[Section], subtitle: str = "") -> None:
@@ -47,19 +80,21 @@ def render(path: Path, title: str, sections: Sequence[Section], subtitle: str = 
     from jinja2 import Environment, PackageLoader
     from plotly.offline import get_plotlyjs
 
-    environment = Environment(loader=PackageLoader("calib.report", "."), autoescape=False, trim_blocks=True)
+    environment = Environment(
+        loader=PackageLoader("calib.report", "."), autoescape=True, trim_blocks=True, finalize=_shown
+    )
     numbered = [(f"s{i}", section, [_figure(f) for f in section.figures]) for i, section in enumerate(sections, 1)]
     page = environment.get_template("page.html.j2").stream(
-        title=escape(title), subtitle=escape(subtitle), sections=numbered, plotly=get_plotlyjs()
+        title=title, subtitle=subtitle, sections=numbered, plotly=Markup(get_plotlyjs())
     )
-    with path.open("wb") as file:  # piece by piece: a page has ten megabytes
+    with open_whole(path) as file:  # piece by piece: a page has ten megabytes
         page.dump(file, encoding="utf-8")
 
 
-def _figure(figure: Any) -> str:
+def _figure(figure: Any) -> Markup:
     from plotly.io import to_html
 
-    return str(to_html(styled(figure), full_html=False, include_plotlyjs=False, config=SCREEN, validate=False))
+    return Markup(to_html(styled(figure), full_html=False, include_plotlyjs=False, config=SCREEN, validate=False))
 
 
 def styled(figure: Any) -> dict[str, Any]:
@@ -67,7 +102,7 @@ def styled(figure: Any) -> dict[str, Any]:
 
     Merged by hand: plotly looks through a template and every axis anew in each figure.
     """
-    made: dict[str, Any] = figure.to_dict()
+    made: dict[str, Any] = _escaped(figure.to_dict())
     layout = made["layout"]
     top = layout.get("margin", {}).get("t") or 48
     if layout.get("title", {}).get("text"):  # above a legend that takes two lines on a phone
@@ -81,6 +116,17 @@ def styled(figure: Any) -> dict[str, Any]:
     label = layout.setdefault("hoverlabel", {})
     label["font"] = {**label.get("font", {}), "size": 12}
     return made
+
+
+def _escaped(part: Any, key: str = "") -> Any:
+    """A part of a figure with its texts escaped, in which plotly would read tags."""
+    if isinstance(part, dict):
+        return {each: _escaped(value, each) for each, value in part.items()}
+    if isinstance(part, np.ndarray) and part.dtype.kind in "OU":
+        part = part.tolist()
+    if isinstance(part, list | tuple):
+        return [_escaped(value, key) for value in part]
+    return str(escape(_shown(part))) if isinstance(part, str) and key in FIGURE_TEXTS else part
 
 
 @cache

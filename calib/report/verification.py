@@ -1,12 +1,11 @@
 """Report of a verification as one HTML page, with the paper's Figure 6."""
 
-from html import escape
 from pathlib import Path
 
 from armlink.arm_file import ArmFile
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.report.figures import verify_figure
-from calib.report.page import ReportTable, Section, paragraph, render
+from calib.report.page import ReportTable, Section, paragraph, render, verdict_line
 from calib.sweep.verify import Verification
 
 
@@ -17,7 +16,7 @@ def write_report(
     verdict = "passed" if result.passed else "not passed"
     sensors = "the controllers' own calibration" if calibration is None else f"calibration record {calibration.id}"
     skipped = f" {result.skipped} poses were out of the drives' reach and were skipped." if result.skipped else ""
-    html = f'<p><span class="verdict">{verdict}</span></p>' + paragraph(
+    html = verdict_line(verdict) + paragraph(
         f"Gravity record {gravity.id} against the torque sensors with {sensors}, at {len(result.sensor)} random poses"
         f" that were not used for a fit.{skipped}"
     )
@@ -29,7 +28,7 @@ def write_report(
         result.model_std.mean(axis=0),
         abs(result.model).max(axis=0),
     )
-    rows = [[escape(name), *(f"{column[joint]:.4f}" for column in numbers)] for joint, name in enumerate(result.names)]
+    rows = [[name, *(f"{column[joint]:.4f}" for column in numbers)] for joint, name in enumerate(result.names)]
     section = Section(
         "Model against sensor (the paper's Figure 6)", html, [verify_figure(result)], [ReportTable(header, rows)]
     )

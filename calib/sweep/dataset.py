@@ -15,12 +15,14 @@ import numpy as np
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from armlink.arm_file import ArmFile, is_serial, load_arm
+from armlink.content.atomic_file import part_of, write_whole
+from armlink.content.file_content import MOST_JSON, read_whole
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput, Refused
 from armlink.key_errors import describe
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.types import SweepPlan
-from calib.records.atomic_file import part_of, write_whole
 from calib.records.file_lock import lock_file
 from gcomp.arrays import Array
 
@@ -189,6 +191,11 @@ class SweepData:
 
 def load_data(path: Path) -> SweepData:
     """Read a data set; an incomplete last line is left out. Raises BadInput naming the file and line."""
+    with memory_budget(path):
+        return _loaded(path)
+
+
+def _loaded(path: Path) -> SweepData:
     manifest = _read_manifest(path)
     content = (path / LINES).read_bytes() if (path / LINES).is_file() else b""
     whole = content[: content.rfind(b"\n") + 1]
@@ -275,7 +282,7 @@ def _read_manifest(path: Path) -> Manifest:
     if not file.is_file():
         raise BadInput(f"{path}: no sweep data set there: {MANIFEST} is missing")
     try:
-        return Manifest.model_validate(json.loads(file.read_text(encoding="utf-8")))
+        return Manifest.model_validate(json.loads(read_whole(file, MOST_JSON)))
     except ValidationError as error:
         raise BadInput(f"{file}: {describe(error)}") from None
     except (ValueError, RecursionError, OSError) as error:

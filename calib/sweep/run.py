@@ -14,6 +14,7 @@ from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Slipped, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.collisions import check_plan
+from calib.plan.plan_limits import check_bias, check_limits
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, SweepData, load_data
@@ -55,14 +56,19 @@ def run_sweep(
         run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), on_stall)
         if data.plan is None:
             first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
+            check_limits(arm, first)
             check_plan(arm, first)
             run.total = first.readings
             run.scout(first)
             plan = _final_plan(arm, first, run.readings, reference_mass, seed, mover.known_resolution)
+            check_limits(arm, plan)
             check_plan(arm, plan)
             writer.append(PlanLine(plan=plan, resolution=tuple(mover.known_resolution.tolist())))
         else:
             plan = data.plan
+            check_bias(arm, plan)
+            check_limits(arm, plan)
+            check_plan(arm, plan)
             mover.resolution = np.where(data.resolution > 0, data.resolution, np.inf)
         run.total = plan.readings
         run.acceleration, run.refuge = plan.travel_acceleration, np.array(plan.scout[0])

@@ -98,7 +98,7 @@ def compile_model(path: Path) -> "mujoco.MjModel":
         spec = mujoco.MjSpec.from_file(str(path))
         _drop_absent_meshes(spec, path.parent / spec.compiler.meshdir)
         return spec.compile()
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:  # the latter where it gets no memory
         raise BadModel(f"{path}: MuJoCo refuses it: {' '.join(str(error).split())}") from None
 
 

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
 from armlink.model_file import read_model
 from sim_bus.effects.state import Imperfections
@@ -56,8 +57,9 @@ def build_model(arm: ArmFile, state: Imperfections) -> BuiltModel:
     payload = last.add_body(name="payload", mass=TINY_INERTIA, inertia=[TINY_INERTIA] * 3, explicitinertial=True)
     assert payload is not None
     try:
-        model = spec.compile()
-    except ValueError as error:
+        with memory_budget(arm.path if arm.model_path is None else arm.model_path):
+            model = spec.compile()
+    except (ValueError, RuntimeError) as error:
         raise BadInput(f"{arm.path}: the simulated arm cannot be built: {error}") from None
     bodies = tuple(int(model.joint(name).bodyid[0]) for name in arm.joint_names)
     return BuiltModel(model, bodies, int(model.body("payload").id), spec)

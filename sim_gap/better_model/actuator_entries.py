@@ -1,10 +1,13 @@
 """Actuator entries for training frameworks: a Python file with one entry per joint for Isaac Lab and mjlab."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from armlink.content.atomic_file import write_whole
+from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
 from gcomp.arrays import Array
 
@@ -53,7 +56,7 @@ def write_entries(
     isaac = "\n".join(_isaac(name, row) for name, row in rows.items())
     mjlab = "\n".join(_mjlab(name, row, kind) for name, row in rows.items())
     text = (
-        HEAD.format(step=step, about=about and f" {about}", left=note)
+        HEAD.format(step=step, about=_in_docstring(about and f" {about}"), left=_in_docstring(note))
         + "\ndef isaac_lab():\n"
         + '    """Entries of `ArticulationCfg.actuators`."""\n'
         + "    from isaaclab.actuators import DelayedPDActuatorCfg\n\n"
@@ -64,7 +67,7 @@ def write_entries(
         + f"    return (\n{mjlab}\n    )\n"
     )
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text)
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
 
@@ -80,14 +83,28 @@ def steps_of(delay: Array, step: float) -> dict[str, float]:
 def _isaac(name: str, row: Row) -> str:
     steps = f"min_delay={row['least']:.0f}, max_delay={row['most']:.0f}"
     gains = "" if row.get("stiffness") is not None else "stiffness=None, damping=None, "
-    entry = f'joint_names_expr=["{name}"], {gains}{_given(ISAAC_LAB, row)}, {steps}'
-    return f'        "{name}": DelayedPDActuatorCfg(\n            {entry}\n        ),'
+    entry = f"joint_names_expr=[{_pattern(name)}], {gains}{_given(ISAAC_LAB, row)}, {steps}"
+    return f"        {_literal(name)}: DelayedPDActuatorCfg(\n            {entry}\n        ),"
 
 
 def _mjlab(name: str, row: Row, kind: str) -> str:
     steps = f"delay_min_lag={row['least']:.0f}, delay_max_lag={row['most']:.0f}"
-    entry = f'target_names_expr=("{name}",), {_given(MJLAB, row)}, {steps}'
+    entry = f"target_names_expr=({_pattern(name)},), {_given(MJLAB, row)}, {steps}"
     return f"        {kind}(\n            {entry}\n        ),"
+
+
+def _in_docstring(text: str) -> str:
+    return printable_text(text, keep="\n").replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _literal(text: str) -> str:
+    """A text as Python source, in double quotes."""
+    return '"' + printable_text(text.replace("\\", "\\\\").replace('"', '\\"')) + '"'
+
+
+def _pattern(name: str) -> str:
+    """The regular expression of a joint's name as Python source; that of a plain name is the name."""
+    return _literal(re.sub(r"[\\^$.|?*+()\[\]{}]", r"\\\g<0>", name))
 
 
 def _given(fields: Mapping[str, str], row: Row) -> str:

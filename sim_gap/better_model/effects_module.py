@@ -1,5 +1,6 @@
 """The module written beside an exported MJCF: the source of `forward_effects` with one arm's effects filled in."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -44,11 +45,11 @@ def module_text(sim: SimModel, effects: Sequence[forward.JointEffect], model: st
     """Source of the module with the effects that the MJCF file `model` cannot hold; it imports none of ours."""
     rows = "".join(f"    {each!r},\n" for each in effects)
     text = Path(forward.__file__).read_text(encoding="utf-8")
-    for name, declared, value in (
-        ("Array", "from gcomp.arrays import Array", "np.ndarray"),
-        ("MODEL", 'MODEL = ""', f"{model!r}"),
-        ("JOINTS", "JOINTS: tuple[str, ...] = ()", f"{sim.arm.names!r}"),
-        ("EFFECTS", "EFFECTS: tuple[JointEffect, ...] = ()", f"(\n{rows})"),
-    ):
-        text = text.replace(declared, f"{name} = {value}", 1)
-    return text
+    values = {
+        "from gcomp.arrays import Array": "Array = np.ndarray",
+        'MODEL = ""': f"MODEL = {model!r}",
+        "JOINTS: tuple[str, ...] = ()": f"JOINTS = {sim.arm.names!r}",
+        "EFFECTS: tuple[JointEffect, ...] = ()": f"EFFECTS = (\n{rows})",
+    }
+    declared = "|".join(map(re.escape, values))  # in one pass: what is filled in is not searched
+    return re.sub(f"^(?:{declared})$", lambda found: values[found[0]], text, flags=re.MULTILINE)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
 from sim_gap.better_model.coupled_motors import add_to, coupled_motors
 from sim_gap.better_model.effects_module import joint_effects, module_path, module_text
@@ -94,10 +95,10 @@ def write_model(sim: SimModel, estimate: Estimate | None, path: Path, laws: Sequ
     if path.suffix == URDF:
         text, lines = urdf_of(files.spec.compile(), urdf_behind(sim.path), lines)
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text)
         module = module_path(path)
         if files.module:
-            module.write_text(files.module, encoding="utf-8")
+            write_whole(module, files.module)
         else:
             module.unlink(missing_ok=True)
     except OSError as error:

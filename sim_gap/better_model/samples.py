@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armlink.content.atomic_file import open_whole, write_whole
 from armlink.errors import BadInput
 from sim_bus.effects.registry import effects as simulated
 from sim_gap.search.estimate import Estimate
@@ -57,14 +58,16 @@ def write_rows(rows: Sequence[Mapping[str, float]], path: Path) -> None:
     try:
         if path.suffix == ".json":
             text = json.dumps({"schema": "armlink.samples/1", "samples": [dict(row) for row in rows]}, indent=1)
-            path.write_text(text, encoding="utf-8")
+            write_whole(path, text)
         elif path.suffix == ".csv":
             lines = [",".join(names), *(",".join(f"{row[name]:.9g}" for name in names) for row in rows)]
-            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            write_whole(path, "\n".join(lines) + "\n")
         else:
             import pyarrow as pa
             from pyarrow.parquet import write_table
 
-            write_table(pa.table({name: np.array([row[name] for row in rows]) for name in names}), path)
+            table = pa.table({name: np.array([row[name] for row in rows]) for name in names})
+            with open_whole(path) as stream:
+                write_table(table, stream)
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error.strerror}") from None

@@ -8,8 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from armlink.arm_file import read_yaml
 from armlink.errors import ArmlinkError, BadInput
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording, slice_rows
@@ -54,9 +53,9 @@ def run_real(
 def read_cases(known: Path) -> list[Json]:
     """The cases of a file, in the form of `real_arms.yaml`. Raises BadInput if it is not of that form."""
     try:
-        cases = yaml.safe_load(known.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise BadInput(f"{known}: cannot be read: {str(error).splitlines()[0]}") from None
+        cases = read_yaml(known)
+    except OSError as error:
+        raise BadInput(f"{known}: cannot be read: {error.strerror}") from None
     for number, case in enumerate(cases if isinstance(cases, list) else [cases], start=1):
         lacking = [key for key in ("case", "sim", "train") if not isinstance(case, dict) or key not in case]
         if isinstance(case, dict) and not case.get("refused"):

@@ -25,7 +25,7 @@ def collect(
 
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainColumn, PlainConsole
     from armlink.errors import BadInput
     from armlink.loop.open import open_arm
     from sim_gap.experiment.collect import collect as run
@@ -36,7 +36,10 @@ def collect(
     arm_file = load_arm(arm)
     target = load_motion(motion, arm_file)
     console = PlainConsole()
-    with open_arm(arm_file, bus) as link, Progress(console=console) as bars:
+    with (
+        open_arm(arm_file, bus) as link,
+        Progress(PlainColumn("{task.description}"), *Progress.get_default_columns()[1:], console=console) as bars,
+    ):
         task = bars.add_task(f"{arm_file.name}: {motion.name}", total=len(target))
         link.start()
         link.enable()

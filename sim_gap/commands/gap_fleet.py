@@ -104,9 +104,11 @@ def _write_table(rows: list[dict[str, Any]], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    from armlink.content.atomic_file import open_whole
     from armlink.errors import BadInput
 
     try:
-        pq.write_table(pa.Table.from_pylist(rows), path)
+        with open_whole(path) as stream:
+            pq.write_table(pa.Table.from_pylist(rows), stream)
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error}") from None

@@ -1,6 +1,5 @@
 """Summary and report of the demo of an arm without torque sensors."""
 
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ from rich.table import Table
 
 from calib.creep.record import HEADINGS, missing, told, values_told
 from calib.report.figures import COLOURS, GREY, PANEL, verify_figure
-from calib.report.page import ReportTable, Section, paragraph, render
+from calib.report.page import ReportTable, Section, bullets, paragraph, paragraphs, render
 from sim_gap.demo.creep_run import CreepDemo, worst_gain_error
 from sim_gap.demo.show import gap_line
 from sim_gap.demo.summary import numbers
@@ -100,14 +99,12 @@ def _overview(result: CreepDemo) -> Section:
         "This arm has no torque sensors: each drive reports current times a torque constant that is wrong. The fit saw"
         " only what came over the bus. What is called true was opened after everything was estimated."
     )
-    return Section(
-        "In short", paragraph(text) + "<ul>" + "".join(f"<li>{escape(item)}</li>" for item in items) + "</ul>"
-    )
+    return Section("In short", paragraph(text) + bullets(items))
 
 
 def _calibration(result: CreepDemo) -> Section:
     rows = [
-        [escape(name), f"{result.run.truth.gain[j]:.4f}", *(_cell(result, family, j) for family, _ in SHOWN)]
+        [name, f"{result.run.truth.gain[j]:.4f}", *(_cell(result, family, j) for family, _ in SHOWN)]
         for j, name in enumerate(result.run.names)
     ]
     header = ("joint", "true reading per N·m", *(HEADINGS[family] for family, _ in SHOWN))
@@ -116,7 +113,7 @@ def _calibration(result: CreepDemo) -> Section:
     text = "Estimated ± half of the 95 % interval. The host keeps these values and corrects readings and commands."
     return Section(
         "Torque constants, zeros and friction",
-        paragraph(text) + "".join(paragraph(line) for line in lines),
+        paragraph(text) + paragraphs(lines),
         [],
         [ReportTable(header, rows)],
     )
@@ -159,7 +156,7 @@ def _gravity(result: CreepDemo) -> Section:
     if sag is not None:
         columns += [np.degrees(sag.nominal), np.degrees(sag.calibrated)]
         header += ["sag, nominal model [°]", "sag, calibrated [°]"]
-    rows = [[escape(name), *(f"{column[j]:.4f}" for column in columns)] for j, name in enumerate(result.run.names)]
+    rows = [[name, *(f"{column[j]:.4f}" for column in columns)] for j, name in enumerate(result.run.names)]
     text = f"Model torque and half sums of short creeps at {len(verify.position)} poses that were not used for any fit."
     table = ReportTable(header, rows, f"N·m; the truth is the plant's own gravity at {check.poses} random poses.")
     return Section("Gravity model", paragraph(text), [verify_figure(verify)], [table])

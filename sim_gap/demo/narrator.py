@@ -5,7 +5,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TimeElapsedColumn
+from rich.text import Text
+
+from armlink.commands.plain_console import PlainColumn
+from armlink.content.printable_text import printable_text
 
 QUIET_SECONDS = 5.0
 """Without a terminal, a line at most this often [s]."""
@@ -27,9 +31,10 @@ class Narrator:
         """Wall time since the start [s]."""
         return time.monotonic() - self._began
 
-    def say(self, text: str) -> None:
+    def say(self, text: str, style: str = "") -> None:
         """One line, with the time since the start."""
-        self._console.print(f"[dim]{self.elapsed:5.0f} s[/dim]  {text}", markup=True)
+        line = Text.assemble((f"{self.elapsed:5.0f} s", "dim"), "  ", (printable_text(text), style))
+        self._console.print(line, soft_wrap=True)
 
     def show(self, table: object) -> None:
         """A rich table."""
@@ -38,7 +43,7 @@ class Narrator:
     @contextmanager
     def stage(self, headline: str) -> Iterator[Report]:
         """A stage of the work; what it yields is told how far it is."""
-        self.say(f"[bold]{headline}[/bold]")
+        self.say(headline, style="bold")
         if self._console.is_terminal:
             with self._bar() as report:
                 yield report
@@ -47,7 +52,7 @@ class Narrator:
 
     @contextmanager
     def _bar(self) -> Iterator[Report]:
-        columns = (TextColumn("        "), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+        columns = (PlainColumn("        "), BarColumn(), PlainColumn("{task.description}"), TimeElapsedColumn())
         with Progress(*columns, console=self._console, transient=True) as progress:
             task = progress.add_task("")
 

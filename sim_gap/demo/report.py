@@ -1,12 +1,11 @@
 """The demo's report: one self-contained HTML page."""
 
-from html import escape
 from pathlib import Path
 
 import numpy as np
 
 from calib.report.figures import verify_figure
-from calib.report.page import ReportTable, Section, paragraph, render
+from calib.report.page import ReportTable, Section, bullets, paragraph, paragraphs, render
 from sim_gap.demo.figures import drift_figure, error_bars, sweep_figure
 from sim_gap.demo.show import drift_line, gap_line
 from sim_gap.demo.summary import SHOWN, DemoResult
@@ -38,19 +37,17 @@ def _overview(result: DemoResult) -> Section:
         gap_line(run.gap) + ".",
     ]
     text = "The fit saw only what came over the bus. What is called true was opened after everything was estimated."
-    return Section(
-        "In short", paragraph(text) + "<ul>" + "".join(f"<li>{escape(item)}</li>" for item in items) + "</ul>"
-    )
+    return Section("In short", paragraph(text) + bullets(items))
 
 
 def _calibration(result: DemoResult) -> Section:
     fit, truth = result.sensors, result.run.truth
     rows = []
     for j, name in enumerate(result.run.names):
-        row = [escape(name)]
+        row = [name]
         for parameter, digits in SHOWN:
             value, (low, high) = fit.value(parameter)[j], fit.ci95(parameter)[j]
-            estimate = f"{value:.{digits}f}&nbsp;±&nbsp;{(high - low) / 2:.{digits}f}"
+            estimate = f"{value:.{digits}f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{(high - low) / 2:.{digits}f}"
             row += [f"{getattr(truth, parameter)[j]:.{digits}f}", "not observable" if np.isnan(value) else estimate]
         rows.append(row)
     what = ("gain", "offset [N·m]", "position gain")
@@ -62,7 +59,7 @@ def _calibration(result: DemoResult) -> Section:
         f" mass of {mass:g} kg was found at ({', '.join(f'{x:.4f}' for x in point)}) m in the last link's frame;"
         f" it hung at ({', '.join(f'{x:.4f}' for x in truth.attachment)}) m."
     )
-    html = paragraph(text) + "".join(paragraph(reason) for reason in reasons)
+    html = paragraph(text) + paragraphs(reasons)
     return Section("Sensor calibration", html, [error_bars(fit, truth.gain)], [ReportTable(header, rows)])
 
 
@@ -80,7 +77,7 @@ def _sweeps(result: DemoResult) -> Section:
 def _gravity(result: DemoResult) -> Section:
     check, verify = result.run.gravity_check, result.run.verify
     rows = [
-        [escape(name), *(f"{x:.4f}" for x in numbers)]
+        [name, *(f"{x:.4f}" for x in numbers)]
         for name, *numbers in zip(
             result.run.names, verify.rms, check.rms_error, check.max_abs_error, check.max_torque, strict=True
         )

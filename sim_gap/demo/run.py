@@ -1,8 +1,6 @@
 """Runs the demo: sweep, calibrate, identify, verify, record, drift and recalibrate, diagnose, report."""
 
-import json
 import shutil
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
@@ -11,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
+from armlink.commands.output import write_json
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.new_arm import new_arm
@@ -53,7 +51,7 @@ def run_demo(
         arm = with_realism(arm, realism, seed)
     arm.require_link()
     data_folder = _fresh(out)
-    teller.say(f"arm [bold]{arm.name}[/bold], hidden truth of seed {seed}, results in {escape(str(out))}")
+    teller.say(f"arm {arm.name}, hidden truth of seed {seed}, results in {out}")
     creeping = sweep_motion(arm) == "creep"
     arm = quick(arm) if creeping else arm
     result: DemoResult | CreepDemo
@@ -67,12 +65,9 @@ def run_demo(
                 result = _work(bench, store, arm, seed, data_folder, teller, other_core)
         store.close()
     content = _told(result, out / "report.html", teller)
-    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-    (out / "summary.json").write_text(text, encoding="utf-8")
-    if json_path is not None:
-        sys.stdout.write(text) if str(json_path) == "-" else json_path.write_text(text, encoding="utf-8")
-    report, numbers = (escape(str(out / name)) for name in ("report.html", "summary.json"))
-    teller.say(f"done: open [bold]{report}[/bold]; numbers in {numbers}")
+    write_json(out / "summary.json", content)
+    write_json(json_path, content)
+    teller.say(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}")
     return result
 
 

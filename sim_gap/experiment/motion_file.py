@@ -7,6 +7,8 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from armlink.arm_file import ArmFile
+from armlink.content.atomic_file import open_whole
+from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
 from armlink.recording.tables import THREADS
 from calib.arm.kinematics import gcomp_arm
@@ -24,7 +26,8 @@ def save_motion(motion: Motion, path: Path) -> None:
     columns = {"t": np.arange(len(motion.target)) / motion.rate}
     columns |= {f"q_cmd_{i + 1}": column for i, column in enumerate(motion.target.T)}
     try:
-        pa_csv.write_csv(pa.table(columns), path)
+        with open_whole(path) as stream:
+            pa_csv.write_csv(pa.table(columns), stream)
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error}") from None
 
@@ -58,7 +61,8 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
 def _columns(path: Path, names: list[str]) -> tuple[Array, Array]:
     """Times (K,) and columns (K, n), all finite, times increasing."""
     try:
-        table = pa_csv.read_csv(path, pa_csv.ReadOptions(use_threads=THREADS))
+        with memory_budget(path):
+            table = pa_csv.read_csv(path, pa_csv.ReadOptions(use_threads=THREADS))
     except (pa.ArrowInvalid, OSError) as error:
         raise BadInput(f"{path}: not a readable CSV file: {str(error).splitlines()[0]}") from None
     missing = [name for name in ("t", *names) if name not in table.column_names]

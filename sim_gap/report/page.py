@@ -1,11 +1,10 @@
 """The diagnosis as sections of a report: verdict, causes, gap before and after, figures of the residuals."""
 
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from armlink.effect_catalogue import CATALOGUE
-from calib.report.page import ReportTable, Section, paragraph, render
+from calib.report.page import ReportTable, Section, html_of, paragraph, paragraphs, render, verdict_line
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, sentence
@@ -31,8 +30,7 @@ def write_report(answer: Diagnosis, path: Path, title: str = "Sim-to-real gap", 
 
 
 def _verdict(answer: Diagnosis) -> Section:
-    html = f'<p><span class="verdict">{escape(WORDS[answer.verdict])}</span> {escape(sentence(answer))}.</p>'
-    html += paragraph(advice(answer)) + "".join(paragraph(note) for note in answer.notes)
+    html = verdict_line(WORDS[answer.verdict], sentence(answer)) + paragraph(advice(answer)) + paragraphs(answer.notes)
     tables = []
     if answer.causes:
         tables.append(
@@ -55,11 +53,13 @@ def _verdict(answer: Diagnosis) -> Section:
 
 
 def _cause_row(cause: Cause) -> list[str]:
-    doubt = f"<br><small>or {escape(', '.join(cause.confounded_with))}: {escape(cause.separate_by or '')}</small>"
+    effect = html_of("<b>{}</b><br><small>{}</small>", cause.effect, CATALOGUE[cause.effect].description)
+    if cause.confounded_with:
+        others = ", ".join(cause.confounded_with)
+        effect += html_of("<br><small>or {}: {}</small>", others, cause.separate_by or "")
     return [
-        f"<b>{escape(cause.effect)}</b><br><small>{escape(CATALOGUE[cause.effect].description)}</small>"
-        + (doubt if cause.confounded_with else ""),
-        escape(", ".join(cause.joints)),
+        effect,
+        ", ".join(cause.joints),
         f"{cause.gap_before:.3g}",
         f"{cause.gap_after:.3g}",
         f"{cause.shrink:.0%}",
@@ -69,7 +69,7 @@ def _cause_row(cause: Cause) -> list[str]:
 
 def _parameter_rows(cause: Cause) -> list[list[str]]:
     return [
-        [escape(cause.effect), escape(joint), escape(name), f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
+        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
         for joint, values in cause.parameters.items()
         for name, v in values.items()
     ]
@@ -77,7 +77,7 @@ def _parameter_rows(cause: Cause) -> list[list[str]]:
 
 def _gap(answer: Diagnosis) -> Section:
     rows = [
-        [escape(name), *(f"{x:.3g}" for x in numbers)]
+        [name, *(f"{x:.3g}" for x in numbers)]
         for name, *numbers in zip(
             answer.names,
             answer.noise_floor,
@@ -146,7 +146,7 @@ def _residuals(answer: Diagnosis) -> list[Section]:
     for channel in channels:
         against = "the model" if channel == data.layout.against_model else "the torque sensor"
         rows = [
-            [escape(name), at.regime, f"{at.share:.0%}", f"{at.rms:.3g}", f"{at.noise:.2g}"]
+            [name, at.regime, f"{at.share:.0%}", f"{at.rms:.3g}", f"{at.noise:.2g}"]
             for name in answer.names
             if (at := locations.get((channel, name))) is not None
         ]

@@ -1,10 +1,9 @@
 """Report of a position-only diagnosis: causes, gap in radians, real, nominal and corrected motion of every joint."""
 
 from collections.abc import Sequence
-from html import escape
 from typing import Any
 
-from calib.report.page import ReportTable, Section, paragraph
+from calib.report.page import ReportTable, Section, html_of, paragraph, paragraphs, verdict_line
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.closed_loop.identify import Identified
@@ -17,9 +16,10 @@ from sim_gap.report.over_time import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_ti
 
 def position_sections(answer: Diagnosis) -> list[Section]:
     """Sections for a separate page or for a part of another report."""
-    html = f'<p><span class="verdict">{escape(WORDS[answer.verdict])}</span> {escape(sentence(answer))}.</p>'
-    html += "" if answer.verdict == "ambiguous" else paragraph(advice(answer))  # else the sentence has it
-    html += "".join(paragraph(note) for note in answer.notes)
+    html = verdict_line(WORDS[answer.verdict], sentence(answer))
+    if answer.verdict != "ambiguous":  # else the sentence has it
+        html += paragraph(advice(answer))
+    html += paragraphs(answer.notes)
     header = ("effect", "joints", "RMS before [rad]", "after [rad]", "confidence", "or")
     causes = ReportTable(header, [_cause_row(cause) for cause in answer.causes], "Causes, on held-out data.", texts=2)
     rows = [row for cause in (*answer.causes, *answer.minor) for row in _parameter_rows(cause)]
@@ -27,13 +27,13 @@ def position_sections(answer: Diagnosis) -> list[Section]:
         ("effect", "joint", "parameter", "value", "95 % interval", "unit"), rows, "Fitted parameters.", texts=3
     )
     gap = [
-        [escape(name), *(f"{x:.3g}" for x in numbers)]
+        [name, *(f"{x:.3g}" for x in numbers)]
         for name, *numbers in zip(
             answer.names, answer.noise_floor, answer.heldout_before, answer.heldout_after, strict=True
         )
     ]
     table = ReportTable(("joint", "noise floor", "before", "after"), gap, f"RMS in rad on {answer.heldout_is}.")
-    out = [Section("Verdict and causes", html, (), [causes, parameters]), Section("Gap", "", (), [table])]
+    out = [Section("Verdict and causes", html, (), [causes, parameters]), Section("Gap", tables=[table])]
     figure = motion_figure(answer.internals, answer.causes) if isinstance(answer.internals, Identified) else None
     if figure is not None:
         text = (
@@ -75,18 +75,18 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
 
 def _cause_row(cause: Cause) -> list[str]:
     return [
-        f"<b>{escape(cause.effect)}</b>",
-        escape(", ".join(cause.joints)),
+        html_of("<b>{}</b>", cause.effect),
+        ", ".join(cause.joints),
         f"{cause.gap_before:.3g}",
         f"{cause.gap_after:.3g}",
         f"{cause.confidence:.2f}",
-        escape(", ".join(cause.confounded_with)),
+        ", ".join(cause.confounded_with),
     ]
 
 
 def _parameter_rows(cause: Cause) -> list[list[str]]:
     return [
-        [escape(cause.effect), escape(joint), escape(name), f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
+        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
         for joint, values in cause.parameters.items()
         for name, v in values.items()
     ]

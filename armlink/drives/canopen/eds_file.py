@@ -1,5 +1,6 @@
 """Electronic data sheets (EDS, CiA 306) of joint controllers: named in the arm file, by default the bundled one."""
 
+import re
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -8,12 +9,17 @@ from typing import Any
 import canopen
 
 from armlink.arm_file import ArmFile, DeviceIdentity, LinkJoint
+from armlink.content.file_content import read_whole
 from armlink.drives.canopen import object_dictionary
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import LINK_PDOS
 from armlink.errors import BadInput
 
 SUFFIXES = (".eds", ".dcf")
+MOST_SHEET = 4 << 20
+"""Size of a data sheet [bytes]; those of drives with all their profiles have some hundreds of kB."""
+MOST_ENTRIES = 254
+"""Largest sub-index of an array (CiA 301: 255 has another use)."""
 OPTIONAL = {
     object_dictionary.TORQUE_OFFSET: "torque offset: nothing latched to clear",
     object_dictionary.PROFILE_VELOCITY: "profile velocity: no profile position mode",
@@ -67,9 +73,12 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
     if path.suffix.lower() not in SUFFIXES:
         raise BadInput(f"{where}: expected a file that ends in {' or '.join(SUFFIXES)}")
     try:
+        _require_few_entries(read_whole(path, MOST_SHEET), where)
         sheet = canopen.import_od(str(path), joint.settings.node)
     except OSError as error:
         raise BadInput(f"{where}: {error.strerror or error}: correct eds of this joint under link.joints") from None
+    except BadInput:
+        raise
     except Exception as error:  # configparser and canopen raise many kinds
         raise BadInput(f"{where}: not a valid EDS (CiA 306): {' '.join(str(error).split())}") from None
     if joint.settings.torque != "record":  # a stock device is asked what it has
@@ -85,6 +94,13 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
             if not sheet.get_variable(entry.index, entry.sub).pdo_mappable:
                 raise BadInput(f"{where}: {entry} cannot be mapped into a PDO, but the link needs it in {pdo.name}")
     return sheet
+
+
+def _require_few_entries(content: bytes, where: str) -> None:
+    """Raise BadInput where an array has more entries than the eight bits of a sub-index count."""
+    for stated in re.findall(rb"(?im)^\s*NrOfEntries\s*[=:]\s*(\S+)", content):
+        if not stated.isdigit() or int(stated[:9]) > MOST_ENTRIES:
+            raise BadInput(f"{where}: NrOfEntries {stated[:20].decode(errors='replace')}, expected 0 to {MOST_ENTRIES}")
 
 
 def expected_identity(joint: LinkJoint, sheet: Any) -> DeviceIdentity:

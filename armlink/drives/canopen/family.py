@@ -33,11 +33,13 @@ def build(arm: ArmFile, joints: Sequence[LinkJoint]) -> Drives:
     return CanopenDrives(arm, joints, TRAITS)
 
 
-def search(arm: ArmFile | None, bus: str | None, json: Path | None, write: Callable[..., None]) -> int:
+def search(
+    arm: ArmFile | None, bus: str | None, json: Path | None, write: Callable[..., None], show: Callable[..., None]
+) -> int:
     """All nodes of a bus; see `armlink.drives.canopen.check.scan_report`."""
     from armlink.drives.canopen.check.scan_report import scan_report
 
-    return scan_report(arm, bus, json, write)
+    return scan_report(arm, bus, json, write, show)
 
 
 def self_test(

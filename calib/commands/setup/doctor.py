@@ -28,7 +28,7 @@ def doctor(
     from armlink.commands.plain_console import PlainConsole
     from calib.commissioning.doctor import examine
 
-    console = PlainConsole(markup=False)
+    console = PlainConsole()
     with console.status(f"examining {arm}"):
         findings = examine(arm, bus, offline)
     for found in findings:

@@ -67,7 +67,7 @@ def new(
     from calib.commands.setup.terminal import Terminal, hand, parse_stops
     from calib.commissioning.new_arm import new_arm
 
-    console = PlainConsole(markup=False)
+    console = PlainConsole()
     interactive = sys.stdin is not None and sys.stdin.isatty()
     if bus is None and by_hand:
         raise BadInput("--by-hand: needs --bus, on which the drives are")
@@ -121,6 +121,7 @@ def new(
 
 
 def _require_free(out: Path, force: bool, interactive: bool) -> None:
+    from armlink.commands.plain_console import confirm
     from armlink.errors import BadInput
 
     if out.suffix.lower() not in (".yaml", ".yml"):
@@ -129,7 +130,7 @@ def _require_free(out: Path, force: bool, interactive: bool) -> None:
         return
     if not interactive:
         raise BadInput(f"{out}: exists already: choose another --out, or --force to replace it")
-    typer.confirm(f"{out} exists. Replace it?", abort=True, err=True)
+    confirm(f"{out} exists. Replace it?")
 
 
 def _show(console: Any, made: "NewArm") -> None:

@@ -4,6 +4,9 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from armlink.content.atomic_file import write_whole
+from armlink.content.file_content import parse_yaml
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -18,8 +21,6 @@ def begin_with_drives(
     console: Any, out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None
 ) -> int:
     """An arm file of nothing but a bus: its drives, and no geometry."""
-    import yaml
-
     from armlink.arm_file import parse_arm
     from armlink.drives.registry import found_drives
     from calib.commissioning.bus_arm import arm_of_bus
@@ -29,8 +30,8 @@ def begin_with_drives(
         made = arm_of_bus(found_drives(opened), str(opened.channel_info), bus_keys(bus, out), name or out.stem, ask)
     finally:
         opened.shutdown()
-    parse_arm(yaml.safe_load(made.text), out)
-    out.write_text(made.text, encoding="utf-8")
+    parse_arm(parse_yaml(made.text, out), out)
+    write_whole(out, made.text)
     nodes = ", ".join(str(match.drive.node) for match in made.matches)
     told = f"{len(made.matches)} joints, nodes {nodes}; the geometry is not known, and says so in the file"
     return _tell(console, out, told, "check", name or out.stem, _matched(made.matches), [], json_file)
@@ -38,9 +39,8 @@ def begin_with_drives(
 
 def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
     """An arm file with the drives of a bus."""
-    import yaml
-
-    from armlink.arm_file import load_arm, parse_arm
+    from armlink.arm_file import load_arm, parse_arm, read_yaml
+    from armlink.content.yaml_text import yaml_comment, yaml_document
     from armlink.drives.registry import found_drives
     from calib.arm.kinematics import gcomp_arm
     from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
@@ -60,14 +60,14 @@ def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", js
             matches, findings = match_by_hand(turned, drives, channel, ask)
     finally:
         opened.shutdown()
-    content = rewired(yaml.safe_load(arm.path.read_text(encoding="utf-8")), matches, bus_keys(bus, out))
+    content = rewired(read_yaml(arm.path), matches, bus_keys(bus, out))
     if arm.model_path is not None:
         import os
 
         content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
     parse_arm(dict(content), out)
-    text = f"# {arm.name} with the drives on {channel}, from {model.name}, by the command new.\n"
-    out.write_text(text + yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    title = yaml_comment(f"{arm.name} with the drives on {channel}, from {model.name}, by the command new.")
+    write_whole(out, title + "\n" + yaml_document(content))
     told = f"nodes {', '.join(str(match.drive.node) for match in matches)}"
     return _tell(console, out, told, "check", arm.name, _matched(matches), findings, json_file)
 
@@ -90,7 +90,7 @@ def copy(console: Any, model: Path, out: Path, bus: str, new_serial: bool, json_
         copied = own_copy(arm, out, bus_keys(bus, out), opened, new_serial=new_serial)
     finally:
         opened.shutdown()
-    out.write_text(copied.text, encoding="utf-8")
+    write_whole(out, copied.text)
     told = f"{', '.join(address for _, address, _ in copied.drives)} answer; limits are those of {model}"
     joints = [{"name": name, "address": address, "serial": serial} for name, address, serial in copied.drives]
     return _tell(console, out, told, "doctor", arm.name, joints, copied.findings, json_file)

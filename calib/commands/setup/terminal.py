@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import typer
-
+from armlink.commands.plain_console import PlainConsole, ask, confirm
 from armlink.errors import BadInput
 
 if TYPE_CHECKING:
@@ -34,11 +33,11 @@ def hand(by_hand: bool | None, interactive: bool) -> "Ask | None":
     if by_hand and not interactive:
         raise BadInput("--by-hand: nobody to ask: run it on a terminal, or leave it out")
     if by_hand is None and interactive:
-        by_hand = typer.confirm("Find each joint's drive by turning the joint by hand?", default=True, err=True)
+        by_hand = confirm("Find each joint's drive by turning the joint by hand?", abort=False, default=True)
     if not by_hand:
         return None
-    typer.echo("The drives must have no power at the motors: release the brakes, and hold the arm.", err=True)
-    return lambda text: typer.prompt(f"{text}, then press Enter", default="", show_default=False, err=True)
+    PlainConsole().print("The drives must have no power at the motors: release the brakes, and hold the arm.")
+    return lambda text: ask(f"{text}, then press Enter", default="", show_default=False)
 
 
 class Terminal:
@@ -52,16 +51,15 @@ class Terminal:
         for number, chain in enumerate(chains, start=1):
             names = ", ".join(joint.name for joint in chain.joints)
             self._console.print(f"{number}: ends in {chain.tip}: {names}")
-        number = int(typer.prompt("The model has several arms. Which one?", type=int, default=1, err=True))
+        number = int(ask("The model has several arms. Which one?", type=int, default=1))
         return chains[min(max(number, 1), len(chains)) - 1]
 
     def stops(self, joint: str) -> tuple[float, float] | None:
         """Stops [rad] of a joint without limits; None where it has none."""
-        text = typer.prompt(
+        text = ask(
             f"{joint} has no limits in the model. Its lower and upper stop [rad], as -2.9 2.9; Enter: it has none",
             default="",
             show_default=False,
-            err=True,
         )
         if not text.strip():
             return None

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
 from sim_gap.better_model.effects_module import module_path, module_text
 from sim_gap.better_model.samples import write_rows
@@ -36,12 +37,12 @@ def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
         text, told = urdf_of(mujoco.MjModel.from_xml_string(text), urdf_behind(found.sim.path), lines)
         lines = tuple(told)
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text)
         for file, content in ({} if path.suffix == URDF else _beside(found, path)).items():
             if content is None:
                 file.unlink(missing_ok=True)
             else:
-                file.write_text(content, encoding="utf-8")
+                write_whole(file, content)
     except OSError as error:
         raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
     return lines

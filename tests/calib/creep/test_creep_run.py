@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from soft_links import soft_arm
 
+from armlink.errors import Refused
 from armlink.link.link import Link
 from calib.creep.choice import is_creep, sweep_motion
 from calib.creep.fit import fit_creep
-from calib.creep.plan import plan_creep
+from calib.creep.plan import CreepGround, check_creep_limits, plan_creep
 from calib.creep.record import calibration_record, gravity_record
 from calib.creep.run import contacts, run_creep
 from calib.creep.verify import verify_creeping
@@ -88,3 +89,24 @@ def test_a_joint_that_meets_something_is_led_back_and_the_sweep_is_noted(tmp_pat
     assert [each.reading for each in contacts(data)] == [sweep.name]
     assert "fore" in contacts(data)[0].reason
     assert {each.joint for each in data.readings} == {0}
+
+
+EDITED = {
+    "faster": ({"speed": 5.0}, "speed 5 rad/s"),
+    "past a stop": ({"steps": (0.0, 3.0, 6.0)}, "last step: fore at 6 rad"),
+    "resting past a stop": ({"rest": (9.0, 0.0)}, "at 9 rad"),
+    "fewer joints": ({"rest": (0.0,)}, "rest has 1 values"),
+}
+
+
+@pytest.mark.parametrize("what", EDITED)
+def test_a_plan_that_was_edited_is_refused(what: str) -> None:
+    plan = plan_creep(arm())
+    changed, said = EDITED[what]
+    sweeps = tuple(each.model_copy(update=changed) if each.joint == 1 else each for each in plan.sweeps)
+    ground = CreepGround.of(arm())
+    check_creep_limits(ground, arm(), plan)
+    with pytest.raises(Refused) as caught:
+        check_creep_limits(ground, arm(), plan.model_copy(update={"sweeps": sweeps}))
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)

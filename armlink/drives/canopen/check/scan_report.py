@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from armlink.arm_file import ArmFile, Bus
 from armlink.bus.bus_group import BusGroup, GroupPort
@@ -20,9 +20,13 @@ from armlink.errors import BusFault
 
 
 def scan_report(
-    arm: ArmFile | None, bus: str | None, json: Path | None, write: Callable[[Path | None, Any], None]
+    arm: ArmFile | None,
+    bus: str | None,
+    json: Path | None,
+    write: Callable[[Path | None, Any], None],
+    show: Callable[..., None],
 ) -> int:
-    """Find every node of a bus and those of an arm, show them, write them as JSON with `write`; exit status.
+    """Find every node of a bus and those of an arm, `show` them, `write` them as JSON; exit status.
 
     Raises BusFault for a joint that does not answer, Refused for another controller than the arm file states.
     """
@@ -63,12 +67,11 @@ def scan_report(
             style = "red" if each.node in wrong or each.answers > 1 else ""
             table.add_row(str(each.node), each.joint, *told, identity, str(each.serial), style=style)
         else:
-            table.add_row(str(each.node), each.joint, "[red]no answer[/red]")
-    console = Console(stderr=True)
-    console.print(table if found else f"{channel}: no node answers")
+            table.add_row(str(each.node), each.joint, Text("no answer", style="red"))
+    show(table if found else f"{channel}: no node answers")
     for lost in dict.fromkeys(lost for each in found for lost in each.lost):
         lacking = [each.joint for each in found if lost in each.lost]
-        console.print(f"{', '.join(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} {lost}", soft_wrap=True)
+        show(f"{', '.join(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} {lost}")
     nodes = [{**vars(each), "state": each.state.value, "mismatches": wrong.get(each.node, [])} for each in found]
     write(json, {"bus": channel, "nodes": nodes})
     missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]

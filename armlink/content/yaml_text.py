@@ -1,0 +1,58 @@
+"""Text of YAML files: values through the dumper, comments on one line each.
+
+Names come from models and drives, so no line is put together from them by hand.
+"""
+
+import math
+from typing import Any
+
+import yaml
+
+from armlink.content.printable_text import printable_text
+
+WIDTH = 160
+"""Characters after which the dumper breaks lines in block style; a choice."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Flow style, text with anything that is not printable in double quotes and escaped."""
+
+    def represent_text(self, text: str) -> yaml.Node:
+        return self.represent_scalar("tag:yaml.org,2002:str", text, None if text.isprintable() else '"')
+
+    def write_double_quoted(self, text: str, split: bool = True) -> None:
+        self.allow_unicode = text.isprintable()
+        super().write_double_quoted(text, split)
+        self.allow_unicode = True
+
+
+_Dumper.add_representer(str, _Dumper.represent_text)
+
+
+def yaml_value(value: Any) -> str:
+    """A value on one line, as a part of YAML in flow or block style."""
+    text: str = yaml.dump(
+        [value], Dumper=_Dumper, default_flow_style=True, width=math.inf, allow_unicode=True, sort_keys=False
+    )
+    return text.strip()[1:-1]
+
+
+def yaml_entry(key: str, value: Any, indent: int = 0, note: str = "") -> str:
+    """A line `key: value  # note`."""
+    return " " * indent + f"{yaml_value(key)}: {yaml_value(value)}" + (f"  {yaml_comment(note)}" if note else "")
+
+
+def yaml_item(value: Any, indent: int, note: str = "") -> str:
+    """A line `- value  # note` of a list."""
+    return " " * indent + f"- {yaml_value(value)}" + (f"  {yaml_comment(note)}" if note else "")
+
+
+def yaml_comment(text: str) -> str:
+    """A comment, on one line whatever is in the text."""
+    return f"# {printable_text(text)}"
+
+
+def yaml_document(content: Any) -> str:
+    """Lines in block style."""
+    text: str = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=WIDTH)
+    return text

@@ -1,0 +1,129 @@
+"""Whether a plan is one that the planner could have made of this arm file: its shape, poses, torques and accelerations.
+
+A plan on disk may have been changed since it was made, and so may the arm file.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Refused
+from calib.arm.drive_limits import Limits
+from calib.arm.sweep_section import SweepSection, sweep_section
+from calib.plan.choices import FASTEST, SERVO_GAP, SLOWEST
+from calib.plan.poses import sweep_range
+from calib.plan.types import Sweep, SweepPlan
+from gcomp.arrays import Array
+
+ROUNDING = 1e-6
+"""Share of a value, or [rad], by which arithmetic in another order may differ: far above that of 64-bit numbers."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the poses of a plan may be, each (n,) [rad]."""
+
+    moving: tuple[Array, Array]
+    """Of joints on their way, scout poses included."""
+    held: tuple[Array, Array]
+    """Of joints that rest in their servo."""
+    pressed: tuple[Array, Array]
+    """Of joints that rest on a stop: the stops."""
+
+
+def check_limits(arm_file: ArmFile, plan: SweepPlan) -> None:
+    """Raise Refused, naming sweep, joint and value, where a plan of static readings leaves the arm file's limits."""
+    section, limits = sweep_section(arm_file), Limits.of(arm_file)
+    ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))]).T
+    stops = (limits.lower, limits.upper)
+    held = (limits.lower + SERVO_GAP, limits.upper - SERVO_GAP)
+    require_bounds(arm_file, plan, Bounds((ends[0], ends[1]), held, stops))
+    refuse_unfit(arm_file, _of_drives(plan, section, limits, arm_file.joint_names))
+
+
+def check_bias(arm_file: ArmFile, plan: SweepPlan) -> None:
+    """Raise Refused where a plan does not say how resting joints are pressed, as one from before the scout."""
+    refuse_unfit(arm_file, (f"sweep {sweep.name}: bias is missing" for sweep in plan.sweeps if sweep.bias is None))
+
+
+def require_bounds(arm_file: ArmFile, plan: SweepPlan, bounds: Bounds) -> None:
+    """Raise Refused where a plan has another number of joints, or a pose beyond the bounds."""
+    refuse_unfit(arm_file, _of_shape(plan, len(arm_file.joint_names)))
+    refuse_unfit(arm_file, _of_poses(plan, bounds, arm_file.joint_names))
+
+
+def refuse_unfit(arm_file: ArmFile, found: Iterator[str]) -> None:
+    """Raise Refused with the first of what does not fit, if anything does not."""
+    first = next(found, None)
+    if first is not None:
+        raise Refused(
+            f"{arm_file.name}: the plan does not fit the arm file: {first}: has one of them been changed since it was"
+            " made? Begin a new pass in another directory"
+        )
+
+
+def _of_shape(plan: SweepPlan, n: int) -> Iterator[str]:
+    if not plan.scout:
+        yield "it has no scout pose, expected at least one"
+    for number, pose in enumerate(plan.scout, start=1):
+        if len(pose) != n:
+            yield f"scout pose {number} has {len(pose)} joints, expected {n}"
+    if plan.standard_error <= 0:
+        yield f"standard_error is {plan.standard_error:g}, expected a number above 0"
+    names = [sweep.name for sweep in plan.sweeps]
+    for sweep in plan.sweeps:
+        each = {"stops": sweep.stops, "rest": sweep.rest, "servo": sweep.servo, "bias": sweep.bias or (0.0,) * n}
+        wrong = next((key for key, values in each.items() if len(values) != n), None)
+        if names.count(sweep.name) > 1:
+            yield f"two sweeps are called {sweep.name!r}"
+        elif wrong:
+            yield f"sweep {sweep.name}: {wrong} has {len(each[wrong])} values, expected one a joint ({n})"
+        elif not 0 <= sweep.joint < n:
+            yield f"sweep {sweep.name}: joint {sweep.joint}, expected 0 to {n - 1}"
+        elif len(sweep.steps) < 2 or (np.diff(sweep.steps) <= 0).any():
+            yield f"sweep {sweep.name}: its steps do not increase"
+        elif any(not (sweep.stops[k] or sweep.servo[k]) for k in range(n) if k != sweep.joint):
+            yield f"sweep {sweep.name}: a joint that rests neither on a stop nor in its servo"
+
+
+def _of_poses(plan: SweepPlan, bounds: Bounds, names: Sequence[str]) -> Iterator[str]:
+    for number, pose in enumerate(plan.scout, start=1):
+        yield from _beyond(f"scout pose {number}", np.array(pose), *bounds.moving, names)
+    for sweep in plan.sweeps:
+        servo = np.array(sweep.servo)
+        stop = np.where(np.array(sweep.stops) > 0, bounds.pressed[1], bounds.pressed[0])
+        lower, upper = (np.where(servo, each, stop) for each in bounds.held)
+        lower[sweep.joint], upper[sweep.joint] = (each[sweep.joint] for each in bounds.moving)
+        for what, step in (("first step", sweep.steps[0]), ("last step", sweep.steps[-1])):
+            there = np.array(sweep.rest)
+            there[sweep.joint] = step
+            yield from _beyond(f"sweep {sweep.name}, {what}", there, lower, upper, names)
+
+
+def _beyond(where: str, pose: Array, lower: Array, upper: Array, names: Sequence[str]) -> Iterator[str]:
+    for k in np.flatnonzero((pose < lower - ROUNDING) | (pose > upper + ROUNDING)).tolist():
+        yield f"{where}: {names[k]} at {pose[k]:.4g} rad, expected {lower[k]:.4g} to {upper[k]:.4g}"
+
+
+def _of_drives(plan: SweepPlan, section: SweepSection, limits: Limits, names: Sequence[str]) -> Iterator[str]:
+    if not 0 < plan.travel_acceleration <= FASTEST * (1 + ROUNDING):
+        yield f"travel_acceleration is {plan.travel_acceleration:g} rad/s², expected at most {FASTEST:g}"
+    fastest = max(section.acceleration, SLOWEST)
+    for sweep in plan.sweeps:
+        if sweep.speed is not None:
+            yield f"sweep {sweep.name} creeps, and a plan of static readings does not"
+        if not 0 < sweep.acceleration <= fastest * (1 + ROUNDING):
+            yield f"sweep {sweep.name}: acceleration {sweep.acceleration:g} rad/s², expected at most {fastest:g}"
+        yield from _of_bias(sweep, limits, names)
+
+
+def _of_bias(sweep: Sweep, limits: Limits, names: Sequence[str]) -> Iterator[str]:
+    for k, bias in enumerate(sweep.bias or ()):
+        pressed = k != sweep.joint and not sweep.servo[k]
+        most, side = limits.max_torque[k] * (1 + ROUNDING), sweep.stops[k]
+        if abs(bias) > most:
+            yield f"sweep {sweep.name}: {names[k]} pressed with {bias:g} N·m, expected at most {limits.max_torque[k]:g}"
+        elif bias * side < 0 or (bias and not pressed):
+            yield f"sweep {sweep.name}: {names[k]} pressed with {bias:g} N·m, not towards the stop that it rests on"
