@@ -253,6 +253,7 @@ class Link(Calibrations):
         Raises BusFault where a drive does not answer, BadInput for drives that no guard can check.
         """
         rules: dict[str, Any] = {"frames": {}, "stop": [], "restarts": {}}
+        watches = {"deadline": self.section.deadline, "fd": self.section.bus.fd}
         wanted = self._wanted_limits()
         for group in self.groups:
             name, family = self.names[group.places[0]], group.family.name
@@ -267,7 +268,7 @@ class Link(Calibrations):
                 "stop": rules["stop"] + found["stop"],
                 "restarts": rules["restarts"] | found["restarts"],
             }
-        return rules
+        return rules | watches
 
     def _gate_limits(self, joint: int) -> JointLimits:
         wanted = self._limits[joint]
