@@ -427,7 +427,7 @@ class Guard:
     def _tell_late(self, age: float) -> None:
         """The drives have stopped by themselves meanwhile; what the program said before counts no more."""
         if not self._late:
-            self._say(f"guard: it stood still: frames {age:.3f} s old are not passed, limit {self.policy.deadline:g} s")
+            self._say(f"guard: it fell behind: frames {age:.3f} s old are not passed, limit {self.policy.deadline:g} s")
         self._late = True
 
     def close(self, why: str) -> None:

@@ -18,6 +18,7 @@ from armlink.drives.family import Guarded
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup, law_torque
 from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence
 from armlink.link.bus_load import overload
+from armlink.link.bus_watchdog import MOST_FRAMES
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault
@@ -410,14 +411,19 @@ class Link(Calibrations):
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Run the loop until `done` or the time is over; enabled joints get their last command in every cycle."""
         end = self.clock.now() + timeout
+        taken = 0
         while not done():
             remaining = end - self.clock.now()
             if remaining <= 0:
                 return False
-            if self._loop.receive(0.0):
+            if taken < MOST_FRAMES and self._loop.receive(0.0):
+                taken += 1
                 continue
+            taken = 0  # a bus that never falls silent must not keep the joints waiting for their commands
             if self._enabled and self._last is not None:
                 self.cycle(replace(self._last, t=None))
             elif not self._loop.receive(remaining):
+                if self._loop.watch.reception:
+                    raise BusFault(self._loop.watch.reception)
                 return False
         return True

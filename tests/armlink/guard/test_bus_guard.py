@@ -609,7 +609,7 @@ def test_a_frame_that_waited_for_longer_than_the_drives_wait_for_their_host_goes
     assert wire.sent == []
     assert not guard.closed
     assert len(lines) == 1
-    assert lines[0].startswith("guard: it stood still: frames 3.0")
+    assert lines[0].startswith("guard: it fell behind: frames 3.0")
     guard._to_wire(0x80, b"", False, time.monotonic())
     assert wire.sent == [(0x80, b"")]
 

@@ -1,0 +1,111 @@
+"""Attacks on real SocketCAN (`bus_attacks`): the joints hold at the end, and the right cause is named."""
+
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from bus_attacks import BARE, GUARDED, Scene, link, scene
+
+from armlink.errors import BusFault
+from armlink.link.link import Link
+
+pytestmark = pytest.mark.vcan
+
+OWN_WATCHES = "the joints could not be told to stop, which their own watches do"
+CLOSED = {
+    "killed": "",
+    "its terminal is closed": "it was told to end; the joints were told to stop",
+    "suspended": "it fell behind: frames",
+    "killed and started again at once": "",
+    "a second guard": "on the wire, which this guard did not send: another host|which only a drive may send",
+    "flood of SYNCs by a program": "80h: more often than 100 times a second",
+    "SYNC as CAN FD by a program": "80h as CAN FD, which these drives do not speak",
+    "command on the wire": "20Bh on the wire, which this guard did not send: another host commands the drives there",
+    "wire down and up": f"an interface failed: Network is down; {OWN_WATCHES}|the wire takes no frames",
+}
+"""Attack → what the guard says of it; empty where a killed one says nothing."""
+SAID = {
+    "flood: readings of a drive": "joint_1: two readings in every cycle: a second node has its id",
+    "flood: extended": "",
+    "flood: bus-off": "bus-off: check wiring, termination and bit rate",
+    "flood while the host does not read": "the host was .* ms late|frames lost: this host reads too slowly",
+    "interface down and up": "Network is down",
+}
+"""Attack → what the host says of it; empty where it may go on."""
+NOT_ITS_OWN = re.compile("encoder|cable|too weak|stuck")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    if not Path("/sys/class/net/vcan1").exists():  # before the mark's own skip, since this fixture is the module's
+        pytest.skip("needs SocketCAN interfaces vcan0 and vcan1, which scripts/with-vcan makes")
+    with scene(tmp_path_factory.mktemp("attacks")) as built:
+        yield built
+
+
+def need_ip(name: str) -> None:
+    if "down" in name and (shutil.which("ip") is None or os.geteuid() != 0):
+        pytest.skip("only root may set an interface down, with ip of iproute2")
+
+
+@pytest.mark.parametrize("name", CLOSED)
+def test_an_attack_on_the_guard_leaves_the_joints_holding(name: str, place: Scene) -> None:
+    need_ip(name)
+    found = place.attack(GUARDED[name], guarded=True)
+    assert not found.wrong, found
+    assert found.host, "the host goes on without its arm"
+    assert not NOT_ITS_OWN.search(found.host)
+    assert re.search(CLOSED[name], found.guard), found.guard
+
+
+@pytest.mark.parametrize("name", SAID)
+def test_an_attack_on_the_bus_leaves_the_joints_holding(name: str, place: Scene) -> None:
+    need_ip(name)
+    found = place.attack(BARE[name], guarded=False)
+    assert not found.wrong, found
+    assert not NOT_ITS_OWN.search(found.host)
+    assert found.host or not SAID[name]
+    assert re.search(SAID[name], found.host), found.host
+
+
+def test_a_guard_that_starts_anew_closes_at_the_commands_of_before(place: Scene) -> None:
+    """It knows of no set-up; the joints hold, and the host has to start them again once the guard is."""
+    found = place.attack(GUARDED["killed and started again at once"], guarded=True)
+    assert not found.wrong, found
+    assert re.match("Silence|BusFault", found.host), found.host
+
+
+def test_an_interface_that_is_removed_during_work_is_one_line(place: Scene) -> None:
+    """Last, since it takes vcan1 away, and makes it again."""
+    need_ip("down")
+    remove = link("vcan1", "delete", "add type vcan", "up")
+    found = place.attack(remove, guarded=True)
+    assert not found.wrong, found
+    assert re.search("No such device|Network is down", found.host), found.host
+    assert "guard: closed: an interface failed: " in found.guard
+    assert "the joints were told to stop" in found.guard
+
+
+def test_a_full_queue_is_put_down_to_a_flood_where_frames_come(place: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A vcan is never full: its system call is made to say so."""
+    import ctypes
+    import errno
+
+    from armlink.arm_file import load_arm
+
+    with Link.open(load_arm(str(place.arm))) as opened:
+        port = opened._loop._port
+
+        def full(*words: object) -> int:
+            ctypes.set_errno(errno.ENOBUFS)
+            return -1
+
+        monkeypatch.setattr(port, "_sendmmsg", full)
+        with pytest.raises(BusFault, match="transmit queue stays full: does any node acknowledge"):
+            opened._loop.send(0x7FE, b"")
+        monkeypatch.setattr(port, "_waiting", [(0x001, b"")])
+        with pytest.raises(BusFault, match="transmit queue stays full: frames of higher priority fill the bus"):
+            opened._loop.send(0x7FE, b"")
