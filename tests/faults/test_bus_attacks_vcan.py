@@ -9,9 +9,6 @@ from pathlib import Path
 import pytest
 from bus_attacks import BARE, GUARDED, Scene, link, scene
 
-from armlink.errors import BusFault
-from armlink.link.link import Link
-
 pytestmark = pytest.mark.vcan
 
 OWN_WATCHES = "the joints could not be told to stop, which their own watches do"
@@ -87,25 +84,3 @@ def test_an_interface_that_is_removed_during_work_is_one_line(place: Scene) -> N
     assert re.search("No such device|Network is down", found.host), found.host
     assert "guard: closed: an interface failed: " in found.guard
     assert "the joints were told to stop" in found.guard
-
-
-def test_a_full_queue_is_put_down_to_a_flood_where_frames_come(place: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A vcan is never full: its system call is made to say so."""
-    import ctypes
-    import errno
-
-    from armlink.arm_file import load_arm
-
-    with Link.open(load_arm(str(place.arm))) as opened:
-        port = opened._loop._port
-
-        def full(*words: object) -> int:
-            ctypes.set_errno(errno.ENOBUFS)
-            return -1
-
-        monkeypatch.setattr(port, "_sendmmsg", full)
-        with pytest.raises(BusFault, match="transmit queue stays full: does any node acknowledge"):
-            opened._loop.send(0x7FE, b"")
-        monkeypatch.setattr(port, "_waiting", [(0x001, b"")])
-        with pytest.raises(BusFault, match="transmit queue stays full: frames of higher priority fill the bus"):
-            opened._loop.send(0x7FE, b"")

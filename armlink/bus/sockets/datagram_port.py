@@ -19,6 +19,8 @@ from armlink.errors import BusFault
 
 BATCH = 64
 """Datagrams per system call."""
+FLOOD = 32
+"""So many frames that came while none could be sent filled the bus: a wire of 125 kbit/s carries 45 in that time."""
 MOST_BATCHES = 16
 """Limit of batches read for one frame, so that a flood of other datagrams cannot block a reader."""
 RECEIVE_BUFFER = 1 << 21
@@ -165,11 +167,11 @@ class DatagramPort(ABC):
             select.select([], [], [], _RETRY)
 
     def _full(self) -> BusFault:
-        """Nothing could be sent for 50 ms. Frames that came meanwhile had a higher priority."""
+        """Nothing could be sent for 50 ms. Where many frames came meanwhile, they had a higher priority."""
         with contextlib.suppress(BusFault):
             if not self._waiting:
                 self._fill()
-        if self._waiting:
+        if len(self._waiting) >= FLOOD:
             return BusFault(f"bus {self._name}: transmit queue stays full: frames of higher priority fill the bus")
         return BusFault(f"bus {self._name}: transmit queue stays full: does any node acknowledge?")
 

@@ -1,6 +1,8 @@
 """A flooded bus: the link keeps its cycle, stops what it can, and says that it is a flood and what it is made of."""
 
+import random
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,8 @@ FLOODS: dict[str, Callable[[list[Frame]], list[Frame]]] = {
     "the drives' own": lambda sent: sent,
 }
 FAMILIES = ("cia402", "damiao", "robstride", "cubemars", "moteus", "odrive")
+ROWS = random.Random(2).sample([*product(FAMILIES, FLOODS, (100, 1100))], 48)
+"""In an order in which the first few have little in common."""
 
 
 class FloodedBus(LockStepBus):
@@ -74,10 +78,8 @@ def flooded(family: str, kind: str, count: int) -> tuple[FloodedBus, ArmlinkErro
     return bus, found
 
 
-@pytest.mark.parametrize("count", [100, 1100])
-@pytest.mark.parametrize("kind", FLOODS)
-@pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.sample(16)
+@pytest.mark.parametrize(("family", "kind", "count"), ROWS)
+@pytest.mark.sample(4)
 def test_a_flood_drops_no_arm(family: str, kind: str, count: int) -> None:
     bus, error = flooded(family, kind, count)
     assert isinstance(error, BusFault)
@@ -185,7 +187,7 @@ class Deaf:
 
 @pytest.mark.parametrize("always", [False, True])
 def test_bus_off_told_again_and_again_keeps_no_stop_from_leaving(enabled: Link, bus: Any, always: bool) -> None:
-    enabled.commander.loop._port = Deaf(enabled.commander.loop._port, always)  # type: ignore[assignment]
+    enabled.commander.loop._port = Deaf(enabled.commander.loop._port, always)
     with pytest.raises(BusFault, match=r"^bus fake: bus-off: check wiring"):
         enabled.cycle(Command.hold(enabled.latest_position))
     assert all(node.status == QUICK_STOP for node in bus.nodes.values())

@@ -1,6 +1,6 @@
 """Campaign: attacks on a real SocketCAN bus, on hosts with and without a guard, at drawn moments of a motion.
 
-    scripts/with-vcan python tests/campaigns/bus_attacks.py [--rounds 3] [--seed 0] [--only WORD]
+    scripts/with-vcan python tests/campaigns/attack_bus.py [--rounds 3] [--seed 0] [--only WORD]
 
 Each round makes every attack of `tests/faults/bus_attacks.py` once. Exit status 1 if a joint was faster than its motion
 by 1 rad/s, or did not hold when its host had ended.
