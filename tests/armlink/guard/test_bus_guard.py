@@ -484,6 +484,9 @@ def broken(change):
         (broken(lambda c: c.update(stop=[[1, "xy"]])), "ValueError"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(at=math.inf)), "OverflowError"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(most=10**400)), "OverflowError"),
+        (broken(lambda c: c.update(deadline=math.nan)), "policy: deadline is no number"),
+        (broken(lambda c: c.update(deadline="soon")), "ValueError"),
+        (broken(lambda c: c["frames"]["128"].update(per_second=math.nan)), "frame: per_second is no number"),
     ],
 )
 def test_a_wrong_policy_is_refused_in_one_line(content, said):
