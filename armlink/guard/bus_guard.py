@@ -7,11 +7,14 @@ The guard alone has the wire; whatever commands the arm has an interface of its 
 the wire goes to the program. From the program to the wire go only identifiers that the policy names, with every field
 within its bounds. The first frame that is not allowed closes the guard: it sends the policy's stop frames, says what it
 was in one line, and passes nothing more until it is started again; the drives' own watches then see a silent host.
+So do a frame on the wire that only the program may send, since then another host is there, and frames that were lost.
+A frame that has waited here for longer than the drives wait for their host goes nowhere.
 
 One file on the standard library, so that no fault elsewhere can change what it does. The policy is written by
 `armlink guard`; `Policy` below says what it holds. Values in it are those of the bytes: whole numbers in drive units.
 """
 
+import contextlib
 import errno
 import json
 import math
@@ -33,6 +36,12 @@ FULL = 0.05
 """A frame waits this long for a full transmit queue [s]."""
 BATCH = 64
 """Frames taken from one side before the other is looked at."""
+RECEIVE_BUFFER = 1 << 21
+"""Size of a receive queue [bytes], some thousand frames; what its user may not have, the kernel cuts off."""
+SO_RCVBUFFORCE, SO_TIMESTAMPNS, SO_RXQ_OVFL = 33, 35, 40
+"""Of Linux (asm-generic/socket.h): a buffer beyond rmem_max, time of reception, count of lost frames."""
+STAMP, COUNT = struct.Struct("@ll"), struct.Struct("=I")
+CONTROL = socket.CMSG_SPACE(STAMP.size) + socket.CMSG_SPACE(COUNT.size)
 NUMBERS = "bBhHiIqQf"
 """Codes of `struct` that a field may have."""
 
@@ -124,8 +133,28 @@ class Field:
         return min(self.slack, self._room + self.rate * max(0.0, now - self._at))
 
 
+class Allowance:
+    """How often a frame may come: `per_second`, by default any number, and after a pause `burst` of them at once."""
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        """From the policy."""
+        self._rate, self._burst = _bound(found, "per_second", math.inf), _bound(found, "burst", 1.0)
+        self._room, self._at = self._burst, -math.inf
+
+    def refusal(self, now: float) -> str:
+        """Why one more is too many, or an empty text; one more is then counted."""
+        if self._rate == math.inf:
+            return ""
+        self._room = min(self._burst, self._room + self._rate * max(0.0, now - self._at))
+        self._at = max(now, self._at)
+        if self._room < 1.0:
+            return f"more often than {self._rate:g} times a second"
+        self._room -= 1.0
+        return ""
+
+
 class Frame:
-    """Frames with one identifier: lengths, fields, and what a drive must have acknowledged before.
+    """Frames with one identifier: lengths, fields, how often, and what a drive must have acknowledged before.
 
     `power`: the number whose bits of `mask` are `value` in a frame that gives the drive power; without it all do.
     """
@@ -134,6 +163,7 @@ class Frame:
         """From the policy; raises PolicyError for a field beyond the frame's bytes."""
         self.lengths = frozenset(found["lengths"])
         self.fields = [Field(each) for each in found.get("fields", ())]
+        self.allowance = Allowance({"name": "frame", **found})
         self.after = frozenset((int(can_id), bytes.fromhex(data)) for can_id, data in found.get("after", ()))
         power = found.get("power")
         self._power = (
@@ -155,6 +185,10 @@ class Frame:
         """The fields that a frame with these bytes has, None if it is not allowed at all."""
         return self.fields if len(data) in self.lengths else None
 
+    def commands(self, data: bytes) -> bool:
+        """Whether a frame makes a drive do anything; else it only asks."""
+        return True
+
     def all_fields(self) -> Collection[Field]:
         """Every field."""
         return self.fields
@@ -168,6 +202,7 @@ class Requests:
     def __init__(self, found: dict[str, Any]) -> None:
         """From the policy."""
         self.after: frozenset[tuple[int, bytes]] = frozenset()
+        self.allowance = Allowance({"name": "request"})
         self.writes: dict[bytes, Field] = {}
         for place, each in found["sdo"].items():
             index, sub = (int(part, 16) for part in place.split(":"))
@@ -182,12 +217,16 @@ class Requests:
         if len(data) != 8:
             return None
         command = data[0]
-        if command == self.UPLOAD or command == self.ABORT or command in self.SEGMENTS:
+        if not self.commands(data):
             return ()
         field = self.writes.get(data[1:4])
         if field is None or command != self.DOWNLOAD | (4 - field.number.size) << 2 or field.number.size > 4:
             return None
         return (field,)
+
+    def commands(self, data: bytes) -> bool:
+        """As Frame.commands: reads and aborts do not."""
+        return data[:1] not in (bytes([each]) for each in (self.UPLOAD, self.ABORT, *self.SEGMENTS))
 
     def all_fields(self) -> Collection[Field]:
         """Every field."""
@@ -197,7 +236,8 @@ class Requests:
 class Policy:
     """What may pass: `frames` by identifier (with the flag of 29 bits in bit 31), `stop` frames, `restarts`.
 
-    A frame in `restarts` means that a drive has forgotten its set-up: what it acknowledged counts no more.
+    A frame in `restarts` means that a drive has forgotten its set-up: what it acknowledged counts no more. The drives
+    wait for `deadline` seconds for their host. `fd`: whether frames are CAN FD; without it both may pass.
     """
 
     def __init__(self, content: Any) -> None:
@@ -210,6 +250,8 @@ class Policy:
             }
             self.stop = [(int(can_id), bytes.fromhex(data)) for can_id, data in content["stop"]]
             self.restarts = {int(key): int(answers) for key, answers in content.get("restarts", {}).items()}
+            self.deadline = _bound({"name": "policy", **content}, "deadline", math.inf)
+            self.fd = None if content.get("fd") is None else bool(content["fd"])
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError, struct.error) as error:
             raise PolicyError(f"{type(error).__name__}: {error}") from None
         self._sources: dict[int, list[tuple[Source, Field]]] = {}
@@ -222,6 +264,7 @@ class Policy:
             for can_id, data in frame.after:
                 self._awaited.setdefault(can_id, set()).add(data)
         self._acknowledged: set[tuple[int, bytes]] = set()
+        self._drives = frozenset(self._sources) | frozenset(self._awaited) | frozenset(self.restarts)
 
     def hear(self, can_id: int, data: bytes, now: float) -> None:
         """A frame came from the wire."""
@@ -239,18 +282,25 @@ class Policy:
     def refusal(self, can_id: int, data: bytes, now: float) -> str:
         """Why a frame of the program may not pass, or an empty text; what passes is kept as where the next starts."""
         frame = self.frames.get(can_id)
+        if frame is None and can_id in self._drives:
+            return (
+                f"identifier {can_id:X}h, which only a drive may send: a second guard, or a program that plays a drive"
+            )
         if frame is None:
             return f"identifier {can_id:X}h, which the policy does not name"
         fields = frame.pick(data)
         if fields is None:
             return f"{can_id:X}h with {data.hex(' ') or 'no data'}: no request that the policy allows"
         if not frame.after <= self._acknowledged:
-            return f"{can_id:X}h before the drive has acknowledged what it means"
+            return f"{can_id:X}h before the drive has acknowledged what it means, since the guard or the drive started"
         power = frame.powers(data)
         for field in fields:
             why = field.refusal(data, now, power)
             if why:
                 return f"{can_id:X}h: {why}"
+        why = frame.allowance.refusal(now)
+        if why:
+            return f"{can_id:X}h: {why}"
         for field in fields:
             field.keep(data, now, power)
         return ""
@@ -258,6 +308,11 @@ class Policy:
 
 class Port:
     """One raw CAN socket."""
+
+    patience = FULL
+    """A frame waits this long for a full transmit queue [s]."""
+    lost = 0
+    """Frames that the receive queue had no room for."""
 
     def __init__(self, interface: str) -> None:
         """Raises OSError."""
@@ -267,23 +322,36 @@ class Port:
             self.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
         except OSError:
             self.fd = False
+        try:
+            self.socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
+        except OSError:  # without CAP_NET_ADMIN
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        for option in (SO_TIMESTAMPNS, SO_RXQ_OVFL):
+            self.socket.setsockopt(socket.SOL_SOCKET, option, 1)
         self.socket.bind((interface,))
         self.socket.setblocking(False)
 
-    def receive(self) -> tuple[int, bytes, bool] | None:
-        """(identifier with flags, data, whether CAN FD), None if nothing is there."""
+    def receive(self) -> tuple[int, bytes, bool, float] | None:
+        """(identifier with flags, data, whether CAN FD, when it came by time.monotonic()), None if nothing is there."""
         try:
-            raw = self.socket.recv(FD_FRAME.size)
+            raw, controls, _, _ = self.socket.recvmsg(FD_FRAME.size, CONTROL)
         except BlockingIOError:
             return None
+        now = came = time.monotonic()
+        for level, kind, value in controls:
+            if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS:
+                seconds, nano = STAMP.unpack(value)
+                came = now - max(0.0, time.time() - seconds - 1e-9 * nano)
+            elif level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
+                self.lost = COUNT.unpack(value)[0]
         layout = FRAME if len(raw) == FRAME.size else FD_FRAME
         can_id, length, _, data = layout.unpack(raw)
-        return can_id, data[:length], layout is FD_FRAME
+        return can_id, data[:length], layout is FD_FRAME, came
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> bool:
         """Send; whether it left before a full queue made it wait too long."""
         layout, flags = (FD_FRAME, FD_FLAGS) if fd else (FRAME, 0)
-        raw, end = layout.pack(can_id, len(data), flags, data), time.monotonic() + FULL
+        raw, end = layout.pack(can_id, len(data), flags, data), time.monotonic() + self.patience
         while True:
             try:
                 self.socket.send(raw)
@@ -303,6 +371,8 @@ class Guard:
         self.policy, self.program, self.wire, self._say = policy, program, wire, say or _say
         self.closed = ""
         """Why nothing more passes to the wire; empty while it is open."""
+        self._late = False
+        """Whether the newest frame of the program had waited too long."""
 
     def step(self, seconds: float) -> None:
         """Wait at most this long for frames of either side and pass them."""
@@ -314,29 +384,60 @@ class Guard:
                 frame = port.receive()
                 if frame is None:
                     break
+                self._check_losses()
                 pass_on(*frame)
 
-    def _to_program(self, can_id: int, data: bytes, fd: bool) -> None:
-        if not can_id & (ERROR | REMOTE):
-            self.policy.hear(can_id, data, time.monotonic())
+    def _to_program(self, can_id: int, data: bytes, fd: bool, came: float | None = None) -> None:
+        if can_id & (ERROR | REMOTE):
+            return
+        frame = self.policy.frames.get(can_id)
+        if frame is None:
+            self.policy.hear(can_id, data, time.monotonic() if came is None else came)
             self.program.send(can_id, data, fd)
+        elif not self.closed and frame.commands(data):  # a closed guard passes none on: two would do so for ever
+            self.program.send(can_id, data, fd)
+            self.close(
+                f"{can_id:X}h on the wire, which this guard did not send: another host commands the drives there"
+            )
 
-    def _to_wire(self, can_id: int, data: bytes, fd: bool) -> None:
+    def _to_wire(self, can_id: int, data: bytes, fd: bool, came: float | None = None) -> None:
         if self.closed:
             return
+        now = time.monotonic()
+        came = now if came is None else came
+        if now - came > self.policy.deadline:
+            self._tell_late(now - came)
+            return
+        self._late = False
         why = "a remote or error frame" if can_id & (ERROR | REMOTE) else ""
-        why = why or self.policy.refusal(can_id, data, time.monotonic())
+        if not why and self.policy.fd not in (None, fd):
+            why = f"{can_id:X}h as {'CAN FD' if fd else 'classical CAN'}, which these drives do not speak"
+        why = why or self.policy.refusal(can_id, data, came)
         if why:
             self.close(why)
         elif not self.wire.send(can_id, data, fd):
-            self.close("the wire takes no frames: is it up, and does anything acknowledge?")
+            self.close("the wire takes no frames: is it up, does anything acknowledge, do others fill it?")
+
+    def _check_losses(self) -> None:
+        """A lost frame may have been a drive's restart, or a stop."""
+        for port, name in ((self.wire, "wire"), (self.program, "program")):
+            if port.lost and not self.closed:
+                self.close(f"{port.lost} frames of the {name} were lost: a flood, or this guard gets too little time")
+
+    def _tell_late(self, age: float) -> None:
+        """The drives have stopped by themselves meanwhile; what the program said before counts no more."""
+        if not self._late:
+            self._say(f"guard: it fell behind: frames {age:.3f} s old are not passed, limit {self.policy.deadline:g} s")
+        self._late = True
 
     def close(self, why: str) -> None:
         """Stop the joints and pass nothing more."""
         self.closed = why
-        for can_id, data in self.policy.stop:
-            self.wire.send(can_id, data)
-        self._say(f"guard: closed: {why}; the joints were told to stop, start the guard again to open it")
+        told = [self.wire.send(can_id, data) for can_id, data in self.policy.stop]
+        then = "the joints were told to stop"
+        if not all(told):
+            then = "the joints could not be told to stop, which their own watches do"
+        self._say(f"guard: closed: {why}; {then}, start the guard again to open it")
 
 
 def _number(code: str) -> struct.Struct:
@@ -355,16 +456,20 @@ def _bound(found: dict[str, Any], key: str, default: float) -> float:
 def _say(text: str) -> None:
     """One line; names come from the policy and the system, and nothing in them acts on a terminal."""
     shown = (each if each.isprintable() else each.encode("unicode_escape").decode("ascii") for each in text)
-    sys.stderr.write("".join(shown) + "\n")
-    sys.stderr.flush()
+    with contextlib.suppress(OSError, ValueError):  # nobody may be there to read it
+        sys.stderr.write("".join(shown) + "\n")
+        sys.stderr.flush()
 
 
 def main(words: list[str]) -> int:
-    """Run until SIGTERM or SIGINT, which close the guard; exit status 2 for a wrong policy or interface."""
+    """Run until a signal to end, which closes the guard; exit status 2 for a wrong policy or interface."""
     if len(words) != 3:
         _say(__doc__.splitlines()[2].strip())
         return 2
     path, program, wire = words
+    if program == wire:
+        _say(f"guard: {wire}: both interfaces: expected one for programs alone, such as a vcan, and the arm's")
+        return 2
     try:
         with open(path, encoding="utf-8") as file:
             policy = Policy(json.load(file))
@@ -378,10 +483,14 @@ def main(words: list[str]) -> int:
         except OSError as error:
             _say(f"guard: {name}: {error.strerror}: expected a CAN interface that is up")
             return 2
+    ports[0].patience = 0.0  # a program that takes no frames must not keep those to the wire waiting
     guard = Guard(policy, ports[0], ports[1])
     ended: list[bool] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: ended.append(True))
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # which nohup asks for
+            signal.signal(number, lambda *_: ended.append(True))
+    for number in (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU):  # a terminal must not suspend it
+        signal.signal(number, signal.SIG_IGN)
     _say(f"guard: {program} may command {wire} by {path}")
     while not ended:
         try:

@@ -1,5 +1,7 @@
 """Detects irregular traffic: a second host, a duplicated node id, a babbling node, a restarted controller."""
 
+from armlink.bus.port import EXTENDED, REMOTE
+
 MOST_FRAMES = 1000
 """Limit of frames taken in at once; a bus at 1 Mbit/s needs 47 ms for them."""
 CROWD_PER_JOINT, CROWD = 5, 30
@@ -22,8 +24,10 @@ class BusWatch:
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
         self._crowded_cycles = 0
-        self.last_id: int | None = None
-        """Identifier of the newest frame that was no reading."""
+        self.others: dict[int, int] = {}
+        """Frames of this cycle that were no readings of the fast way, by identifier."""
+        self.strangers = 0
+        """Frames of this cycle that no drive of ours sends."""
         self.syncs = 0
         """SYNCs sent."""
         self.readings = [0] * joints
@@ -38,13 +42,19 @@ class BusWatch:
         self.syncs, self.readings[:] = 0, [0] * len(self.readings)
         self.intruder = ""
         """Description of a frame received that only the host may send; empty if there was none."""
+        self.reception = ""
+        """Why the interface receives nothing, in words; empty while it does."""
         self.flooded = False
         self._double_cycles = [0] * len(self._double_cycles)
         self._crowded_cycles = 0
+        self._counted = [0] * len(self.readings)
+        self._culprit: str | int = ""
+        self.crowding = 0.0
+        """Frames a cycle that no drive of ours sends, a mean over CROWDED_CYCLES."""
 
     def settle(self) -> None:
         """After an interruption: reset the crowding counters; replies that are owed may still arrive."""
-        self.flooded, self._crowded_cycles = False, 0
+        self.flooded, self._crowded_cycles, self.crowding, self.reception = False, 0, 0.0, ""
         self._doubled.clear()
         self._double_cycles = [0] * len(self._double_cycles)
 
@@ -60,7 +70,21 @@ class BusWatch:
             for joint, count in enumerate(self._double_cycles):
                 self._double_cycles[joint] = count + 1 if joint in self._doubled else 0
             self._doubled.clear()
+        self.crowding += (self.strangers - self.crowding) / CROWDED_CYCLES
         self._crowded_cycles = self._crowded_cycles + 1 if frames > self._crowd else 0
+        if self._crowded_cycles or self.flooded or self.strangers:
+            most = self._most_frequent()
+            self._culprit = self._culprit if most == "" else most
+        self.others.clear()
+        self.strangers, self._counted = 0, self.readings.copy()
+
+    def _most_frequent(self) -> str | int:
+        """What came most often in this cycle: a joint's readings, or a frame in words; empty where nothing came."""
+        joint = max(range(len(self.readings)), key=lambda each: self.readings[each] - self._counted[each])
+        can_id, count = max(self.others.items(), key=lambda each: each[1], default=(0, 0))
+        if self.readings[joint] - self._counted[joint] > max(count, 1):
+            return joint
+        return frame_name(can_id) if count else ""
 
     @property
     def doubled(self) -> int | None:
@@ -74,6 +98,13 @@ class BusWatch:
         return self.flooded or self._crowded_cycles >= CROWDED_CYCLES
 
     @property
-    def last(self) -> str:
-        """COB-ID of the newest frame that was no process data: the probable source of a flood."""
-        return "none" if self.last_id is None else f"{self.last_id:03X}h"
+    def culprit(self) -> str | int:
+        """What comes most often on a crowded bus, as `_most_frequent`: the probable source of a flood."""
+        most = self._most_frequent() if self.flooded or self._culprit == "" else ""
+        return self._culprit if most == "" else most
+
+
+def frame_name(can_id: int) -> str:
+    """A frame by its identifier, as people write it; which of several buses it is on is left out."""
+    digits = f"{can_id & 0x1FFFFFFF:08X}h" if can_id & EXTENDED else f"{can_id & 0x7FF:03X}h"
+    return f"remote frames {digits}" if can_id & REMOTE else digits

@@ -266,8 +266,8 @@ class Commander:
     def stop(self) -> None:
         """Stop every joint, repeated until none is ON, as far as the bus still carries it."""
         power = [Power.STOPPED] * self.n
-        with contextlib.suppress(BusFault):
-            for _ in range(STOP_CYCLES):
+        for _ in range(STOP_CYCLES):
+            with contextlib.suppress(BusFault):  # a queue that is full now may have room in the next cycle
                 self.stand(power)
                 if not self._any_on():
                     break
@@ -324,13 +324,17 @@ class Commander:
             )
 
     def _fault(self, now: float, modes: Sequence[int]) -> BusFault | None:
-        """The fault at time `now`; what the host's own lateness explains is put down to that and to nothing else."""
+        """The fault at time `now`; what the host's own lateness explains is put down to that and to nothing else, and
+        what the state of the bus explains to that."""
         fault = self._drive_fault(now, modes)
         shown = bus_fault(self.names, self.loop.watch, self.loop.dropped)
         if self._gap_at + MEMORY >= now and self._gap > self.max_age:
             return HostLate(self._gap, self.max_age, self._own_stop())
+        watch = self.loop.watch
+        if shown is not None and (fault is None or watch.reception or watch.intruder or isinstance(fault, Silence)):
+            return BusFault(shown)
         if fault is None:
-            return None if shown is None else BusFault(shown)
+            return None
         if self._gap_at + MEMORY >= now and self._gap > BLAME_SHARE * self.max_age:
             stopped = self._own_stop()
             if stopped or isinstance(fault, Silence):
@@ -343,7 +347,7 @@ class Commander:
             fault = group.drives.alarm()
             if fault is not None:
                 return fault
-        silent = silence(self.names, self.loop.seen, now, self.max_age)
+        silent = silence(self.names, self.loop.seen, now, self.max_age, self.loop.watch)
         if silent is not None:
             return silent
         for group in groups:

@@ -14,7 +14,7 @@ from armlink.clock import Clock
 from armlink.drives.board import Board, Event
 from armlink.drives.family import ANY, FillsBoard
 from armlink.drives.orders import Order, Reading, power_code
-from armlink.errors import HostLate
+from armlink.errors import BusFault, HostLate
 from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
 from armlink.link.joints.groups import Group, traits_of
 from armlink.link.joints.values import JointValues
@@ -27,6 +27,8 @@ EARLIER, LATER = 0.998, 1.03
 cycle while they all had, later once one had not."""
 LEAST_REST = 1e-4
 """Shorter rests are not worth their system call [s]."""
+RECEPTION_TRIES = 16
+"""A frame is asked for so often of a port that reports faults; a batch that tells of one may hold frames too."""
 OWED_CYCLES = 25
 """A reply that has been owed for this many cycles is lost."""
 _UNTAGGED = (1 << BUS_SHIFT) - 1
@@ -130,13 +132,22 @@ class Loop:
 
     def receive(self, timeout: float) -> bool:
         """Take one frame in, waiting for it at most `timeout` seconds; False where none came."""
-        frame = self._port.receive(timeout)
+        frame = self._hear(timeout)
         if frame is None:
             return False
         self.stats.frames += 1
         self.bits += FIXED_BITS + 8 * len(frame[1])
         self.take(*frame)
         return True
+
+    def _hear(self, timeout: float) -> Frame | None:
+        """The next frame. A port that cannot receive is a fault among others: it keeps no frame from leaving."""
+        for _ in range(RECEPTION_TRIES):
+            try:
+                return self._port.receive(timeout)
+            except BusFault as fault:
+                self.watch.reception, timeout = self.watch.reception or str(fault), 0.0
+        return None
 
     def drain(self) -> None:
         """Take in all that came between cycles; replies among it are late: newest known, but of no sample."""
@@ -152,7 +163,7 @@ class Loop:
 
     def _take_what_is_there(self) -> int:
         """Take in the frames that are there, counted all at once; how many they were."""
-        receive, fast, came, size = self._port.receive, self._fast, 0, 0
+        receive, fast, came, size = self._hear, self._fast, 0, 0
         while came < MOST_FRAMES:
             frame = receive(0.0)
             if frame is None:
@@ -306,13 +317,14 @@ class Loop:
             fast(data)
             return
         take = self._others.get(can_id)
+        others = self.watch.others
+        others[can_id] = others.get(can_id, 0) + 1
         if take is not None:
-            self.watch.last_id = can_id
             take(can_id, data)
             return
         if not self.watch.intruder:
             self._suspect(can_id, data)
-        self.watch.last_id = can_id
+        self.watch.strangers += 1
         for take in self._any:
             take(can_id, data)
         self.on_unknown(can_id, data)

@@ -13,8 +13,13 @@ from armlink.link.types import Command
 _MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
 
 
-def silence(names: Sequence[str], seen: Sequence[float], now: float, max_age: float) -> Silence | None:
-    """Which joints have sent no reading for longer than `max_age` [s]; `seen` is when they last did [s]."""
+def silence(
+    names: Sequence[str], seen: Sequence[float], now: float, max_age: float, watch: BusWatch | None = None
+) -> Silence | None:
+    """Which joints have sent no reading for longer than `max_age` [s]; `seen` is when they last did [s].
+
+    `watch` tells of what others sent meanwhile: more frames than the joints should have is no fault of theirs.
+    """
     if now - min(seen) <= max_age:
         return None
     silent = [name for name, at in zip(names, seen, strict=True) if not now - at <= max_age]
@@ -22,7 +27,13 @@ def silence(names: Sequence[str], seen: Sequence[float], now: float, max_age: fl
     what = "has sent a reading" if who == "no joint" else "no reading"
     age = now - min(seen)
     colon = "" if who == "no joint" else ":"
-    return Silence(f"{who}{colon} {what} for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms")
+    said = f"{who}{colon} {what} for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
+    if watch is not None and watch.crowding > len(names):
+        said += (
+            f"; others fill the bus meanwhile with {watch.crowding:.0f} frames a cycle, most of them "
+            f"{_culprit(names, watch)}: a node babbles: disconnect it"
+        )
+    return Silence(said)
 
 
 def refusal(
@@ -73,14 +84,24 @@ def refusal(
 
 
 def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None:
-    """Faults of the bus itself: a second host, a duplicated node id, a babbling node, lost frames; or None."""
+    """Faults of the bus itself: no reception, a second host, a duplicated id, a babbling node, lost frames; or None."""
+    if watch.reception:
+        return watch.reception
     if watch.intruder:
         return f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
     doubled = watch.doubled
     if doubled is not None:
         return f"{names[doubled]}: two readings in every cycle: a second node has its id: give every node its own"
     if watch.babbling:
-        return f"more frames than these joints send, the last other one {watch.last}: a node babbles: disconnect it"
+        return (
+            f"more frames than these joints send, most of them {_culprit(names, watch)}: a node babbles: disconnect it"
+        )
     if dropped:
         return f"{dropped} frames lost: this host reads too slowly: give it more time or less to do"
     return None
+
+
+def _culprit(names: Sequence[str], watch: BusWatch) -> str:
+    """What fills the bus, in words."""
+    most = watch.culprit
+    return f"readings of {names[most]}" if isinstance(most, int) else most

@@ -20,6 +20,7 @@ from armlink.drives.family import Guarded, TellsPosition
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup, law_torque
 from armlink.errors import BadInput, BusFault, HostLate, Silence
 from armlink.link.bus_load import overload
+from armlink.link.bus_watchdog import MOST_FRAMES
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.ends import Cause, cause_of, end
@@ -300,6 +301,7 @@ class Link(Calibrations):
         Raises BusFault where a drive does not answer, BadInput for drives that no guard can check.
         """
         rules: dict[str, Any] = {"frames": {}, "stop": [], "restarts": {}}
+        watches = {"deadline": self.section.deadline, "fd": self.section.bus.fd}
         self.correct_turns()
         wanted = self.wanted_limits()
         for group in self.groups:
@@ -315,7 +317,7 @@ class Link(Calibrations):
                 "stop": rules["stop"] + found["stop"],
                 "restarts": rules["restarts"] | found["restarts"],
             }
-        return rules
+        return rules | watches
 
     def _gate_limits(self, joint: int) -> JointLimits:
         wanted = self._limits[joint]
@@ -481,16 +483,21 @@ class Link(Calibrations):
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
         """Run the loop until `done` or the time is over; enabled joints get their last command in every cycle."""
         end = self.clock.now() + timeout
+        taken = 0
         while not done():
             remaining = end - self.clock.now()
             if remaining <= 0:
                 return False
-            if self._loop.receive(0.0):
+            if taken < MOST_FRAMES and self._loop.receive(0.0):
+                taken += 1
                 continue
+            taken = 0  # a bus that never falls silent must not keep the joints waiting for their commands
             if self._enabled and self._last is not None:
                 self.cycle(replace(self._last, t=None))
             elif self._held:
                 self.keep()
             elif not self._loop.receive(remaining):
+                if self._loop.watch.reception:
+                    raise BusFault(self._loop.watch.reception)
                 return False
         return True

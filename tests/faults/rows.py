@@ -115,7 +115,7 @@ ROWS = (
         "frames a cycle, ten cycles running",
         11,
         QUICK_STOP,
-        "more frames than these joints send, the last other one 001h: a node babbles: disconnect it",
+        "more frames than these joints send, most of them 001h: a node babbles: disconnect it",
     ),
     Row(
         "corrupted frames",

@@ -3,6 +3,7 @@
 Subclasses define the datagram: SocketCAN's frame or python-can's udp_multicast message.
 """
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -18,6 +19,8 @@ from armlink.errors import BusFault
 
 BATCH = 64
 """Datagrams per system call."""
+FLOOD = 32
+"""So many frames that came while none could be sent filled the bus: a wire of 125 kbit/s carries 45 in that time."""
 MOST_BATCHES = 16
 """Limit of batches read for one frame, so that a flood of other datagrams cannot block a reader."""
 RECEIVE_BUFFER = 1 << 21
@@ -164,7 +167,12 @@ class DatagramPort(ABC):
             select.select([], [], [], _RETRY)
 
     def _full(self) -> BusFault:
-        """Nothing could be sent for 50 ms."""
+        """Nothing could be sent for 50 ms. Where many frames came meanwhile, they had a higher priority."""
+        with contextlib.suppress(BusFault):
+            if not self._waiting:
+                self._fill()
+        if len(self._waiting) >= FLOOD:
+            return BusFault(f"bus {self._name}: transmit queue stays full: frames of higher priority fill the bus")
         return BusFault(f"bus {self._name}: transmit queue stays full: does any node acknowledge?")
 
     def receive(self, timeout: float) -> Frame | None:
@@ -205,13 +213,16 @@ class DatagramPort(ABC):
             return False
         self._dry = count < BATCH
         frames = self._decode(count)
+        others: list[int] = []
         for can_id, _ in frames:
             if can_id & NO_FRAME:
-                self._take_others([each for each, _ in frames if each & NO_FRAME])
+                others = [each for each, _ in frames if each & NO_FRAME]
                 frames = [frame for frame in frames if not frame[0] & NO_FRAME]
                 break
         frames.reverse()
         self._waiting[:] = frames
+        if others:
+            self._take_others(others)  # may raise: the frames beside are kept
         return not self._dry
 
     def _take_batch(self) -> int:

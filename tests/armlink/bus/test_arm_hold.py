@@ -1,6 +1,8 @@
 """One program drives an arm: a second one is refused, and told who has it, until the first has ended."""
 
+import contextlib
 import os
+import socket
 import subprocess
 import sys
 
@@ -50,6 +52,21 @@ def test_a_second_program_is_told_who_drives_the_arm(other):
         pass
     with ArmHold(RealTimeBus("another bus"), nodes(3, 4)):
         pass
+
+
+def test_who_fills_the_queue_of_a_hold_neither_takes_it_nor_keeps_others_waiting(other):
+    crowd = [socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) for _ in range(20)]
+    try:
+        for each in crowd:
+            each.setblocking(False)
+            with contextlib.suppress(OSError):
+                each.connect(f"\0armlink/{RealTimeBus().channel_info}/node 4")
+                each.send(bytes(100_000))
+        with pytest.raises(BusFault, match="node 4 is driven by "):
+            ArmHold(RealTimeBus(), nodes(4))
+    finally:
+        for each in crowd:
+            each.close()
 
 
 def test_however_the_first_ends_the_arm_is_free(other):

@@ -111,6 +111,31 @@ def test_extended_and_remote_frames_come_with_their_flags_and_error_frames_are_c
         port.receive(0.0)
 
 
+def test_frames_beside_a_bus_off_are_kept(pair):
+    port = SocketPort(pair.socket, "pair")
+    for can_id in (1, 0x20000040, 2):
+        pair.other.send(raw(can_id))
+    with pytest.raises(BusFault, match="bus-off: check wiring"):
+        port.receive(0.0)
+    assert [port.receive(0.0) for _ in range(2)] == [(1, b""), (2, b"")]
+
+
+def test_a_queue_that_a_flood_keeps_full_is_put_down_to_it(pair, monkeypatch):
+    monkeypatch.setattr(datagram_port, "_RETRY", 0.0)
+    port = SocketPort(pair.socket, "pair")
+
+    def sendmmsg(*arguments):
+        datagram_port.ctypes.set_errno(errno.ENOBUFS)
+        return -1
+
+    port._sendmmsg = sendmmsg
+    for _ in range(datagram_port.FLOOD):
+        pair.other.send(raw(0x001))
+    with pytest.raises(BusFault, match="transmit queue stays full: frames of higher priority fill the bus"):
+        port.send(1, b"")
+    assert port.receive(0.0) == (0x001, b"")
+
+
 def test_a_full_transmit_queue_is_waited_for_then_said(pair, monkeypatch):
     monkeypatch.setattr(datagram_port, "_RETRY", 0.0)
     port = SocketPort(pair.socket, "pair")

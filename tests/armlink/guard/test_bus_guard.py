@@ -9,6 +9,7 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from compromised import (
     COMMAND,
     CONTENT,
     ENABLED_AT,
+    HEARD,
     MAX_TORQUE,
     PERIOD,
     RATED,
@@ -482,6 +484,9 @@ def broken(change):
         (broken(lambda c: c.update(stop=[[1, "xy"]])), "ValueError"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(at=math.inf)), "OverflowError"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(most=10**400)), "OverflowError"),
+        (broken(lambda c: c.update(deadline=math.nan)), "policy: deadline is no number"),
+        (broken(lambda c: c.update(deadline="soon")), "ValueError"),
+        (broken(lambda c: c["frames"]["128"].update(per_second=math.nan)), "frame: per_second is no number"),
     ],
 )
 def test_a_wrong_policy_is_refused_in_one_line(content, said):
@@ -590,3 +595,187 @@ def test_main_closes_when_an_interface_fails_and_stays(wires, monkeypatch, tmp_p
     assert all_heard(wires[1]) == STOP
     _, line = capfd.readouterr().err.splitlines()
     assert line.startswith("guard: closed: an interface failed: Network is down; ")
+
+
+def opened(content=CONTENT):
+    """A guard with this policy, its two sides and the lines that it says."""
+    program, wire, lines = Side(), Side(), []
+    return Guard(Policy(content), program, wire, lines.append), program, wire, lines
+
+
+def test_a_frame_that_waited_for_longer_than_the_drives_wait_for_their_host_goes_nowhere():
+    guard, _, wire, lines = opened()
+    now, deadline = time.monotonic(), Policy(CONTENT).deadline
+    assert deadline == 0.1
+    for age in (3.0, 2.0, 1.01 * deadline):
+        guard._to_wire(0x80, b"", False, now - age)
+    assert wire.sent == []
+    assert not guard.closed
+    assert len(lines) == 1
+    assert lines[0].startswith("guard: it fell behind: frames 3.0")
+    guard._to_wire(0x80, b"", False, time.monotonic())
+    assert wire.sent == [(0x80, b"")]
+
+
+def test_a_reading_counts_from_when_it_came():
+    guard, _, _, _ = opened()
+    now = time.monotonic()
+    for can_id, data, then in HEARD:
+        guard._to_program(can_id, data, False, now - 10.0 + then - ENABLED_AT)
+    guard._to_wire(0x201, COMMAND.pack(0x0F, 50, 0), False, now)
+    assert "with power, where no reading shows the joint" in guard.closed
+
+
+@pytest.mark.parametrize(
+    ("can_id", "data"), [(0x201, bytes(8)), (0x80, b""), (0x000, b"\1\0"), (0x601, b"\x2f\x60\x60")]
+)
+def test_another_host_on_the_wire_closes_it_and_is_shown_to_the_program_once(can_id, data):
+    guard, program, wire, _ = opened()
+    for _ in range(3):
+        guard._to_program(can_id, data, False)
+    assert guard.closed.startswith(f"{can_id:X}h on the wire, which this guard did not send")
+    assert program.sent == [(can_id, data)]
+    assert wire.sent == [(0x600 + node, bytes.fromhex("2b40600002000000")) for node in (1, 2)]
+
+
+def test_requests_on_the_wire_that_only_read_stay_there():
+    guard, program, _, _ = opened()
+    for first in (0x40, 0x60, 0x70, 0x80):
+        guard._to_program(0x601, bytes([first, 0x64, 0x60, 0, 0, 0, 0, 0]), False)
+    assert not guard.closed
+    assert program.sent == []
+
+
+def test_two_guards_of_one_wire_pass_no_frame_around_for_ever():
+    program, wire = [], []
+
+    class Shared:
+        """An interface that two guards have."""
+
+        def __init__(self, others):
+            self.others = others
+
+        def send(self, can_id, data, fd=False):
+            self.others.append((self, can_id, data))
+            return True
+
+    sides = [(Shared(program), Shared(wire)) for _ in range(2)]
+    guards = [Guard(Policy(CONTENT), *each, lambda text: None) for each in sides]
+    program.append((None, 0x80, b""))
+    program.append((None, 0x601, bytes.fromhex("4064600000000000")))
+    passed = 0
+    while program or wire:
+        passed += 1
+        assert passed < 100
+        if program:
+            sender, *frame = program.pop(0)
+            for guard, (own, _) in zip(guards, sides, strict=True):
+                if own is not sender:
+                    guard._to_wire(*frame, False)
+        if wire:
+            sender, *frame = wire.pop(0)
+            for guard, (_, own) in zip(guards, sides, strict=True):
+                if own is not sender:
+                    guard._to_program(*frame, False)
+    assert all("another host" in guard.closed for guard in guards)
+
+
+def test_a_drives_frame_from_the_program_is_named_as_one():
+    guard, _, _, _ = opened()
+    guard._to_wire(0x181, bytes(8), False)
+    assert (
+        guard.closed == "identifier 181h, which only a drive may send: a second guard, or a program that plays a drive"
+    )
+
+
+def test_frames_of_the_other_kind_close_it():
+    guard, _, wire, _ = opened()
+    guard._to_wire(0x80, b"", True)
+    assert guard.closed == "80h as CAN FD, which these drives do not speak"
+    assert (0x80, b"") not in wire.sent
+    guard, _, wire, _ = opened({**CONTENT, "fd": True})
+    guard._to_wire(0x80, b"", True)
+    assert not guard.closed
+    guard._to_wire(0x80, b"", False)
+    assert guard.closed == "80h as classical CAN, which these drives do not speak"
+
+
+def test_a_policy_of_before_says_nothing_of_deadline_and_kind():
+    guard, _, wire, _ = opened({key: value for key, value in CONTENT.items() if key not in ("deadline", "fd")})
+    for fd in (False, True):
+        guard._to_wire(0x80, b"", fd, time.monotonic() - 100.0)
+    assert not guard.closed
+    assert len(wire.sent) == 2
+
+
+def test_syncs_that_no_cycle_needs_close_it():
+    policy, now = Policy(CONTENT), ENABLED_AT
+    for cycle in range(1000):
+        assert policy.refusal(0x80, b"", now + PERIOD * cycle) == ""
+    now += 1000 * PERIOD
+    answers = [policy.refusal(0x80, b"", now + 1e-4 * number) for number in range(50)]
+    assert answers[:5] == [""] * 5
+    assert "80h: more often than 500 times a second" in answers
+
+
+@pytest.mark.parametrize(("side", "name"), [("wire", "wire"), ("program", "program")])
+def test_lost_frames_close_it(wires, side, name):
+    program, wire = wires
+    guard = Guard(Policy(CONTENT), program.port, wire.port, lambda text: None)
+    (wire if side == "wire" else program).port.lost = 7
+    wire.say(0x181, bytes(8))
+    guard.step(1.0)
+    assert guard.closed == f"7 frames of the {name} were lost: a flood, or this guard gets too little time"
+
+
+def test_a_stop_that_did_not_leave_is_not_told_as_one():
+    guard, _, wire, lines = opened()
+    wire.full = True
+    guard.close("it was told to end")
+    (line,) = lines
+    assert "the joints could not be told to stop, which their own watches do" in line
+
+
+def test_a_program_that_takes_no_frames_keeps_none_to_the_wire_waiting(wires, monkeypatch, tmp_path):
+    program = wires[0]
+    program.port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+    for _ in range(40):
+        wires[1].say(0x181, bytes(8))
+    monkeypatch.setattr(Port, "patience", math.inf)  # a wait would last for ever
+    assert run_main(wires, monkeypatch, tmp_path, [None, None]) == 0
+    assert 0 < len(all_heard(program)) < 40
+
+
+def test_one_interface_for_both_sides_is_refused(capfd, tmp_path):
+    path = tmp_path / "policy.json"
+    path.write_text(json.dumps(CONTENT))
+    assert bus_guard.main([str(path), "can0", "can0"]) == 2
+    assert capfd.readouterr().err == (
+        "guard: can0: both interfaces: expected one for programs alone, such as a vcan, and the arm's\n"
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT])
+def test_the_end_of_a_terminal_stops_the_joints(wires, monkeypatch, tmp_path, number):
+    raise_signal = signal.raise_signal
+    before = signal.getsignal(number)
+    monkeypatch.setattr(signal, "raise_signal", lambda _: raise_signal(number))
+    try:
+        assert run_main(wires, monkeypatch, tmp_path, []) == 0
+        assert signal.getsignal(signal.SIGTSTP) == signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
+        for each in (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU):
+            signal.signal(each, signal.SIG_DFL)
+    assert all_heard(wires[1]) == STOP
+
+
+def test_nobody_there_to_read_what_it_says_is_no_error(monkeypatch):
+    class Gone:
+        def write(self, text):
+            raise BrokenPipeError
+
+    monkeypatch.setattr(bus_guard.sys, "stderr", Gone())
+    guard = Guard(Policy(CONTENT), Side(), Side())
+    guard.close("it was told to end")
+    assert guard.closed

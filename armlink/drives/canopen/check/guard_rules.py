@@ -20,6 +20,8 @@ from armlink.torque_calibration import GAIN_RANGE
 
 BURST = 5
 """Cycles whose change may come at once, after the host was late."""
+SYNCS_A_CYCLE = 2
+"""Every drive acts on a SYNC at once; a cycle may follow another early, when the host was late."""
 READING_AGE = 5.0
 """A reading stands for where a joint is for this long [s]; its set-up takes some seconds before the first cycle."""
 MOST_OFFSET = 1e4
@@ -42,7 +44,8 @@ def guard_rules(
 ) -> dict[str, Any]:
     """Rules of the joints with scales and objects as their devices tell them; raises BadInput, BusFault."""
     nodes = tuple(row.settings.node for row in rows)
-    rules: dict[str, Any] = {"frames": shared_rules(nodes, protection.host), "stop": [], "restarts": {}}
+    shared = shared_rules(nodes, protection.host, limits[0].period)
+    rules: dict[str, Any] = {"frames": shared, "stop": [], "restarts": {}}
     for row, each, limit in zip(rows, services, limits, strict=True):
         device.check_identity(each, row)
         unit, profile = read_units(each, row), device.examined(each, row.settings)
@@ -58,8 +61,8 @@ def guard_rules(
     return rules
 
 
-def shared_rules(nodes: tuple[int, ...], host: int) -> dict[str, Any]:
-    """Frames to all drives: NMT to these nodes, SYNC, the host's heartbeat."""
+def shared_rules(nodes: tuple[int, ...], host: int, period: float) -> dict[str, Any]:
+    """Frames to all drives: NMT to these nodes, SYNC once in a cycle of `period` [s], the host's heartbeat."""
     return {
         f"{objects.NMT_ID}": {
             "lengths": [2],
@@ -68,7 +71,7 @@ def shared_rules(nodes: tuple[int, ...], host: int) -> dict[str, Any]:
                 {"name": "node", "at": 1, "code": "B", "values": [0, *nodes]},
             ],
         },
-        f"{objects.SYNC_ID}": {"lengths": [0]},
+        f"{objects.SYNC_ID}": {"lengths": [0], "per_second": SYNCS_A_CYCLE / period, "burst": BURST},
         f"{objects.HEARTBEAT_ID + host}": {
             "lengths": [1],
             "fields": [{"name": "state of the host", "at": 0, "code": "B", "values": [objects.OPERATIONAL]}],
