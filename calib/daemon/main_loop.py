@@ -66,8 +66,8 @@ class Daemon:
         self._ticked = self._kept_alive = -math.inf
         self._notified = ""
         self._presses = Presses()
-        self._replacing: asyncio.Task[None] | None = None
-        """Ends a bus process and starts another."""
+        self._bus_ends, self._replacing = Worker(self._loop, "end of the bus process"), False
+        """Waits for a bus process that brings its arm to the end; whether another one is to take its place."""
 
     async def run(self) -> None:
         """Run until SIGTERM, SIGINT or SIGQUIT; then the arm comes to its end (`armlink.link.ends`), however long that
@@ -92,10 +92,11 @@ class Daemon:
                     ending.result()
         finally:
             self._notify("STOPPING=1")
-            if self._replacing is not None:
-                await self._replacing
-            self._loop.remove_reader(self.process.fileno())
-            await asyncio.to_thread(self.process.close, Cause.INTERRUPTED, self._ending())
+            if self.process.fileno() >= 0:
+                self._loop.remove_reader(self.process.fileno())
+            closed, tell = self._loop.create_future(), self._ending()
+            self._bus_ends(lambda: self.process.close(Cause.INTERRUPTED, tell), closed.set_result)
+            await closed
             for task in (web, timer, ended):
                 task.cancel()
             await asyncio.gather(web, timer, ended, return_exceptions=True)
@@ -155,7 +156,7 @@ class Daemon:
 
     def _judge(self, now: float, stood_still: float) -> None:
         """Replace a bus process that hangs; not because this process itself stood still (stopped, say) [s]."""
-        if stood_still > PAUSE_SECONDS or (self._replacing is not None and not self._replacing.done()):
+        if stood_still > PAUSE_SECONDS or self._replacing:
             self._heard = max(self._heard, now)
         if now - self._heard > SILENT_SECONDS:
             self._messages()  # what waits here is a sign of life too
@@ -181,16 +182,20 @@ class Daemon:
 
     def _restart(self, why: str) -> None:
         """Replace the bus process; it brings the arm to its end first, if it can."""
-        if self._replacing is not None and not self._replacing.done():
+        if self._replacing:
             return
+        self._replacing = True
         log.error(why)
         if self.process.fileno() >= 0:
             self._loop.remove_reader(self.process.fileno())
         self.service.take(Down(why))
-        self._replacing = asyncio.create_task(self._replace())
+        process, tell = self.process, said(self.arm.name, self._presses)
+        self._bus_ends(lambda: process.close(Cause.FAILED, tell), self._replace)
 
-    async def _replace(self) -> None:
-        await asyncio.to_thread(self.process.close, Cause.FAILED, said(self.arm.name, self._presses))
+    def _replace(self, outcome: Exception | None) -> None:
+        self._replacing = False
+        if self._ended.is_set():
+            return
         try:
             self.process = LoopProcess(self.options.loop(self.arm))
         except OSError as error:

@@ -125,7 +125,7 @@ class BusProcess(LoopProcess):
         ours, theirs = socket.socketpair()
         for end in (ours, theirs):
             end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 22)
-        self._process = SimpleNamespace(join=lambda seconds=0.0: None, is_alive=lambda: False, pid=0)  # type: ignore[assignment]
+        self._process = SimpleNamespace(join=lambda seconds=0.0: None, is_alive=lambda: False, kill=lambda: None, pid=0)  # type: ignore[assignment]
         self._channel = Channel(FailingSocket(ours, arm.failing))  # type: ignore[arg-type]
         self._waiting: dict[int, Future[Answer]] = {}
         self._sending = threading.Lock()

@@ -171,7 +171,7 @@ def test_a_decision_that_names_another_content_is_refused(tmp_path: Path) -> Non
     assert not any(call.startswith("write") for call in daemon.sdo)
     daemon.kill()
     daemon.start()
-    assert daemon.view.decisions.approve(proposal.id, "ann", proposal.hash).state == "applied"
+    assert daemon.view.decisions.approve(proposal.id, "ann", proposal.hash).result(0).state == "applied"
 
 
 def test_after_a_damaged_journal_nothing_is_written_automatically_for_a_day(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_a_record_that_is_not_current_in_the_store_any_more_is_not_followed(tmp_
     daemon = drifted(tmp_path, "propose")
     (calibration, _) = daemon.good_records()
     other = daemon.store.put(calibration.model_copy(update={"note": "other"}), daemon.arm, by="ann", reason="sweep")
-    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann")
+    answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
     assert answer.state == "failed"
     assert f"is not current in {daemon.store.url} any more ({other} is): superseded" in answer.note
     assert not any(call.startswith("write") for call in daemon.sdo)

@@ -185,7 +185,7 @@ def test_one_that_takes_too_long_is_ended(tmp_path: Path) -> None:
     bench.work(30.0)
     bench.due()
     assert bench.daily._process is not None
-    bench.daily._begun -= timedelta(hours=1)
+    bench.daily._begun -= 3600.0
     bench.daily.tick()
     assert "took longer than 30 min" in bench.said[0][2]
 

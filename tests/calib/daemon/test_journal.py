@@ -78,11 +78,11 @@ def test_ids_that_leave_no_room_for_more_are_damage(tmp_path: Path) -> None:
 def test_ids_go_on_over_a_restart_and_where_a_file_is_begun_anew_under_way(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.db", lambda: 0.0)
     finding = Finding(0, "gain", 1.02, 0.0, np.zeros((2, 2)), 40, 0.99)
-    assert [journal.add_proposal(NOW, "j1", "new", "old", finding) for _ in range(2)] == [1, 2]
+    assert [journal.add_proposal(NOW, "j1", "0a", "0b", finding) for _ in range(2)] == [1, 2]
     journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
     journal.probe()
     assert journal.proposals() == []
     journal.decide(2, NOW, "approved", "ann")
-    assert journal.add_proposal(NOW, "j1", "new", "old", finding) == 3
+    assert journal.add_proposal(NOW, "j1", "0a", "0b", finding) == 3
     journal.close()
     assert [row.state for row in Journal(tmp_path / "journal.db").proposals()] == ["pending"]

@@ -4,7 +4,7 @@ import asyncio
 import os
 import socket
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -71,25 +71,15 @@ class Running:
         change(content)
         self.arm_file.write_text(yaml.safe_dump(content))
 
-    async def replaced(self) -> None:
-        """Wait until a bus process that was to be replaced has been."""
-        replacing = self.daemon._replacing
-        assert replacing is not None
-        await replacing
-
     def kinds(self) -> list[str]:
         return [event.kind for event in self.daemon.service.journal.events()]
 
 
-def with_daemon(
-    folder: Path, patch: pytest.MonkeyPatch, act: Callable[[Running], Coroutine[Any, Any, None] | None]
-) -> None:
+def with_daemon(folder: Path, patch: pytest.MonkeyPatch, act: Callable[[Running], None]) -> None:
     async def main() -> None:
         running = Running(folder, patch)
         try:
-            waiting = act(running)
-            if waiting is not None:
-                await waiting
+            act(running)
         finally:
             running.daemon.service.close("end")
 
@@ -161,11 +151,10 @@ def test_an_observer_that_cannot_be_made_leaves_the_one_before(tmp_path: Path, m
 
 
 def test_other_limits_reach_a_new_bus_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def act(running: Running) -> None:
+    def act(running: Running) -> None:
         running.write(limit("max_velocity", 0.3))
         running.daemon._reload()
         assert running.kinds()[-1] in ("configuration", "fault")
-        await running.replaced()
         assert running.process.closed
         assert [process.options.arm.link.joints[2].max_velocity for process in running.started] == [0.3]
 
@@ -238,7 +227,7 @@ def test_a_service_that_stood_still_does_not_judge_its_bus_process(
 def test_a_bus_process_that_hangs_is_replaced_and_again_where_there_is_no_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def act(running: Running) -> None:
+    def act(running: Running) -> None:
         daemon = running.daemon
 
         def none_left(options: object) -> None:
@@ -248,12 +237,10 @@ def test_a_bus_process_that_hangs_is_replaced_and_again_where_there_is_no_proces
             patch.setattr(main_loop, "LoopProcess", none_left)
             daemon._heard = time.monotonic() - SILENT_SECONDS - 5.0
             daemon._judge(time.monotonic(), 0.0)
-            await running.replaced()
             assert running.process.killed
             assert running.process.closed
             assert not running.started
         daemon._judge(time.monotonic() + SILENT_SECONDS, 0.0)
-        await running.replaced()
         assert len(running.started) == 1
         daemon._judge(time.monotonic() + BEGIN_SECONDS, 0.0)
         assert len(running.started) == 1
