@@ -57,6 +57,12 @@ class Board:
         """Readings of each joint; the watch of the bus takes stock of them."""
         self.on_again: Callable[[int], None] = lambda joint: None
         """Called where a second reading of a joint comes in a cycle."""
+        self.on_slow: Callable[[int], None] = lambda joint: None
+        """Called where motor torque and velocity of a joint come apart from its position."""
+        self.apart = [math.inf] * n
+        """Two positions of a joint that sends by its own clock, in one cycle, differ by no more than this [rad]."""
+        self.on_apart: Callable[[int], None] = lambda joint: None
+        """Called where they do."""
 
     def reading(self, joint: int, position: float, sensor: float) -> None:
         """A position, and the torque of a sensor where there is one (else NaN)."""
@@ -68,12 +74,15 @@ class Board:
             else:
                 self.owed[joint] = max(self.owed[joint] - 1, 0)
                 self.on_again(joint)
+        elif abs(position - self.position[joint]) > self.apart[joint]:
+            self.on_apart(joint)
         self.position[joint], self.sensor[joint] = position, sensor
 
     def slow(self, joint: int, motor: float, velocity: float) -> None:
         """Motor torque and velocity."""
         self.motor[joint], self.velocity[joint] = motor, velocity
         self.slow_came = True
+        self.on_slow(joint)
 
     def drop(self) -> None:
         """Forget positions and sensor torques that were replies: what comes from now on belongs to the next sample."""

@@ -13,6 +13,12 @@ FORGIVEN = 250
 itself and catches up."""
 
 
+SLOW_CYCLES = 4
+"""A drive that sends velocity and state apart from its position does so after every so many SYNCs."""
+EXCESS = 3
+"""So many readings more than a drive sends mean a second sender; one may be early, none is sent twice."""
+
+
 class BusWatch:
     """Counts the readings of the cyclic loop, and frames that are no process data."""
 
@@ -21,6 +27,8 @@ class BusWatch:
         self._crowd = CROWD_PER_JOINT * joints + CROWD
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
+        self._slow_readings = [0] * joints
+        self._contradictions = [0] * joints
         self._crowded_cycles = 0
         self.last_id: int | None = None
         """Identifier of the newest frame that was no reading."""
@@ -40,6 +48,9 @@ class BusWatch:
         """Description of a frame received that only the host may send; empty if there was none."""
         self.flooded = False
         self._double_cycles = [0] * len(self._double_cycles)
+        self._slow_readings, self._contradictions = ([0] * len(self.readings) for _ in range(2))
+        self.forged: int | None = None
+        """The joint in whose name a second node sends velocities and states, or other positions; None: no joint."""
         self._crowded_cycles = 0
 
     def settle(self) -> None:
@@ -53,6 +64,19 @@ class BusWatch:
         self.readings[joint] = max(self.readings[joint], self.syncs - FORGIVEN)
         if self.readings[joint] > self.syncs:
             self._doubled.add(joint)
+
+    def slow(self, joint: int) -> None:
+        """Velocity and state of a joint came apart from its position: more often than it sends them, or not."""
+        due = self.syncs // SLOW_CYCLES + 1
+        count = self._slow_readings[joint] = max(self._slow_readings[joint] + 1, due - FORGIVEN // SLOW_CYCLES)
+        if count >= due + EXCESS:
+            self.forged = joint
+
+    def contradicts(self, joint: int) -> None:
+        """Two positions of a joint came in one cycle between which it cannot have moved."""
+        self._contradictions[joint] += 1
+        if self._contradictions[joint] >= EXCESS:
+            self.forged = joint
 
     def cycle_ends(self, frames: int) -> None:
         """Evaluate the completed cycle, with the number of frames sent and received in it."""

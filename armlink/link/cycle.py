@@ -6,14 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from armlink.arrays import Array
 from armlink.clock import Clock
 from armlink.drives.family import Drives
-from armlink.drives.orders import Mode, Order, Power
+from armlink.drives.orders import Mode, Order, Power, law_torque
 from armlink.errors import BusFault, HostLate, Refused, Silence
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault, refusal, silence
 from armlink.link.gate import JointLimits, Seen, beyond, hold_at, pass_gate, start_from
 from armlink.link.integral import Integral
+from armlink.link.motion_watchdog import MotionWatch
 from armlink.link.types import Command, Sample
 
 ENABLE_SECONDS = 3.0
@@ -49,9 +51,11 @@ class Commander:
         loop.verify = self._verify
         self._slow_age = max_age + SLOWEST * period
         self._modes_of: list[frozenset[int]] = [frozenset()] * self.n
-        self._commanded = [OFF] * self.n
+        self._commanded, self._unknown = [OFF] * self.n, [math.nan] * self.n
         self._integrals: list[Integral | None] = [None] * self.n
         self._with_gains = False
+        self.motion = MotionWatch(self.n, period)
+        """What the readings prove about the motion."""
         self._seen_now: list[Seen] = []
         self._due = 0.0
         self.unhurried = False
@@ -63,11 +67,15 @@ class Commander:
         self._gap, self._gap_at = 0.0, -math.inf
         """Longest time without commands of late, less a period, and when it ended [s]."""
 
-    def begin(self, limits: list[JointLimits], passed: list[Order], modes: list[frozenset[int]]) -> None:
-        """Take over drives that are set up: limits, what the first cycle starts from, modes that each has."""
+    def begin(
+        self, limits: list[JointLimits], passed: list[Order], modes: list[frozenset[int]], position_step: Array
+    ) -> None:
+        """Take over drives that are set up: limits, what the first cycle starts from, modes that each has, and the
+        resolution of their positions (n,) [rad]."""
         self.limits, self.passed, self._modes_of = limits, passed, modes
         self._integrals = [Integral() if each.kp else None for each in limits]
         self._with_gains = any(each is not None for each in self._integrals)
+        self.motion.use(position_step, np.array([each.position_step / self.period for each in limits]))
         self._due = self.clock.now()
 
     def command(self, command: Command) -> Sample:
@@ -226,19 +234,29 @@ class Commander:
         return modes, command.torque.tolist(), command.position.tolist()
 
     def _seen(self, now: float, healthy: bool) -> list[Seen]:
-        loop, oldest = self.loop, now - self._slow_age
+        loop, motion, oldest = self.loop, self.motion, now - self._slow_age
         torques = zip(loop.latest_motor_torque, loop.slow_seen, strict=True)
         velocities = zip(loop.latest_velocity, loop.speed_seen, strict=True)
-        rows = zip(torques, velocities, loop.latest_position, loop.seen, strict=True)
+        velocity = [value if came >= oldest else math.nan for value, came in velocities]
+        motion.update(loop.latest_position, loop.earliest, loop.latest, velocity)
+        bounds = zip(motion.proven.tolist(), motion.ahead.tolist(), motion.contradicted.tolist(), strict=True)
+        rows = zip(torques, velocity, loop.latest_position, loop.seen, bounds, self._ordered_torques(), strict=True)
         return [
-            Seen(
-                torque if told >= oldest else math.nan,
-                position,
-                velocity if moved >= oldest else math.nan,
-                now - came,
-                healthy,
-            )
-            for (torque, told), (velocity, moved), position, came in rows
+            Seen(torque if told >= oldest else math.nan, position, turns, now - came, healthy, *bound, ordered)
+            for (torque, told), turns, position, came, bound, ordered in rows
+        ]
+
+    def _ordered_torques(self) -> list[float]:
+        """Torque that the newest order of each drive with gains comes to [N·m], as its bytes tell it; else NaN."""
+        if not self._with_gains:
+            return self._unknown
+        loop = self.loop
+        rows = zip(loop.told, loop.latest_position, loop.latest_velocity, strict=True)
+        return [
+            law_torque(told, position, velocity)
+            if told is not None and told.kp > 0 and told.power is Power.ON
+            else math.nan
+            for told, position, velocity in rows
         ]
 
     def _verify(self, joint: int, sent: Order) -> None:
@@ -297,6 +315,7 @@ class Commander:
     def settle(self) -> None:
         """Restart after an interruption: what came meanwhile, and how late the host was, is forgotten."""
         self.loop.settle()
+        self.motion.restart()
         self._gap, self._gap_at = 0.0, -math.inf
         self._due = self.clock.now()
 

@@ -46,9 +46,19 @@ def refusal(
             return f"{name}: target position is {command.position[joint]}, expected a finite number"
         if why == gate.VELOCITY and math.isnan(now.velocity):
             return f"{name}: no velocity has come of late, and torque control needs to know it"
+        if why == gate.CONTRADICTION:
+            return (
+                f"{name}: its positions and its velocity ({now.velocity:.3g} rad/s) contradict each other: one of them "
+                "is false: armlink check --scales says which scale is off; else look for a second node or its encoder"
+            )
+        if why == gate.FALSE_TORQUE:
+            return (
+                f"{name}: tells a torque of {now.torque:.3g} N·m where its gains and its order come to "
+                f"{now.ordered_torque:.3g}: torque control would start from a false one: armlink check --scales"
+            )
         if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
             return (
-                f"{name}: turns at {now.velocity:.3g} rad/s under position control, limit {limit.servo_overspeed:.3g} "
+                f"{name}: turns at {_speed(now)} under position control, limit {limit.servo_overspeed:.3g} "
                 "(max_velocity and its margin): something else moves it, or its servo is unstable"
             )
         if why == gate.FOLLOWING:
@@ -58,7 +68,7 @@ def refusal(
             )
         if why == gate.VELOCITY:
             return (
-                f"{name}: turns at {now.velocity:.3g} rad/s under torque control, limit {limit.overspeed:.3g} "
+                f"{name}: turns at {_speed(now)} under torque control, limit {limit.overspeed:.3g} "
                 "(max_velocity and its margin): less torque, or a higher max_velocity"
             )
         if why == gate.WINDOW:
@@ -72,10 +82,23 @@ def refusal(
     return None
 
 
+def _speed(seen: Seen) -> str:
+    """The speed that a joint is refused for: the drive's, with its sign, or what its positions prove."""
+    by_positions = max(seen.proven, seen.ahead)
+    if by_positions > abs(seen.velocity):
+        return f"{by_positions:.3g} rad/s by its positions (velocity reading {seen.velocity:.3g} rad/s)"
+    return f"{seen.velocity:.3g} rad/s"
+
+
 def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None:
     """Faults of the bus itself: a second host, a duplicated node id, a babbling node, lost frames; or None."""
     if watch.intruder:
         return f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
+    if watch.forged is not None:
+        return (
+            f"{names[watch.forged]}: more readings than it sends, or two that cannot both be true: a second node sends "
+            "in its name: give every node its own id, and find out who sends"
+        )
     doubled = watch.doubled
     if doubled is not None:
         return f"{names[doubled]}: two readings in every cycle: a second node has its id: give every node its own"

@@ -240,7 +240,7 @@ class Link(Calibrations):
         for joint, (setup, limit) in enumerate(zip(self.setups, limits, strict=True)):
             torque = self.values.torque_of(joint, setup.torque)
             passed.append(start_from(limit, torque, self.values.position_of(joint, setup.position)))
-        self.commander.begin(limits, passed, [each.modes for each in self.setups])
+        self.commander.begin(limits, passed, [each.modes for each in self.setups], self.position_step)
 
     def _wanted_limits(self) -> list[Limits]:
         """The arm file's limits of every joint."""
