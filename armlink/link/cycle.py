@@ -68,14 +68,19 @@ class Commander:
         """Longest time without commands of late, less a period, and when it ended [s]."""
 
     def begin(
-        self, limits: list[JointLimits], passed: list[Order], modes: list[frozenset[int]], position_step: Array
+        self,
+        limits: list[JointLimits],
+        passed: list[Order],
+        modes: list[frozenset[int]],
+        position_step: Array | None = None,
     ) -> None:
         """Take over drives that are set up: limits, what the first cycle starts from, modes that each has, and the
         resolution of their positions (n,) [rad]."""
         self.limits, self.passed, self._modes_of = limits, passed, modes
         self._integrals = [Integral() if each.kp else None for each in limits]
         self._with_gains = any(each is not None for each in self._integrals)
-        self.motion.use(position_step, np.array([each.position_step / self.period for each in limits]))
+        step = np.zeros(self.n) if position_step is None else position_step
+        self.motion.use(step, np.array([each.position_step / self.period for each in limits]))
         self._due = self.clock.now()
 
     def command(self, command: Command) -> Sample:
@@ -239,11 +244,23 @@ class Commander:
         velocities = zip(loop.latest_velocity, loop.speed_seen, strict=True)
         velocity = [value if came >= oldest else math.nan for value, came in velocities]
         motion.update(loop.latest_position, loop.earliest, loop.latest, velocity)
+        rows = zip(loop.latest_position, loop.seen, torques, velocity, self._ordered_torques(), strict=True)
         bounds = zip(motion.proven.tolist(), motion.ahead.tolist(), motion.contradicted.tolist(), strict=True)
-        rows = zip(torques, velocity, loop.latest_position, loop.seen, bounds, self._ordered_torques(), strict=True)
         return [
-            Seen(torque if told >= oldest else math.nan, position, turns, now - came, healthy, *bound, ordered)
-            for (torque, told), turns, position, came, bound, ordered in rows
+            Seen(
+                torque if told >= oldest else math.nan,
+                position,
+                turns,
+                now - came,
+                healthy,
+                proven,
+                ahead,
+                contradicted,
+                ordered,
+            )
+            for (position, came, (torque, told), turns, ordered), (proven, ahead, contradicted) in zip(
+                rows, bounds, strict=True
+            )
         ]
 
     def _ordered_torques(self) -> list[float]:

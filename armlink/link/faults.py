@@ -58,8 +58,8 @@ def refusal(
             )
         if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
             return (
-                f"{name}: turns at {_speed(now)} under position control, limit {limit.servo_overspeed:.3g} "
-                "(max_velocity and its margin): something else moves it, or its servo is unstable"
+                f"{name}: turns at {_speed(now):.3g} rad/s under position control, limit {limit.servo_overspeed:.3g} "
+                f"(max_velocity and its margin){_by_positions(now)}: something else moves it, or its servo is unstable"
             )
         if why == gate.FOLLOWING:
             return (
@@ -68,8 +68,8 @@ def refusal(
             )
         if why == gate.VELOCITY:
             return (
-                f"{name}: turns at {_speed(now)} under torque control, limit {limit.overspeed:.3g} "
-                "(max_velocity and its margin): less torque, or a higher max_velocity"
+                f"{name}: turns at {_speed(now):.3g} rad/s under torque control, limit {limit.overspeed:.3g} "
+                f"(max_velocity and its margin){_by_positions(now)}: less torque, or a higher max_velocity"
             )
         if why == gate.WINDOW:
             lower, upper = limit.lower - limit.outside, limit.upper + limit.outside
@@ -82,12 +82,16 @@ def refusal(
     return None
 
 
-def _speed(seen: Seen) -> str:
-    """The speed that a joint is refused for: the drive's, with its sign, or what its positions prove."""
-    by_positions = max(seen.proven, seen.ahead)
-    if by_positions > abs(seen.velocity):
-        return f"{by_positions:.3g} rad/s by its positions (velocity reading {seen.velocity:.3g} rad/s)"
-    return f"{seen.velocity:.3g} rad/s"
+def _speed(seen: Seen) -> float:
+    """The speed that a joint is refused for [rad/s]: the drive's, with its sign, or what its positions prove."""
+    return max(seen.proven, seen.ahead) if _by_positions(seen) else seen.velocity
+
+
+def _by_positions(seen: Seen) -> str:
+    """That its positions prove more speed than its drive tells, in words; empty where they do not."""
+    if max(seen.proven, seen.ahead) > abs(seen.velocity):
+        return f", by its positions where its velocity reads {seen.velocity:.3g}"
+    return ""
 
 
 def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None:

@@ -29,8 +29,8 @@ ROWS = int(LAGS[-1]) + 1
 PRESENT = 4
 """The first so many lags tell of the present: a mean over up to eight cycles."""
 REACTION_CYCLES = 2
-"""An order that a reading is to change acts after so many cycles: a reading is of the cycle before, and the next chance
-to stop comes a cycle later."""
+"""An order that is not changed by this reading is changed by the next one: by then the joint has gone on for a cycle
+since the reading was taken, and for another one."""
 MEMORY = 0.5
 """Ways by positions and by velocities are compared over this time [s]: long against a drive's filter, and so short that
 a velocity reading's zero error (half a step of 12 bits, 0.02 rad/s) comes to no more than WAY."""
