@@ -89,7 +89,7 @@ class MoteusDrive(SimulatedDrive):
         if usual is not None:
             self._write(usual)
             if "feedback.lost" not in self.faults or self.fault_code:
-                self._reply(source, CYCLE_REPLY.pack(self._shown_in_cycles()))
+                self.tell(lambda: self._reply(source, CYCLE_REPLY.pack(self._shown_in_cycles())))
             return
         frames = list(unpack(data))
         errors = self._write({each.register: each.value for each in frames if each.kind == WRITE})
@@ -122,12 +122,12 @@ class MoteusDrive(SimulatedDrive):
 
     def _shown_in_cycles(self) -> dict[int, float]:
         """Registers of the reply to a host's usual frame."""
-        motor = self.motor
+        position, velocity, torque = self.told()
         return {
             Register.MODE: self.mode,
-            Register.POSITION: motor.position / TURN * self._shown("position"),
-            Register.VELOCITY: motor.velocity / TURN * self._shown("velocity"),
-            Register.TORQUE: motor.torque * self._shown("torque"),
+            Register.POSITION: position / TURN * self._shown("position"),
+            Register.VELOCITY: velocity / TURN * self._shown("velocity"),
+            Register.TORQUE: torque * self._shown("torque"),
             Register.TEMPERATURE: STAGE_TEMPERATURE,
             Register.FAULT: self.fault_code,
         }
