@@ -13,7 +13,7 @@ from armlink.drives.orders import Mode, Order, Power, law_torque
 from armlink.errors import BusFault, HostLate, Refused, Silence
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault, refusal, silence
-from armlink.link.gate import JointLimits, Seen, beyond, hold_at, pass_gate, start_from
+from armlink.link.gate import Corroboration, JointLimits, Seen, beyond, hold_at, pass_gate, start_from
 from armlink.link.integral import Integral
 from armlink.link.motion_watchdog import MotionWatch
 from armlink.link.types import Command, Sample
@@ -90,12 +90,13 @@ class Commander:
         age = 0.0 if command.t is None else now - command.t
         fault = self._fault(now, self._commanded)
         self._seen_now = seen = self._seen(now, fault is None)
+        others = self._others()
         if self._with_gains:
             self._integrate(modes, torques, seen)
         refused = False
         for joint, mode in enumerate(modes):
             limits, held = self.limits[joint], passed[joint]
-            order = pass_gate(limits, mode, torques[joint], positions[joint], age, held, seen[joint])
+            order = pass_gate(limits, mode, torques[joint], positions[joint], age, held, seen[joint], others[joint])
             passed[joint] = order
             if order.refused:
                 refused = True
@@ -108,7 +109,7 @@ class Commander:
         if not self._lock_step:  # this process may have stood still at any line
             self._note_gap(self.loop.synced - sent, self.loop.synced)
             self._note_gap(sample.delay, now)
-        why = refused and refusal(self.names, command, age, passed, seen, self.limits)
+        why = refused and refusal(self.names, command, age, passed, seen, self.limits, others)
         if why:
             raise Refused(f"gate: {why}")
         fault = fault or self._fault(now, modes)
@@ -244,24 +245,16 @@ class Commander:
         velocities = zip(loop.latest_velocity, loop.speed_seen, strict=True)
         velocity = [value if came >= oldest else math.nan for value, came in velocities]
         motion.update(loop.latest_position, loop.earliest, loop.latest, velocity)
-        rows = zip(loop.latest_position, loop.seen, torques, velocity, self._ordered_torques(), strict=True)
-        bounds = zip(motion.proven.tolist(), motion.ahead.tolist(), motion.contradicted.tolist(), strict=True)
+        rows = zip(torques, velocity, loop.latest_position, loop.seen, strict=True)
         return [
-            Seen(
-                torque if told >= oldest else math.nan,
-                position,
-                turns,
-                now - came,
-                healthy,
-                proven,
-                ahead,
-                contradicted,
-                ordered,
-            )
-            for (position, came, (torque, told), turns, ordered), (proven, ahead, contradicted) in zip(
-                rows, bounds, strict=True
-            )
+            Seen(torque if told >= oldest else math.nan, position, turns, now - came, healthy)
+            for (torque, told), turns, position, came in rows
         ]
+
+    def _others(self) -> list[Corroboration]:
+        motion = self.motion
+        bounds = (motion.proven.tolist(), motion.ahead.tolist(), motion.contradicted.tolist(), self._ordered_torques())
+        return [Corroboration(*each) for each in zip(*bounds, strict=True)]
 
     def _ordered_torques(self) -> list[float]:
         """Torque that the newest order of each drive with gains comes to [N·m], as its bytes tell it; else NaN."""

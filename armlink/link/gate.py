@@ -102,6 +102,11 @@ class Seen(NamedTuple):
     """Time since the position came [s]."""
     healthy: bool
     """Neither the bus nor a node nor a drive has a fault."""
+
+
+class Corroboration(NamedTuple):
+    """What a joint's other readings and its order say where one reading would be believed alone."""
+
     proven: float = 0.0
     """Speed that its positions prove [rad/s]; 0 where they prove none."""
     ahead: float = 0.0
@@ -112,18 +117,28 @@ class Seen(NamedTuple):
     """Torque that its newest order comes to by the drive's gains [N·m]; NaN where the drive's law is not known."""
 
 
+NOTHING_KNOWN = Corroboration()
+
+
 def pass_gate(
-    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Order, seen: Seen
+    limits: JointLimits,
+    mode: int,
+    torque: float,
+    position: float,
+    age: float,
+    held: Order,
+    seen: Seen,
+    others: Corroboration = NOTHING_KNOWN,
 ) -> Order:
     """Limit one joint's command (torque [N·m], position [rad]), decided `age` seconds ago.
 
-    `held` is what passed in the cycle before, `seen` what is known of the joint now. Under position control of a drive
-    without an integral term `torque` is the feed-forward.
+    `held` is what passed in the cycle before, `seen` what is known of the joint now, `others` what speaks for it or
+    against it. Under position control of a drive without an integral term `torque` is the feed-forward.
     """
-    refused = _refusal(limits, mode, torque, position, age, held, seen)
+    refused = _refusal(limits, mode, torque, position, age, held, seen, others)
     start_torque, start_position = held.torque, held.position
     if held.mode not in TORQUE_MODES and math.isfinite(seen.torque):
-        start_torque = seen.ordered_torque if math.isfinite(seen.ordered_torque) else seen.torque
+        start_torque = others.ordered_torque if math.isfinite(others.ordered_torque) else seen.torque
     if held.mode not in POSITION_MODES and math.isfinite(seen.position):
         start_position = seen.position
     if refused:
@@ -173,7 +188,14 @@ def is_fresh(age: float, limit: float) -> bool:
 
 
 def _refusal(
-    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Order, seen: Seen
+    limits: JointLimits,
+    mode: int,
+    torque: float,
+    position: float,
+    age: float,
+    held: Order,
+    seen: Seen,
+    others: Corroboration,
 ) -> str:
     """Why a command is not passed on, or an empty text."""
     if mode not in MODES:
@@ -188,32 +210,31 @@ def _refusal(
         return STATE
     if mode == OFF:
         return ""
-    if seen.contradicted:
+    if others.contradicted:
         return CONTRADICTION
     if mode in POSITION_MODES:
-        return _servo_refusal(limits, held, seen)
-    if not abs(seen.velocity) <= limits.overspeed or seen.ahead > limits.overspeed:
+        return _servo_refusal(limits, held, seen, others)
+    if not abs(seen.velocity) <= limits.overspeed or others.ahead > limits.overspeed:
         return VELOCITY
     if not limits.lower - limits.outside <= seen.position <= limits.upper + limits.outside:
         return WINDOW
     if held.mode not in TORQUE_MODES:
         if not math.isfinite(seen.torque):
             return ENTRY
-        if _is_false_torque(limits, seen):
+        if _is_false_torque(limits, seen.torque, others.ordered_torque):
             return FALSE_TORQUE
     return ""
 
 
-def _is_false_torque(limits: JointLimits, seen: Seen) -> bool:
+def _is_false_torque(limits: JointLimits, told: float, ordered: float) -> bool:
     """Whether a drive cannot make the torque that it tells, by its order and gains; false where those are unknown."""
-    ordered, told = seen.ordered_torque, seen.torque
     explained = TORQUE_SHARE * limits.max_torque + TORQUE_RATIO * max(abs(ordered), abs(told))
     return abs(told - ordered) > explained
 
 
-def _servo_refusal(limits: JointLimits, held: Order, seen: Seen) -> str:
+def _servo_refusal(limits: JointLimits, held: Order, seen: Seen, others: Corroboration) -> str:
     """Why a joint under position control must be stopped; a velocity that is not known is no reason."""
-    if abs(seen.velocity) > limits.servo_overspeed or seen.proven > limits.servo_overspeed:
+    if abs(seen.velocity) > limits.servo_overspeed or others.proven > limits.servo_overspeed:
         return VELOCITY
     if held.mode in POSITION_MODES and not abs(held.position - seen.position) <= limits.following:
         return FOLLOWING
