@@ -28,9 +28,9 @@ ROWS = int(LAGS[-1]) + 1
 """Cycles whose readings are kept."""
 PRESENT = 4
 """The first so many lags tell of the present: a mean over up to eight cycles."""
-REACTION_CYCLES = 2
-"""An order that is not changed by this reading is changed by the next one: by then the joint has gone on for a cycle
-since the reading was taken, and for another one."""
+REACTION_CYCLES = 3
+"""What is not stopped by this reading is stopped by the next: the reading is a cycle old, the next comes a cycle later,
+and an order acts within a third."""
 MEMORY = 0.5
 """Ways by positions and by velocities are compared over this time [s]: long against a drive's filter, and so short that
 a velocity reading's zero error (half a step of 12 bits, 0.02 rad/s) comes to no more than WAY."""
