@@ -2,10 +2,10 @@
 
 `false_readings.py [--draws 100] [--seed 1] [--family six-damiao …]`; a draw is a pose, a job and one falsehood about
 one joint: its position, velocity or torque frozen, forged or doubled (by a second node that sends in its name), or
-scaled by 0.2 to 5. The job is a motion under position control, or torque control of that joint with a push besides gravity. All
-is in lock-step; speeds and angles are the true ones of the simulated plant, from the end of the set-up to the cycle in
-which the host notices. As many sound draws are moved, and none of them may be refused. Exit status 0 where no joint
-turned 1.5 times as fast as max_velocity, none was 0.1 rad past a stop, and no sound arm was refused.
+scaled by 0.2 to 5. The job is a motion under position control, or torque control of that joint with a push besides
+gravity. All is in lock-step; speeds and angles are the true ones of the simulated plant, from the end of the set-up to
+the cycle in which the host notices. As many sound draws are moved, and none of them may be refused. Exit status 0 where
+no joint turned 1.5 times as fast as max_velocity, none was 0.1 rad past a stop, and no sound arm was refused.
 """
 
 import argparse
@@ -32,6 +32,8 @@ LEAST, MOST = 0.2, 5.0
 CARRYING = 3
 """Falsehoods about torque are drawn on the joints that carry the others, the first three: the others make little."""
 HOLD_SECONDS, JOB_SECONDS = 0.6, 3.0
+TAKE_UP_SECONDS = 0.3
+"""In which joints that are enabled take up their loads, sound ones too."""
 FASTEST = 1.5
 """Times max_velocity."""
 PAST_A_STOP = 0.1
@@ -84,7 +86,10 @@ def drawn(name: str, seed: int, sound: bool = False) -> Draw:
     joint = int(random.integers(CARRYING if quantity == "torque" else n))
     factor = float(np.exp(random.uniform(np.log(LEAST), np.log(MOST))))
     forged = {"position": 1.5, "velocity": 1.0, "torque": 10.0}[quantity] * float(random.uniform(-1, 1))
-    coded = how == "scaled" and (quantity == "position" or (name != "sarcos" and random.random() < 0.5))
+    tells_its_units = name == "sarcos"
+    if how == "scaled" and quantity == "position" and tells_its_units:
+        quantity = "velocity"
+    coded = how == "scaled" and not tells_its_units and (quantity == "position" or random.random() < 0.5)
     torque, begins = bool(random.random() < 0.5), float(random.uniform(0.0, 0.8))
     if quantity == "torque" and not coded:
         begins -= HOLD_SECONDS  # so that it is false when torque control begins
@@ -153,9 +158,8 @@ class Run:
         link, draw, period = self.link, self.draw, self.link.period
         link.start()
         hold = Command.hold(link.enable().position)
-        if draw.coded:
-            self.watching = True
         for cycle in range(round(HOLD_SECONDS / period)):
+            self.watching = draw.coded and cycle * period > TAKE_UP_SECONDS
             self._begin(cycle * period - HOLD_SECONDS, period)
             link.commander.command(hold)
         self.watching = True
@@ -217,8 +221,8 @@ def main() -> int:
         noticed = sum(bool(outcome.says) for _, outcome in false)
         fastest, past = max(each.fastest for _, each in false), max(each.past for _, each in false)
         print(
-            f"{name}: {len(false)} false, {noticed} noticed, fastest {fastest:.2f} of max_velocity, {past:.3f} rad past "
-            f"a stop; {len(sound)} sound; {len(wrong)} wrong",
+            f"{name}: {len(false)} false, {noticed} noticed, fastest {fastest:.2f} of max_velocity, {past:.3f} rad "
+            f"past a stop; {len(sound)} sound; {len(wrong)} wrong",
             flush=True,
         )
         for draw, outcome in wrong if not asked.verbose else false + sound:
