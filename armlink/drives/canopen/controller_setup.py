@@ -20,6 +20,9 @@ from armlink.errors import BusFault, Refused
 
 QUICK_STOP_AND_HOLD = 6
 """605Ah: quick stop ramp, then stay in quick stop, power on: the joint holds."""
+MAX_PROFILE_VELOCITY = Entry(0x607F, 0, "I", "max profile velocity")
+MAX_MOTOR_SPEED = Entry(0x6080, 0, "I", "max motor speed")
+"""Bounds that a device may have besides the objects that the link uses: no data sheet needs them."""
 COARSER = "choose a coarser unit in the device"
 SPEED_ROUNDING = 1e-3
 """A speed in whole counts is as exact as this."""
@@ -298,8 +301,8 @@ def reading_ranges(
     than the arm file asks for: 607Fh, in units of 606Ch, and 6080h, in motor revolutions a minute."""
     stated = limits.max_velocity
     for entry, fastest in (
-        (objects.MAX_PROFILE_VELOCITY, unit.velocity),
-        (objects.MAX_MOTOR_SPEED, 2 * math.pi / 60 * _turns_a_motor_turn(services)),
+        (MAX_PROFILE_VELOCITY, unit.velocity),
+        (MAX_MOTOR_SPEED, 2 * math.pi / 60 * _turns_a_motor_turn(services)),
     ):
         count = int(services.read(entry)) if services.has(entry) else 0
         if 0 < count * fastest < stated * (1 - SPEED_ROUNDING):
