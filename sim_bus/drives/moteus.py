@@ -1,5 +1,6 @@
 """Simulated moteus controllers: registers, position mode with PID, watchdog to zero velocity."""
 
+import contextlib
 import math
 from collections.abc import Callable
 
@@ -96,12 +97,13 @@ class MoteusDrive(SimulatedDrive):
         asked = [each for each in frames if each.kind == READ]
         if not replies or ("feedback.lost" in self.faults and not self.fault_code):
             return
-        try:
+
+        def reply() -> None:
             shown = self._shown_registers() if asked else {}
-            content = pack_reply([*errors, *(_shown(each, shown) for each in asked)])
-        except ValueError:  # more than a frame holds: the controller sends none
-            return
-        self._reply(source, content)
+            self._reply(source, pack_reply([*errors, *(_shown(each, shown) for each in asked)]))
+
+        with contextlib.suppress(ValueError):  # more than a frame holds: the controller sends none
+            self.tell(reply)
 
     def _reply(self, source: int, content: bytes) -> None:
         answer = identifier(self.address, source)

@@ -31,9 +31,9 @@ LEAST, MOST = 0.2, 5.0
 """Factors of scaled readings."""
 CARRYING = 3
 """Falsehoods about torque are drawn on the joints that carry the others, the first three: the others make little."""
-HOLD_SECONDS, JOB_SECONDS = 0.6, 3.0
-TAKE_UP_SECONDS = 0.3
-"""In which joints that are enabled take up their loads, sound ones too."""
+HOLD_SECONDS, JOB_SECONDS = 1.0, 3.0
+TAKE_UP_SECONDS = 0.6
+"""Time in which a hand lets go of an arm that has just been enabled: its joints take up their loads."""
 FASTEST = 1.5
 """Times max_velocity."""
 PAST_A_STOP = 0.1
@@ -92,7 +92,7 @@ def drawn(name: str, seed: int, sound: bool = False) -> Draw:
     coded = how == "scaled" and not tells_its_units and (quantity == "position" or random.random() < 0.5)
     torque, begins = bool(random.random() < 0.5), float(random.uniform(0.0, 0.8))
     if quantity == "torque" and not coded:
-        begins -= HOLD_SECONDS  # so that it is false when torque control begins
+        begins = -0.3 * begins  # so that it is false when torque control begins
     value = factor if how == "scaled" else forged if how == "forged" else 0.0
     fault = "" if sound else f"{how}.{quantity}"
     return Draw(name, seed, joint, fault, value, coded and not sound, torque and not sound, begins)
@@ -128,8 +128,9 @@ class Run:
         self.most = np.array([joint.max_velocity for joint in true.require_link().joints])
         for joint in range(sim.n):
             sim.turn_by_hand(joint, float(self.random.uniform(self.lower[joint] + 0.1, self.upper[joint] - 0.1)))
-        if sim.nodes:  # their brakes hold; their velocities forget the hand
-            sim.advance(0.5)
+        self.gravity = plant.model.opt.gravity.copy()
+        plant.model.opt.gravity[:] = 0.0  # a hand carries the arm
+        sim.advance(0.5)
         if draw.coded and true is told:
             sim.device(draw.joint).inject(f"scale.{draw.fault.partition('.')[2]}", draw.value)  # type: ignore[union-attr]
         self.link = Link(told, self.bus)
@@ -160,6 +161,7 @@ class Run:
         hold = Command.hold(link.enable().position)
         for cycle in range(round(HOLD_SECONDS / period)):
             self.watching = draw.coded and cycle * period > TAKE_UP_SECONDS
+            self.sim.plant.model.opt.gravity[:] = self.gravity * min(cycle * period / TAKE_UP_SECONDS, 1.0)
             self._begin(cycle * period - HOLD_SECONDS, period)
             link.commander.command(hold)
         self.watching = True
