@@ -244,7 +244,7 @@ class Commander:
         torques = zip(loop.latest_motor_torque, loop.slow_seen, strict=True)
         velocities = zip(loop.latest_velocity, loop.speed_seen, strict=True)
         velocity = [value if came >= oldest else math.nan for value, came in velocities]
-        motion.update(loop.latest_position, loop.earliest, loop.latest, velocity)
+        motion.update(loop.latest_position, loop.earliest, loop.latest, velocity, loop.speed_seen)
         rows = zip(torques, velocity, loop.latest_position, loop.seen, strict=True)
         return [
             Seen(torque if told >= oldest else math.nan, position, turns, now - came, healthy)

@@ -52,7 +52,7 @@ class MotionWatch:
         """`period` of a cycle [s]."""
         self.n, self._period = n, period
         self._delay = FILTER_TIME + (SLOW_CYCLES + 1) * period
-        """Oldest motion that the newest velocity may tell of [s]."""
+        """Age of the motion that a velocity tells of, where none was lost or late [s]."""
         self._step, self._most = np.zeros(n), np.full(n, math.inf)
         self.restart()
 
@@ -77,9 +77,9 @@ class MotionWatch:
         self._newest = np.full(n, -math.inf)
         self._before, self._time = np.full(n, math.nan), np.full(n, math.nan)
         """Newest position, and the middle of the time in which it was taken."""
-        self._apart, self._way, self._peak, self._width = (np.zeros(n) for _ in range(4))
+        self._apart, self._way, self._peak, self._width, self._age = (np.zeros(n) for _ in range(5))
         """Way by positions less that by velocities, way of the two together [rad]; greatest speed [rad/s]; longest time
-        in which a sample was taken [s]. All fade with MEMORY."""
+        in which a sample was taken, greatest age of a velocity [s]. All fade with MEMORY."""
 
     def update(
         self,
@@ -87,10 +87,12 @@ class MotionWatch:
         earliest: Sequence[float],
         latest: Sequence[float],
         velocity: Sequence[float],
+        came: Sequence[float],
     ) -> None:
         """The newest readings (n,) of a cycle: positions [rad] that were taken between `earliest` and `latest` [s], and
-        velocities [rad/s], NaN where none came of late."""
+        velocities [rad/s] that came at `came` [s], NaN where none came of late."""
         here, since, until, told = (np.array(each, float) for each in (position, earliest, latest, velocity))
+        age = np.where(np.isfinite(told), FILTER_TIME + until - np.array(came, float), 0.0)
         new = until > self._newest
         self._newest = np.where(new, until, self._newest)
         self._cycles += 1
@@ -100,12 +102,12 @@ class MotionWatch:
         speed = np.where(np.isfinite(told), np.abs(told), 0.0)
         with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings():
             least, greatest = self._means(here, since, until)
-            self._compare(here, since, until, told, np.fmax(speed, least))
+            self._compare(here, since, until, told, np.fmax(speed, least), age)
             busy = np.fmax(speed, least) > IDLE_SHARE * self._most
             self.proven = least
             self.ahead = np.fmax(least, self._extrapolated(here, since, until)) if busy.any() else least
             self._fastest[self._cycles % len(self._fastest)] = greatest
-            unseen = (speed > self._most) & ((1 - SHARE) * speed > self._fastest.max(axis=0))
+            unseen = (age <= self._delay) & (speed > self._most) & ((1 - SHARE) * speed > self._fastest.max(axis=0))
         self.contradicted = unseen | (self._apart_too_far())
 
     def _means(self, here: Array, since: Array, until: Array) -> tuple[Array, Array]:
@@ -132,20 +134,25 @@ class MotionWatch:
         least: Array = np.fmax.reduce(ahead - exact * (2 / interval + 4 * lead / interval**2), axis=0)
         return least
 
-    def _compare(self, here: Array, since: Array, until: Array, told: Array, speed: Array) -> None:
-        """Bring the ways by positions and by velocities up to date; `speed` (n,) is the present one [rad/s]."""
+    def _compare(self, here: Array, since: Array, until: Array, told: Array, speed: Array, age: Array) -> None:
+        """Bring the ways by positions and by velocities up to date; `speed` (n,) is the present one, `age` (n,) how
+        old the motion is that the velocities tell of [s]."""
         new = np.isfinite(here)
         middle = (since + until) / 2
         elapsed = np.where(new, middle - self._time, math.nan)
         moved, turned = here - self._before, told * elapsed
-        known = np.isfinite(moved) & np.isfinite(turned)
-        keep = np.where(known, np.maximum(1.0 - elapsed / MEMORY, 0.0), 1.0)
+        gap = elapsed > self._delay + self._period  # in which the velocity may have been anything
+        known = np.isfinite(moved) & np.isfinite(turned) & ~gap
+        keep = np.where(gap, 0.0, np.where(known, np.maximum(1.0 - elapsed / MEMORY, 0.0), 1.0))
         self._apart = keep * self._apart + np.where(known, moved - turned, 0.0)
         self._way = keep * self._way + np.where(known, np.fmax(np.abs(moved), np.abs(turned)), 0.0)
         self._peak = np.fmax(keep * self._peak, speed)
+        self._age = np.fmax(keep * self._age, age)
         self._width = np.where(new, np.fmax(keep * self._width, until - since), self._width)
         self._before, self._time = np.where(new, here, self._before), np.where(new, middle, self._time)
 
     def _apart_too_far(self) -> NDArray[np.bool_]:
-        explained = WAY + 2 * self._step + SHARE * self._way + (self._delay + self._width) * self._peak
+        explained = (
+            WAY + 2 * self._step + SHARE * self._way + (np.maximum(self._delay, self._age) + self._width) * self._peak
+        )
         return np.abs(self._apart) > explained
