@@ -59,10 +59,6 @@ class Board:
         """Called where a second reading of a joint comes in a cycle."""
         self.on_slow: Callable[[int], None] = lambda joint: None
         """Called where motor torque and velocity of a joint come apart from its position."""
-        self.apart = [math.inf] * n
-        """Two positions of a joint that sends by its own clock, in one cycle, differ by no more than this [rad]."""
-        self.on_apart: Callable[[int], None] = lambda joint: None
-        """Called where they do."""
 
     def reading(self, joint: int, position: float, sensor: float) -> None:
         """A position, and the torque of a sensor where there is one (else NaN)."""
@@ -74,8 +70,6 @@ class Board:
             else:
                 self.owed[joint] = max(self.owed[joint] - 1, 0)
                 self.on_again(joint)
-        elif abs(position - self.position[joint]) > self.apart[joint]:
-            self.on_apart(joint)
         self.position[joint], self.sensor[joint] = position, sensor
 
     def slow(self, joint: int, motor: float, velocity: float) -> None:

@@ -28,7 +28,6 @@ class BusWatch:
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
         self._slow_readings = [0] * joints
-        self._contradictions = [0] * joints
         self._crowded_cycles = 0
         self.last_id: int | None = None
         """Identifier of the newest frame that was no reading."""
@@ -48,9 +47,9 @@ class BusWatch:
         """Description of a frame received that only the host may send; empty if there was none."""
         self.flooded = False
         self._double_cycles = [0] * len(self._double_cycles)
-        self._slow_readings, self._contradictions = ([0] * len(self.readings) for _ in range(2))
+        self._slow_readings = [0] * len(self.readings)
         self.forged: int | None = None
-        """The joint in whose name a second node sends velocities and states, or other positions; None: no joint."""
+        """The joint in whose name a second node sends velocities and states; None: no joint."""
         self._crowded_cycles = 0
 
     def settle(self) -> None:
@@ -70,12 +69,6 @@ class BusWatch:
         due = self.syncs // SLOW_CYCLES + 1
         count = self._slow_readings[joint] = max(self._slow_readings[joint] + 1, due - FORGIVEN // SLOW_CYCLES)
         if count >= due + EXCESS:
-            self.forged = joint
-
-    def contradicts(self, joint: int) -> None:
-        """Two positions of a joint came in one cycle between which it cannot have moved."""
-        self._contradictions[joint] += 1
-        if self._contradictions[joint] >= EXCESS:
             self.forged = joint
 
     def cycle_ends(self, frames: int) -> None:

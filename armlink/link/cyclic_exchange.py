@@ -45,7 +45,7 @@ class Loop:
         self.stats = Stats()
         self.board = board = Board(self.n)
         self.watch = BusWatch(self.n)
-        board.on_again, board.on_slow, board.on_apart = self.watch.again, self.watch.slow, self.watch.contradicts
+        board.on_again, board.on_slow = self.watch.again, self.watch.slow
         board.readings = self.watch.readings
         self.withheld: frozenset[int] = frozenset()
         """Joints that get no command, so that their own deadline is put to the test."""

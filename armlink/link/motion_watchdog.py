@@ -92,7 +92,8 @@ class MotionWatch:
         """The newest readings (n,) of a cycle: positions [rad] that were taken between `earliest` and `latest` [s], and
         velocities [rad/s] that came at `came` [s], NaN where none came of late."""
         here, since, until, told = (np.array(each, float) for each in (position, earliest, latest, velocity))
-        age = np.where(np.isfinite(told), FILTER_TIME + until - np.array(came, float), 0.0)
+        known = np.isfinite(told)
+        age = np.where(known, FILTER_TIME + until - np.where(known, np.array(came, float), 0.0), 0.0)
         new = until > self._newest
         self._newest = np.where(new, until, self._newest)
         self._cycles += 1
