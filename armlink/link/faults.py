@@ -103,8 +103,8 @@ def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None
         return f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
     if watch.forged is not None:
         return (
-            f"{names[watch.forged]}: more readings than it sends: a second node sends velocities and states in its name: "
-            "give every node its own id, and find out who sends"
+            f"{names[watch.forged]}: more readings than it sends: a second node sends velocities and states "
+            "in its name: give every node its own id, and find out who sends"
         )
     doubled = watch.doubled
     if doubled is not None:
