@@ -57,6 +57,8 @@ class Board:
         """Readings of each joint; the watch of the bus takes stock of them."""
         self.on_again: Callable[[int], None] = lambda joint: None
         """Called where a second reading of a joint comes in a cycle."""
+        self.on_slow: Callable[[int], None] = lambda joint: None
+        """Called where motor torque and velocity of a joint come apart from its position."""
 
     def reading(self, joint: int, position: float, sensor: float) -> None:
         """A position, and the torque of a sensor where there is one (else NaN)."""
@@ -74,6 +76,7 @@ class Board:
         """Motor torque and velocity."""
         self.motor[joint], self.velocity[joint] = motor, velocity
         self.slow_came = True
+        self.on_slow(joint)
 
     def drop(self) -> None:
         """Forget positions and sensor torques that were replies: what comes from now on belongs to the next sample."""

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from armlink.drives.mit_packing import Ranges
-from armlink.drives.orders import Gains, Limits, Mode, Setup
+from armlink.drives.orders import Gains, Limits, Mode, ReadingRange, Setup
 from armlink.errors import BadInput
 
 MODES = frozenset((int(Mode.POSITION), int(Mode.TORQUE)))
@@ -18,8 +18,20 @@ def require_window(name: str, limits: Limits, ranges: Ranges, where: str = "") -
         )
 
 
-def mit_setup(position: float, kp: float, kd: float, ranges: Ranges, notes: Sequence[str]) -> Setup:
-    """Set-up of a drive without power at `position` [rad], with the gains of its position control."""
+def mit_setup(
+    position: float,
+    kp: float,
+    kd: float,
+    ranges: Ranges,
+    notes: Sequence[str],
+    where: tuple[str, str, str],
+    remedy: str,
+) -> Setup:
+    """Set-up of a drive without power at `position` [rad], with the gains of its position control.
+
+    `where` the ranges of position, velocity and torque come from, and how they are made larger.
+    """
+    quantities = zip(("position", "velocity", "torque"), ranges[:3], where, strict=True)
     return Setup(
         position=position,
         torque=0.0,
@@ -32,4 +44,5 @@ def mit_setup(position: float, kp: float, kd: float, ranges: Ranges, notes: Sequ
             "velocity range, rad/s": ranges.velocity,
             "torque range, N·m": ranges.torque,
         },
+        ranges=tuple(ReadingRange(*each, remedy) for each in quantities),
     )

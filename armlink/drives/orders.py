@@ -150,6 +150,19 @@ class Gains:
     """[N·m·s/rad]."""
 
 
+class ReadingRange(NamedTuple):
+    """Values of one quantity that a drive can tell, at its output: beyond them a reading stays at the end."""
+
+    quantity: str
+    """`position` [rad], `velocity` [rad/s] or `torque` [N·m]."""
+    largest: float
+    """It tells from minus this to this."""
+    where: str
+    """Where the range is set, as people write it: `register 22 (VMAX)`."""
+    remedy: str = "set it to that or more in the drive"
+    """How it is made larger."""
+
+
 @dataclass(frozen=True)
 class Setup:
     """What the set-up of one drive found; the first cycle starts from it."""
@@ -170,6 +183,8 @@ class Setup:
     """Settings that were read or written, for `check`."""
     scales: Mapping[str, float] = field(default_factory=dict)
     """Scales that were read from the device, by name with unit, for `check`."""
+    ranges: tuple[ReadingRange, ...] = ()
+    """Ends of its readings, where it has any."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,12 @@ FORGIVEN = 250
 itself and catches up."""
 
 
+SLOW_CYCLES = 4
+"""A drive that sends velocity and state apart from its position does so after every so many SYNCs."""
+EXCESS = 3
+"""So many readings more than a drive sends mean a second sender; one may be early, none is sent twice."""
+
+
 class BusWatch:
     """Counts the readings of the cyclic loop, and frames that are no process data."""
 
@@ -23,6 +29,7 @@ class BusWatch:
         self._crowd = CROWD_PER_JOINT * joints + CROWD
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
+        self._slow_readings = [0] * joints
         self._crowded_cycles = 0
         self.others: dict[int, int] = {}
         """Frames of this cycle that were no readings of the fast way, by identifier."""
@@ -46,6 +53,9 @@ class BusWatch:
         """Why the interface receives nothing, in words; empty while it does."""
         self.flooded = False
         self._double_cycles = [0] * len(self._double_cycles)
+        self._slow_readings = [0] * len(self.readings)
+        self.forged: int | None = None
+        """The joint in whose name a second node sends velocities and states; None: no joint."""
         self._crowded_cycles = 0
         self._counted = [0] * len(self.readings)
         self._culprit: str | int = ""
@@ -63,6 +73,13 @@ class BusWatch:
         self.readings[joint] = max(self.readings[joint], self.syncs - FORGIVEN)
         if self.readings[joint] > self.syncs:
             self._doubled.add(joint)
+
+    def slow(self, joint: int) -> None:
+        """Velocity and state of a joint came apart from its position: more often than it sends them, or not."""
+        due = self.syncs // SLOW_CYCLES + 1
+        count = self._slow_readings[joint] = max(self._slow_readings[joint] + 1, due - FORGIVEN // SLOW_CYCLES)
+        if count >= due + EXCESS:
+            self.forged = joint
 
     def cycle_ends(self, frames: int) -> None:
         """Evaluate the completed cycle, with the number of frames sent and received in it."""

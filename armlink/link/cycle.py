@@ -9,12 +9,13 @@ import numpy as np
 from armlink.arrays import Array
 from armlink.clock import Clock
 from armlink.drives.family import Drives
-from armlink.drives.orders import Mode, Order, Power
+from armlink.drives.orders import Mode, Order, Power, law_torque
 from armlink.errors import BusFault, HostLate, Refused, Silence
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault, refusal, silence
-from armlink.link.gate import JointLimits, Seen, beyond, hold_at, is_fresh, pass_gate, start_from
+from armlink.link.gate import Corroboration, JointLimits, Seen, beyond, hold_at, is_fresh, pass_gate, start_from
 from armlink.link.integral import Integral
+from armlink.link.motion_watchdog import MotionWatch
 from armlink.link.types import Command, Sample
 
 ENABLE_SECONDS = 3.0
@@ -50,13 +51,15 @@ class Commander:
         loop.verify = self._verify
         self._slow_age = max_age + SLOWEST * period
         self._modes_of: list[frozenset[int]] = [frozenset()] * self.n
-        self._commanded = [OFF] * self.n
+        self._commanded, self._unknown = [OFF] * self.n, [math.nan] * self.n
         self._integrals: list[Integral | None] = [None] * self.n
         self._with_gains = False
         self._caught: set[int] = set()
         """Joints that are being switched on again after their drives stopped by themselves."""
         self._mute_cycles = 0
         """Cycles of `keep` in a row in which nothing could be sent."""
+        self.motion = MotionWatch(self.n, period)
+        """What the readings prove about the motion."""
         self._seen_now: list[Seen] = []
         self._due = 0.0
         self.unhurried = False
@@ -68,11 +71,20 @@ class Commander:
         self._gap, self._gap_at = 0.0, -math.inf
         """Longest time without commands of late, less a period, and when it ended [s]."""
 
-    def begin(self, limits: list[JointLimits], passed: list[Order], modes: list[frozenset[int]]) -> None:
-        """Take over drives that are set up: limits, what the first cycle starts from, modes that each has."""
+    def begin(
+        self,
+        limits: list[JointLimits],
+        passed: list[Order],
+        modes: list[frozenset[int]],
+        position_step: Array | None = None,
+    ) -> None:
+        """Take over drives that are set up: limits, what the first cycle starts from, modes that each has, and the
+        resolution of their positions (n,) [rad]."""
         self.limits, self.passed, self._modes_of = limits, passed, modes
         self._integrals = [Integral() if each.kp else None for each in limits]
         self._with_gains = any(each is not None for each in self._integrals)
+        step = np.zeros(self.n) if position_step is None else position_step
+        self.motion.use(step, np.array([each.position_step / self.period for each in limits]))
         self._due = self.clock.now()
 
     def command(self, command: Command) -> Sample:
@@ -82,12 +94,13 @@ class Commander:
         age = 0.0 if command.t is None else now - command.t
         fault = self._fault(now, self._commanded)
         self._seen_now = seen = self._seen(now, fault is None)
+        others = self._others()
         if self._with_gains:
             self._integrate(modes, torques, seen)
         refused = False
         for joint, mode in enumerate(modes):
             limits, held = self.limits[joint], passed[joint]
-            order = pass_gate(limits, mode, torques[joint], positions[joint], age, held, seen[joint])
+            order = pass_gate(limits, mode, torques[joint], positions[joint], age, held, seen[joint], others[joint])
             passed[joint] = order
             if order.refused:
                 refused = True
@@ -100,7 +113,7 @@ class Commander:
         if not self._lock_step:  # this process may have stood still at any line
             self._note_gap(self.loop.synced - sent, self.loop.synced)
             self._note_gap(sample.delay, now)
-        why = refused and refusal(self.names, command, age, passed, seen, self.limits)
+        why = refused and refusal(self.names, command, age, passed, seen, self.limits, others)
         if why:
             raise Refused(f"gate: {why}")
         fault = fault or self._fault(now, modes)
@@ -155,10 +168,11 @@ class Commander:
         """
         loop, now = self.loop, self._await_turn()
         self._seen_now = seen = self._seen(now, True)
+        others = self._others()
         self._commanded = [POSITION] * self.n
         for group in loop.groups:
             for drive, place in enumerate(group.places):
-                order = self._kept(group.drives, drive, place, seen[place], goal)
+                order = self._kept(group.drives, drive, place, seen[place], others[place], goal)
                 self.passed[place] = order or self._braked(place, seen[place])
         try:
             sample = self._keep_sending(now)
@@ -177,7 +191,9 @@ class Commander:
             self.passed[:] = [self._braked(place, each) for place, each in enumerate(self._seen_now)]
             return self.loop.exchange(self.passed, now)
 
-    def _kept(self, drives: Drives, drive: int, place: int, seen: Seen, goal: Array | None) -> Order | None:
+    def _kept(
+        self, drives: Drives, drive: int, place: int, seen: Seen, others: Corroboration, goal: Array | None
+    ) -> Order | None:
         """The order by which a joint is held; None where it cannot be."""
         limits, held, integral = self.limits[place], self.passed[place], self._integrals[place]
         power = drives.power(drive)
@@ -190,7 +206,7 @@ class Commander:
             torque = 0.0
             if integral is not None:
                 torque = integral.update(limits, POSITION, held.position, held.velocity, seen)
-            return pass_gate(limits, POSITION, torque, target, 0.0, held, seen)
+            return pass_gate(limits, POSITION, torque, target, 0.0, held, seen, others)
         if power is not Power.STOPPED and place not in self._caught and not drives.own_stop(drive):
             return None
         self._caught.add(place)
@@ -295,19 +311,33 @@ class Commander:
         return modes, command.torque.tolist(), command.position.tolist()
 
     def _seen(self, now: float, healthy: bool) -> list[Seen]:
-        loop, oldest = self.loop, now - self._slow_age
+        loop, motion, oldest = self.loop, self.motion, now - self._slow_age
         torques = zip(loop.latest_motor_torque, loop.slow_seen, strict=True)
         velocities = zip(loop.latest_velocity, loop.speed_seen, strict=True)
-        rows = zip(torques, velocities, loop.latest_position, loop.seen, strict=True)
+        velocity = [value if came >= oldest else math.nan for value, came in velocities]
+        motion.update(loop.latest_position, loop.earliest, loop.latest, velocity, loop.speed_seen)
+        rows = zip(torques, velocity, loop.latest_position, loop.seen, strict=True)
         return [
-            Seen(
-                torque if told >= oldest else math.nan,
-                position,
-                velocity if moved >= oldest else math.nan,
-                now - came,
-                healthy,
-            )
-            for (torque, told), (velocity, moved), position, came in rows
+            Seen(torque if told >= oldest else math.nan, position, turns, now - came, healthy)
+            for (torque, told), turns, position, came in rows
+        ]
+
+    def _others(self) -> list[Corroboration]:
+        motion = self.motion
+        bounds = (motion.proven.tolist(), motion.ahead.tolist(), motion.contradicted.tolist(), self._ordered_torques())
+        return [Corroboration(*each) for each in zip(*bounds, strict=True)]
+
+    def _ordered_torques(self) -> list[float]:
+        """Torque that the newest order of each drive with gains comes to [N·m], as its bytes tell it; else NaN."""
+        if not self._with_gains:
+            return self._unknown
+        loop = self.loop
+        rows = zip(loop.told, loop.latest_position, loop.latest_velocity, strict=True)
+        return [
+            law_torque(told, position, velocity)
+            if told is not None and told.kp > 0 and told.power is Power.ON
+            else math.nan
+            for told, position, velocity in rows
         ]
 
     def _verify(self, joint: int, sent: Order) -> None:
@@ -371,6 +401,7 @@ class Commander:
     def settle(self) -> None:
         """Restart after an interruption: what came meanwhile, and how late the host was, is forgotten."""
         self.loop.settle()
+        self.motion.restart()
         self._gap, self._gap_at = 0.0, -math.inf
         self._due = self.clock.now()
 

@@ -1,6 +1,7 @@
 """The cyclic path: orders out as frames, readings in. One loop owns the port."""
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -46,7 +47,7 @@ class Loop:
         self.stats = Stats()
         self.board = board = Board(self.n)
         self.watch = BusWatch(self.n)
-        board.on_again = self.watch.again
+        board.on_again, board.on_slow = self.watch.again, self.watch.slow
         board.readings = self.watch.readings
         self.withheld: frozenset[int] = frozenset()
         """Joints that get no command, so that their own deadline is put to the test."""
@@ -57,6 +58,7 @@ class Loop:
         self.on_unknown: Callable[[int, bytes], None] = lambda can_id, data: None
         """Takes frames that no drive of ours sends, such as those of another host."""
         self._port, self._clock = port, clock
+        self._lock_step = lock_step
         self._patience = 0.0 if lock_step else COLLECT_SHARE * period
         self._rest = 0.0
         """Time from the commands until it looks for replies [s]."""
@@ -102,6 +104,12 @@ class Loop:
         """When the last commands left, by the clock [s]."""
         self._owed_for = 0
         """Cycles for which some reply has been owed."""
+        self.earliest, self.latest = [-math.inf] * self.n, [-math.inf] * self.n
+        """Bounds of the time at which the newest position of each joint was taken, by the clock [s]."""
+        self._asked_at: deque[float] = deque(maxlen=OWED_CYCLES + 2)
+        """When the newest commands left, by the clock [s]."""
+        self._collected = self._heard_until = -math.inf
+        """When the replies of this cycle and of the one before were in, by the clock [s]."""
 
     def _route(self, group: Group) -> None:
         drives, tag = group.drives, group.tag
@@ -183,9 +191,11 @@ class Loop:
     def _keep_late(self) -> None:
         """Replies that came after their cycle: as old as the last commands at least."""
         board, values = self.board, self.values
+        now = self._clock.now()
         for joint, raw in enumerate(board.position):
             if raw == raw and board.asked[joint]:  # not NaN
                 self.latest_position[joint] = values.position_of(joint, raw)
+                self._note_time(joint, max(board.owed[joint], 1), now)
                 self.seen[joint] = max(self.seen[joint], self.synced)
                 board.owed[joint] = max(board.owed[joint] - 1, 0)
 
@@ -227,7 +237,9 @@ class Loop:
         if self._pass_time is not None:
             self._pass_time(self.period)
         self.synced, self.just_woke = now, False
+        self._asked_at.append(now)
         delay = self._collect(now, until)
+        self._heard_until, self._collected = self._collected, now if self._lock_step else now + delay
         self.stats.missed += board.awaited
         timely = None if board.awaited <= 0 and not self._owed_for else self._timely()
         sample = self.sample(now)
@@ -380,11 +392,20 @@ class Loop:
         torque = values.torque(np.array(board.sensor), motor)
         for joint in self._keep(position, self.latest_position):
             self.seen[joint] = now
+            self._note_time(joint, board.owed[joint] + 1, self._collected)
         self.stats.cycles += 1
         self.stats.errors = board.errors
         status: NDArray[np.int64] = np.array(board.status, np.int64)
         age: Array = now - np.array(self.seen)
         return Sample(now - (self._first or 0.0), position, velocity, torque, motor, status, age)
+
+    def _note_time(self, joint: int, back: int, latest: float) -> None:
+        """When the newest position of a joint was taken: before `latest` [s], and no earlier than it was asked for,
+        `back` commands ago; of a drive that sends by its own clock, than the readings before had been taken in."""
+        asked = self._asked_at
+        earliest = asked[-min(back, len(asked))] if asked else -math.inf
+        self.earliest[joint] = earliest if self.board.asked[joint] or self._lock_step else self._heard_until
+        self.latest[joint] = latest
 
     def drop_readings(self) -> None:
         """Forget what came: what comes from now on belongs to the next sample."""

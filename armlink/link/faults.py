@@ -7,7 +7,7 @@ from armlink.drives.orders import MODE_NAMES, Order
 from armlink.errors import Silence
 from armlink.link import gate
 from armlink.link.bus_watchdog import BusWatch
-from armlink.link.gate import JointLimits, Seen
+from armlink.link.gate import NOTHING_KNOWN, Corroboration, JointLimits, Seen
 from armlink.link.types import Command
 
 _MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
@@ -43,10 +43,12 @@ def refusal(
     passed: Sequence[Order],
     seen: Sequence[Seen],
     limits: Sequence[JointLimits],
+    others: Sequence[Corroboration] = (),
 ) -> str | None:
     """Why the gate refused a command, in one line; None where a fault of the bus or a joint was the reason."""
     for joint, name in enumerate(names):
         why, limit, now = passed[joint].refused, limits[joint], seen[joint]
+        other = others[joint] if others else NOTHING_KNOWN
         if why == gate.COMMAND_AGE:
             return f"the command is {age * 1e3:.0f} ms old, expected 0 to {limit.max_age * 1e3:.0f} ms"
         if why == gate.BAD_MODE:
@@ -57,10 +59,21 @@ def refusal(
             return f"{name}: target position is {command.position[joint]}, expected a finite number"
         if why == gate.VELOCITY and math.isnan(now.velocity):
             return f"{name}: no velocity has come of late, and torque control needs to know it"
+        if why == gate.CONTRADICTION:
+            return (
+                f"{name}: its positions and its velocity ({now.velocity:.3g} rad/s) contradict each other: one of them "
+                "is false: armlink check --scales says which scale is off; else look for a second node or its encoder"
+            )
+        if why == gate.FALSE_TORQUE:
+            return (
+                f"{name}: tells a torque of {now.torque:.3g} N·m where its gains and its order come to "
+                f"{other.ordered_torque:.3g}: torque control would start from a false one: armlink check --scales"
+            )
         if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
             return (
-                f"{name}: turns at {now.velocity:.3g} rad/s under position control, limit {limit.servo_overspeed:.3g} "
-                "(max_velocity and its margin): something else moves it, or its servo is unstable"
+                f"{name}: turns at {_speed(now, other):.3g} rad/s under position control, limit "
+                f"{limit.servo_overspeed:.3g} (max_velocity and its margin){_by_positions(now, other)}: something else "
+                "moves it, or its servo is unstable"
             )
         if why == gate.FOLLOWING:
             return (
@@ -69,8 +82,8 @@ def refusal(
             )
         if why == gate.VELOCITY:
             return (
-                f"{name}: turns at {now.velocity:.3g} rad/s under torque control, limit {limit.overspeed:.3g} "
-                "(max_velocity and its margin): less torque, or a higher max_velocity"
+                f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, limit {limit.overspeed:.3g} "
+                f"(max_velocity and its margin){_by_positions(now, other)}: less torque, or a higher max_velocity"
             )
         if why == gate.WINDOW:
             lower, upper = limit.lower - limit.outside, limit.upper + limit.outside
@@ -83,12 +96,29 @@ def refusal(
     return None
 
 
+def _speed(seen: Seen, other: Corroboration) -> float:
+    """The speed that a joint is refused for [rad/s]: the drive's, with its sign, or what its positions prove."""
+    return max(other.proven, other.ahead) if _by_positions(seen, other) else seen.velocity
+
+
+def _by_positions(seen: Seen, other: Corroboration) -> str:
+    """That its positions prove more speed than its drive tells, in words; empty where they do not."""
+    if max(other.proven, other.ahead) > abs(seen.velocity):
+        return f", by its positions where its velocity reads {seen.velocity:.3g}"
+    return ""
+
+
 def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None:
     """Faults of the bus itself: no reception, a second host, a duplicated id, a babbling node, lost frames; or None."""
     if watch.reception:
         return watch.reception
     if watch.intruder:
         return f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
+    if watch.forged is not None:
+        return (
+            f"{names[watch.forged]}: more readings than it sends: a second node sends velocities and states "
+            "in its name: give every node its own id, and find out who sends"
+        )
     doubled = watch.doubled
     if doubled is not None:
         return f"{names[doubled]}: two readings in every cycle: a second node has its id: give every node its own"

@@ -11,11 +11,13 @@ and raises:
 
 - an unknown mode, a number that is not finite where the mode needs it, a command that is too old or of the future;
 - a reading that is too old or missing, a fault of bus, node or drive;
-- a joint that turns faster than its limit allows with the margin stated for its mode;
+- a joint that turns faster than its limit allows with the margin stated for its mode, by the velocity that its drive
+  tells or by what its positions prove, whichever is faster; readings that contradict each other;
 - under torque control, where nothing else bounds the motion: a joint that reads a position beyond the window and its
   margin, or whose velocity is not known;
 - under position control: a joint that is further from its target than the following error allowed;
-- entering torque control where the torque now produced is not known: zero would drop the load.
+- entering torque control where the torque now produced is not known: zero would drop the load; or where the drive tells
+  another than its gains and its order come to.
 
 A joint under torque control follows its measured position with the target position, and a joint under position control
 its produced torque with the target torque, so that a change of mode starts from what is.
@@ -34,12 +36,17 @@ MODES = (OFF, *POSITION_MODES, *TORQUE_MODES)
 ON, STOPPED, NO_POWER = Power.ON, Power.STOPPED, Power.OFF
 
 BAD_MODE, BAD_NUMBER, COMMAND_AGE = "mode", "number", "command age"
-SAMPLE_AGE, STATE = "sample age", "state"
+SAMPLE_AGE, STATE, CONTRADICTION = "sample age", "state", "contradiction"
 VELOCITY, WINDOW, ENTRY, FOLLOWING = "velocity", "window", "entry", "following error"
+FALSE_TORQUE = "false torque"
 LEASH = 0.97
 """Share of max_torque that gains, targets and feed-forward may come to together; the rest is for their rounding."""
 EXACT, ROUNDED = 1 + 1e-6, 1e-6
 """Rounding of a bound in single precision: relative, and absolute for positions [rad]."""
+TORQUE_SHARE = 0.15
+"""A drive's torque reading may differ so much from what its gains and order come to, as a share of max_torque, ..."""
+TORQUE_RATIO = 0.4
+"""... and by this share of the greater besides: scales that are off by 10 to 40 % are for `armlink check --scales`."""
 LED_BACK = 1e-3
 """Rounding of a target outside the window, on its way back [rad]."""
 
@@ -97,18 +104,41 @@ class Seen(NamedTuple):
     """Neither the bus nor a node nor a drive has a fault."""
 
 
+class Corroboration(NamedTuple):
+    """What a joint's other readings and its order say where one reading would be believed alone."""
+
+    proven: float = 0.0
+    """Speed that its positions prove [rad/s]; 0 where they prove none."""
+    ahead: float = 0.0
+    """Speed that they prove for when an order acts, if the joint goes on as it does [rad/s]; likewise."""
+    contradicted: bool = False
+    """Its position and velocity readings cannot both be right."""
+    ordered_torque: float = math.nan
+    """Torque that its newest order comes to by the drive's gains [N·m]; NaN where the drive's law is not known."""
+
+
+NOTHING_KNOWN = Corroboration()
+
+
 def pass_gate(
-    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Order, seen: Seen
+    limits: JointLimits,
+    mode: int,
+    torque: float,
+    position: float,
+    age: float,
+    held: Order,
+    seen: Seen,
+    others: Corroboration = NOTHING_KNOWN,
 ) -> Order:
     """Limit one joint's command (torque [N·m], position [rad]), decided `age` seconds ago.
 
-    `held` is what passed in the cycle before, `seen` what is known of the joint now. Under position control of a drive
-    without an integral term `torque` is the feed-forward.
+    `held` is what passed in the cycle before, `seen` what is known of the joint now, `others` what speaks for it or
+    against it. Under position control of a drive without an integral term `torque` is the feed-forward.
     """
-    refused = _refusal(limits, mode, torque, position, age, held, seen)
+    refused = _refusal(limits, mode, torque, position, age, held, seen, others)
     start_torque, start_position = held.torque, held.position
     if held.mode not in TORQUE_MODES and math.isfinite(seen.torque):
-        start_torque = seen.torque
+        start_torque = others.ordered_torque if math.isfinite(others.ordered_torque) else seen.torque
     if held.mode not in POSITION_MODES and math.isfinite(seen.position):
         start_position = seen.position
     if refused:
@@ -158,7 +188,14 @@ def is_fresh(age: float, limit: float) -> bool:
 
 
 def _refusal(
-    limits: JointLimits, mode: int, torque: float, position: float, age: float, held: Order, seen: Seen
+    limits: JointLimits,
+    mode: int,
+    torque: float,
+    position: float,
+    age: float,
+    held: Order,
+    seen: Seen,
+    others: Corroboration,
 ) -> str:
     """Why a command is not passed on, or an empty text."""
     if mode not in MODES:
@@ -171,22 +208,33 @@ def _refusal(
         return SAMPLE_AGE
     if not seen.healthy:
         return STATE
-    if mode in POSITION_MODES:
-        return _servo_refusal(limits, held, seen)
     if mode == OFF:
         return ""
-    if not abs(seen.velocity) <= limits.overspeed:
+    if others.contradicted:
+        return CONTRADICTION
+    if mode in POSITION_MODES:
+        return _servo_refusal(limits, held, seen, others)
+    if not abs(seen.velocity) <= limits.overspeed or others.ahead > limits.overspeed:
         return VELOCITY
     if not limits.lower - limits.outside <= seen.position <= limits.upper + limits.outside:
         return WINDOW
-    if held.mode not in TORQUE_MODES and not math.isfinite(seen.torque):
-        return ENTRY
+    if held.mode not in TORQUE_MODES:
+        if not math.isfinite(seen.torque):
+            return ENTRY
+        if _is_false_torque(limits, seen.torque, others.ordered_torque):
+            return FALSE_TORQUE
     return ""
 
 
-def _servo_refusal(limits: JointLimits, held: Order, seen: Seen) -> str:
+def _is_false_torque(limits: JointLimits, told: float, ordered: float) -> bool:
+    """Whether a drive cannot make the torque that it tells, by its order and gains; false where those are unknown."""
+    explained = TORQUE_SHARE * limits.max_torque + TORQUE_RATIO * max(abs(ordered), abs(told))
+    return abs(told - ordered) > explained
+
+
+def _servo_refusal(limits: JointLimits, held: Order, seen: Seen, others: Corroboration) -> str:
     """Why a joint under position control must be stopped; a velocity that is not known is no reason."""
-    if abs(seen.velocity) > limits.servo_overspeed:
+    if abs(seen.velocity) > limits.servo_overspeed or others.proven > limits.servo_overspeed:
         return VELOCITY
     if held.mode in POSITION_MODES and not abs(held.position - seen.position) <= limits.following:
         return FOLLOWING

@@ -1,8 +1,10 @@
 """The gate's limits of an arm, from its file."""
 
+from collections.abc import Sequence
+
 from armlink.arm_file import ArmFile, LinkJoint
-from armlink.drives.orders import Gains, Limits
-from armlink.errors import BadInput
+from armlink.drives.orders import Gains, Limits, ReadingRange
+from armlink.errors import BadInput, Refused
 from armlink.link.gate import JointLimits
 from armlink.model_file import compile_model
 
@@ -20,6 +22,8 @@ sinks is caught at that speed."""
 FOLLOWING = 0.5
 """A joint under position control may read a position this far from its target before it is stopped [rad]; a motion of
 calib takes a joint for blocked long before."""
+RANGE_ROUNDING = 1e-6
+"""Relative rounding of a range in a 32-bit float, which registers hold."""
 OUTSIDE = 0.1
 """A joint under torque control may read a position this far outside the target window before it is stopped [rad]."""
 
@@ -50,6 +54,32 @@ def target_window(lower: float, upper: float) -> tuple[float, float]:
     """Where a position target may lie [rad]: the stops, the position sensor's error, and some press-in."""
     margin = POSITION_GAIN_ERROR * max(-lower, upper) + PRESS_IN
     return lower - margin, upper + margin
+
+
+def require_ranges(
+    name: str, ranges: Sequence[ReadingRange], gate: JointLimits, row: LinkJoint, ends: tuple[float, float]
+) -> None:
+    """Raise Refused where a drive's readings end before a limit of the gate: what is beyond could never be seen.
+
+    `ends` of the target window at the drive's output [rad], in either order.
+    """
+    gear = abs(row.settings.gear)
+    needed = {
+        "position": (
+            max(map(abs, ends)) + gate.outside * gear,
+            "rad",
+            "correct zero and direction, or limit the joint",
+        ),
+        "velocity": (max(gate.overspeed, gate.servo_overspeed) * gear, "rad/s", "lower max_velocity"),
+        "torque": (gate.most_sent / gear, "N·m", "lower max_torque"),
+    }
+    for quantity, largest, where, remedy in ranges:
+        least, unit, otherwise = needed[quantity]
+        if largest < least * (1 - RANGE_ROUNDING):
+            raise Refused(
+                f"{name}: {where} ends {quantity} readings at {largest:.6g} {unit}, and the gate must see "
+                f"{least:.6g} {unit}: {remedy}, or {otherwise}"
+            )
 
 
 def drive_limits(joint: LinkJoint, window: tuple[float, float], period: float, deadline: float) -> Limits:

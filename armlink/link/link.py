@@ -26,7 +26,7 @@ from armlink.link.cyclic_exchange import Loop
 from armlink.link.ends import Cause, cause_of, end
 from armlink.link.faults import bus_fault
 from armlink.link.gate import JointLimits, start_from
-from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window
+from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, require_ranges, target_window
 from armlink.link.guard import Crossed
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
@@ -268,9 +268,12 @@ class Link(Calibrations):
         self._limits, passed = wanted, []
         limits = [self._gate_limits(joint) for joint in range(self.n)]
         for joint, (setup, limit) in enumerate(zip(self.setups, limits, strict=True)):
+            at_drive = self.values.limits(joint, wanted[joint])
+            ends = (at_drive.lower, at_drive.upper)
+            require_ranges(self.names[joint], setup.ranges, limit, self.section.joints[joint], ends)
             torque = self.values.torque_of(joint, setup.torque)
             passed.append(start_from(limit, torque, self.values.position_of(joint, setup.position)))
-        self.commander.begin(limits, passed, [each.modes for each in self.setups])
+        self.commander.begin(limits, passed, [each.modes for each in self.setups], self.position_step)
 
     @property
     def set_up_positions(self) -> Array:

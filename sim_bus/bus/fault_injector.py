@@ -9,10 +9,11 @@ import numpy as np
 
 from armlink.errors import BadInput
 from sim_bus.bus.fault_kinds import CANOPEN_FAULTS, Fault
+from sim_bus.drives.false_readings import FALSE_READINGS, QUANTITIES, FalseReadings
 from sim_bus.drives.fault_kinds import DRIVE_KINDS
 from sim_bus.drives.simulated_drive import SimulatedDrive
 from sim_bus.node.node import Node
-from sim_bus.node.pdo import Frame
+from sim_bus.node.pdo import Frame, layout
 from sim_bus.simulated_arm import SERVICE, SimulatedArm
 
 ERROR_FLAG = 0x20000000
@@ -21,6 +22,8 @@ PROTOCOL_ERROR, BUS_OFF, RESTARTED = 0x08, 0x40, 0x100
 ABORT_CODE, STORM_CODE = 0x08000022, 0x7305
 BABBLE = (0x001, bytes(8))
 TPDO1, SDO_ANSWER, SDO_REQUEST = 0x180, 0x580, 0x600
+OBJECTS = {0x6064: "position", 0x606C: "velocity", 0x6077: "torque"}
+"""Objects of a node that falsehoods are about."""
 TO_NODES = (0x200, 0x300, 0x400, 0x500, SDO_REQUEST)
 """Function codes of frames to one node: RPDO1 to 4 and SDO."""
 HOST_REFUSES = {
@@ -46,6 +49,8 @@ class Injector:
         self._until: dict[str, float] = {}
         self._on: dict[tuple[str, int], float] = {}
         self._owed: dict[tuple[str, int], float] = {}
+        self._false: dict[int, FalseReadings] = {}
+        """Falsehoods about CANopen nodes."""
 
     def inject(self, fault: Fault) -> None:
         """Inject a fault now, or at its time. Raises BadInput for a fault that the joint's drive cannot have."""
@@ -71,6 +76,7 @@ class Injector:
             self._error(RESTARTED)
         self._until.clear()
         self._on.clear()
+        self._false.clear()
 
     @property
     def refusal(self) -> str:
@@ -123,7 +129,9 @@ class Injector:
     def _start(self, fault: Fault, place: int) -> None:
         arm = self.arm
         device = arm.device(place) if place >= 0 else None
-        if isinstance(device, SimulatedDrive) and (fault.id in DRIVE_KINDS or fault.id == "mode.refused"):
+        if isinstance(device, SimulatedDrive) and (
+            fault.id in DRIVE_KINDS or fault.id in FALSE_READINGS or fault.id == "mode.refused"
+        ):
             device.inject(fault.id, fault.amount)
             return
         once: dict[str, Callable[[], None]] = {
@@ -133,6 +141,8 @@ class Injector:
         }
         if fault.id in once:
             once[fault.id]()
+        elif fault.id in FALSE_READINGS:
+            self._false.setdefault(place, FalseReadings()).begin(fault.id, fault.amount)
         elif fault.id in HOST_REFUSES:
             self._until[fault.id] = arm.time + fault.amount
             if fault.id == "bus.off":
@@ -188,7 +198,30 @@ class Injector:
             return ((can_id, data[:3]),)
         if ("node.duplicate", place) in self._on:
             return ((can_id, data), (can_id, bytes(len(data)) if is_reading else data))
-        return ((can_id, data),)
+        false = self._false.get(place)
+        return ((can_id, data),) if false is None else self._told(place, false, can_id, data)
+
+    def _told(self, place: int, false: FalseReadings, can_id: int, data: bytes) -> tuple[Frame, ...]:
+        """A node's frame with what falsehoods make of it, and a second node's where there is one."""
+        device = self.arm.device(place)
+        assert isinstance(device, Node)
+        mapped = [each for each in device.pdos(receive=False) if each.cob_id == can_id and each.mapping]
+        if not mapped or len(data) != layout(mapped[0].mapping).itemsize:
+            return ((can_id, data),)
+        fields, packed = layout(mapped[0].mapping).names or (), layout(mapped[0].mapping)
+        units, carried, found = self.arm.drives.units(place), {}, []
+        for name, entry in zip(fields, mapped[0].mapping, strict=True):
+            if (index := entry >> 16) in OBJECTS:
+                carried[OBJECTS[index]] = name
+        for second in (False, True) if false.repeated(tuple(carried)) else (False,):
+            values = np.frombuffer(data, packed).copy()
+            for quantity, name in carried.items():
+                unit = units[QUANTITIES.index(quantity)]
+                told = false.told(quantity, float(values[name][0]) * unit, second) / unit
+                ends = np.iinfo(values[name].dtype)
+                values[name] = min(max(round(told), ends.min), ends.max)
+            found.append((can_id, values.tobytes()))
+        return tuple(found)
 
     def _strikes(self, fault: str, place: int) -> bool:
         share = self._on.get((fault, place))

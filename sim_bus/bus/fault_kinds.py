@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from armlink.errors import BadInput
+from sim_bus.drives.false_readings import FALSE_READINGS
 from sim_bus.drives.fault_kinds import DRIVE_KINDS, FaultKind
 
 FORM = "ID:JOINT[:VALUE][@T] or ID::VALUE[@T], for example node.silent:joint_2 or bus.off::0.5@3"
@@ -30,7 +31,7 @@ KINDS = {
         FaultKind("clock.jump", False, "jump [s]", 1.0, "time jumps: as if the host had slept"),
     )
 }
-ALL_KINDS = KINDS | DRIVE_KINDS
+ALL_KINDS = KINDS | DRIVE_KINDS | FALSE_READINGS
 CANOPEN_FAULTS = frozenset(("emcy.storm", "sdo.abort", "sdo.timeout"))
 """Faults that only a CANopen node can have."""
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.cubemars.frames import NO_COMMAND, Reply, pack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
-from armlink.drives.mit_packing import MitFeedback, Ranges, Special, special_of, unpack_command
+from armlink.drives.mit_packing import Ranges, Special, special_of, unpack_command
 from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, SimulatedDrive
@@ -54,7 +54,7 @@ class CubeMarsDrive(SimulatedDrive):
             return
         elif special is None and self.motor_mode:
             self.command = unpack_command(data, self.coding)
-        self._answer()
+        self.tell(self._answer)
         self.heard = self.now
         self._follow()
 
@@ -74,9 +74,9 @@ class CubeMarsDrive(SimulatedDrive):
         return (position - self._zero + largest) % (2 * largest) - largest
 
     def _answer(self) -> None:
-        motor, coding = self.motor, self.coding
-        feedback = MitFeedback(self._shown(motor.position), motor.velocity, motor.torque)
-        temperature = int(MOTOR_TEMPERATURE + motor.heating)
+        told, coding = self.told(), self.coding
+        feedback = told._replace(position=self._shown(told.position))
+        temperature = int(MOTOR_TEMPERATURE + self.motor.heating)
         self.answer(self.reply, pack_reply(Reply(self.address, feedback, temperature, self.error), coding))
 
     def trip(self) -> None:

@@ -20,7 +20,7 @@ from armlink.drives.damiao.frames import (
     unpack_value,
 )
 from armlink.drives.damiao.models import MODELS
-from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, Special, special_of, unpack_command
+from armlink.drives.mit_packing import MitCommand, Ranges, Special, special_of, unpack_command
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 
@@ -112,8 +112,12 @@ class DamiaoDrive(SimulatedDrive):
     def _reply(self) -> None:
         if "feedback.lost" in self.faults:
             return
+        self.tell(self._feed_back)
+
+    def _feed_back(self) -> None:
         motor, coding = self.motor, self.coding
-        feedback = MitFeedback(_wrapped(motor.position, coding.position), motor.velocity, motor.torque)
+        told = self.told()
+        feedback = told._replace(position=_wrapped(told.position, coding.position))
         drive = int(self.registers[Register.COMMAND_ID])
         reply = Reply(drive, self.state, feedback, STAGE, int(MOTOR_TEMPERATURE + motor.heating))
         self.answer(int(self.registers[Register.REPLY_ID]), pack_reply(reply, coding))

@@ -1,5 +1,6 @@
 """Simulated moteus controllers: registers, position mode with PID, watchdog to zero velocity."""
 
+import contextlib
 import math
 from collections.abc import Callable
 
@@ -89,19 +90,20 @@ class MoteusDrive(SimulatedDrive):
         if usual is not None:
             self._write(usual)
             if "feedback.lost" not in self.faults or self.fault_code:
-                self._reply(source, CYCLE_REPLY.pack(self._shown_in_cycles()))
+                self.tell(lambda: self._reply(source, CYCLE_REPLY.pack(self._shown_in_cycles())))
             return
         frames = list(unpack(data))
         errors = self._write({each.register: each.value for each in frames if each.kind == WRITE})
         asked = [each for each in frames if each.kind == READ]
         if not replies or ("feedback.lost" in self.faults and not self.fault_code):
             return
-        try:
+
+        def reply() -> None:
             shown = self._shown_registers() if asked else {}
-            content = pack_reply([*errors, *(_shown(each, shown) for each in asked)])
-        except ValueError:  # more than a frame holds: the controller sends none
-            return
-        self._reply(source, content)
+            self._reply(source, pack_reply([*errors, *(_shown(each, shown) for each in asked)]))
+
+        with contextlib.suppress(ValueError):  # more than a frame holds: the controller sends none
+            self.tell(reply)
 
     def _reply(self, source: int, content: bytes) -> None:
         answer = identifier(self.address, source)
@@ -122,12 +124,12 @@ class MoteusDrive(SimulatedDrive):
 
     def _shown_in_cycles(self) -> dict[int, float]:
         """Registers of the reply to a host's usual frame."""
-        motor = self.motor
+        position, velocity, torque = self.told()
         return {
             Register.MODE: self.mode,
-            Register.POSITION: motor.position / TURN * self._shown("position"),
-            Register.VELOCITY: motor.velocity / TURN * self._shown("velocity"),
-            Register.TORQUE: motor.torque * self._shown("torque"),
+            Register.POSITION: position / TURN * self._shown("position"),
+            Register.VELOCITY: velocity / TURN * self._shown("velocity"),
+            Register.TORQUE: torque * self._shown("torque"),
             Register.TEMPERATURE: STAGE_TEMPERATURE,
             Register.FAULT: self.fault_code,
         }

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.odrive import frames
@@ -15,6 +16,8 @@ HEARTBEAT_PERIOD = 0.1
 """axis0.config.can.heartbeat_msg_rate_ms, by default 100 [s]."""
 TORQUE_CONSTANT = 0.083
 """8.27/KV as its user typed it in [N·m/A]."""
+CARRIED = {Message.ESTIMATES: ("position", "velocity"), Message.TORQUES: ("torque",)}
+"""Quantities in its cyclic messages."""
 RATES = {Message.HEARTBEAT: HEARTBEAT_PERIOD, Message.TEMPERATURE: 0.5}
 
 
@@ -156,10 +159,10 @@ class ODriveAxis(SimulatedDrive):
         for message, instant in self._next.items():
             if instant <= now + 1e-9:
                 self._next[message] = max(instant + self._periods[message], now)
-                self._send_message(message)
+                self.tell(partial(self._send_message, message), CARRIED.get(message, ()))
 
     def _send_message(self, command: int) -> None:
-        motor, estimated = self.motor, "feedback.lost" not in self.faults
+        motor, estimated, told = self.motor, "feedback.lost" not in self.faults, self.told()
         content: dict[int, tuple[float, ...]] = {
             Message.VERSION: (2, 4, 4, 58, 0, 6, 10, 0),
             Message.HEARTBEAT: (self.errors, self.state, 0, 1),
@@ -169,9 +172,9 @@ class ODriveAxis(SimulatedDrive):
             Message.BUS: (BUS_VOLTAGE, 0.5),
         }
         if estimated:
-            position, velocity = motor.position / TURN, motor.velocity / TURN
+            position, velocity = told.position / TURN, told.velocity / TURN
             content[Message.ESTIMATES] = (position / self.scale("position"), velocity / self.scale("velocity"))
-            torque = motor.torque / self.scale("torque")
+            torque = told.torque / self.scale("torque")
             content[Message.TORQUES] = (self._input[2], torque)
         values = content.get(command)
         if values is not None:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 from armlink.bus.port import EXTENDED, REMOTE
-from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges
+from armlink.drives.mit_packing import MitCommand, Ranges
 from armlink.drives.robstride.frames import (
     MOTION_MODE,
     NEVER_READ,
@@ -134,11 +134,13 @@ class RobStrideDrive(SimulatedDrive):
     def _feed_back(self, kind: int) -> None:
         if "feedback.lost" in self.faults and not self.fault_bits:
             return
-        motor = self.motor
-        motion = MitFeedback(motor.position, motor.velocity, motor.torque)
-        feedback = Feedback(self.address, self.fault_bits, self.mode, motion, MOTOR_TEMPERATURE)
-        can_id, data = pack_feedback(feedback, self._host, self.coding, kind)
-        self.answer(can_id | EXTENDED, data)
+
+        def send() -> None:
+            feedback = Feedback(self.address, self.fault_bits, self.mode, self.told(), MOTOR_TEMPERATURE)
+            can_id, data = pack_feedback(feedback, self._host, self.coding, kind)
+            self.answer(can_id | EXTENDED, data)
+
+        self.tell(send)
 
     def _read(self, parameter: int) -> None:
         live = {

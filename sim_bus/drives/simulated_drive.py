@@ -4,7 +4,8 @@ import math
 from collections.abc import Callable
 
 from armlink.bus.port import CLASSICAL
-from armlink.drives.mit_packing import Ranges
+from armlink.drives.mit_packing import MitFeedback, Ranges
+from sim_bus.drives.false_readings import FALSE_READINGS, QUANTITIES, FalseReadings
 from sim_bus.drives.motor import Motor
 
 STAGE_TEMPERATURE, MOTOR_TEMPERATURE = 31.0, 33.0
@@ -32,6 +33,8 @@ class SimulatedDrive:
         """Commands to write flash that it got."""
         self.faults: dict[str, float] = {}
         """Firmware faults in force, by id, with their values."""
+        self.false, self._second = FalseReadings(), False
+        """Falsehoods in force; whether the frame that is made now is a second node's."""
         self._send = send
 
     # ---- bus
@@ -49,6 +52,23 @@ class SimulatedDrive:
         """Send a frame, but from an unplugged drive."""
         if not self.unplugged:
             self._send(can_id | CLASSICAL * ("drive.classic" in self.faults), data)
+
+    def told(self) -> MitFeedback:
+        """Position, velocity and torque of its motor, as its next frame tells them."""
+        motor = self.motor
+        true = MitFeedback(motor.position, motor.velocity, motor.torque)
+        if not self.false.any:
+            return true
+        pairs = zip(QUANTITIES, true, strict=True)
+        return MitFeedback(*(self.false.told(quantity, value, self._second) for quantity, value in pairs))
+
+    def tell(self, send: Callable[[], None], quantities: tuple[str, ...] = QUANTITIES) -> None:
+        """Send a frame of readings by `send`; once more, where a second node sends in its name."""
+        send()
+        if self.false.repeated(quantities):
+            self._second = True
+            send()
+            self._second = False
 
     # ---- time
 
@@ -93,7 +113,10 @@ class SimulatedDrive:
         raise NotImplementedError
 
     def inject(self, fault: str, value: float) -> None:
-        """A firmware fault begins."""
+        """A firmware fault begins, or a falsehood."""
+        if fault in FALSE_READINGS:
+            self.false.begin(fault, value)
+            return
         self.faults[fault] = value
         if fault in ("drive.trip", "drive.latched"):
             self.trip()
@@ -107,6 +130,7 @@ class SimulatedDrive:
     def end_faults(self) -> None:
         """All injected faults end; what they did stays until it is cleared by the host."""
         self.faults.clear()
+        self.false.end()
 
     @property
     def latched(self) -> bool:

@@ -83,6 +83,15 @@ class Drives:
             if device.rpm:
                 self._velocity_per_count[place] = 60.0 / self._sensors.increments[place]
 
+    def units(self, joint: int) -> tuple[float, float, float]:
+        """One count of position [rad], velocity [rad/s] and torque of the motor [N·m], as its PDOs have them."""
+        step = float(self._sensors.position_step[joint])
+        return (
+            step / float(self._user_per_count[joint]),
+            step / float(self._velocity_per_count[joint]),
+            1.0 / float(self._per_mille[joint]),
+        )
+
     # ---- readings
 
     def sample(self, time: float, elapsed: float) -> None:

@@ -15,11 +15,17 @@ from armlink.drives.canopen.profile import OURS, Profile, examine
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.canopen.units import Units
-from armlink.drives.orders import Limits, Mode
+from armlink.drives.orders import Limits, Mode, ReadingRange
 from armlink.errors import BusFault, Refused
 
 QUICK_STOP_AND_HOLD = 6
 """605Ah: quick stop ramp, then stay in quick stop, power on: the joint holds."""
+MAX_PROFILE_VELOCITY = Entry(0x607F, 0, "I", "max profile velocity")
+MAX_MOTOR_SPEED = Entry(0x6080, 0, "I", "max motor speed")
+"""Bounds that a device may have besides the objects that the link uses: no data sheet needs them."""
+COARSER = "choose a coarser unit in the device"
+SPEED_ROUNDING = 1e-3
+"""A speed in whole counts is as exact as this."""
 DISPLAY_READS = 5
 """A mode that was written is displayed within this many reads."""
 ABORT_IS_QUICK_STOP = 3
@@ -294,6 +300,39 @@ def interpolation(period: float) -> tuple[int, int]:
             return value, exponent
     exponent = math.ceil(math.log10(period / 255))
     return round(period / 10.0**exponent), exponent
+
+
+def reading_ranges(
+    services: NodeServices, joint: LinkJoint, unit: Units, limits: Limits, profile: Profile
+) -> tuple[ReadingRange, ...]:
+    """Ends of a device's readings by the sizes of its objects. Raises Refused where the device itself turns no faster
+    than the arm file asks for: 607Fh, in units of 606Ch, and 6080h, in motor revolutions a minute."""
+    stated = limits.max_velocity
+    for entry, fastest in (
+        (MAX_PROFILE_VELOCITY, unit.velocity),
+        (MAX_MOTOR_SPEED, 2 * math.pi / 60 * _turns_a_motor_turn(services)),
+    ):
+        count = int(services.read(entry)) if services.has(entry) else 0
+        if 0 < count * fastest < stated * (1 - SPEED_ROUNDING):
+            raise Refused(
+                f"{joint.name} ({joint.settings.address}): {entry} is {count}, which is {count * fastest:.4g} rad/s, "
+                f"and max_velocity asks for {stated:.4g}: set it to {math.ceil(stated / fastest)} or more, or lower "
+                "max_velocity"
+            )
+    ranges = [ReadingRange("position", 2**31 * unit.position, str(objects.POSITION), COARSER)]
+    if profile.has(objects.VELOCITY):
+        ranges.append(ReadingRange("velocity", 2**31 * unit.velocity, str(objects.VELOCITY), COARSER))
+    if profile.has(objects.MOTOR_TORQUE):
+        ranges.append(ReadingRange("torque", (2**15 - 1) * unit.torque, str(objects.MOTOR_TORQUE), COARSER))
+    return tuple(ranges)
+
+
+def _turns_a_motor_turn(services: NodeServices) -> float:
+    """Turns of the output for one of the motor, by 6091h; 1 where the device does not tell."""
+    if not (services.has(objects.GEAR_MOTOR) and services.has(objects.GEAR_SHAFT)):
+        return 1.0
+    motor, shaft = int(services.read(objects.GEAR_MOTOR)), int(services.read(objects.GEAR_SHAFT))
+    return shaft / motor if motor else 1.0
 
 
 def read_temperature(services: NodeServices) -> float:

@@ -210,6 +210,7 @@ class CanopenDrives:
             position_step=max(unit.position, unit.encoder_step),
             modes=profile.usable_modes(supported),
             lost=profile.lost,
+            ranges=device.reading_ranges(services, row, unit, limits, profile),
             scales={"torque [N·m]": unit.torque, "position [rad]": unit.position, "velocity [rad/s]": unit.velocity},
         )
         return Wire(row.settings.node, profile, unit, limits), setup

@@ -13,6 +13,7 @@ from armlink.drives.orders import Limits, Setup
 from armlink.errors import BadInput, BusFault
 
 SCALES = (Register.POSITION_RANGE, Register.VELOCITY_RANGE, Register.TORQUE_RANGE)
+RANGE_REMEDY = "write it with the maker's tool and store it"
 LARGEST_RANGE = 1e4
 """No range of a real drive is larger [rad, rad/s, N·m]."""
 NOTED = (Register.TORQUE_CONSTANT, Register.OVER_CURRENT, Register.LARGEST_CURRENT, Register.GEAR_RATIO)
@@ -85,7 +86,8 @@ def _result(ask: Ask, name: str, settings: DamiaoSettings, ranges: Ranges, known
         f"gear {known[Register.GEAR_RATIO]:g}",
         f"current limit {known[Register.OVER_CURRENT] * known[Register.LARGEST_CURRENT]:g} A",
     ]
-    return mit_setup(reply.feedback.position, settings.kp, settings.kd, ranges, notes)
+    where = ("register 21 (PMAX)", "register 22 (VMAX)", "register 23 (TMAX)")
+    return mit_setup(reply.feedback.position, settings.kp, settings.kd, ranges, notes, where, RANGE_REMEDY)
 
 
 def read_position(ask: Ask, name: str, settings: DamiaoSettings) -> float:

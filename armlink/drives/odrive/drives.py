@@ -4,8 +4,10 @@ The drive's cyclic messages, its watchdog and its limits are set over USB: CANSi
 """
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.frame_bits import longest_frame_bits
@@ -44,6 +46,8 @@ ASK_AGAIN = 0.25
 """A request that shows in no heartbeat is sent again after this time [s]."""
 PATIENCE = 0.5
 """Longest wait for heartbeat, estimates and torques at the start [s]."""
+RECENT = 3
+"""Positions of which the middle one is held: one false reading among them does not count."""
 LARGEST_POSITION = 1e5
 """No motor's position is larger [rev]; a larger one is no reading."""
 
@@ -56,6 +60,8 @@ class _Known:
     heartbeat: frames.Heartbeat | None = None
     position: float = math.nan
     """[rad]."""
+    recent: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    """The newest positions [rad]."""
     velocity: float = math.nan
     torque: float = math.nan
     """That came since the newest estimates [N·m]; it goes with the next ones."""
@@ -192,7 +198,14 @@ class ODriveDrives(BasicDrives):
         if order.power is Power.STOPPED and on:
             # no state in which it holds without its host: hold by input, where it stands now
             known.stopping = True
-            at = held.position if held is not None and held.power is Power.STOPPED else known.position
+            # by the middle one of its newest positions: a false one may be what it is stopped for
+            at = (
+                held.position
+                if held is not None and held.power is Power.STOPPED
+                else median(known.recent)
+                if known.recent
+                else known.position
+            )
             return self._input(joint, Order(Power.STOPPED, False, Mode.POSITION, at, 0.0, 0.0, 0.0, 0.0))
         if (
             order.power is not Power.ON
@@ -269,6 +282,7 @@ class ODriveDrives(BasicDrives):
             if not abs(position) < LARGEST_POSITION or not math.isfinite(velocity):
                 return None
             known.position, known.velocity = position * TURN, velocity * TURN
+            known.recent.append(known.position)
             torque, known.torque = known.torque, math.nan
             return Reading(joint, known.position, known.velocity, torque)
         if message == Message.TORQUES and math.isfinite(values[1]):

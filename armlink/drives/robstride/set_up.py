@@ -49,7 +49,9 @@ def prepare(ask: Ask, name: str, settings: RobStrideSettings, limits: Limits, ra
     deadman = round(limits.deadline / TIMEOUT_UNIT)
     _set(ask, name, settings, Parameter.TIMEOUT, deadman, "it would keep on after its host died")
     notes = (f"scales of {settings.model} by its manual: the drive has no register for them",)
-    return mit_setup(feedback.motion.position, settings.kp, settings.kd, ranges, notes)
+    where = (f"the range of an {settings.model}",) * 3
+    remedy = "the drive has no register for it: correct drive.model, or take a drive with more"
+    return mit_setup(feedback.motion.position, settings.kp, settings.kd, ranges, notes, where, remedy)
 
 
 def _set(ask: Ask, name: str, settings: RobStrideSettings, parameter: Parameter, value: float, otherwise: str) -> None:

@@ -1,0 +1,110 @@
+"""What readings prove about the motion of a joint, and what they do not: nothing is put down to a drive that a late
+host, a late reply or a lost frame explains."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from armlink.link.bus_watchdog import EXCESS, SLOW_CYCLES, BusWatch
+from armlink.link.motion_watchdog import MotionWatch
+
+PERIOD, MOST = 0.004, 1.0
+STEP = 2 * np.pi / 2**12
+"""Of a coarse encoder [rad]."""
+
+
+def watch(step=STEP):
+    made = MotionWatch(1, PERIOD)
+    made.use(np.array([step]), np.array([MOST]))
+    return made
+
+
+@st.composite
+def motions(draw):
+    """A smooth motion of at most MOST; times in which samples may have been taken, which wander and jump with the host;
+    delay of the velocity; whether a reading is lost."""
+    seed = draw(st.integers(0, 2**32 - 1))
+    return np.random.default_rng(seed), draw(st.floats(0.0, 0.01)), draw(st.sampled_from([0.0, 0.1, 0.5]))
+
+
+@settings(max_examples=60, deadline=None)
+@given(motions())
+def test_a_sound_joint_is_neither_contradicted_nor_proven_fast(motion):
+    random, delay, lost = motion
+    made, now = watch(), 0.0
+    amplitude, omega = random.uniform(0.0, 1.0), random.uniform(0.5, 6.0)
+    amplitude = min(amplitude, MOST / omega)
+
+    def angle(t):
+        return amplitude * np.sin(omega * t)
+
+    velocity, came = np.nan, -np.inf
+    for cycle in range(400):
+        asked = now
+        answered = asked + random.uniform(0.0, 0.9 * PERIOD) + (random.random() < 0.02) * random.uniform(0.0, 0.3)
+        taken = random.uniform(asked, answered)
+        if cycle % SLOW_CYCLES == 0:
+            came = answered
+            velocity = amplitude * omega * np.cos(omega * (taken - delay)) + random.uniform(-0.02, 0.02)
+        if random.random() >= lost:
+            reading = STEP * np.rint(angle(taken) / STEP)
+            made.update([reading], [asked], [answered], [velocity], [came])
+            assert not made.contradicted[0]
+            assert made.proven[0] <= amplitude * omega * (1 + 1e-9)
+        now = max(answered, asked + PERIOD)
+
+
+def test_a_steady_speed_is_proven_by_positions_alone():
+    made = watch(2 * np.pi / 2**17)
+    for cycle in range(40):
+        now = cycle * PERIOD
+        made.update([2.0 * now], [now], [now], [np.nan], [now])
+    assert made.proven[0] == pytest.approx(2.0, rel=0.01)
+    assert made.ahead[0] == pytest.approx(2.0, rel=0.01)
+
+
+@pytest.mark.parametrize("told", [0.0, 0.2, 5.0])
+def test_a_velocity_that_the_positions_do_not_bear_out_contradicts_them(told):
+    made, noticed = watch(2 * np.pi / 2**17), 0.0
+    for cycle in range(400):
+        now = cycle * PERIOD
+        speed = 2.0 * now
+        made.update([now**2], [now], [now], [told * speed], [now])
+        if made.contradicted[0]:
+            noticed = speed
+            break
+    assert 0.0 < noticed < 1.0
+
+
+def test_scales_that_the_scale_check_looks_for_are_left_to_it():
+    for factor in (1 / 1.4, 1.4):
+        made = watch()
+        for cycle in range(500):
+            now = cycle * PERIOD
+            made.update([0.5 * now], [now], [now], [factor * 0.5], [now])
+            assert not made.contradicted[0]
+
+
+def test_after_an_interruption_nothing_is_proven():
+    made = watch()
+    for cycle in range(20):
+        made.update([0.0], [cycle * PERIOD], [cycle * PERIOD], [0.0], [cycle * PERIOD])
+    made.restart()
+    made.update([3.0], [0.1], [0.1], [0.0], [0.1])
+    assert not made.contradicted[0]
+    assert made.proven[0] == 0.0
+
+
+def test_velocities_that_come_as_often_as_a_drive_sends_them_are_one_senders():
+    bus = BusWatch(2)
+    for cycle in range(1000):
+        bus.syncs += 1
+        if cycle % SLOW_CYCLES == 3:
+            bus.slow(0)
+        if cycle % SLOW_CYCLES == 0 and cycle % 24:  # some are lost
+            bus.slow(1)
+    assert bus.forged is None
+    for _ in range(EXCESS + 1):  # one may be early
+        bus.slow(0)
+    assert bus.forged == 0
