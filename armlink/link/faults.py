@@ -114,17 +114,17 @@ def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None
         return watch.reception
     if watch.intruder:
         return f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
-    if watch.forged is not None:
-        return (
-            f"{names[watch.forged]}: more readings than it sends: a second node sends velocities and states "
-            "in its name: give every node its own id, and find out who sends"
-        )
     doubled = watch.doubled
     if doubled is not None:
         return f"{names[doubled]}: two readings in every cycle: a second node has its id: give every node its own"
     if watch.babbling:
         return (
             f"more frames than these joints send, most of them {_culprit(names, watch)}: a node babbles: disconnect it"
+        )
+    if watch.forged is not None:
+        return (
+            f"{names[watch.forged]}: more readings than it sends: a second node sends velocities and states "
+            "in its name: give every node its own id, and find out who sends"
         )
     if dropped:
         return f"{dropped} frames lost: this host reads too slowly: give it more time or less to do"

@@ -85,7 +85,7 @@ def see_out(channel: Channel, runs: Callable[[], bool], cause: Cause, tell: Call
             try:
                 for message in channel.receive():
                     heard = time.monotonic()
-                    if isinstance(message, Told):
+                    if isinstance(message, Told) and not message.id:
                         tell(message.text)
                 tell("")
             except Dropped:

@@ -137,11 +137,10 @@ class DriveLoop:
         """Tell what a function does; raises KeyboardInterrupt in it where the job says so."""
         self._channel.put(Told(id, text))
         self._channel.flush()
-        for message in self._channel.receive():
-            if isinstance(message, End):
-                self._end = message
-            if isinstance(message, Cut | End):
-                raise KeyboardInterrupt
+        messages = self._channel.receive()
+        self._end = next((each for each in messages if isinstance(each, End)), self._end)
+        if any(isinstance(each, Cut | End) for each in messages):
+            raise KeyboardInterrupt
 
     def _keep(self) -> None:
         """Hold the joints, which were stopped."""

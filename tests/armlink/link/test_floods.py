@@ -100,7 +100,7 @@ def test_a_flood_drops_no_arm(family: str, kind: str, count: int) -> None:
 def test_what_a_flood_is_made_of_is_named(kind: str, named: str, count: int) -> None:
     said = str(flooded("cia402", kind, count)[1])
     if kind == "the drives' own" and count == 200:
-        assert "two readings in every cycle: a second node has its id" in said
+        assert "a second node" in said
     else:
         assert said.startswith("more frames than these joints send, most of them " + named)
 

@@ -1,5 +1,6 @@
 """The link on scripted nodes: what it sends, byte for byte, and how it leaves the joints."""
 
+import signal
 import struct
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from armlink.drives.orders import Power
 from armlink.errors import BadInput, BusFault, Refused
+from armlink.link.cycle import Commander
 from armlink.link.link import Link
 from armlink.link.types import Calibration, Command
 
@@ -209,16 +211,18 @@ def test_leaving_normally_or_by_an_exception_is_a_quick_stop(arm_of, bus):
 
 
 def test_an_interruption_while_leaving_is_a_quick_stop_too(arm_of, bus, monkeypatch):
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
+    stop = Commander.stop
 
-    monkeypatch.setattr("armlink.link.link.leave", interrupted)
+    def interrupted(commander: Commander) -> None:
+        signal.raise_signal(signal.SIGINT)
+        stop(commander)
+
+    monkeypatch.setattr(Commander, "stop", interrupted)
     link = Link(arm_of(), bus)
     link.start()
     link.enable()
     link.cycle(command(TORQUE, torque=5.0))
-    with pytest.raises(KeyboardInterrupt):
-        link.__exit__(None, None, None)
+    link.__exit__(None, None, None)
     assert [node.status for node in bus.nodes.values()] == [QUICK_STOP] * 3
     assert bus.closed
 

@@ -123,7 +123,7 @@ def arm_file(family: str, bus: Bus) -> dict[str, object]:
         "kinematics": {"gravity": [9.81, 0.0, 0.0], "joints": [{"name": "hinge", "lower": -2.0, "upper": 2.0}]},
         "link": {
             "bus": {"interface": "udp_multicast", "channel": bus.channel, "fd": bus.fd},
-            "joints": [{"name": "hinge", "drive": DRIVES[family], "rated_torque": 10.0, "max_torque": 20.0}],
+            "joints": [{"name": "hinge", "drive": DRIVES[family], "rated_torque": 8.0, "max_torque": 10.0}],
             **LINK,
         },
     }
