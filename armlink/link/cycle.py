@@ -324,7 +324,7 @@ class Commander:
 
     def _others(self) -> list[Corroboration]:
         motion = self.motion
-        bounds = (motion.proven.tolist(), motion.ahead.tolist(), motion.contradicted.tolist(), self._ordered_torques())
+        bounds = (motion.proven, motion.ahead, motion.contradicted, self._ordered_torques())
         return [Corroboration(*each) for each in zip(*bounds, strict=True)]
 
     def _ordered_torques(self) -> list[float]:

@@ -13,18 +13,15 @@ or a lost frame did to the time between them. The encoder's resolution widens bo
 """
 
 import math
-import warnings
 from collections.abc import Sequence
-
-import numpy as np
-from numpy.typing import NDArray
+from itertools import pairwise
 
 from armlink.arrays import Array
 from armlink.link.bus_watchdog import SLOW_CYCLES
 
-LAGS = 2 ** np.arange(6)
+LAGS = (1, 2, 4, 8, 16, 32)
 """Mean speeds are taken over so many cycles: the short ones are quick, the long ones exact."""
-ROWS = int(LAGS[-1]) + 1
+ROWS = LAGS[-1] + 1
 """Cycles whose readings are kept."""
 PRESENT = 4
 """The first so many lags tell of the present: a mean over up to eight cycles."""
@@ -45,41 +42,56 @@ IDLE_SHARE = 0.25
 """Slower than this share of max_velocity a joint proves no speed that any limit asks for."""
 
 
+class _Joint:
+    """The newest readings of one joint, and what they prove."""
+
+    __slots__ = ("age", "apart", "at", "before", "cycles", "earliest", "fastest", "latest", "most", "newest", "peak",
+                 "positions", "step", "time", "way", "width")  # fmt: skip
+
+    def __init__(self, step: float, most: float, fastest: int) -> None:
+        """Resolution of its positions [rad], its speed limit [rad/s], and of how many cycles the speeds are kept."""
+        self.step, self.most = step, most
+        self.cycles = self.at = 0
+        self.positions, self.earliest, self.latest = [math.nan] * ROWS, [math.nan] * ROWS, [math.nan] * ROWS
+        self.fastest = [math.inf] * fastest
+        """Greatest speeds that the positions allowed, in the newest cycles [rad/s]."""
+        self.newest = -math.inf
+        self.before = self.time = math.nan
+        """Newest position, and the middle of the time in which it was taken."""
+        self.apart = self.way = self.peak = self.width = self.age = 0.0
+        """Way by positions less that by velocities, way of the two together [rad]; greatest speed [rad/s]; longest time
+        in which a sample was taken, greatest age of a velocity [s]. All fade with MEMORY."""
+
+
 class MotionWatch:
-    """Bounds of the speeds of n joints by the readings of the newest cycles."""
+    """Bounds of the speeds of n joints by the readings of the newest cycles.
+
+    Plain numbers, a joint at a time: of arrays this short a cycle would cost five times as much.
+    """
 
     def __init__(self, n: int, period: float) -> None:
         """`period` of a cycle [s]."""
         self.n, self._period = n, period
         self._delay = FILTER_TIME + (SLOW_CYCLES + 1) * period
         """Age of the motion that a velocity tells of, where none was lost or late [s]."""
-        self._step, self._most = np.zeros(n), np.full(n, math.inf)
+        self._step, self._most = [0.0] * n, [math.inf] * n
         self.restart()
 
     def use(self, step: Array, max_velocity: Array) -> None:
         """Resolution of the positions (n,) [rad] and speed limits (n,) [rad/s] from now on."""
-        self._step, self._most = np.array(step, float), np.array(max_velocity, float)
+        self._step, self._most = step.tolist(), max_velocity.tolist()
         self.restart()
 
     def restart(self) -> None:
         """After an interruption: what was before proves nothing of what comes."""
-        n = self.n
-        self.proven: Array = np.zeros(n)
+        self.proven = [0.0] * self.n
         """(n,) [rad/s]; 0 where the positions prove nothing."""
-        self.ahead: Array = np.zeros(n)
+        self.ahead = [0.0] * self.n
         """(n,) [rad/s]; likewise."""
-        self.contradicted: NDArray[np.bool_] = np.zeros(n, bool)
+        self.contradicted = [False] * self.n
         """(n,)."""
-        self._at = self._cycles = 0
-        self._positions, self._earliest, self._latest = (np.full((ROWS, n), math.nan) for _ in range(3))
-        self._fastest = np.full((math.ceil(self._delay / self._period), n), math.nan)
-        """Greatest speeds that the positions allowed, in the newest cycles [rad/s]."""
-        self._newest = np.full(n, -math.inf)
-        self._before, self._time = np.full(n, math.nan), np.full(n, math.nan)
-        """Newest position, and the middle of the time in which it was taken."""
-        self._apart, self._way, self._peak, self._width, self._age = (np.zeros(n) for _ in range(5))
-        """Way by positions less that by velocities, way of the two together [rad]; greatest speed [rad/s]; longest time
-        in which a sample was taken, greatest age of a velocity [s]. All fade with MEMORY."""
+        kept = math.ceil(self._delay / self._period)
+        self._joints = [_Joint(*each, kept) for each in zip(self._step, self._most, strict=True)]
 
     def update(
         self,
@@ -91,69 +103,86 @@ class MotionWatch:
     ) -> None:
         """The newest readings (n,) of a cycle: positions [rad] that were taken between `earliest` and `latest` [s], and
         velocities [rad/s] that came at `came` [s], NaN where none came of late."""
-        here, since, until, told = (np.array(each, float) for each in (position, earliest, latest, velocity))
-        known = np.isfinite(told)
-        age = np.where(known, FILTER_TIME + until - np.where(known, np.array(came, float), 0.0), 0.0)
-        new = until > self._newest
-        self._newest = np.where(new, until, self._newest)
-        self._cycles += 1
-        row = self._at = self._cycles % ROWS
-        self._positions[row] = here = np.where(new, here, math.nan)
-        self._earliest[row], self._latest[row] = since, until
-        speed = np.where(np.isfinite(told), np.abs(told), 0.0)
-        with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings():
-            least, greatest = self._means(here, since, until)
-            self._compare(here, since, until, told, np.fmax(speed, least), age)
-            busy = np.fmax(speed, least) > IDLE_SHARE * self._most
-            self.proven = least
-            self.ahead = np.fmax(least, self._extrapolated(here, since, until)) if busy.any() else least
-            self._fastest[self._cycles % len(self._fastest)] = greatest
-            unseen = (age <= self._delay) & (speed > self._most) & ((1 - SHARE) * speed > self._fastest.max(axis=0))
-        self.contradicted = unseen | (self._apart_too_far())
+        rows = zip(position, earliest, latest, velocity, came, strict=True)
+        for joint, (own, row) in enumerate(zip(self._joints, rows, strict=True)):
+            self.proven[joint], self.ahead[joint], self.contradicted[joint] = self._judged(own, *row)
 
-    def _means(self, here: Array, since: Array, until: Array) -> tuple[Array, Array]:
-        """Least present speed (n,) and greatest speed of late (n,) that the positions allow [rad/s]."""
-        rows = (self._at - LAGS) % ROWS
-        ways = np.abs(here - self._positions[rows])
-        longest, shortest = until - self._earliest[rows], since - self._latest[rows]
-        least = np.fmax.reduce((ways[:PRESENT] - self._step) / longest[:PRESENT], axis=0)
-        most = np.where(shortest > 0, (ways + self._step) / shortest, math.inf)
-        most[np.isnan(ways)] = math.nan
-        greatest = np.where(np.isnan(most[0]), math.inf, np.fmax.reduce(most, axis=0))
-        return np.fmax(least, 0.0), greatest
+    def _judged(
+        self, own: _Joint, here: float, since: float, until: float, told: float, came: float
+    ) -> tuple[float, float, bool]:
+        """`proven`, `ahead` and `contradicted` of one joint by its newest readings."""
+        known = told == told  # not NaN
+        age, speed = (FILTER_TIME + until - came, abs(told)) if known else (0.0, 0.0)
+        if until > own.newest:
+            own.newest = until
+        else:
+            here = math.nan
+        own.cycles += 1
+        row = own.at = own.cycles % ROWS
+        own.positions[row], own.earliest[row], own.latest[row] = here, since, until
+        least, greatest = _means(own, here, since, until)
+        present = max(speed, least)
+        self._compare(own, here, since, until, told, present, age)
+        ahead = max(least, self._extrapolated(own, here, since, until)) if present > IDLE_SHARE * own.most else least
+        own.fastest[own.cycles % len(own.fastest)] = greatest
+        unseen = speed > own.most and age <= self._delay and (1 - SHARE) * speed > max(own.fastest)
+        explained = WAY + 2 * own.step + SHARE * own.way + (max(self._delay, own.age) + own.width) * own.peak
+        return least, ahead, unseen or abs(own.apart) > explained
 
-    def _extrapolated(self, here: Array, since: Array, until: Array) -> Array:
-        """Least speed (n,) when an order acts, from the means over the newest cycles and those before [rad/s]."""
-        rows = (self._at - LAGS) % ROWS
-        positions, middles = self._positions[rows], (self._earliest[rows] + self._latest[rows]) / 2
-        middle = (since + until) / 2
-        interval, before = middle - middles[:-1], middles[:-1] - middles[1:]
-        mean, mean_before = (here - positions[:-1]) / interval, (positions[:-1] - positions[1:]) / before
-        lead = interval / 2 + REACTION_CYCLES * self._period
-        ahead = np.abs(mean + (mean - mean_before) / ((interval + before) / 2) * lead)
-        exact = self._step / 2 + self._peak * self._width / 2
-        least: Array = np.fmax.reduce(ahead - exact * (2 / interval + 4 * lead / interval**2), axis=0)
-        return least
+    def _extrapolated(self, own: _Joint, here: float, since: float, until: float) -> float:
+        """Least speed when an order acts, from the means over the newest cycles and those before [rad/s]."""
+        middle, lead, found = (since + until) / 2, REACTION_CYCLES * self._period, 0.0
+        exact = own.step / 2 + own.peak * own.width / 2
+        for near, far in pairwise(LAGS):
+            at, before = (own.at - near) % ROWS, (own.at - far) % ROWS
+            then, earlier = ((own.earliest[each] + own.latest[each]) / 2 for each in (at, before))
+            interval, interval_before = middle - then, then - earlier
+            if not (interval > 0.0 and interval_before > 0.0):
+                continue
+            mean = (here - own.positions[at]) / interval
+            mean_before = (own.positions[at] - own.positions[before]) / interval_before
+            reach = interval / 2 + lead
+            speed = abs(mean + (mean - mean_before) / ((interval + interval_before) / 2) * reach)
+            least = speed - exact * (2 / interval + 4 * reach / interval**2)
+            if least > found:  # not NaN
+                found = least
+        return found
 
-    def _compare(self, here: Array, since: Array, until: Array, told: Array, speed: Array, age: Array) -> None:
-        """Bring the ways by positions and by velocities up to date; `speed` (n,) is the present one, `age` (n,) how
-        old the motion is that the velocities tell of [s]."""
-        new = np.isfinite(here)
-        middle = (since + until) / 2
-        elapsed = np.where(new, middle - self._time, math.nan)
-        moved, turned = here - self._before, told * elapsed
-        gap = elapsed > self._delay + self._period  # in which the velocity may have been anything
-        known = np.isfinite(moved) & np.isfinite(turned) & ~gap
-        keep = np.where(gap, 0.0, np.where(known, np.maximum(1.0 - elapsed / MEMORY, 0.0), 1.0))
-        self._apart = keep * self._apart + np.where(known, moved - turned, 0.0)
-        self._way = keep * self._way + np.where(known, np.fmax(np.abs(moved), np.abs(turned)), 0.0)
-        self._peak = np.fmax(keep * self._peak, speed)
-        self._age = np.fmax(keep * self._age, age)
-        self._width = np.where(new, np.fmax(keep * self._width, until - since), self._width)
-        self._before, self._time = np.where(new, here, self._before), np.where(new, middle, self._time)
+    def _compare(
+        self, own: _Joint, here: float, since: float, until: float, told: float, speed: float, age: float
+    ) -> None:
+        """Bring the ways by positions and by velocities up to date; `speed` is the present one, `age` how old the
+        motion is that the velocity tells of [s]."""
+        keep, new, middle = 1.0, here == here, (since + until) / 2
+        elapsed = middle - own.time if new else math.nan
+        if elapsed > self._delay + self._period:  # in which the velocity may have been anything
+            keep, own.apart, own.way = 0.0, 0.0, 0.0
+        else:
+            moved, turned = here - own.before, told * elapsed
+            if moved - turned == moved - turned:  # neither is NaN
+                keep = max(1.0 - elapsed / MEMORY, 0.0)
+                own.apart = keep * own.apart + moved - turned
+                own.way = keep * own.way + max(abs(moved), abs(turned))
+        own.peak, own.age = max(keep * own.peak, speed), max(keep * own.age, age)
+        if new:
+            own.width = max(keep * own.width, until - since)
+            own.before, own.time = here, middle
 
-    def _apart_too_far(self) -> NDArray[np.bool_]:
-        explained = (
-            WAY + 2 * self._step + SHARE * self._way + (np.maximum(self._delay, self._age) + self._width) * self._peak
-        )
-        return np.abs(self._apart) > explained
+
+def _means(own: _Joint, here: float, since: float, until: float) -> tuple[float, float]:
+    """Least present speed and greatest speed of late that the positions allow [rad/s]."""
+    least = greatest = 0.0
+    for place, lag in enumerate(LAGS):
+        row = (own.at - lag) % ROWS
+        way = abs(here - own.positions[row])
+        if way != way:
+            if not place:
+                greatest = math.inf
+            continue
+        if place < PRESENT:
+            longest = until - own.earliest[row]
+            if longest > 0.0:
+                least = max(least, (way - own.step) / longest)
+        shortest = since - own.latest[row]
+        greatest = max(greatest, (way + own.step) / shortest if shortest > 0.0 else math.inf)
+    return least, greatest
