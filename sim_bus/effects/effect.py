@@ -20,11 +20,11 @@ class EffectSetting(Protocol):
     """One effect with its parameter values, as an arm file gives it."""
 
     @property
-    def effect(self) -> str: ...  # noqa: D102
+    def effect(self) -> str: ...
     @property
-    def joint(self) -> str | None: ...  # noqa: D102
+    def joint(self) -> str | None: ...
     @property
-    def parameters(self) -> dict[str, Any]: ...  # noqa: D102
+    def parameters(self) -> dict[str, Any]: ...
 
 
 @dataclass(frozen=True)
