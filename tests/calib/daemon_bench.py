@@ -11,7 +11,6 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.loop.messages import Answer
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.environment import Environment
-from calib.daemon.loop.arm_loop import ArmLoop
 from calib.daemon.loop.loop_messages import LoopOptions, Message
 from calib.daemon.loop.loop_process import LoopControllers, _tour
 from calib.daemon.service import Service
@@ -64,6 +63,8 @@ class InlineLoop:
     """The loop in this thread: `pump` runs the cycles of a tenth of a second."""
 
     def __init__(self, options: LoopOptions) -> None:
+        from calib.daemon.loop.arm_loop import ArmLoop  # not loaded where only the records are wanted
+
         self.loop = ArmLoop(options)
         self.controllers = LoopControllers(self.loop.handle)
 
