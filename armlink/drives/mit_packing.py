@@ -51,11 +51,6 @@ class Ranges(NamedTuple):
     """[N·m·s/rad]."""
 
     @property
-    def torque_quantum(self) -> float:
-        """Step of a packed torque [N·m]; zero lies half a step from its neighbours."""
-        return 2 * self.torque / 0xFFF
-
-    @property
     def position_quantum(self) -> float:
         """Step of a packed position [rad]."""
         return 2 * self.position / 0xFFFF

@@ -86,12 +86,9 @@ class Refined:
     fit: GlobalFit
     factor: Array
     """Scatter of each joint's readings over their samples' noise (n,)."""
-    raw_factor: Array
-    """The same without the lower bound; NaN for a joint with too few readings."""
     linear: Linear
     coefficients: Array
     """Of the extras, in their units (m,)."""
-    coefficient_std: Array
     freedom: Array
     """Free readings of each joint (n,)."""
     levels: Levels
@@ -118,7 +115,7 @@ def refine(
         level = step.levels.level
         vector[problem.free] += step.solution[: step.parameters]
         raw, freedom = _scatter(step.linear, kinematics.n)
-        used, factor = factor, np.maximum(factor * np.where(np.isnan(raw), 1.0, raw), LEAST_FACTOR)
+        factor = np.maximum(factor * np.where(np.isnan(raw), 1.0, raw), LEAST_FACTOR)
     found = analyse(step.triangle, step.scale)
     inner, behind = slice(0, step.parameters), slice(step.parameters, None)
     residual = np.full(readings.torque.shape, np.nan)
@@ -140,16 +137,13 @@ def refine(
         chi2=float(scaled @ scaled),
         dof=round(float(freedom.sum())),
     )
-    spread = np.sqrt(np.abs(np.diag(found.covariance)[behind]))
     certainty = np.full(len(vector), 1.0)
     certainty[problem.free] = _certainty(step, np.nan_to_num(covariance), freedom)
     return Refined(
         refined,
         factor,
-        raw * used,
         step.linear,
         step.solution[behind],
-        spread,
         freedom,
         step.levels,
         step.troubles,

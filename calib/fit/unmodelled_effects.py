@@ -33,13 +33,12 @@ PATH = 12
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """An effect found: its columns, in the effect's own units, and its significance."""
+    """An effect found: its columns, in the effect's own units."""
 
     joint: int
     id: str
     """In `armlink.effect_catalogue`."""
     extras: tuple[Extra, ...]
-    p_value: float
     knee: float = np.nan
     """Torque at which a sensor begins to saturate [N·m]."""
     doubt: Array | None = None
@@ -82,7 +81,7 @@ def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: 
         shape = (columns * linear.sigma[:, None] @ coefficient)[own]
         size = float(np.std(shape)) if len(shape) else 0.0
         if p_value < CHANCE and size > MATERIAL * rated[effect.joint] and gain > most:
-            best, most = replace(effect, p_value=p_value), gain
+            best, most = effect, gain
     return best
 
 
@@ -104,7 +103,7 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
         sides = [here * side for side in _sides(rows, joint)]
         if sides:
             columns = tuple(_one(kinematics.n, joint, "torque.hysteresis", side).extras[0] for side in sides)
-            yield Effect(joint, "torque.hysteresis", columns, 1.0, doubt=doubt, each_sweep=True)
+            yield Effect(joint, "torque.hysteresis", columns, doubt=doubt, each_sweep=True)
         yield replace(
             _one(kinematics.n, joint, "torque.hysteresis", here * lag(kinematics, rows, refined, joint)), doubt=doubt
         )
@@ -124,14 +123,14 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
         if float(np.ptp(angle[here])) > TURN:
             turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
             extras = tuple(Extra(joint, "position.eccentricity", each) for each in turn)
-            yield Effect(joint, "position.eccentricity", extras, 1.0)
+            yield Effect(joint, "position.eccentricity", extras)
 
 
 def _one(n: int, joint: int, effect_id: str, values: Array, knee: float = np.nan) -> Effect:
     """An effect that shows in one joint's sensor alone, `values` (K,)."""
     column = np.zeros((len(values), n))
     column[:, joint] = values
-    return Effect(joint, effect_id, (Extra(joint, effect_id, column),), 1.0, knee)
+    return Effect(joint, effect_id, (Extra(joint, effect_id, column),), knee)
 
 
 def _sides(rows: SweepReadings, joint: int) -> Iterator[Array]:

@@ -10,11 +10,10 @@ from typing import Any, TypeVar
 import sqlalchemy as sa
 
 from armlink.arm_file import ArmFile, read_yaml
-from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput, Refused
 from calib.records.bounds import require_sound
 from calib.records.database import StoreFault, default_url, first_line, open_database, reading, transaction
-from calib.records.records import CalibrationRecord, GravityRecord, Record, digest_id, parse_record
+from calib.records.records import CalibrationRecord, GravityRecord, digest_id, parse_record
 from calib.records.schema import ACTIVATIONS, RECORDS, WRITES
 
 R = TypeVar("R", CalibrationRecord, GravityRecord)
@@ -233,11 +232,6 @@ def load_yaml(path: Path) -> AnyRecord:
     except OSError as error:
         raise BadInput(f"{path}: cannot be read as YAML: {first_line(error)}") from None
     return parse_record(content, str(path))
-
-
-def export_yaml(record: Record, path: Path) -> None:
-    """Write a record to a YAML file, atomically."""
-    write_whole(path, record.to_yaml())
 
 
 def _now() -> str:

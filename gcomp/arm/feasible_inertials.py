@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from gcomp.arm.arm import Arm
-from gcomp.arm.mass_moments import base_parameters
 from gcomp.arrays import Array, as_array, frozen
 from gcomp.errors import GcompError
 
@@ -99,28 +97,6 @@ def nearest_inertials(beta: Array, nominal: Inertials, bounds: Bounds, moments: 
     if further is None:
         raise NotFeasible("no masses above their bounds with centres of mass inside theirs have these mass moments")
     return _unpack(start + unit * (shift + free @ further))
-
-
-def feasible_moments(arm: Arm, beta: Array, covariance: Array, bounds: Bounds) -> Array:
-    """The mass moments (2n,) [kg·m] nearest to β in the metric of its covariance (2n, 2n) that the bounds allow.
-
-    Equal to constrained least squares on the readings that β was fitted to. Raises NotFeasible on empty bounds.
-    """
-    n, known = arm.n, ~np.isnan(beta)
-    linear = _matrix(n, lambda mass, moment: base_parameters(arm, mass, moment))
-    spread, axes = np.linalg.eigh(covariance[np.ix_(known, known)])
-    whiten = axes.T / np.sqrt(np.maximum(spread, 1e-12 * spread[-1]))[:, None]
-    keep_small = 1e-6 * np.linalg.norm(whiten @ linear[known])  # makes the solution unique, with negligible weight
-    system = np.vstack([whiten @ linear[known], keep_small * np.eye(4 * n)])
-    target = np.concatenate([whiten @ beta[known], np.zeros(4 * n)])
-    orthogonal, triangle = np.linalg.qr(system)
-    middle = np.linalg.solve(triangle, orthogonal.T @ target)
-    rows, limits = bounds.rows()
-    further = least_distance(np.linalg.solve(triangle.T, rows.T).T, limits - rows @ middle)
-    if further is None:
-        raise NotFeasible("no masses above their bounds have centres of mass inside theirs")
-    moments: Array = linear @ (middle + np.linalg.solve(triangle, further))
-    return np.where(known, moments, np.nan)
 
 
 def least_distance(rows: Array, limits: Array) -> Array | None:

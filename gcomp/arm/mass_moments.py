@@ -25,14 +25,6 @@ def base_parameters(arm: Arm, mass: ArrayLike, first_moment: ArrayLike) -> Array
     return beta.ravel()
 
 
-def bar_moments(arm: Arm, first_moment: ArrayLike) -> Array:
-    """First moments (n, 3) given in Denavit-Hartenberg frames' axes, from o_{i-1}, in bar frames' axes: Rx(α_i)."""
-    moments = as_array("first_moment", first_moment, (arm.n, 3))
-    ca, sa = np.cos(arm.alpha), np.sin(arm.alpha)
-    x, y, z = moments.T
-    return np.stack([x, ca * y - sa * z, sa * y + ca * z], axis=1)
-
-
 def payload_columns(arm: Arm) -> tuple[Array, Array]:
     """(E_0 (2n,), E_ρ (2n, 3)): mass μ at point ρ of bar frame n adds Δβ = μ (E_0 + E_ρ ρ); equation (P)."""
     none = np.zeros((arm.n, 3))

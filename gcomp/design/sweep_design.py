@@ -119,33 +119,6 @@ def choose_sweeps(
     return judge.design(sorted(sweeps, key=lambda sweep: sweep.joint))
 
 
-def choose_steps(
-    arm: Arm,
-    guess: Parameters,
-    sweeps: Sequence[Sweep],
-    *,
-    sigma: ArrayLike,
-    unknown: Collection[str],
-    count: int,
-    loads: Sequence[float] = (0.0,),
-    criterion: Criterion = "D",
-) -> Design:
-    """The same sweeps with `count` of their steps each, those that serve the families `unknown` best.
-
-    Give sweeps of many steps to choose from: ends and turning points of the sinusoids win. Keep 13 or more if harmonics
-    are to show in the residual (docs/theory.md, section 5.3).
-    """
-    judge = _Judge.of(arm, guess, sweeps, sigma, unknown, loads)
-    information = []
-    for sweep in sweeps:
-        by_step = judge.jacobian([sweep]).reshape(len(loads), len(sweep.angles), -1)
-        information.append(np.einsum("lkp,lkq->kpq", by_step, by_step))
-    kept = judge.select(information, [count] * len(sweeps), criterion)
-    return judge.design(
-        [Sweep(each.joint, each.pose, each.angles[sorted(steps)]) for each, steps in zip(sweeps, kept, strict=True)]
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class _Judge:
     """Comparison of sweeps: the parameters expected, which of them are unknown, and their natural units."""

@@ -43,10 +43,8 @@ class Wire:
         self.outbox: deque[Frame] = deque()
         self.time = self._free = 0.0
         """Times [s]: end of the last period; when the wire becomes free."""
-        self.full = 0
-        """Number of the host's frames that had to wait for a full transmit queue."""
-        self._busy = self._waited = self._cycling = 0.0
-        """Sums over cycles [s]: time with a frame on the wire; time from start to last frame; length."""
+        self._busy = self._cycling = 0.0
+        """Sums over cycles [s]: time with a frame on the wire; length."""
         self._on_wire = 0.0
         self._host: deque[Frame] = deque()
         self._nodes: list[tuple[int, int, bytes]] = []
@@ -58,11 +56,6 @@ class Wire:
         """Share of the cycle time in which a frame is on the wire."""
         return self._busy / self._cycling if self._cycling else 0.0
 
-    @property
-    def wait_share(self) -> float:
-        """Share of the cycle time from start to last frame, in which the host waits for the wire."""
-        return self._waited / self._cycling if self._cycling else 0.0
-
     def on_frame(self, can_id: int, data: bytes) -> None:
         """Queue a frame of the host; if the queue is full, the host waits until a frame has been sent.
 
@@ -70,7 +63,6 @@ class Wire:
         """
         self._free = max(self._free, self.time)
         while len(self._host) >= self.transmit_queue:
-            self.full += 1
             if self._free > self.time + PATIENCE:
                 raise BusFault("wire: transmit queue stays full: frames of higher priority occupy the whole bus")
             self._send_next()
@@ -85,7 +77,6 @@ class Wire:
             self._send_next()
         if self._synced:
             self._busy += self._on_wire
-            self._waited += min(self._free, end) - self.time
             self._cycling += duration
         self._synced, self._on_wire = False, 0.0
         self.line.advance(duration)

@@ -60,8 +60,6 @@ COMMANDS = {
 class MoteusDrive(SimulatedDrive):
     """One controller with id `drive`."""
 
-    LATCHES = True
-
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, serial: int) -> None:
         """As configured for its joint: gains tuned, encoder at the output."""
         super().__init__(motor, send)

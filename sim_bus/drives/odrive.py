@@ -30,8 +30,6 @@ def cyclic_periods(cycle: float) -> dict[Message, float]:
 class ODriveAxis(SimulatedDrive):
     """One axis with node id `node`."""
 
-    LATCHES = True
-
     def __init__(
         self,
         motor: Motor,
@@ -45,7 +43,7 @@ class ODriveAxis(SimulatedDrive):
         super().__init__(motor, send)
         self.address, self.serial = node, serial
         self.state, self.errors, self.reason = AxisState.IDLE, 0, 0
-        self.control_mode, self.input_mode = frames.POSITION_CONTROL, frames.PASSTHROUGH
+        self.control_mode = frames.POSITION_CONTROL
         stiffness, damping, integral = motor.tuned
         self._position_gain, self._velocity_gain = stiffness / damping, damping
         """[1/s], [N·m·s/rad]."""
@@ -84,7 +82,7 @@ class ODriveAxis(SimulatedDrive):
             self._request(int(values[0]))
         elif command == Message.CONTROLLER_MODE:
             if "mode.refused" not in self.faults:
-                self.control_mode, self.input_mode = int(values[0]), int(values[1])
+                self.control_mode = int(values[0])
         elif command == Message.INPUT_POSITION:
             ahead = self.scale("torque")
             position, velocity, torque = values
@@ -189,7 +187,7 @@ class ODriveAxis(SimulatedDrive):
     def reboot(self) -> None:
         """See SimulatedDrive."""
         self.state, self.errors, self.reason = AxisState.IDLE, 0, 0
-        self.control_mode, self.input_mode = frames.POSITION_CONTROL, frames.PASSTHROUGH
+        self.control_mode = frames.POSITION_CONTROL
         self.motor.free()
 
     def inject(self, fault: str, value: float) -> None:

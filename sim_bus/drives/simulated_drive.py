@@ -16,8 +16,6 @@ BUS_VOLTAGE = 48.0
 class SimulatedDrive:
     """One drive on one joint. A family's drive overrides receive(), control(), and what a fault does."""
 
-    LATCHES = False
-    """Whether a trip of the watchdog ends only by a command of its own."""
     address: int
     """Its id on the bus, where its family has but one."""
 

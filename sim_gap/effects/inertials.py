@@ -67,10 +67,3 @@ def pseudo_inertia(inertial: Array) -> Array:
     out[:3, 3] = out[3, :3] = inertial[1:4]
     out[3, 3] = inertial[0]
     return out
-
-
-def of_pseudo_inertia(matrix: Array) -> Array:
-    """Ten parameters from a pseudo-inertia matrix."""
-    spread = matrix[:3, :3]
-    inertia = np.trace(spread) * np.eye(3) - spread
-    return np.concatenate([[matrix[3, 3]], matrix[:3, 3], inertia[SIX]])

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
+from armlink.loop.messages import Answer
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import LoopOptions
-from calib.daemon.loop.loop_process import InlineLoop
+from calib.daemon.loop.loop_messages import LoopOptions, Message
+from calib.daemon.loop.loop_process import LoopControllers, _tour
 from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection
@@ -56,6 +57,28 @@ def run_now(work: Callable[[], Any], done: Callable[[Any], None]) -> None:
     except Exception as error:
         outcome = error
     done(outcome)
+
+
+class InlineLoop:
+    """The loop in this thread: `pump` runs the cycles of a tenth of a second."""
+
+    def __init__(self, options: LoopOptions) -> None:
+        from calib.daemon.loop.arm_loop import ArmLoop  # not loaded where only the records are wanted
+
+        self.loop = ArmLoop(options)
+        self.controllers = LoopControllers(self.loop.handle)
+
+    def sweep(self, poses: int, seed: int) -> Answer | None:
+        """Ask for a tour of poses."""
+        return self.loop.handle(_tour(poses, seed))
+
+    def pump(self) -> list[Message]:
+        """Run cycles; returns their messages."""
+        return self.loop.run()
+
+    def close(self) -> None:
+        """Leave the joints safe."""
+        self.loop.close()
 
 
 class DaemonBench:

@@ -9,10 +9,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))  # importlib mode leaves this folder out
 
-from gravity_rig import SARCOS_MOMENTS, Built, make_random_arm, make_sarcos
+from gravity_rig import SARCOS_MOMENTS, Built, bar_moments, make_random_arm, make_sarcos
 
 from gcomp.arm.arm import Arm
-from gcomp.arm.mass_moments import bar_moments
 from gcomp.arrays import Array
 
 

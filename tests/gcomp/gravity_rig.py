@@ -62,6 +62,13 @@ def make_sarcos(gravity: tuple[float, float, float] = TILTED) -> Arm:
     )
 
 
+def bar_moments(arm: Arm, first_moment: Array) -> Array:
+    """First moments (n, 3) given in Denavit-Hartenberg frames' axes, from o_{i-1}, in bar frames' axes: Rx(α_i)."""
+    ca, sa = np.cos(arm.alpha), np.sin(arm.alpha)
+    x, y, z = first_moment.T
+    return np.stack([x, ca * y - sa * z, sa * y + ca * z], axis=1)
+
+
 def make_random_arm(rng: np.random.Generator, n: int | None = None) -> Built:
     """Any twists (right angles, parallel axes and odd ones), lengths, base orientation and inertials."""
     n = n or int(rng.integers(2, 9))

@@ -85,20 +85,6 @@ class Heartbeat(NamedTuple):
     done: int = 0
 
 
-class Estimates(NamedTuple):
-    """Motor position [rev] and velocity [rev/s]."""
-
-    position: float
-    velocity: float
-
-
-class Torques(NamedTuple):
-    """Target and estimated torque of the motor [N·m]."""
-
-    target: float
-    estimate: float
-
-
 LAYOUTS = {
     Message.VERSION: "<8B",
     Message.HEARTBEAT: "<IBBBx",

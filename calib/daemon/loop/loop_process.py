@@ -1,4 +1,4 @@
-"""Runs the bus loop in this thread (`InlineLoop`, lock-step) or in a process of its own (`LoopProcess`)."""
+"""Runs the bus loop in a process of its own."""
 
 import itertools
 import multiprocessing
@@ -58,28 +58,6 @@ class LoopControllers:
             raise answer.error
         assert isinstance(answer.value, kind)
         return answer.value
-
-
-class InlineLoop:
-    """The loop in this thread: `pump` runs the cycles of a tenth of a second."""
-
-    def __init__(self, options: LoopOptions) -> None:
-        from calib.daemon.loop.arm_loop import ArmLoop
-
-        self.loop = ArmLoop(options)
-        self.controllers = LoopControllers(self.loop.handle)
-
-    def sweep(self, poses: int, seed: int) -> Answer | None:
-        """Ask for a tour of poses."""
-        return self.loop.handle(_tour(poses, seed))
-
-    def pump(self) -> list[Message]:
-        """Run cycles; returns their messages."""
-        return self.loop.run()
-
-    def close(self) -> None:
-        """Leave the joints safe."""
-        self.loop.close()
 
 
 class LoopProcess:

@@ -60,8 +60,6 @@ class Admission:
         self._trusted: set[Connection] = set()
         self._strangers: OrderedDict[Connection, None] = OrderedDict()
         self._stuck: OrderedDict[Connection, None] = OrderedDict()
-        self.turned_away = 0
-        """Connections that were cut to make room, or had none."""
 
     def enter(self, connection: Connection) -> None:
         """Take a new connection in; it is told to `begin`, now or later."""
@@ -146,7 +144,6 @@ class Admission:
         connection.give_way()
 
     def _turn_away(self, connection: Connection) -> None:
-        self.turned_away += 1
         self._strangers.pop(connection, None)
         self._queued.pop(connection, None)
         connection.cut()

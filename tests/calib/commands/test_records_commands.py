@@ -10,7 +10,7 @@ import pytest
 from armlink.arm_file import load_arm
 from armlink.cli import run
 from calib.records.records import CalibrationRecord, JointCalibration, matrix, provenance
-from calib.records.store import RecordStore, export_yaml
+from calib.records.store import RecordStore
 
 
 @pytest.fixture
@@ -120,17 +120,17 @@ def test_diff_counts_changes_in_standard_deviations(kept, capsys) -> None:
 def test_diff_takes_yaml_files_and_refuses_what_has_nothing_common(kept, capsys, tmp_path) -> None:
     path, first, second = kept
     old = RecordStore(path).get(first)
-    export_yaml(old, tmp_path / "old.yaml")
+    (tmp_path / "old.yaml").write_text(old.to_yaml())
     assert run(["diff", str(tmp_path / "old.yaml"), second, "--store", path, "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["before"]["id"] == first
-    export_yaml(old.model_copy(update={"serial": "X-2"}), tmp_path / "other.yaml")
+    (tmp_path / "other.yaml").write_text(old.model_copy(update={"serial": "X-2"}).to_yaml())
     assert run(["diff", str(tmp_path / "other.yaml"), second, "--store", path]) == 1
     assert "serial X-2 and" in capsys.readouterr().err
 
 
 def test_history_imports_a_record_and_says_who_made_it_current(kept, capsys, tmp_path) -> None:
     path, first, _ = kept
-    export_yaml(RecordStore(path).get(first), tmp_path / "record.yaml")
+    (tmp_path / "record.yaml").write_text(RecordStore(path).get(first).to_yaml())
     other = str(tmp_path / "other.db")
     arguments = ["history", "sarcos", "--store", other, "--import", str(tmp_path / "record.yaml")]
     assert run([*arguments, "--json", "-"]) == 0

@@ -19,7 +19,7 @@ from calib.records.bounds import CLOCK_TOLERANCE, require_sound
 from calib.records.database import StoreFault
 from calib.records.in_force import calibrations_in_force
 from calib.records.records import CalibrationRecord, Discrepancy, GravityRecord, MotorTorque, parse_record
-from calib.records.store import RecordStore, export_yaml
+from calib.records.store import RecordStore
 
 AnyRecord = CalibrationRecord | GravityRecord
 
@@ -100,7 +100,7 @@ def test_a_record_of_no_working_arm_is_neither_imported_nor_made_current_nor_tak
     store: RecordStore, tmp_path: Path, record: AnyRecord, path: tuple[Any, ...], value: Any, said: str
 ) -> None:
     wrong = changed(record, path, value)
-    export_yaml(wrong, tmp_path / "wrong.yaml")
+    (tmp_path / "wrong.yaml").write_text(wrong.to_yaml())
     with pytest.raises(Refused, match=said):
         store.import_yaml(tmp_path / "wrong.yaml", ARM)
     assert store.history(ARM) == []

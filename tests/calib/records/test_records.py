@@ -21,7 +21,7 @@ from calib.records.records import (
     parse_record,
     provenance,
 )
-from calib.records.store import RecordStore, export_yaml
+from calib.records.store import RecordStore
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def test_a_record_of_another_schema_is_refused() -> None:
 
 
 def test_yaml_goes_out_and_comes_back(store: RecordStore, tmp_path: Path) -> None:
-    export_yaml(calibration(), tmp_path / "record.yaml")
+    (tmp_path / "record.yaml").write_text(calibration().to_yaml())
     assert store.get(store.import_yaml(tmp_path / "record.yaml", ARM)) == calibration()
 
 

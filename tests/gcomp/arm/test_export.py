@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from gravity_rig import SARCOS_BETA, SARCOS_MASS, make_random_arm
+from gravity_rig import make_random_arm
 from published_arms import MJCF, PANDA, mujoco_torque, urdf
 from scipy.optimize import minimize
 
@@ -14,7 +14,6 @@ from gcomp.arm.feasible_inertials import (
     Bounds,
     Inertials,
     NotFeasible,
-    feasible_moments,
     least_distance,
     nearest_inertials,
 )
@@ -114,31 +113,6 @@ def test_bounds_that_leave_nothing_are_said_to(rng) -> None:
     tight = Bounds(built.mass, nominal.com - 1e-3, nominal.com + 1e-3)
     with pytest.raises(NotFeasible, match="no masses above their bounds"):
         nearest_inertials(built.beta + 100 * np.ones(6), nominal, tight, lambda m, s: base_parameters(built.arm, m, s))
-
-
-def test_constraint_pulls_an_infeasible_estimate_to_the_nearest_feasible_one(sarcos, sarcos_moments, rng) -> None:
-    """Constrained least squares: inside the bounds nothing happens, outside the estimate comes to the border."""
-    com = sarcos_moments / SARCOS_MASS[:, None]
-    bounds = Bounds(0.5 * SARCOS_MASS, com - 0.02, com + 0.02)
-    covariance = np.diag(rng.uniform(1e-4, 1e-2, 14))
-    assert feasible_moments(sarcos, SARCOS_BETA, covariance, Bounds.positive(0.1 * SARCOS_MASS)) == pytest.approx(
-        SARCOS_BETA, abs=1e-6
-    )
-    far = SARCOS_BETA + np.sqrt(np.diag(covariance)) * rng.normal(size=14) * 40
-    found = feasible_moments(sarcos, far, covariance, bounds)
-    inside = nearest_inertials(
-        found, Inertials(SARCOS_MASS, sarcos_moments), loosened(bounds), lambda m, s: base_parameters(sarcos, m, s)
-    )
-    assert np.all(inside.mass > 0.49 * SARCOS_MASS)
-    pull = np.linalg.solve(covariance, far - found)
-    for _ in range(50):  # the gradient points out of the convex set: no feasible point is nearer
-        mass = SARCOS_MASS * rng.uniform(0.5, 3, 7)
-        other = base_parameters(sarcos, mass, mass[:, None] * (com + rng.uniform(-0.02, 0.02, (7, 3))))
-        assert pull @ (other - found) < 1e-6 * np.abs(pull).max()
-
-
-def loosened(bounds: Bounds) -> Bounds:
-    return Bounds(bounds.mass - 1e-6, bounds.com_lower - 1e-6, bounds.com_upper + 1e-6)
 
 
 def test_least_distance_solves_the_textbook_case() -> None:

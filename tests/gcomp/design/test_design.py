@@ -7,7 +7,7 @@ from gravity_rig import DOWN, SARCOS_BETA, make_readings, make_sarcos, sweep_row
 from gcomp.arm.arm import Arm
 from gcomp.design.remedies import remedies
 from gcomp.design.selection import sweep_jacobian
-from gcomp.design.sweep_design import Design, Sweep, choose_steps, choose_sweeps, readings_of, stop_combinations
+from gcomp.design.sweep_design import Design, Sweep, choose_sweeps, readings_of, stop_combinations
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.global_fit import Prediction, identify_global, predict_covariance
@@ -88,15 +88,6 @@ def test_prediction_is_what_the_fit_then_reports_and_what_repeats_scatter(sarcos
     scatter = np.std([each.values.beta for each in fits], axis=0)
     assert scatter / design.prediction.std.beta == pytest.approx(np.ones(14), abs=0.35)
     assert np.mean(scatter / design.prediction.std.beta) == pytest.approx(1.0, abs=0.1)
-
-
-def test_chosen_steps_beat_even_ones_of_the_same_number(sarcos) -> None:
-    fine = choose_sweeps(sarcos, GUESS, sigma=SIGMA, unknown=MOMENTS, poses=2, steps=49)
-    thinned = choose_steps(sarcos, GUESS, fine.sweeps, sigma=SIGMA, unknown=MOMENTS, count=13)
-    even = [Sweep(each.joint, each.pose, each.stepped(13)) for each in fine.sweeps]
-    evenly = predict_covariance(sarcos, readings_of(sarcos, even, SIGMA), GUESS, unknown=MOMENTS)
-    assert all(len(each.angles) == 13 for each in thinned.sweeps)
-    assert log_volume(thinned.prediction) < log_volume(evenly)
 
 
 def test_calibration_design_determines_everything_with_small_intervals(sarcos) -> None:
