@@ -210,12 +210,12 @@ def _refusal(
         return STATE
     if mode == OFF:
         return ""
-    if others.contradicted:
-        return CONTRADICTION
     if mode in POSITION_MODES:
         return _servo_refusal(limits, held, seen, others)
     if not abs(seen.velocity) <= limits.overspeed or others.ahead > limits.overspeed:
         return VELOCITY
+    if others.contradicted:
+        return CONTRADICTION
     if not limits.lower - limits.outside <= seen.position <= limits.upper + limits.outside:
         return WINDOW
     if held.mode not in TORQUE_MODES:
@@ -236,6 +236,8 @@ def _servo_refusal(limits: JointLimits, held: Order, seen: Seen, others: Corrobo
     """Why a joint under position control must be stopped; a velocity that is not known is no reason."""
     if abs(seen.velocity) > limits.servo_overspeed or others.proven > limits.servo_overspeed:
         return VELOCITY
+    if others.contradicted:
+        return CONTRADICTION
     if held.mode in POSITION_MODES and not abs(held.position - seen.position) <= limits.following:
         return FOLLOWING
     return ""

@@ -46,7 +46,7 @@ class _Joint:
     """The newest readings of one joint, and what they prove."""
 
     __slots__ = ("age", "apart", "at", "before", "cycles", "earliest", "fastest", "latest", "most", "newest", "peak",
-                 "positions", "step", "time", "way", "width")  # fmt: skip
+                 "positions", "step", "time", "told", "way", "width")  # fmt: skip
 
     def __init__(self, step: float, most: float, fastest: int) -> None:
         """Resolution of its positions [rad], its speed limit [rad/s], and of how many cycles the speeds are kept."""
@@ -56,6 +56,9 @@ class _Joint:
         self.fastest = [math.inf] * fastest
         """Greatest speeds that the positions allowed, in the newest cycles [rad/s]."""
         self.newest = -math.inf
+        self.told = 0.0
+        """Newest speed that the drive told of, 0 where it was old [rad/s]: the positions of the cycle after it count,
+        too, since a joint that strikes its stop turns round between two of them."""
         self.before = self.time = math.nan
         """Newest position, and the middle of the time in which it was taken."""
         self.apart = self.way = self.peak = self.width = self.age = 0.0
@@ -125,7 +128,8 @@ class MotionWatch:
         self._compare(own, here, since, until, told, present, age)
         ahead = max(least, self._extrapolated(own, here, since, until)) if present > IDLE_SHARE * own.most else least
         own.fastest[own.cycles % len(own.fastest)] = greatest
-        unseen = speed > own.most and age <= self._delay and (1 - SHARE) * speed > max(own.fastest)
+        told_before, own.told = own.told, speed if age <= self._delay else 0.0
+        unseen = told_before > own.most and (1 - SHARE) * told_before > max(own.fastest)
         explained = WAY + 2 * own.step + SHARE * own.way + (max(self._delay, own.age) + own.width) * own.peak
         return least, ahead, unseen or abs(own.apart) > explained
 

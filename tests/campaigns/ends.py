@@ -63,7 +63,7 @@ def commands(bench: EndsBench, job: str, seed: int) -> Callable[[], None]:
 
     def step() -> None:
         here = link.latest_position
-        push[:] = 0.999 * push + 0.002 * limits * random.normal(size=6)
+        push[:] = 0.999 * push + 0.001 * limits * random.normal(size=6)
         torque = bench.sim.gravity_torque(here[None])[0] + push - 0.05 * limits * bench.sim.plant.velocity
         link.cycle(Command(np.full(6, Mode.TORQUE, np.int8), torque, here))
 
@@ -92,7 +92,10 @@ def campaign(name: str, job: str, draws: int, seed: int) -> list[dict[str, Any]]
     step, found = commands(bench, job, seed), []
     for number in range(draws):
         for _ in range(int(random.integers(5, 100))):
-            step()
+            try:
+                step()
+            except Refused:  # the push was too much
+                bench.link.recover()
         cause = list(CAUSES)[int(random.integers(len(CAUSES)))]
         with tempfile.TemporaryFile("w+") as answer:
             child = os.fork()

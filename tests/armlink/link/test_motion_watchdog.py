@@ -108,3 +108,18 @@ def test_velocities_that_come_as_often_as_a_drive_sends_them_are_one_senders():
     for _ in range(EXCESS + 1):  # one may be early
         bus.slow(0)
     assert bus.forged == 0
+
+
+def test_a_joint_that_strikes_its_stop_and_turns_round_is_not_contradicted() -> None:
+    """Its velocity is that after the stroke, its positions still tell of the way before it."""
+    watch = MotionWatch(1, PERIOD)
+    watch.use(np.array([1e-4]), np.array([1.0]))
+    position, velocity = 0.0, -0.9
+    for cycle in range(60):
+        if cycle == 30:
+            velocity = 1.45  # between two samples, the newest of which is just after it
+        else:
+            position += velocity * PERIOD
+        t = cycle * PERIOD
+        watch.update([position], [t], [t], [velocity], [t])
+        assert not watch.contradicted[0]
