@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHON
-CAMPAIGNS ?= demo_seeds random_arms hard_cases kill_sweep kill_records kill_host random_kills daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fuzz_files fault_injection systemd_units kill_drives two_hosts scales web
+CAMPAIGNS ?= ends false_readings demo_seeds random_arms hard_cases kill_sweep kill_records kill_host random_kills daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fuzz_files fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
 .PHONY: long elsewhere surfaces mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
