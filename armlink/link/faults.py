@@ -62,12 +62,12 @@ def refusal(
         if why == gate.CONTRADICTION:
             return (
                 f"{name}: its positions and its velocity ({now.velocity:.3g} rad/s) contradict each other: one of them "
-                "is false: armlink check --scales says which scale is off; else look for a second node or its encoder"
+                "is false: a scale that is off (docs/safety.md, Scales), a second node, or its encoder"
             )
         if why == gate.FALSE_TORQUE:
             return (
                 f"{name}: tells a torque of {now.torque:.3g} N·m where its gains and its order come to "
-                f"{other.ordered_torque:.3g}: torque control would start from a false one: armlink check --scales"
+                f"{other.ordered_torque:.3g}: torque control would start from a false one (docs/safety.md, Scales)"
             )
         if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
             return (
@@ -78,7 +78,7 @@ def refusal(
         if why == gate.FOLLOWING:
             return (
                 f"{name}: reads {now.position:.4g} rad, more than {limit.following:g} rad from its target "
-                f"{passed[joint].position:.4g}: it is blocked, too weak, or something else moves it"
+                f"{passed[joint].position:.4g}: it is blocked, too weak, something else moves it, or its reading is false"
             )
         if why == gate.VELOCITY:
             return (

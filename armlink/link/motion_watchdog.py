@@ -5,8 +5,9 @@ taken for what it can prove. A sample was taken no earlier than it was asked for
 samples with the way between them therefore prove a least and a greatest mean speed, whatever a late host, a late reply
 or a lost frame did to the time between them. The encoder's resolution widens both.
 
-- `proven` is a speed that a joint has at the least, by its positions; `ahead` the one that it has by then at which an
-  order that is made now can act, if it goes on as it does.
+- `proven` is a speed that a joint has at the least, by all means over its newest positions and by those of the cycle
+  before: one false position is no speed. `ahead` is the one that it has by then at which an order that is made now can
+  act, if it goes on as it does, by any of the means.
 - `contradicted` joints have positions and velocities that cannot both be right: the way by the one and the way by the
   other differ by more than resolution, lateness and the drive's own filter explain, or the drive tells of a speed above
   the joint's limit of which its positions show nothing.
@@ -46,7 +47,7 @@ class _Joint:
     """The newest readings of one joint, and what they prove."""
 
     __slots__ = ("age", "apart", "at", "before", "cycles", "earliest", "fastest", "latest", "most", "newest", "peak",
-                 "positions", "step", "time", "told", "way", "width")  # fmt: skip
+                 "positions", "steady", "step", "time", "told", "way", "width")  # fmt: skip
 
     def __init__(self, step: float, most: float, fastest: int) -> None:
         """Resolution of its positions [rad], its speed limit [rad/s], and of how many cycles the speeds are kept."""
@@ -56,6 +57,8 @@ class _Joint:
         self.fastest = [math.inf] * fastest
         """Greatest speeds that the positions allowed, in the newest cycles [rad/s]."""
         self.newest = -math.inf
+        self.steady = 0.0
+        """Speed that all means over the newest positions prove [rad/s]."""
         self.told = 0.0
         """Newest speed that the drive told of, 0 where it was old [rad/s]: the positions of the cycle after it count,
         too, since a joint that strikes its stop turns round between two of them."""
@@ -123,7 +126,8 @@ class MotionWatch:
         own.cycles += 1
         row = own.at = own.cycles % ROWS
         own.positions[row], own.earliest[row], own.latest[row] = here, since, until
-        least, greatest = _means(own, here, since, until)
+        least, steady, greatest = _means(own, here, since, until)
+        proven, own.steady = min(steady, own.steady), steady
         present = max(speed, least)
         self._compare(own, here, since, until, told, present, age)
         ahead = max(least, self._extrapolated(own, here, since, until)) if present > IDLE_SHARE * own.most else least
@@ -131,7 +135,7 @@ class MotionWatch:
         told_before, own.told = own.told, speed if age <= self._delay else 0.0
         unseen = told_before > own.most and (1 - SHARE) * told_before > max(own.fastest)
         explained = WAY + 2 * own.step + SHARE * own.way + (max(self._delay, own.age) + own.width) * own.peak
-        return least, ahead, unseen or abs(own.apart) > explained
+        return proven, ahead, unseen or abs(own.apart) > explained
 
     def _extrapolated(self, own: _Joint, here: float, since: float, until: float) -> float:
         """Least speed when an order acts, from the means over the newest cycles and those before [rad/s]."""
@@ -173,9 +177,11 @@ class MotionWatch:
             own.before, own.time = here, middle
 
 
-def _means(own: _Joint, here: float, since: float, until: float) -> tuple[float, float]:
-    """Least present speed and greatest speed of late that the positions allow [rad/s]."""
+def _means(own: _Joint, here: float, since: float, until: float) -> tuple[float, float, float]:
+    """Least present speed, by any of the means and by all of them, and greatest speed of late that the positions allow
+    [rad/s]."""
     least = greatest = 0.0
+    steady = math.inf
     for place, lag in enumerate(LAGS):
         row = (own.at - lag) % ROWS
         way = abs(here - own.positions[row])
@@ -186,7 +192,8 @@ def _means(own: _Joint, here: float, since: float, until: float) -> tuple[float,
         if place < PRESENT:
             longest = until - own.earliest[row]
             if longest > 0.0:
-                least = max(least, (way - own.step) / longest)
+                mean = max((way - own.step) / longest, 0.0)
+                least, steady = max(least, mean), min(steady, mean)
         shortest = since - own.latest[row]
         greatest = max(greatest, (way + own.step) / shortest if shortest > 0.0 else math.inf)
-    return least, greatest
+    return least, steady if steady < math.inf else 0.0, greatest
