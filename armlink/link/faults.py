@@ -78,7 +78,8 @@ def refusal(
         if why == gate.FOLLOWING:
             return (
                 f"{name}: reads {now.position:.4g} rad, more than {limit.following:g} rad from its target "
-                f"{passed[joint].position:.4g}: it is blocked, too weak, something else moves it, or its reading is false"
+                f"{passed[joint].position:.4g}: it is blocked or too weak, something else moves it, or its reading is "
+                "false"
             )
         if why == gate.VELOCITY:
             return (
