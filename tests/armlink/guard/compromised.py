@@ -52,8 +52,9 @@ class GuardedBus(FakeBus):
 def guarded(content, n=N):
     """The bus of an arm behind a guard with this policy, and its link."""
     bus = GuardedBus(range(1, n + 1), Policy(content))
+    link = Link(make_arm(n, (), JOINT), bus)
     link.commander.motion.update = lambda *readings: None  # these joints have no mass and tell no velocity
-    return bus, Link(make_arm(n, (), JOINT), bus)
+    return bus, link
 
 
 CONTENT = content_of()
