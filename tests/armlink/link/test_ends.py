@@ -49,6 +49,7 @@ def test_whatever_ends_the_job_the_arm_is_parked(name, end):
     assert (bench.peak < speed + EXTRA_SPEED).all(), bench.peak
 
 
+@pytest.mark.sample(2)
 @every_family
 def test_a_command_that_the_gate_refuses_leaves_the_arm_held(name):
     bench = EndsBench(name)
@@ -65,6 +66,7 @@ def test_a_command_that_the_gate_refuses_leaves_the_arm_held(name):
     assert (bench.peak < 1.5 + EXTRA_SPEED).all(), bench.peak
 
 
+@pytest.mark.sample(2)
 @every_family
 def test_one_drive_that_falls_silent_does_not_let_the_others_go(name):
     bench = EndsBench(name)
@@ -78,6 +80,7 @@ def test_one_drive_that_falls_silent_does_not_let_the_others_go(name):
     assert not any(bench.powered[:5])
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("name", [name for name in FALLING if name != "six-cubemars"])
 def test_a_drive_that_stops_by_itself_is_caught(name):
     """A CubeMars drive makes torque again at the next command."""
@@ -91,6 +94,7 @@ def test_a_drive_that_stops_by_itself_is_caught(name):
     assert not any(bench.powered)
 
 
+@pytest.mark.sample(2)
 @every_family
 def test_a_host_that_stood_still_catches_the_arm(name):
     bench = EndsBench(name)
@@ -119,6 +123,7 @@ def test_an_arm_without_a_pose_is_let_down_slowly(caplog):
     assert (bench.peak < 0.1 + EXTRA_SPEED).all(), "and does not fall further"
 
 
+@pytest.mark.long
 def test_an_arm_that_is_blocked_on_its_way_is_let_down(caplog):
     bench = EndsBench("six-damiao")
     at = float(bench.sim.plant.position[1])

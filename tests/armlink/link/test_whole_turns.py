@@ -158,6 +158,7 @@ def test_a_joint_that_leans_on_its_stop_by_a_sensor_that_reads_too_much_is_not_r
             with Link(arm, LockStepBus(arm=SimulatedArm(arm, Truth.of(arm)))) as link:
                 link.start()
                 link.enable()
+                link.disable()
 
 
 def test_a_reading_that_no_turn_explains_is_refused_in_other_words():
