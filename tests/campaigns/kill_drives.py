@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "armlink" / "drives"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "sim_bus"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "sim_bus" / "drives"))
 
 import serving
@@ -66,7 +67,7 @@ def one_try(name: str, arm: serving.Served, group: str, number: int) -> float:
         time.sleep(0.02 * (number % 10) / 10)
         os.kill(host.pid, signal.SIGKILL)
         struck = time.monotonic()
-        described = serving.pendulum(DRIVES[name])
+        described = serving.pendulum(DRIVES[name], bus={"interface": "virtual", "fd": name == "moteus"})
         falls = family(name).build(described, described.require_link().joints).traits(0).silence == "falls"
         done = serving.wait_for(lambda: not arm.drive.motor.powered if falls else arm.drive.mode == 11, LONGEST)
         return time.monotonic() - struck if done else float("inf")
