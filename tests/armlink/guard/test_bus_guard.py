@@ -759,7 +759,7 @@ def test_one_interface_for_both_sides_is_refused(capfd, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT])
 def test_the_end_of_a_terminal_stops_the_joints(wires, monkeypatch, tmp_path, number):
     raise_signal = signal.raise_signal
-    before = signal.signal(number, signal.SIG_DFL)  # under nohup it would be ignored
+    before = signal.getsignal(number)
     monkeypatch.setattr(signal, "raise_signal", lambda _: raise_signal(number))
     try:
         assert run_main(wires, monkeypatch, tmp_path, []) == 0

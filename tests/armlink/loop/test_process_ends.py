@@ -80,7 +80,6 @@ class Pendulum:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
-            preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # under nohup it would be ignored
         )
         assert self.job.stdout is not None
         loop = int(self.job.stdout.readline())
