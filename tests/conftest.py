@@ -18,8 +18,15 @@ NO_REALDATA, NO_RERUN = "no real recordings", "rerun-sdk is not installed"
 option of one command is not asked of everybody who runs the tests."""
 IN_CI = os.environ.get("CI", "").lower() == "true"
 
-if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as in a shell's background: children would inherit it
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+HEARD = {
+    signal.SIGINT: signal.default_int_handler,
+    signal.SIGHUP: signal.SIG_DFL,
+    signal.SIGQUIT: signal.SIG_DFL,
+}
+"""Signals that a shell's background or nohup have a program ignore: tests send them, and children would inherit that."""
+for number, handler in HEARD.items():
+    if signal.getsignal(number) == signal.SIG_IGN:
+        signal.signal(number, handler)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
