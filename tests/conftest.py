@@ -23,7 +23,7 @@ HEARD = {
     signal.SIGHUP: signal.SIG_DFL,
     signal.SIGQUIT: signal.SIG_DFL,
 }
-"""Signals that a shell's background or nohup have a program ignore: tests send them, and children would inherit that."""
+"""Signals that a shell's background and nohup have a program ignore: tests send them, and children inherit that."""
 for number, handler in HEARD.items():
     if signal.getsignal(number) == signal.SIG_IGN:
         signal.signal(number, handler)
