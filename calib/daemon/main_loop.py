@@ -91,6 +91,7 @@ class Daemon:
                 if ending.done():
                     ending.result()
         finally:
+            self._ended.set()
             self._notify("STOPPING=1")
             if self.process.fileno() >= 0:
                 self._loop.remove_reader(self.process.fileno())
@@ -119,12 +120,14 @@ class Daemon:
         self._ended.set()
 
     def _ending(self) -> Tell:
-        """What is told while the arm comes to its end: it goes to the log, and systemd waits."""
+        """What is told, by the thread of `_bus_ends`, while the arm comes to its end: it goes to the log, and systemd
+        waits."""
         say = said(self.arm.name, self._presses)
 
         def tell(text: str) -> None:
             if text:
-                self._notify(f"STATUS={text}", f"EXTEND_TIMEOUT_USEC={round(SILENT_SECONDS * 1e6)}")
+                lines = f"STATUS={text}", f"EXTEND_TIMEOUT_USEC={round(SILENT_SECONDS * 1e6)}"
+                self._loop.call_soon_threadsafe(self._notify, *lines)
             say(text)
 
         return tell
@@ -155,8 +158,9 @@ class Daemon:
             self._notify("WATCHDOG=1")
 
     def _judge(self, now: float, stood_still: float) -> None:
-        """Replace a bus process that hangs; not because this process itself stood still (stopped, say) [s]."""
-        if stood_still > PAUSE_SECONDS or self._replacing:
+        """Replace a bus process that hangs: not because this process itself stood still (stopped, say) [s], and none
+        that brings its arm to the end, which `_bus_ends` sees to."""
+        if stood_still > PAUSE_SECONDS or self._replacing or self._ended.is_set():
             self._heard = max(self._heard, now)
         if now - self._heard > SILENT_SECONDS:
             self._messages()  # what waits here is a sign of life too

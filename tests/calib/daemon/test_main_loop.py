@@ -224,6 +224,27 @@ def test_a_service_that_stood_still_does_not_judge_its_bus_process(
     with_daemon(tmp_path, monkeypatch, act)
 
 
+@pytest.mark.parametrize("at_its_end", ["_ended", "_replacing"])
+def test_a_bus_process_that_parks_its_arm_for_long_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_its_end: str
+) -> None:
+    """Neither killed nor heard: the thread that sees it to its end reads the channel."""
+
+    def act(running: Running) -> None:
+        daemon = running.daemon
+        if at_its_end == "_ended":
+            daemon._ended.set()
+        else:
+            daemon._replacing = True
+        for seconds in (1.0, SILENT_SECONDS + 1.0, 100.0):
+            daemon._judge(time.monotonic() + seconds + BEGIN_SECONDS, 0.0)
+        assert not running.process.killed
+        assert not running.process.pumped
+        assert not running.started
+
+    with_daemon(tmp_path, monkeypatch, act)
+
+
 def test_a_bus_process_that_hangs_is_replaced_and_again_where_there_is_no_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
