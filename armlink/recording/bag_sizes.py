@@ -8,7 +8,7 @@ from zstandard import ZstdDecompressor, ZstdError
 
 from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
 from armlink.errors import BadInput
-from armlink.recording.mcap import DAMAGED, MOST_CHUNK, most_record
+from armlink.recording.mcap import DAMAGED, most_record, require_chunk_size
 from armlink.recording.recording import require_size
 
 MOST_WINDOW = 1 << 27
@@ -49,9 +49,7 @@ def _require_chunks(path: Path) -> None:
     try:
         with path.open("rb") as stream:
             for record in StreamReader(stream, emit_chunks=True, record_size_limit=most_record(path)).records:
-                if isinstance(record, Chunk) and record.uncompressed_size > MOST_CHUNK:
-                    raise BadInput(
-                        f"{path}: a chunk of {record.uncompressed_size} bytes, expected at most {MOST_CHUNK}"
-                    )
+                if isinstance(record, Chunk):
+                    require_chunk_size(record, path)
     except DAMAGED:
         return  # said by who reads it

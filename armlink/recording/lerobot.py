@@ -17,7 +17,7 @@ from armlink.arrays import Array
 from armlink.content.file_content import MOST_JSON, read_whole
 from armlink.errors import BadInput
 from armlink.recording.recording import MOST_JOINTS, Recording, require_size
-from armlink.recording.tables import THREADS, numbers, require_numbers
+from armlink.recording.tables import THREADS, has_lists, numbers, require_numbers
 
 STATE, ACTION = "observation.state", "action"
 _COLUMNS = ("episode_index", "timestamp", STATE, ACTION)
@@ -73,8 +73,7 @@ def _names(path: Path) -> tuple[str, ...]:
 
 def _lengths(column: pa.ChunkedArray) -> Array:
     """Number of values in each row of a column of lists; 0 where a row has none or the column holds no lists."""
-    kind = column.type
-    if not (pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)):
+    if not has_lists(column.type):
         return np.zeros(len(column))
     return numbers(pa_compute.list_value_length(column).fill_null(0).cast(pa.float64()))
 

@@ -188,11 +188,16 @@ def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:
     most = most_record(path)
     for record in StreamReader(stream, validate_crcs=True, emit_chunks=True, record_size_limit=most).records:
         if isinstance(record, Chunk):
-            if record.uncompressed_size > MOST_CHUNK:
-                raise BadInput(f"{path}: a chunk of {record.uncompressed_size} bytes, expected at most {MOST_CHUNK}")
+            require_chunk_size(record, path)
             yield from breakup_chunk(_unpacked(record), validate_crc=True)
         else:
             yield record
+
+
+def require_chunk_size(chunk: Chunk, path: Path) -> None:
+    """Raise BadInput where a chunk states that it unpacks to more than a recording may hold."""
+    if chunk.uncompressed_size > MOST_CHUNK:
+        raise BadInput(f"{path}: a chunk of {chunk.uncompressed_size} bytes, expected at most {MOST_CHUNK}")
 
 
 def most_record(path: Path) -> int:

@@ -118,22 +118,25 @@ def require_numbers(file: Any, columns: Collection[str], source: str) -> None:
         row_group = file.metadata.row_group(group)
         for place in range(row_group.num_columns):
             chunk = row_group.column(place)
-            if chunk.path_in_schema.partition(".")[0] not in columns:
+            column = chunk.path_in_schema.partition(".")[0]
+            if column not in columns:
                 continue
             if chunk.physical_type == "BYTE_ARRAY":
-                raise BadInput(
-                    f"{source}: column {chunk.path_in_schema.partition('.')[0]} holds texts, expected numbers"
-                )
+                raise BadInput(f"{source}: column {column} holds texts, expected numbers")
             count += chunk.num_values
     require_size(8 * count, source)
+
+
+def has_lists(kind: pa.DataType) -> bool:
+    """Whether each value of a column of this type is a list."""
+    return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind))
 
 
 def columns_of_lists(file: Any, source: str) -> dict[str, tuple[str, int | None]]:
     """Name → column and place in it, of a Parquet file; a column of lists `q` counts as columns `q_1`, `q_2` …"""
     found: dict[str, tuple[str, int | None]] = {}
     for field in file.schema_arrow:
-        kind = field.type
-        if not (pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)):
+        if not has_lists(field.type):
             found[field.name] = field.name, None
             continue
         require_numbers(file, [field.name], source)
