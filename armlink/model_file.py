@@ -63,10 +63,7 @@ class ModelFile:
     @property
     def left_out(self) -> str:
         """The meshes that are left out, with the reason; nothing if none is."""
-        reasons = {
-            "not found": self.absent,
-            "not binary STL, OBJ or MSH, which MuJoCo reads": self.unreadable,
-        }
+        reasons = {"not found": self.absent, "not binary STL, OBJ or MSH, which MuJoCo reads": self.unreadable}
         return " and ".join(
             f"{len(files)} {'mesh' if len(files) == 1 else 'meshes'} {reason}, such as {files[0]}"
             for reason, files in reasons.items()
