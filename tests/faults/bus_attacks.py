@@ -15,14 +15,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import can
+from processes import ARMLINK, ROOT
 from witnessed_arm import Motion, Witness, witnessed
 
 from armlink.guard import bus_guard
 
-ROOT = Path(__file__).parent.parent.parent
-ARMLINK = [sys.executable, "-c", "from armlink.cli import main; main()"]
-RATE, DEADLINE = 50.0, 0.3
-"""Slow enough for one core of a user-mode kernel that runs everything."""
+sys.path.insert(0, str(Path(__file__).parents[1] / "armlink"))
+
+from vcan_pair import pair_text
+
+DEADLINE = 0.3
+"""Of the arm [s]."""
 AMPLITUDE, OMEGA = 0.4, 1.0
 """Of the host's motion [rad], [rad/s]: its fastest is their product."""
 EXCESS, STILL = 1.0, 0.02
@@ -32,25 +35,7 @@ STARTS = 4
 AFTERWARDS = 1.2
 """Time after an attack until the joints must hold [s]: the deadline, the stop, and what a busy machine adds."""
 FLOOD_RATE, FLOOD_SECONDS = 20_000, 1.0
-ARM = """
-name: pair
-kinematics:
-  joints:
-    - {name: joint_1, alpha: 1.5707963, d: 0.2, lower: -2.0, upper: 2.0}
-    - {name: joint_2, a: 0.3, lower: -2.0, upper: 2.0}
-link:
-  bus: {interface: socketcan, channel: vcan0, bitrate: 1000000}
-  rate: 50
-  deadline: 0.3
-  joints:
-    - {name: joint_1, node: 11, rated_torque: 40.0, max_torque: 30.0, max_velocity: 1.0}
-    - {name: joint_2, node: 12, rated_torque: 40.0, max_torque: 30.0, max_velocity: 1.0}
-sim:
-  links:
-    - {mass: 2.0, com: [0.0, 0.0, 0.05], inertia: [0.01, 0.01, 0.01]}
-    - {mass: 1.0, com: [0.1, 0.0, 0.0], inertia: [0.01, 0.01, 0.01]}
-  sensors: {gain: [1.1, 1.0], offset: [0.0, 1.0], position_gain: [1.0, 1.0], noise: [0.01, 0.01], bits: 16}
-"""
+ARM = pair_text(DEADLINE, 1.0, 1.0)
 HOST = f"""
 import sys
 import numpy as np
@@ -58,19 +43,15 @@ from armlink.arm_file import load_arm
 from armlink.errors import ArmlinkError
 from armlink.link.link import Link
 from armlink.link.types import Command
+sys.path.insert(0, "tests/faults")
+from patient_start import start
 try:
     with Link.open(load_arm(sys.argv[1])) as link:
-        for attempt in range(5):  # a busy machine may be late with an answer; that is not what is tried here
-            try:
-                link.start()
-                break
-            except ArmlinkError:
-                if attempt == 4:
-                    raise
-        start = link.enable().position
-        side = -np.sign(start)
+        start(link)
+        origin = link.enable().position
+        side = -np.sign(origin)
         for cycle in range(1_000_000):
-            link.cycle(Command.hold(start + side * {AMPLITUDE} * np.sin({OMEGA} * cycle * link.period)))
+            link.cycle(Command.hold(origin + side * {AMPLITUDE} * np.sin({OMEGA} * cycle * link.period)))
             if cycle == 20:
                 print("moving", flush=True)
 except ArmlinkError as error:

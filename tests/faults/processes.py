@@ -27,15 +27,11 @@ from armlink.arm_file import load_arm
 from armlink.errors import ArmlinkError
 from armlink.link.link import Link
 from armlink.link.types import Command
+sys.path.insert(0, "tests/faults")
+from patient_start import start
 try:
     with Link.open(load_arm(sys.argv[1]), sys.argv[2]) as link:
-        for attempt in range(5):  # a busy machine may be late with an answer; that is not what is tried here
-            try:
-                link.start()
-                break
-            except ArmlinkError:
-                if attempt == 4:
-                    raise
+        start(link)
         command = Command.hold(link.enable().position)
         command.mode[0], command.torque[0] = 10, 2.0
         for cycle in range(1_000_000):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patient_start import start
 from processes import SAFE, Ear, simulated, start_host, write_arm
 from rows import QUICK_STOP, ROWS, Row
 from test_lock_step import pattern
@@ -76,13 +77,7 @@ def until_fault(link: Link, command: Command, most: int = 60) -> ArmlinkError:
 
 
 def enabled(link: Link) -> Command:
-    for attempt in range(5):  # a busy machine may be late with an answer; that is not what is tried here
-        try:
-            link.start()
-            break
-        except BusFault:
-            if attempt == 4:
-                raise
+    start(link, late=BusFault)
     command = Command.hold(np.array(link.enable().position))
     command.mode[0], command.torque[0] = 10, 2.0
     for _ in range(10):

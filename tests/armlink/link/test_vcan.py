@@ -10,6 +10,7 @@ from pathlib import Path
 
 import can
 import pytest
+from vcan_pair import pair_text
 
 from armlink.drives.canopen.cia402 import State, state_of
 from armlink.guard import bus_guard
@@ -21,25 +22,7 @@ BUS = "socketcan:vcan0"
 ARMLINK = str(Path(sys.executable).with_name("armlink"))
 
 # Slow enough for one core of a user-mode kernel that runs everything; the deadline leaves room for a busy machine.
-ARM = """
-name: pair
-kinematics:
-  joints:
-    - {name: joint_1, alpha: 1.5707963, d: 0.2, lower: -2.0, upper: 2.0}
-    - {name: joint_2, a: 0.3, lower: -2.0, upper: 2.0}
-link:
-  bus: {interface: socketcan, channel: vcan0, bitrate: 1000000}
-  rate: 50
-  deadline: 0.5
-  joints:
-    - {name: joint_1, node: 11, rated_torque: 40.0, max_torque: 30.0}
-    - {name: joint_2, node: 12, rated_torque: 40.0, max_torque: 30.0, max_velocity: 60.0}
-sim:
-  links:
-    - {mass: 2.0, com: [0.0, 0.0, 0.05], inertia: [0.01, 0.01, 0.01]}
-    - {mass: 1.0, com: [0.1, 0.0, 0.0], inertia: [0.01, 0.01, 0.01]}
-  sensors: {gain: [1.1, 1.0], offset: [0.0, 1.0], position_gain: [1.0, 1.0], noise: [0.01, 0.01], bits: 16}
-"""
+ARM = pair_text(0.5, None, 60.0)
 HOST = """
 import sys
 from armlink.arm_file import load_arm
