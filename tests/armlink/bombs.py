@@ -9,6 +9,7 @@ import struct
 import sys
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -92,14 +93,6 @@ def blf(folder: Path) -> Path:
     return path
 
 
-def long_line(folder: Path) -> Path:
-    """A frame log of one line without an end; the file has no blocks on the disk."""
-    path = folder / "run.log"
-    with path.open("wb") as file:
-        file.truncate(8 * GIANT)
-    return path
-
-
 def laughs(folder: Path) -> Path:
     """An arm file whose aliases stand for 10^9 values."""
     path = folder / "laughs.yaml"
@@ -109,7 +102,7 @@ def laughs(folder: Path) -> Path:
 
 
 def sparse(folder: Path, name: str) -> Path:
-    """A file of eight gigabytes of nothing."""
+    """A file of eight gigabytes of nothing, which has no blocks on the disk."""
     path = folder / name
     with path.open("wb") as file:
         file.truncate(8 * GIANT)
@@ -182,25 +175,29 @@ def readers() -> dict[str, Reader]:
     }
 
 
+SPARSE = {
+    "CSV": ("recording", "sparse.csv"),
+    "Parquet": ("recording", "sparse.parquet"),
+    "arm file": ("arm", "sparse.yaml"),
+    "data sheet": ("sheet", "sparse.eds"),
+    "model": ("model", "sparse.urdf"),
+}
+"""What is of nothing: its kind, and its name."""
 BOMBS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "Parquet of one number": ("recording", parquet_of_one_number),
     "Parquet of texts": ("recording", parquet_of_texts),
-    "LeRobot of texts": ("recording", lambda folder: lerobot(folder, "texts")),
+    "LeRobot of texts": ("recording", partial(lerobot, kind="texts")),
     "packed bag": ("recording", packed_bag),
-    "sparse CSV": ("recording", lambda folder: sparse(folder, "sparse.csv")),
-    "sparse Parquet": ("recording", lambda folder: sparse(folder, "sparse.parquet")),
     "BLF": ("frames", blf),
-    "line without end": ("frames", long_line),
+    "line without end": ("frames", partial(sparse, name="run.log")),
     "aliases": ("arm", laughs),
-    "sparse arm file": ("arm", lambda folder: sparse(folder, "sparse.yaml")),
     "data sheet": ("sheet", sheet),
-    "sparse data sheet": ("sheet", lambda folder: sparse(folder, "sparse.eds")),
-    "sparse model": ("model", lambda folder: sparse(folder, "sparse.urdf")),
-    **{f"model, {what}": ("model", lambda folder, what=what: model(folder, what)) for what in MODELS},
+    **{f"sparse {what}": (kind, partial(sparse, name=name)) for what, (kind, name) in SPARSE.items()},
+    **{f"model, {what}": ("model", partial(model, what=what)) for what in MODELS},
 }
 LARGE: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "gzipped CSV": ("recording", gzipped_csv),
-    "LeRobot of lists": ("recording", lambda folder: lerobot(folder, "lists")),
+    "LeRobot of lists": ("recording", partial(lerobot, kind="lists")),
 }
 """Bombs that take some ten seconds to make."""
 
