@@ -1,5 +1,7 @@
 """A simulated arm at full stretch with a mass on, whose true joint speeds are watched until its work has ended."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
@@ -8,6 +10,7 @@ from armlink.link.link import Link
 from armlink.link.park import straight
 from armlink.link.types import Command
 from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.physics.plant import Plant
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -16,6 +19,17 @@ MASS = 0.3
 """On the tip [kg]."""
 EXTRA_SPEED = 1.0
 """No joint may turn so much faster than its trajectory had it [rad/s]."""
+
+
+def after_each_step(plant: Plant, look: Callable[[], None]) -> None:
+    """Have `look` called whenever the simulated plant has moved on."""
+    step = plant.step
+
+    def watched(*args: object) -> None:
+        step(*args)  # type: ignore[arg-type]
+        look()
+
+    plant.step = watched  # type: ignore[method-assign, assignment]
 
 
 class EndsBench:
@@ -36,13 +50,10 @@ class EndsBench:
             self.link.cycle(Command.hold(target))
         self.sim.attach_mass(MASS)
         self.hold(1.0)
-        step, plant = self.sim.plant.step, self.sim.plant
+        after_each_step(self.sim.plant, self._look)
 
-        def watched(*args: object) -> None:
-            step(*args)  # type: ignore[arg-type]
-            self.peak = np.maximum(self.peak, np.abs(plant.velocity))
-
-        plant.step = watched  # type: ignore[method-assign, assignment]
+    def _look(self) -> None:
+        self.peak = np.maximum(self.peak, np.abs(self.sim.plant.velocity))
 
     def stretched(self) -> np.ndarray:
         """A pose, 0.15 rad within the stops, whose gravity torque is large and within what the joints may make."""

@@ -25,13 +25,7 @@ from armlink.bus.open import open_bus
 from armlink.drives.orders import Limits, Mode, Order, Power
 from armlink.drives.registry import family
 
-DRIVES = {
-    "damiao": {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 40, "kd": 1.0},
-    "cubemars": {"family": "cubemars", "id": 2, "model": "AK80-9", "can_timeout": 10_000, "kp": 40, "kd": 1.0},
-    "robstride": {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 1.0},
-    "moteus": {"family": "moteus", "id": 4},
-    "odrive": {"family": "odrive", "node": 5},
-}
+DRIVES = serving.drives(kd=1.0)
 DEADLINE, LONGEST = 0.25, 5.0
 
 

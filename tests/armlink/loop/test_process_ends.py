@@ -17,16 +17,11 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "sim_bus" / "drives"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "sim_bus"))
 
 import serving
+from ends_bench import after_each_step
 
 from armlink.arm_file import Bus
 
-DRIVES = {
-    "damiao": {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 40, "kd": 2.0},
-    "cubemars": {"family": "cubemars", "id": 2, "model": "AK80-9", "can_timeout": 10_000, "kp": 40, "kd": 2.0},
-    "robstride": {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": 2.0},
-    "moteus": {"family": "moteus", "id": 4},
-    "odrive": {"family": "odrive", "node": 5},
-}
+DRIVES = serving.drives(kd=2.0)
 LINK = {"rate": 100, "deadline": 0.5, "park": {"pose": [0.0], "speed": 0.8}}
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL)
 OUT = 1.2
@@ -60,13 +55,10 @@ class Pendulum:
         self.served, self.path, self.bus = served, path, bus
         self.fastest = 0.0
         self.job: subprocess.Popen[str] | None = None
-        plant, step = served.arm.plant, served.arm.plant.step
+        after_each_step(served.arm.plant, self._look)
 
-        def watched(*args: object) -> None:
-            step(*args)  # type: ignore[arg-type]
-            self.fastest = max(self.fastest, abs(float(plant.velocity[0])))
-
-        plant.step = watched  # type: ignore[method-assign, assignment]
+    def _look(self) -> None:
+        self.fastest = max(self.fastest, abs(float(self.served.arm.plant.velocity[0])))
 
     @property
     def powered(self) -> bool:
@@ -120,7 +112,7 @@ def arm_file(family: str, bus: Bus) -> dict[str, object]:
     return {
         "name": "pendulum",
         "serial": "P-1",
-        "kinematics": {"gravity": [9.81, 0.0, 0.0], "joints": [{"name": "hinge", "lower": -2.0, "upper": 2.0}]},
+        "kinematics": serving.KINEMATICS,
         "link": {
             "bus": {"interface": "udp_multicast", "channel": bus.channel, "fd": bus.fd},
             "joints": [{"name": "hinge", "drive": DRIVES[family], "rated_torque": 8.0, "max_torque": 10.0}],

@@ -20,16 +20,29 @@ from sim_bus.truth import Truth
 CHANNELS = count()
 GRAVITY_TORQUE = 1.0 * 9.81 * 0.2
 """Largest torque of the pendulum [N·m]."""
+KINEMATICS: dict[str, Any] = {
+    "gravity": [9.81, 0.0, 0.0],
+    "joints": [{"name": "hinge", "lower": -2.0, "upper": 2.0}],
+}
+"""Of the pendulum."""
+
+
+def drives(kd: float) -> dict[str, dict[str, Any]]:
+    """Settings of one drive of every family but CANopen; `kd` is the damping of those that take one."""
+    return {
+        "damiao": {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 40, "kd": kd},
+        "cubemars": {"family": "cubemars", "id": 2, "model": "AK80-9", "can_timeout": 10_000, "kp": 40, "kd": kd},
+        "robstride": {"family": "robstride", "id": 3, "model": "RS01", "kp": 40, "kd": kd},
+        "moteus": {"family": "moteus", "id": 4},
+        "odrive": {"family": "odrive", "node": 5},
+    }
 
 
 def pendulum(drive: dict[str, Any], **link: Any) -> ArmFile:
     """A pendulum that hangs at 0 and may swing to ±2 rad, 1 kg at 0.2 m, no noise, no friction."""
     content = {
         "name": "pendulum",
-        "kinematics": {
-            "gravity": [9.81, 0.0, 0.0],
-            "joints": [{"name": "hinge", "lower": -2.0, "upper": 2.0}],
-        },
+        "kinematics": KINEMATICS,
         "link": {"joints": [{"name": "hinge", "drive": drive, "rated_torque": 10.0, "max_torque": 20.0}], **link},
         "sim": {
             "links": [{"mass": 1.0, "com": [0.2, 0.0, 0.0], "inertia": [0.01, 0.01, 0.01]}],
