@@ -65,7 +65,7 @@ class Record(_Frozen):
     @property
     def number(self) -> int:
         """`id` as the UNSIGNED32 that a controller keeps beside its gain and offset."""
-        return int(self.id, 16)
+        return number_of(self.id)
 
     def require(self, arm: ArmFile) -> Self:
         """This record, if it is of this arm; else raises Refused with one line that names the difference."""
@@ -252,6 +252,11 @@ class GravityRecord(Record):
 def digest_id(body: str) -> str:
     """Id of a record by its JSON, as it was stored."""
     return hashlib.sha256(body.encode()).hexdigest()[:8]
+
+
+def number_of(record_id: str) -> int:
+    """Id of a record as a number (32 bits)."""
+    return int(record_id, 16)
 
 
 def provenance(arm: ArmFile, sources: dict[str, str] | None = None, created: datetime | None = None) -> dict[str, Any]:

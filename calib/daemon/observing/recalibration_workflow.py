@@ -114,13 +114,8 @@ class RecalibrationWorkflow:
         with self._journal.transaction():
             added = self._journal.add_proposal(now, joint, record.id, record.parent or "", finding)
             std = dict(zip(("gain_std", "offset_std"), finding.std, strict=True))
-            evidence = {
-                "proposal": int(record.id, 16),
-                "record": record.id,
-                "gain": finding.gain,
-                "offset": finding.offset,
-                **std,
-            }
+            named = {"proposal": record.number, "record": record.id}
+            evidence = {**named, "gain": finding.gain, "offset": finding.offset, **std}
             text = f"{joint}: record {record.id} proposed: gain {outcome.gain:.5f}, offset {outcome.offset:.3f} N·m"
             self._events.say("proposal", joint, text, evidence)
             if automatic:
@@ -377,7 +372,7 @@ class RecalibrationWorkflow:
 
     def _named(self, number: int, digest: str | None = None) -> ProposalRow:
         """The proposal of that number; raises NoSuch, and NotPossible where it is not the one of that digest."""
-        row = self._journal.proposal_of(f"{number:08x}")
+        row = self._journal.proposal_numbered(number)
         if row is None:
             raise NoSuch(f"no proposal {number}: the list of proposals has the numbers of now")
         if digest is not None and digest != row.digest:

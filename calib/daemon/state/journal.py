@@ -440,9 +440,9 @@ class Journal:
         """The proposal of that id."""
         return self._rows.get(number)
 
-    def proposal_of(self, record: str) -> ProposalRow | None:
-        """The newest proposal of that record."""
-        return next((row for row in self._rows.values() if row.record == record), None)
+    def proposal_numbered(self, number: int) -> ProposalRow | None:
+        """The newest proposal of that number."""
+        return next((row for row in self._rows.values() if row.number == number), None)
 
     # ---- belief and history
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from calib.daemon.view.api_models import Proposal
 from calib.observer.decision import Finding
+from calib.records.records import number_of
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class ProposalRow:
 
     @property
     def number(self) -> int:
-        """What a person or a program names it by: its record's number, which is of what would be written and of
-        nothing else, in this journal and any other."""
-        return int(self.record, 16)
+        """Its record's number, by which a person or a program names it: that is of what would be written and of nothing
+        else, in this journal and any other."""
+        return number_of(self.record)
 
     @property
     def digest(self) -> str:
