@@ -36,6 +36,10 @@ class StoreFault(BadInput):
     """The record store cannot be reached, read or written now; nothing was changed."""
 
 
+class _Replaced(Exception):
+    """Another file has got the name of the one that a connection holds open."""
+
+
 def default_url() -> str:
     """URL of the store in the user's state directory (XDG_STATE_HOME, else ~/.local/state)."""
     state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
@@ -109,20 +113,13 @@ def _file_of(engine: sa.Engine) -> FileIdentity:
         found = os.stat(str(engine.url.database))
     except OSError as error:
         engine.dispose()
-        raise StoreFault(
-            f"record store {engine.url.render_as_string(hide_password=True)}: its file is gone ({error.strerror}): put"
-            " it back"
-        ) from None
+        raise StoreFault(f"{_store_name(engine)}: its file is gone ({error.strerror}): put it back") from None
     return found.st_dev, found.st_ino
 
 
 def _is_file(engine: sa.Engine) -> bool:
     name = engine.url.database or ""
     return engine.dialect.name == "sqlite" and name not in ("", ":memory:") and not name.startswith("file:")
-
-
-class _Replaced(Exception):
-    """Another file has got the name of the one that a connection holds open."""
 
 
 def _require_same_file(engine: sa.Engine, connection: sa.Connection) -> None:
@@ -145,8 +142,8 @@ def _replaced(engine: sa.Engine) -> StoreFault:
     except sa.exc.SQLAlchemyError as error:
         return _fault(engine, "was replaced by another file, which cannot be opened", error)
     return StoreFault(
-        f"record store {engine.url.render_as_string(hide_password=True)}: was replaced by another file while it was in"
-        " use: nothing was written; that one is used from now on"
+        f"{_store_name(engine)}: was replaced by another file while it was in use: nothing was written; that one is"
+        " used from now on"
     )
 
 
@@ -154,8 +151,12 @@ def _fault(engine: sa.Engine, what: str, error: sa.exc.SQLAlchemyError) -> Store
     """A failure of the database in one line; its connections are closed, since they may hold a lost server or file."""
     engine.dispose()
     reason = first_line(getattr(error, "orig", None) or error)
-    shown = engine.url.render_as_string(hide_password=True)
-    return StoreFault(f"record store {shown}: {what}: {reason}: fix that and run the command again")
+    return StoreFault(f"{_store_name(engine)}: {what}: {reason}: fix that and run the command again")
+
+
+def _store_name(engine: sa.Engine) -> str:
+    """The store at the beginning of a message, without its password."""
+    return f"record store {engine.url.render_as_string(hide_password=True)}"
 
 
 def _migrate(engine: sa.Engine) -> None:
@@ -170,8 +171,8 @@ def _migrate(engine: sa.Engine) -> None:
             return
         if found is not None and found not in MIGRATIONS:
             raise BadInput(
-                f"record store {engine.url.render_as_string(hide_password=True)}: its schema {found}"
-                f" is newer than this armlink knows ({HEAD}): install a newer armlink; nothing was changed"
+                f"{_store_name(engine)}: its schema {found} is newer than this armlink knows ({HEAD}): install a newer"
+                " armlink; nothing was changed"
             )
         _upgrade(connection, stamp=found is None and sa.inspect(connection).has_table("records"))
 

@@ -77,13 +77,16 @@ class RecordStore:
             raise Refused(f"no record {record_id} in {self.url}; the history of an arm lists its records")
         return self._record(record_id, body)
 
-    def usable(self, record_id: str, arm: ArmFile) -> AnyRecord:
-        """The record of that id, to be used on this arm; raises Refused if it is of another, or of no working one."""
-        return require_sound(self.get(record_id).require(arm), arm)
+    def usable(self, record_id: str, arm: ArmFile, now: datetime | None = None) -> AnyRecord:
+        """The record of that id, to be used on this arm; raises Refused if it is of another, or of no working one.
+
+        `now`, when it becomes current, as for `require_sound`.
+        """
+        return require_sound(self.get(record_id).require(arm), arm, now)
 
     def activate(self, record_id: str, arm: ArmFile, by: str, reason: str) -> Activation:
         """Make a kept record the current one of its kind; raises Refused if it is of another arm, or not sound."""
-        record = require_sound(self.get(record_id).require(arm), arm, datetime.now(UTC))
+        record = self.usable(record_id, arm, datetime.now(UTC))
         with transaction(self._engine) as connection:
             return _activate(connection, record, arm, by, reason)
 
