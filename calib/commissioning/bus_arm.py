@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from math import pi
 from typing import Any
 
+from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from armlink.drives.found import FoundDrives
 from armlink.errors import BusFault
@@ -67,7 +68,7 @@ def _text(
         yaml_entry("name", name),
         yaml_entry("serial", "unknown", note="assumed"),
         "kinematics:",
-        yaml_entry("gravity", [0.0, 0.0, -9.80665], 2, "m/s² in the base frame, assumed: the arm stands upright"),
+        yaml_entry("gravity", list(STANDARD_GRAVITY), 2, "m/s² in the base frame, assumed: the arm stands upright"),
         "  joints:  # a, alpha, d assumed: unknown; give them, or make the file of the arm's URDF or MJCF",
     ]
     for match, (lower, upper) in zip(matches, stops, strict=True):
@@ -77,7 +78,7 @@ def _text(
     lines += ["link:", yaml_entry("bus", dict(bus), 2), yaml_entry("rate", 250, 2, "Hz, assumed"), "  joints:"]
     for match in matches:
         place = "by turning the joint by hand" if known else "assumed: in the order of node ids"
-        lines += [yaml_item(_joint(match), 4), "      " + yaml_comment(f"node {place}; max_velocity assumed")]
+        lines += [yaml_item(_joint(match), 4), yaml_comment(f"node {place}; max_velocity assumed", 6)]
     if not known:
         lines += ["sweep:", yaml_entry("hold", "servo", 2, "assumed: the stops are not known")]
     return "\n".join(lines) + "\n"

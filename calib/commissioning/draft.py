@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.model_sizes import model_budget
 from calib.commissioning.chain import Chain
 from calib.commissioning.clear_range import ClearRange
@@ -87,7 +88,7 @@ def draft_of_model(
     tip = chain.tip if chain.aside else None
     notes = []
     if not np.any(gravity):
-        gravity = (0.0, 0.0, -9.80665)
+        gravity = STANDARD_GRAVITY
         notes.append("gravity: the model has none, assumed to point down")
     need = _load_torque(path, [joint.name for joint in chain.joints], gravity)
     rated = np.maximum(LOAD_FACTOR * need, min(LEAST_TORQUE, LOAD_FACTOR * float(need.max())))

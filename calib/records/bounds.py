@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from armlink.arm_file import ArmFile
+from armlink.arm_file import STANDARD_GRAVITY, ArmFile
 from armlink.errors import Refused
 from armlink.torque_calibration import GAIN_RANGE
 from calib.records.records import PARAMETERS, CalibrationRecord, GravityRecord, JointCalibration, Parameter
@@ -36,8 +36,6 @@ M-2000iA/2300, data sheet)."""
 BALANCED = 10.0
 """Gravity torque of an arm over the largest torque of its drives, at most [1]: a choice, springs and counterweights
 then carry nine tenths."""
-STANDARD_GRAVITY = 9.80665
-"""[m/s²], CGPM 1901."""
 LARGEST_GRAVITY = 25.0
 """[m/s²]: the strongest of the planets, Jupiter's, is 24.8 (NASA planetary fact sheet)."""
 TURN = 2 * np.pi
@@ -154,7 +152,7 @@ def _of_gravity(record: GravityRecord, arm: ArmFile) -> Iterator[Value]:
     largest = LARGEST_MASS_MOMENT
     if arm.link is not None:
         torque = max(max(joint.max_torque, joint.rated_torque) for joint in arm.link.joints)
-        largest = BALANCED * torque / STANDARD_GRAVITY
+        largest = BALANCED * torque / math.hypot(*STANDARD_GRAVITY)
     names = [f"{name}: {axis} of the mass moment" for name in record.names for axis in ("x", "y")]
     for name, value in zip(names, record.beta, strict=True):
         yield Value(name, value, -largest, largest, "kg·m")
