@@ -39,17 +39,17 @@ def yaml_value(value: Any) -> str:
 
 def yaml_entry(key: str, value: Any, indent: int = 0, note: str = "") -> str:
     """A line `key: value  # note`."""
-    return " " * indent + f"{yaml_value(key)}: {yaml_value(value)}" + (f"  {yaml_comment(note)}" if note else "")
+    return " " * indent + f"{yaml_value(key)}: {yaml_value(value)}" + (note and yaml_comment(note, 2))
 
 
 def yaml_item(value: Any, indent: int, note: str = "") -> str:
     """A line `- value  # note` of a list."""
-    return " " * indent + f"- {yaml_value(value)}" + (f"  {yaml_comment(note)}" if note else "")
+    return " " * indent + f"- {yaml_value(value)}" + (note and yaml_comment(note, 2))
 
 
-def yaml_comment(text: str) -> str:
+def yaml_comment(text: str, indent: int = 0) -> str:
     """A comment, on one line whatever is in the text."""
-    return f"# {printable_text(text)}"
+    return " " * indent + f"# {printable_text(text)}"
 
 
 def yaml_document(content: Any) -> str:

@@ -23,18 +23,16 @@ def arm_text(draft: Draft, out: Path) -> str:
     if draft.tip is not None:
         lines.append(yaml_entry("tip", draft.tip, 2))
     lines.append(yaml_entry("gravity", list(draft.gravity), 2, "m/s² in the model's frame"))
-    lines += [
-        "  " + yaml_comment(f"{name} {why}: set aside, it keeps the model's position") for name, why in draft.aside
-    ]
+    lines += [yaml_comment(f"{name} {why}: set aside, it keeps the model's position", 2) for name, why in draft.aside]
     given = {joint.name: list(joint.stops) for joint in draft.joints if joint.stops is not None}
     if given:
         lines.append(f"  stops:  # {'working range' if draft.servo else 'mechanical stops'} [rad]")
         lines += [yaml_entry(name, stops, 4) for name, stops in given.items()]
     lines += ["link:", *_bus(draft, out), yaml_entry("rate", 250, 2, "Hz, assumed"), "  joints:"]
     for joint in draft.joints:
-        lines += [yaml_item(_joint(joint), 4), *("      " + yaml_comment(note) for note in joint.notes)]
+        lines += [yaml_item(_joint(joint), 4), *(yaml_comment(note, 6) for note in joint.notes)]
     if draft.servo is not None:
-        lines += ["sweep:", yaml_entry("hold", "servo", 2), "  " + yaml_comment(f"assumed: {draft.servo}")]
+        lines += ["sweep:", yaml_entry("hold", "servo", 2), yaml_comment(f"assumed: {draft.servo}", 2)]
     lines += [
         "sim:  # the simulated arm, for the command demo: masses are the model's",
         f"  effects:  # assumed: friction of {FRICTION:.0%} of rated torque",
@@ -49,7 +47,7 @@ def _bus(draft: Draft, out: Path) -> list[str]:
         simulated = {"interface": "armlink_sim", "channel": out.name, "bitrate": 1000000}
         real = "{interface: socketcan, channel: can0}"
         note = f"assumed: no bus yet, this is the simulated arm; a real one: {real}"
-        return [yaml_entry("bus", simulated, 2), "  " + yaml_comment(note)]
+        return [yaml_entry("bus", simulated, 2), yaml_comment(note, 2)]
     return [yaml_entry("bus", draft.bus, 2)]
 
 
