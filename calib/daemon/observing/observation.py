@@ -55,15 +55,12 @@ class Observation:
 
     def _report(self, events: list[Event]) -> None:
         """Keep events and estimates together, then act on the findings."""
-        told = one_alarm_a_joint(events)
-        described = [describe(event) for event in told]
-        rows = zip(told, described, strict=True)
-        said = [(kind, event.joint, text, evidence) for event, (kind, text, evidence) in rows]
+        described = [(event, *describe(event)) for event in one_alarm_a_joint(events)]
         with self._journal.transaction():
-            for event_said in said:
-                self._events.say(*event_said)
+            for event, kind, text, evidence in described:
+                self._events.say(kind, event.joint, text, evidence)
             self._storage.save(self.feed, history=True)
-        for event, (kind, _, _) in zip(told, described, strict=True):
+        for event, kind, _, _ in described:
             if event.kind == "verdict":
                 self.recalibrations.explained(kind, event.joint)
         for event in events:
