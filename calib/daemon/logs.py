@@ -10,6 +10,10 @@ from typing import TextIO
 
 from armlink.content.printable_text import printable_json
 
+MOST_LINES = 10_000
+"""Lines that wait for a reader of stderr that takes none; further ones are dropped."""
+LAST_SECONDS = 2.0
+"""Time at the end for the lines that wait [s]."""
 _KNOWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 
 
@@ -30,19 +34,12 @@ class JsonFormatter(logging.Formatter):
         return printable_json(line, default=str)
 
 
-MOST_LINES = 10_000
-"""Lines that wait for a reader of stderr that takes none; further ones are dropped."""
-LAST_SECONDS = 2.0
-"""Time at the end for the lines that wait [s]."""
-
-
 class LineQueue:
     """A text stream before another, which a thread writes: systemd's journal waits for a disk, nobody here for it."""
 
     def __init__(self, to: TextIO) -> None:
         self._to = to
         self._lines = queue.Queue[str](MOST_LINES)
-        self._idle = threading.Condition()
         threading.Thread(target=self._run, name="log", daemon=True).start()
         atexit.register(self.drain, LAST_SECONDS)
 
@@ -58,8 +55,8 @@ class LineQueue:
 
     def drain(self, seconds: float) -> None:
         """Wait until everything is written, at most so long [s]."""
-        with self._idle:
-            self._idle.wait_for(lambda: not self._lines.unfinished_tasks, seconds)
+        with self._lines.all_tasks_done:
+            self._lines.all_tasks_done.wait_for(lambda: not self._lines.unfinished_tasks, seconds)
 
     def _run(self) -> None:
         while True:
@@ -70,8 +67,6 @@ class LineQueue:
             except (OSError, ValueError):  # nobody reads, or it is closed
                 pass
             self._lines.task_done()
-            with self._idle:
-                self._idle.notify_all()
 
 
 class LineLimit(logging.Filter):
