@@ -12,6 +12,8 @@ from armlink.errors import BadInput
 
 MOST_TEXT = 64 << 20
 """Size of a URDF or MJCF file, and of an OBJ or MSH mesh [bytes]: a hundred times that of published arms' files."""
+MOST_FILES = 100
+"""Files that a model may include."""
 MOST_ELEMENTS = 200_000
 """Elements of a model file; MuJoCo's largest published models have some thousands."""
 MOST_COPIES = 10_000
@@ -25,8 +27,6 @@ MOST_ARENA = 1 << 30
 COPYING = ("replicate", "composite", "flexcomp")
 POINTS = {"hfield": ("nrow", "ncol"), "texture": ("width", "height")}
 UNITS = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30, "t": 1 << 40, "p": 1 << 50, "e": 1 << 60}
-MOST_FILES = 100
-"""Files that a model may include."""
 
 
 def model_budget(path: Path) -> AbstractContextManager[None]:

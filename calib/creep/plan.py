@@ -37,6 +37,14 @@ TRAVEL_ACCELERATION = 1.5
 """Largest acceleration from one creep to the next [rad/s²]; a choice: the arm hangs in soft position loops."""
 HAND = 0.12
 """Distance of the mass from the flange that the plan allows for [m]."""
+TRAVEL_SECONDS = 6.0
+"""Rough time from one creep to the next [s]."""
+RAMP = 0.4
+"""Time over which a creep reaches its speed, and comes to rest [s]."""
+SETTLE = 0.4
+"""Time after that in which friction has turned round and the position loop has settled [s]."""
+RESTING: Side = 0
+"""No joint rests on a stop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +160,6 @@ def _unfit(ground: CreepGround, plan: SweepPlan, ends: Array) -> Iterator[str]:
             yield f"sweep {sweep.name}: a drive cannot hold its joint there within max_torque, with {mass:g} kg"
 
 
-TRAVEL_SECONDS = 6.0
-"""Rough time from one creep to the next [s]."""
-
-
 def creep_seconds(plan: SweepPlan) -> float:
     """Rough duration of a pass [s]."""
     total = 0.0
@@ -164,12 +168,6 @@ def creep_seconds(plan: SweepPlan) -> float:
         way = (sweep.steps[-1] - sweep.steps[0]) * (1 + 1 / (len(sweep.steps) - 1)) + 2 * lead_way(speed)
         total += 2 * way / speed + TRAVEL_SECONDS
     return total
-
-
-RAMP = 0.4
-"""Time over which a creep reaches its speed, and comes to rest [s]."""
-SETTLE = 0.4
-"""Time after that in which friction has turned round and the position loop has settled [s]."""
 
 
 def creep_speed(sweep: Sweep) -> float:
@@ -189,10 +187,6 @@ def creep_ends(sweep: Sweep) -> tuple[float, float]:
     middles = sweep.steps
     half = (middles[1] - middles[0]) / 2 + lead_way(creep_speed(sweep))
     return middles[0] - half, middles[-1] + half
-
-
-RESTING: Side = 0
-"""No joint rests on a stop."""
 
 
 def _sweep(ground: CreepGround, one: Candidate, number: int, speed: float) -> Sweep:

@@ -14,8 +14,6 @@ GAP = 1.0
 """A pause in the samples longer than this begins a new file [s]."""
 RETRY_SECONDS = 60.0
 """After a failure nothing is written for this time [s]."""
-
-
 MOST_WAITING = 300
 """Batches that wait for the disk: those of 30 s; further ones are left out."""
 
