@@ -9,9 +9,10 @@ import struct
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import h11
+from fastapi import Depends, Request
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from calib.daemon.web.admission import FIRST_SECONDS, Admission
@@ -65,6 +66,14 @@ def peer_of(scope: Scope) -> Peer:
     """The peer of a request."""
     found = scope.get(PEER, UNKNOWN)
     return found if isinstance(found, Peer) else UNKNOWN
+
+
+async def _owner(request: Request) -> str:
+    return peer_of(request.scope).owner
+
+
+Owner = Annotated[str, Depends(_owner)]
+"""Parameter of a route: whose connection the request came by."""
 
 
 def describe_peer(transport: asyncio.Transport) -> Peer:

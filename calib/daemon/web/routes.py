@@ -32,7 +32,7 @@ from calib.daemon.web.parameters import (
     OverviewQuery,
     StreamQuery,
 )
-from calib.daemon.web.peer import Peer, peer_of
+from calib.daemon.web.peer import Owner, peer_of
 from calib.daemon.web.stream import StreamResponse, Streams
 from calib.daemon.web.window import add_window
 
@@ -56,12 +56,12 @@ STREAM: dict[int | str, dict[str, Any]] = {
         "content": {"text/event-stream": {"schema": {"type": "string"}}},
     }
 }
+_HTML: dict[int | str, dict[str, Any]] = {200: {"content": {"text/html": {}}, "description": "HTML"}}
 REPORT_CSP = (
     "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline';"
     " style-src 'unsafe-inline'; img-src data: blob:"
 )
 """The report is one file with its scripts inside; it may not send requests to this daemon or anyone else."""
-
 DECISION_SECONDS = 5.0
 """Wait for a decision to be on disk; after it the answer is "not yet" [s]."""
 
@@ -80,10 +80,10 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
 
     @router.get("/api/stream", response_class=Response, responses=STREAM, tags=["now"])
     async def stream(
-        request: Request, query: Annotated[StreamQuery, Query()], last_event_id: Annotated[Id | None, Header()] = None
+        owner: Owner, query: Annotated[StreamQuery, Query()], last_event_id: Annotated[Id | None, Header()] = None
     ) -> Response:
         """Joints at 10 Hz, and events as they happen; a slow client still gets every event, in order."""
-        if not streams.make_room(peer_of(request.scope).owner):
+        if not streams.make_room(owner):
             raise TooMany(f"{streams.clients} clients are on the stream already")
         return StreamResponse(streams, query.after if last_event_id is None else last_event_id)
 
@@ -107,9 +107,9 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
         return view.joints()
 
     @router.get("/api/arm", responses=NO_SUCH, tags=["now"])
-    async def arm(request: Request) -> DrawnArm:
+    async def arm(owner: Owner) -> DrawnArm:
         """The arm's shape, to draw it at any joint positions."""
-        return await histories.aside(peer_of(request.scope).owner, view.arm)
+        return await histories.aside(owner, view.arm)
 
     @router.get("/api/estimates", tags=["now"])
     async def estimates() -> tuple[JointEstimate, ...]:
@@ -117,7 +117,7 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
         return view.estimates()
 
     @router.get("/api/overview", response_model=Overview, tags=["now"])
-    async def overview(request: Request, query: Annotated[OverviewQuery, Query()]) -> Response:
+    async def overview(owner: Owner, query: Annotated[OverviewQuery, Query()]) -> Response:
         """Everything that the page shows, in one answer, with the newest events and history."""
         status = view.status()
         since = status.time - timedelta(seconds=query.seconds) if query.seconds else None
@@ -135,8 +135,7 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
             history = view.history(None, since, None, query.limit)
             return answer.model_copy(update={"events": events, "history": history}).model_dump_json()
 
-        content = await histories.aside(peer_of(request.scope).owner, encoded)
-        return Response(content, media_type="application/json")
+        return Response(await histories.aside(owner, encoded), media_type="application/json")
 
 
 def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None:
@@ -146,9 +145,9 @@ def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None
         return await histories.short(lambda: view.events(after=query.after, limit=query.limit))
 
     @router.get("/api/history", response_model=tuple[HistoryPoint, ...], responses=NO_SUCH, tags=["past"])
-    async def history(request: Request, query: Annotated[HistoryQuery, Query()]) -> Response:
+    async def history(owner: Owner, query: Annotated[HistoryQuery, Query()]) -> Response:
         """Gain and offset over time, oldest first; without a joint, one joint after the other."""
-        return await histories.answer(peer_of(request.scope).owner, query)
+        return await histories.answer(owner, query)
 
     @router.get("/api/report", response_class=FileResponse, responses=NO_SUCH | _HTML, tags=["past"])
     async def report() -> FileResponse:
@@ -157,9 +156,6 @@ def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None
         if path is None or not await histories.short(path.is_file):
             raise NoSuch("no report yet: the newest HTML file in the state directory (calibrate --report writes one)")
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
-
-
-_HTML: dict[int | str, dict[str, Any]] = {200: {"content": {"text/html": {}}, "description": "HTML"}}
 
 
 def _add_proposals(router: APIRouter, view: DaemonView) -> None:
@@ -171,16 +167,23 @@ def _add_proposals(router: APIRouter, view: DaemonView) -> None:
     @router.post("/api/proposals/{id}/approve", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def approve(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Write a pending proposal to the controller; `applied` or `failed` follows as an event."""
-        return await _decided(id, view.decisions.approve(id, _who(decision, peer_of(request.scope)), _digest(decision)))
+        return await _decided(view.decisions.approve, id, request, decision)
 
     @router.post("/api/proposals/{id}/reject", responses=NO_SUCH | NOT_NOW, tags=["proposals"])
     async def reject(request: Request, id: ProposalId, decision: OptionalDecision = None) -> Proposal:
         """Drop a pending proposal."""
-        return await _decided(id, view.decisions.reject(id, _who(decision, peer_of(request.scope)), _digest(decision)))
+        return await _decided(view.decisions.reject, id, request, decision)
 
 
-async def _decided(number: int, answer: Future[Proposal]) -> Proposal:
-    """The answer once the decision is on disk; raises NotYet where that takes long."""
+async def _decided(
+    decide: Callable[[int, str, str | None], Future[Proposal]], number: int, request: Request, given: Decision | None
+) -> Proposal:
+    """The answer once the decision is on disk; raises NotYet where that takes long.
+
+    The audit trail has the name given, and always the peer of the connection.
+    """
+    decision, peer = given or Decision(), peer_of(request.scope)
+    answer = decide(number, peer.name if decision.by is None else f"{decision.by} ({peer.name})", decision.hash)
     try:
         async with asyncio.timeout(DECISION_SECONDS):
             return await asyncio.shield(asyncio.wrap_future(answer))
@@ -189,15 +192,6 @@ async def _decided(number: int, answer: Future[Proposal]) -> Proposal:
             f"not yet: the decision on proposal {number} waits for the disk, which has not answered for "
             f"{DECISION_SECONDS:.0f} s, and is carried out once it does: do not repeat it, see /api/proposals"
         ) from None
-
-
-def _who(decision: Decision | None, peer: Peer) -> str:
-    """For the audit trail: the name given, and always the peer of the connection."""
-    return peer.name if decision is None or decision.by is None else f"{decision.by} ({peer.name})"
-
-
-def _digest(decision: Decision | None) -> str | None:
-    return None if decision is None else decision.hash
 
 
 ERRORS: dict[type[Exception], int] = {NoSuch: 404, NotPossible: 409, TooMany: 429, sqlite3.Error: 503, NotYet: 503}

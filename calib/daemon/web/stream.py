@@ -123,7 +123,7 @@ class Streams:
         return after
 
     async def _events(self, after: int) -> tuple[EventRecord, ...]:
-        """None where they cannot be read now: they come with the next one."""
+        """Empty where they cannot be read now: they come with the next one."""
         with suppress(sqlite3.Error):
             return await self.histories.short(lambda: self._view.events(after=after))
         return ()

@@ -7,7 +7,7 @@ from datetime import timedelta
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
 from armlink.recording.mcap import TOPICS, RecordingWriter
@@ -16,7 +16,7 @@ from calib.daemon.view.view import DaemonView
 from calib.daemon.view.window import Window
 from calib.daemon.web.history import Histories
 from calib.daemon.web.parameters import WindowQuery
-from calib.daemon.web.peer import peer_of
+from calib.daemon.web.peer import Owner
 from gcomp.arrays import Array
 
 COLUMNS = {"position": "q", "torque": "tau", "temperature": "temp", "model_torque": "model"}
@@ -34,26 +34,22 @@ def add_window(router: APIRouter, view: DaemonView, histories: Histories) -> Non
     """GET /api/window, /api/window.csv, /api/window.mcap."""
 
     @router.get("/api/window", response_model=WindowRows, tags=["past"])
-    async def window(request: Request, query: Annotated[WindowQuery, Query()]) -> Response:
+    async def window(owner: Owner, query: Annotated[WindowQuery, Query()]) -> Response:
         """Readings of the last minutes, oldest first."""
         found = view.window(query.seconds, query.limit)
-        return await histories.send(peer_of(request.scope).owner, iter([found]), _as_json, "application/json")
+        return await histories.send(owner, iter([found]), _as_json, "application/json")
 
     @router.get("/api/window.csv", response_class=Response, responses=_file(CSV), tags=["past"])
-    async def window_csv(request: Request, query: Annotated[WindowQuery, Query()]) -> Response:
+    async def window_csv(owner: Owner, query: Annotated[WindowQuery, Query()]) -> Response:
         """The same as a recording in CSV, with the model's torques as further columns."""
         found = view.window(query.seconds, query.limit)
-        return await histories.send(
-            peer_of(request.scope).owner, csv_lines(found), str.encode, CSV, _attached(found, "csv")
-        )
+        return await histories.send(owner, csv_lines(found), str.encode, CSV, _attached(found, "csv"))
 
     @router.get("/api/window.mcap", response_class=Response, responses=_file(MCAP), tags=["past"])
-    async def window_mcap(request: Request, query: Annotated[WindowQuery, Query()]) -> Response:
+    async def window_mcap(owner: Owner, query: Annotated[WindowQuery, Query()]) -> Response:
         """The same as a recording in MCAP, with the model's torques as effort on /model_torques."""
         found = view.window(query.seconds, query.limit)
-        return await histories.send(
-            peer_of(request.scope).owner, mcap_pieces(found), bytes, MCAP, _attached(found, "mcap")
-        )
+        return await histories.send(owner, mcap_pieces(found), bytes, MCAP, _attached(found, "mcap"))
 
 
 def csv_lines(window: Window) -> Iterator[str]:
