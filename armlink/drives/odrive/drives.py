@@ -199,13 +199,9 @@ class ODriveDrives(BasicDrives):
             # no state in which it holds without its host: hold by input, where it stands now
             known.stopping = True
             # by the middle one of its newest positions: a false one may be what it is stopped for
-            at = (
-                held.position
-                if held is not None and held.power is Power.STOPPED
-                else median(known.recent)
-                if known.recent
-                else known.position
-            )
+            at = median(known.recent or [known.position])
+            if held is not None and held.power is Power.STOPPED:
+                at = held.position
             return self._input(joint, Order(Power.STOPPED, False, Mode.POSITION, at, 0.0, 0.0, 0.0, 0.0))
         if (
             order.power is not Power.ON
