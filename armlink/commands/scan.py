@@ -56,7 +56,7 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
 
     with Link.open(arm, bus) as link:
         found, channel = link.scan(), str(link.bus.channel_info)
-        traits = traits_of(link.groups, link.n)
+        traits = traits_of(link.groups)
     table = Table(
         Column("joint", overflow="fold"),
         "family",

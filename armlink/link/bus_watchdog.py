@@ -13,8 +13,6 @@ DOUBLE_CYCLES = 3
 FORGIVEN = 250
 """Missed readings that may still arrive, several per cycle: one second of SYNCs at 250 Hz, from an arm that was late
 itself and catches up."""
-
-
 SLOW_CYCLES = 4
 """A drive that sends velocity and state apart from its position does so after every so many SYNCs."""
 EXCESS = 3

@@ -8,13 +8,14 @@ import numpy as np
 
 from armlink.arrays import Array
 from armlink.clock import Clock
-from armlink.drives.family import Drives
 from armlink.drives.orders import Mode, Order, Power, law_torque
 from armlink.errors import BusFault, HostLate, Refused, Silence
+from armlink.link.bus_watchdog import SLOW_CYCLES
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault, refusal, silence
 from armlink.link.gate import Corroboration, JointLimits, Seen, beyond, hold_at, is_fresh, pass_gate, start_from
 from armlink.link.integral import Integral
+from armlink.link.joints.groups import by_joint
 from armlink.link.motion_watchdog import MotionWatch
 from armlink.link.types import Command, Sample
 
@@ -27,8 +28,6 @@ MEMORY = 1.0
 heartbeat too, which they may miss for twice `link.deadline`."""
 BLAME_SHARE = 0.5
 """A host that was late by this share of `link.deadline` explains a watchdog that acts at the whole of it."""
-SLOWEST = 4
-"""Motor torque and velocity come in every this many cycles, at the least often."""
 LEAD_SHARE = 0.05
 """Of the newest cycle in the mean time from a wake to its frames."""
 OFF, POSITION = int(Mode.OFF), int(Mode.POSITION)
@@ -49,9 +48,11 @@ class Commander:
         """Orders of the last frames."""
         self.loop, self._lock_step = loop, lock_step
         loop.verify = self._verify
-        self._slow_age = max_age + SLOWEST * period
+        self._drives = tuple((group.drives, number) for group, number in by_joint(loop.groups))
+        """Each joint's drive: the drives of its family, and its number among them."""
+        self._slow_age = max_age + SLOW_CYCLES * period
         self._modes_of: list[frozenset[int]] = [frozenset()] * self.n
-        self._commanded, self._unknown = [OFF] * self.n, [math.nan] * self.n
+        self._commanded = [OFF] * self.n
         self._integrals: list[Integral | None] = [None] * self.n
         self._with_gains = False
         self._caught: set[int] = set()
@@ -72,19 +73,14 @@ class Commander:
         """Longest time without commands of late, less a period, and when it ended [s]."""
 
     def begin(
-        self,
-        limits: list[JointLimits],
-        passed: list[Order],
-        modes: list[frozenset[int]],
-        position_step: Array | None = None,
+        self, limits: list[JointLimits], passed: list[Order], modes: list[frozenset[int]], position_step: Array
     ) -> None:
         """Take over drives that are set up: limits, what the first cycle starts from, modes that each has, and the
         resolution of their positions (n,) [rad]."""
         self.limits, self.passed, self._modes_of = limits, passed, modes
         self._integrals = [Integral() if each.kp else None for each in limits]
         self._with_gains = any(each is not None for each in self._integrals)
-        step = np.zeros(self.n) if position_step is None else position_step
-        self.motion.use(step, np.array([each.position_step / self.period for each in limits]))
+        self.motion.use(position_step, np.array([each.position_step / self.period for each in limits]))
         self._due = self.clock.now()
 
     def command(self, command: Command) -> Sample:
@@ -138,25 +134,22 @@ class Commander:
         """
         loop, now = self.loop, self._await_turn()
         self._seen_now = seen = self._seen(now, True)
-        for group in loop.groups:
-            for drive, place in enumerate(group.places):
-                limits, held = self.limits[place], self.passed[place]
-                wanted, position = power[place], loop.latest_position[place]
-                on = group.drives.power(drive) is Power.ON
-                if on or not math.isfinite(position):
-                    position = held.position
-                integral = self._integrals[place]
-                if integral is None:
-                    order = start_from(limits, loop.latest_motor_torque[place], position)
+        for joint, (now_power, wanted) in enumerate(zip(self.powers, power, strict=True)):
+            limits, position, on = self.limits[joint], loop.latest_position[joint], now_power is Power.ON
+            if on or not math.isfinite(position):
+                position = self.passed[joint].position
+            integral = self._integrals[joint]
+            if integral is None:
+                order = start_from(limits, loop.latest_motor_torque[joint], position)
+            else:
+                torque = 0.0
+                if on:
+                    torque = integral.update(limits, POSITION, position, 0.0, seen[joint])
                 else:
-                    torque = 0.0
-                    if on:
-                        torque = integral.update(limits, POSITION, position, 0.0, seen[place])
-                    else:
-                        integral.reset()
-                    order = hold_at(limits, torque, position, seen[place])
-                mode = POSITION if on or walk or wanted is Power.ON else OFF
-                self.passed[place] = order._replace(power=wanted, walk=walk, mode=mode)
+                    integral.reset()
+                order = hold_at(limits, torque, position, seen[joint])
+            mode = POSITION if on or walk or wanted is Power.ON else OFF
+            self.passed[joint] = order._replace(power=wanted, walk=walk, mode=mode)
         return loop.exchange(self.passed, now)
 
     def keep(self, goal: Array | None = None) -> Sample:
@@ -170,10 +163,9 @@ class Commander:
         self._seen_now = seen = self._seen(now, True)
         others = self._others()
         self._commanded = [POSITION] * self.n
-        for group in loop.groups:
-            for drive, place in enumerate(group.places):
-                order = self._kept(group.drives, drive, place, seen[place], others[place], goal)
-                self.passed[place] = order or self._braked(place, seen[place])
+        for joint in range(self.n):
+            order = self._kept(joint, seen[joint], others[joint], goal)
+            self.passed[joint] = order or self._braked(joint, seen[joint])
         try:
             sample = self._keep_sending(now)
         except BusFault:
@@ -188,37 +180,36 @@ class Commander:
         try:
             return self.loop.exchange(self.passed, now)
         except Refused:  # what the bytes would say is beyond a limit: brake
-            self.passed[:] = [self._braked(place, each) for place, each in enumerate(self._seen_now)]
+            self.passed[:] = [self._braked(joint, each) for joint, each in enumerate(self._seen_now)]
             return self.loop.exchange(self.passed, now)
 
-    def _kept(
-        self, drives: Drives, drive: int, place: int, seen: Seen, others: Corroboration, goal: Array | None
-    ) -> Order | None:
+    def _kept(self, joint: int, seen: Seen, others: Corroboration, goal: Array | None) -> Order | None:
         """The order by which a joint is held; None where it cannot be."""
-        limits, held, integral = self.limits[place], self.passed[place], self._integrals[place]
+        limits, held, integral = self.limits[joint], self.passed[joint], self._integrals[joint]
+        drives, drive = self._drives[joint]
         power = drives.power(drive)
         answers = is_fresh(seen.age, self.max_age) and math.isfinite(seen.position)
         if power is Power.FAULT or not answers or drives.has_restarted(drive):
             return None
         if power is Power.ON:
-            self._caught.discard(place)
-            target = seen.position if held.mode != POSITION else held.position if goal is None else float(goal[place])
+            self._caught.discard(joint)
+            target = seen.position if held.mode != POSITION else held.position if goal is None else float(goal[joint])
             torque = 0.0
             if integral is not None:
                 torque = integral.update(limits, POSITION, held.position, held.velocity, seen)
             return pass_gate(limits, POSITION, torque, target, 0.0, held, seen, others)
-        if power is not Power.STOPPED and place not in self._caught and not drives.own_stop(drive):
+        if power is not Power.STOPPED and joint not in self._caught and not drives.own_stop(drive):
             return None
-        self._caught.add(place)
+        self._caught.add(joint)
         if integral is not None:
             integral.reset()
         order = hold_at(limits, 0.0, seen.position, seen)
         return order._replace(power=Power.ON, walk=True, mode=POSITION)
 
-    def _braked(self, place: int, seen: Seen) -> Order:
+    def _braked(self, joint: int, seen: Seen) -> Order:
         """The order to stop a joint as its drive can, from where it stands."""
-        position = seen.position if math.isfinite(seen.position) else self.passed[place].position
-        return start_from(self.limits[place], seen.torque, position)._replace(power=Power.STOPPED)
+        position = seen.position if math.isfinite(seen.position) else self.passed[joint].position
+        return start_from(self.limits[joint], seen.torque, position)._replace(power=Power.STOPPED)
 
     @property
     def held(self) -> list[bool]:
@@ -231,31 +222,29 @@ class Commander:
         To be ON also takes that the joint is in position control and has told the torque that it now produces.
         Raises BusFault naming the joint that does not get there.
         """
-        loop = self.loop
         on = target is Power.ON
         self._commanded = [POSITION if on else OFF] * self.n
         since = [math.inf] * self.n
-        drives = [(group.drives, drive, place) for group in loop.groups for drive, place in enumerate(group.places)]
         for _ in range(max(int(ENABLE_SECONDS / self.period), STOP_CYCLES)):
             sample = self.stand([target] * self.n, walk=True)
             now = self.clock.now()
             reached = True
-            for each, drive, place in drives:
-                if each.power(drive) is target:
-                    since[place] = min(since[place], now)
+            for joint, power in enumerate(self.powers):
+                if power is target:
+                    since[joint] = min(since[joint], now)
                 else:
-                    since[place], reached = math.inf, False
+                    since[joint], reached = math.inf, False
             reached = reached and bool(np.isfinite(sample.position).all())
             if reached and on:
-                reached = self._torque_told(since) and all(each.ready(drive) for each, drive, _ in drives)
+                reached = self._torque_told(since) and all(drives.ready(drive) for drives, drive in self._drives)
             if reached:
                 self.passed[:] = [order._replace(walk=False) for order in self.passed]
                 return sample
-            if loop.watch.intruder or self.restarted():
+            if self.loop.watch.intruder or self.restarted():
                 break
-        raise BusFault(self._stuck(target, drives))
+        raise BusFault(self._stuck(target))
 
-    def _stuck(self, target: Power, drives: Sequence[tuple[Drives, int, int]]) -> str:
+    def _stuck(self, target: Power) -> str:
         loop = self.loop
         why = bus_fault(self.names, loop.watch, 0)
         if why:
@@ -264,15 +253,19 @@ class Commander:
             alarm = group.drives.alarm() if self.restarted() else None
             if alarm:
                 return str(alarm)
-        for each, drive, _ in drives:
-            if each.power(drive) is not target or (target is Power.ON and not each.ready(drive)):
-                return each.stuck(drive, target, ENABLE_SECONDS)
+        for drives, drive in self._drives:
+            if drives.power(drive) is not target or (target is Power.ON and not drives.ready(drive)):
+                return drives.stuck(drive, target, ENABLE_SECONDS)
         return f"no complete set of readings within {ENABLE_SECONDS} s of cycles: frames are lost"
 
     def restarted(self) -> bool:
         """Whether some drive has restarted."""
-        drives = ((group.drives, drive) for group in self.loop.groups for drive in range(len(group.places)))
-        return any(each.has_restarted(drive) for each, drive in drives)
+        return any(drives.has_restarted(drive) for drives, drive in self._drives)
+
+    @property
+    def powers(self) -> list[Power]:
+        """Newest power state of each joint's drive (n,)."""
+        return [drives.power(drive) for drives, drive in self._drives]
 
     def _torque_told(self, since: list[float]) -> bool:
         """Whether each joint that has torque control has told its torque since it has power, from time `since` on."""
@@ -285,13 +278,8 @@ class Commander:
         for _ in range(STOP_CYCLES):
             with contextlib.suppress(BusFault):  # a queue that is full now may have room in the next cycle
                 self.stand(power)
-                if not self._any_on():
+                if Power.ON not in self.powers:
                     break
-
-    def _any_on(self) -> bool:
-        return any(
-            group.drives.power(drive) is Power.ON for group in self.loop.groups for drive in range(len(group.places))
-        )
 
     def _numbers(self, command: Command) -> tuple[list[int], list[float], list[float]]:
         """A command's fields as lists; raises Refused where they are not n numbers each, or a mode is not supported."""
@@ -330,7 +318,7 @@ class Commander:
     def _ordered_torques(self) -> list[float]:
         """Torque that the newest order of each drive with gains comes to [N·m], as its bytes tell it; else NaN."""
         if not self._with_gains:
-            return self._unknown
+            return [math.nan] * self.n
         loop = self.loop
         rows = zip(loop.told, loop.latest_position, loop.latest_velocity, strict=True)
         return [
@@ -389,8 +377,7 @@ class Commander:
 
     def _own_stop(self) -> str:
         """The first joint that stopped itself since it did not hear its host, in words; empty if none."""
-        drives = ((group.drives, drive) for group in self.loop.groups for drive in range(len(group.places)))
-        return next((stop for each, drive in drives if (stop := each.own_stop(drive))), "")
+        return next((stop for drives, drive in self._drives if (stop := drives.own_stop(drive))), "")
 
     def _note_gap(self, seconds: float, now: float) -> None:
         """No commands were sent for so long before `now` [s]; the longest of late is kept."""

@@ -67,7 +67,7 @@ class Loop:
         self.just_woke = False
         """Whether that was after the last commands."""
         self._alone = self.groups[0] if len(self.groups) == 1 else None
-        traits = traits_of(self.groups, self.n)
+        traits = traits_of(self.groups)
         cadences = {each.cadence for each in traits}
         self._pass_time: Callable[[float], None] | None = None
         if lock_step and "sync" not in cadences:

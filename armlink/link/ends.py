@@ -51,7 +51,8 @@ ENDS: dict[Cause, tuple[Response, Response]] = {
     Cause.SILENT: (Response.HOLD, Response.HOLD),
     Cause.DROPPED: (Response.QUICK_STOP, Response.LET_GO),
 }
-"""For arms whose drives all hold, and for arms with drives that let go."""
+"""For arms whose drives all hold, and for arms with drives that let go. A silent job has not ended: its arm is held by
+`armlink.loop.process`, which makes the cycles."""
 
 
 class Ended(Parked, Protocol):
@@ -105,7 +106,7 @@ def end(link: Ended, cause: Cause, tell: Tell) -> None:
     try:
         _stow(link, tell)
     except Dropped:
-        link.let_go()
+        end(link, Cause.DROPPED, tell)
     except BusFault as fault:
         link.let_go()
         with suppress(Dropped):

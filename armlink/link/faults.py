@@ -7,15 +7,13 @@ from armlink.drives.orders import MODE_NAMES, Order
 from armlink.errors import Silence
 from armlink.link import gate
 from armlink.link.bus_watchdog import BusWatch
-from armlink.link.gate import NOTHING_KNOWN, Corroboration, JointLimits, Seen
+from armlink.link.gate import Corroboration, JointLimits, Seen
 from armlink.link.types import Command
 
 _MODES = ", ".join(f"{int(mode)} ({name})" for mode, name in MODE_NAMES.items())
 
 
-def silence(
-    names: Sequence[str], seen: Sequence[float], now: float, max_age: float, watch: BusWatch | None = None
-) -> Silence | None:
+def silence(names: Sequence[str], seen: Sequence[float], now: float, max_age: float, watch: BusWatch) -> Silence | None:
     """Which joints have sent no reading for longer than `max_age` [s]; `seen` is when they last did [s].
 
     `watch` tells of what others sent meanwhile: more frames than the joints should have is no fault of theirs.
@@ -28,7 +26,7 @@ def silence(
     age = now - min(seen)
     colon = "" if who == "no joint" else ":"
     said = f"{who}{colon} {what} for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
-    if watch is not None and watch.crowding > len(names):
+    if watch.crowding > len(names):
         said += (
             f"; others fill the bus meanwhile with {watch.crowding:.0f} frames a cycle, most of them "
             f"{_culprit(names, watch)}: a node babbles: disconnect it"
@@ -43,12 +41,11 @@ def refusal(
     passed: Sequence[Order],
     seen: Sequence[Seen],
     limits: Sequence[JointLimits],
-    others: Sequence[Corroboration] = (),
+    others: Sequence[Corroboration],
 ) -> str | None:
     """Why the gate refused a command, in one line; None where a fault of the bus or a joint was the reason."""
     for joint, name in enumerate(names):
-        why, limit, now = passed[joint].refused, limits[joint], seen[joint]
-        other = others[joint] if others else NOTHING_KNOWN
+        why, limit, now, other = passed[joint].refused, limits[joint], seen[joint], others[joint]
         if why == gate.COMMAND_AGE:
             return f"the command is {age * 1e3:.0f} ms old, expected 0 to {limit.max_age * 1e3:.0f} ms"
         if why == gate.BAD_MODE:

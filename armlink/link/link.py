@@ -30,7 +30,7 @@ from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, re
 from armlink.link.guard import Crossed
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
-from armlink.link.joints.groups import Group, make_groups
+from armlink.link.joints.groups import Group, by_joint, make_groups
 from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import WholeTurns, positions_before_power
 from armlink.link.park import falling, park, require_deadman
@@ -46,8 +46,6 @@ PATIENCE = 2.5
 LISTEN_PERIODS, LISTEN_SECONDS = 2, 0.1
 """Another host is listened for before anything is sent to the nodes: this many periods, and at least this long [s],
 since a host on a busy computer may pause for some 0.05 s."""
-
-
 ANSWER_SECONDS = 5.0
 """After a stall a controller may take so long to answer [s]."""
 R = TypeVar("R")
@@ -246,11 +244,9 @@ class Link(Calibrations):
 
     def _alone(self) -> None:
         """Raise BusFault where another host was heard or a controller has restarted."""
-        for group in self.groups:
-            for drive, place in enumerate(group.places):
-                if group.drives.has_restarted(drive):
-                    told = f"{self.names[place]}: its controller has just restarted (boot-up message): start again"
-                    raise BusFault(told)
+        for name, (group, number) in zip(self.names, by_joint(self.groups), strict=True):
+            if group.drives.has_restarted(number):
+                raise BusFault(f"{name}: its controller has just restarted (boot-up message): start again")
         fault = bus_fault(self.names, self._loop.watch, 0)
         if fault:
             raise BusFault(fault)

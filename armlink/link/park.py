@@ -66,13 +66,13 @@ class Parked(Protocol):
 
 def falling(link: Parked) -> list[str]:
     """Joints whose drives do not hold on their own when their host falls silent."""
-    traits = traits_of(link.groups, link.n)
+    traits = traits_of(link.groups)
     return [name for name, each in zip(link.names, traits, strict=True) if each.silence != "holds"]
 
 
 def require_deadman(link: Parked) -> None:
     """Raise Refused where a drive keeps its last command when its host dies."""
-    traits = traits_of(link.groups, link.n)
+    traits = traits_of(link.groups)
     for name, each in zip(link.names, traits, strict=True):
         if each.silence == "keeps on":
             raise Refused(
@@ -121,13 +121,13 @@ def _power_off(link: Parked) -> None:
 
 def _require_following(link: Parked, target: Array, most: float, how: str) -> None:
     """Raise Refused, the joints holding, where one that is held is further than `most` [rad] from its target."""
-    off = np.where(link.commander.held, np.abs(link.latest_position - target), 0.0)
+    here = link.latest_position
+    off = np.where(link.commander.held, np.abs(here - target), 0.0)
     joint = int(np.argmax(off))
     if off[joint] > most:
-        link.keep(link.latest_position)
+        link.keep(here)
         raise Refused(
-            f"park: {link.names[joint]}: at {link.latest_position[joint]:.3f} rad it {how} to {target[joint]:.3f} rad; "
-            "the joints hold"
+            f"park: {link.names[joint]}: at {here[joint]:.3f} rad it {how} to {target[joint]:.3f} rad; the joints hold"
         )
 
 
@@ -137,7 +137,8 @@ def let_down(link: Parked, tell: Tell, why: str) -> None:
     Each joint moves against the torque that its drive makes to hold it: downhill, whatever the arm carries, and away
     from what it presses on. Raises BusFault where nothing can be sent.
     """
-    target, before = np.array(link.latest_position), np.array(link.latest_position)
+    target = before = link.latest_position
+    step = speeds(link, LOWERING_SPEED) * link.period
     light = LIGHT_LOAD * np.array([joint.max_torque for joint in link.section.joints])
     lower, upper = np.array([(each.lower, each.upper) for each in link.commander.limits]).T
     every, window = cycles(link, TELL_SECONDS), cycles(link, LOWERED_SECONDS)
@@ -145,14 +146,18 @@ def let_down(link: Parked, tell: Tell, why: str) -> None:
         if row % every == 0:
             tell(f"letting the arm down, {LONGEST_LOWERING - row * link.period:.0f} s at most: {why}")
         load = np.nan_to_num(np.array(link.commander.loop.latest_motor_torque))
-        target -= speeds(link, LOWERING_SPEED) * link.period * np.clip(load / light, -1.0, 1.0)
         here = link.latest_position
-        target = np.clip(target, np.maximum(here - LAG, lower), np.minimum(here + LAG, upper))
+        target = np.clip(
+            target - step * np.clip(load / light, -1.0, 1.0),
+            np.maximum(here - LAG, lower),
+            np.minimum(here + LAG, upper),
+        )
         link.keep(target)
         if row % window == window - 1:
-            if np.abs(link.latest_position - before).max() < LOWERED:
+            here = link.latest_position
+            if np.abs(here - before).max() < LOWERED:
                 break
-            before = link.latest_position
+            before = here
     _power_off(link)
     tell("let down, the power is off")
 

@@ -29,10 +29,10 @@ class Ending:
     A job that does not within GRACE after SIGTERM hangs, and this process then ends by itself.
     """
 
-    def __init__(self, own_session: bool = True) -> None:
-        """Take over the signals of this process; `own_session`: leave the terminal, too."""
+    def __init__(self) -> None:
+        """Take over the signals of this process, and leave the terminal."""
         self._asked: float | None = None
-        if own_session and os.getsid(0) != os.getpid():
+        if os.getsid(0) != os.getpid():
             os.setsid()
         for number in OF_THE_TERMINAL:
             signal.signal(number, signal.SIG_IGN)

@@ -16,7 +16,7 @@ from armlink.drives.board import NO_STATUS
 from armlink.errors import BadInput
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.joints.foreign_host import ForeignHost
-from armlink.link.joints.groups import make_groups
+from armlink.link.joints.groups import by_joint, make_groups
 from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import PlaceWatch
 from armlink.link.types import Sample
@@ -112,7 +112,7 @@ class Monitor:
     def _joint(self, sample: Sample, joint: int) -> dict[str, Any]:
         sends = math.isfinite(sample.position[joint])
         status = int(sample.status[joint])
-        group = next(group for group in self._groups if joint in group.places)
+        group, _ = by_joint(self._groups)[joint]
         misplaced = self._places.found.get(joint)
         return {
             "joint": self.names[joint],

@@ -178,7 +178,7 @@ def echo_commander(arm: ArmFile, port: EchoPort, clock: Clock) -> Commander:
     setups = drives.set_up(LinkAsk(loop, clock, lambda done, timeout: False), limits)
     gates = [gate_limits(limit) for limit in limits]
     passed = [start_from(gate, 0.0, place) for gate, place in zip(gates, port.standing, strict=True)]
-    commander.begin(gates, passed, [each.modes for each in setups])
+    commander.begin(gates, passed, [each.modes for each in setups], np.zeros(n))
     return commander
 
 

@@ -11,6 +11,7 @@ from armlink.drives.orders import Order, Power
 from armlink.errors import BusFault
 from armlink.link.faults import bus_fault
 from armlink.link.gate_limits import joint_ranges
+from armlink.link.joints.groups import by_joint
 from armlink.link.joints.values import JointValues
 from armlink.link.link import Link
 from armlink.link.listener import Listener
@@ -146,13 +147,12 @@ def _ways(source: Link | Listener) -> list[float]:
 
 def _currents(link: Link, joint: int) -> list[tuple[float, float]]:
     """Torque as reported and by current, a few times; of a drive that tells its current."""
-    group = next(group for group in link.groups if joint in group.places)
+    group, number = by_joint(link.groups)[joint]
     drives = group.drives
     if not isinstance(drives, TellsCurrent):
         return []
-    place = group.places.index(joint)
     ask: Callable[..., object] = link.ask.on(group.tag)
-    found = [drives.torque_by_current(place, ask) for _ in range(ASKED)]  # type: ignore[arg-type]
+    found = [drives.torque_by_current(number, ask) for _ in range(ASKED)]  # type: ignore[arg-type]
     return [each for each in found if each is not None]
 
 

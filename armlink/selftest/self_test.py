@@ -13,7 +13,7 @@ from armlink.drives.orders import Power
 from armlink.drives.traits import Silence
 from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link.faults import bus_fault
-from armlink.link.joints.groups import traits_of
+from armlink.link.joints.groups import by_joint, traits_of
 from armlink.link.link import Link
 from armlink.link.park import falling, park, speeds, straight
 from armlink.link.types import Command, Sample, Tell
@@ -147,7 +147,7 @@ class SelfTest:
     def _calibrations(self) -> None:
         """Calibrations that the host keeps: which record is in force, or that there is none."""
         link = self.link
-        for joint, (name, traits) in enumerate(zip(link.names, traits_of(link.groups, link.n), strict=True)):
+        for joint, (name, traits) in enumerate(zip(link.names, traits_of(link.groups), strict=True)):
             if traits.calibration != "host":
                 continue
             held = link.read_calibration(joint)
@@ -159,7 +159,7 @@ class SelfTest:
 
     def _watched(self) -> str:
         """Why the joints are not driven: a drive that is known to keep on when its host falls silent; else empty."""
-        for name, traits in zip(self.link.names, traits_of(self.link.groups, self.link.n), strict=True):
+        for name, traits in zip(self.link.names, traits_of(self.link.groups), strict=True):
             if traits.silence == "keeps on":
                 self._add(name, "silence", "failed", KEEPS_ON)
         keeping = [each.joint for each in self.results if each.check == "silence"]
@@ -207,7 +207,7 @@ class SelfTest:
     def _silence(self, joint: int) -> None:
         """No command for one joint, all others commanded as before: what does its drive do, and is that its trait?"""
         link = self.link
-        name, trait = link.names[joint], traits_of(link.groups, link.n)[joint].silence
+        name, trait = link.names[joint], traits_of(link.groups)[joint].silence
         does, seconds = self._left_alone(joint)
         if does is None:  # its drive tells no state: it shows it where gravity pulls
             self._lean(joint)
@@ -234,8 +234,7 @@ class SelfTest:
     def _left_alone(self, joint: int) -> tuple[Silence | None, float]:
         """What a drive does without commands, None where it does not tell, and after how long [s]; then it is ON."""
         link, limit = self.link, self.link.section.deadline
-        group = next(group for group in link.groups if joint in group.places)
-        drive = group.places.index(joint)
+        group, drive = by_joint(link.groups)[joint]
         self.progress(f"{link.names[joint]}: no commands for {limit * 1e3:.0f} ms")
         loop, on = link.commander.loop, [Power.ON] * link.n
         standing = np.array(loop.latest_position)

@@ -15,7 +15,7 @@ from armlink.contributed import contributed
 from armlink.drives.family import KeepsCalibration, TellsSerialNumber
 from armlink.errors import BadInput
 from armlink.link.joints.ask import LinkAsk
-from armlink.link.joints.groups import Group, traits_of
+from armlink.link.joints.groups import Group, by_joint, traits_of
 from armlink.link.joints.values import JointValues
 from armlink.link.types import DriveSerial
 from armlink.torque_calibration import GAIN_RANGE, Calibration, per_joint
@@ -52,7 +52,7 @@ class Calibrations:
         Raises Refused where the record in force is of another arm.
         """
         self._simulated = simulated
-        traits = traits_of(self.groups, self.n)
+        traits = traits_of(self.groups)
         hosted = [joint for joint in range(self.n) if traits[joint].calibration == "host"]
         found = calibrations_by_record(self.arm) if hosted and not simulated else [None] * self.n
         self._in_host = {joint: found[joint] or BLANK for joint in hosted}
@@ -87,25 +87,24 @@ class Calibrations:
     def read_temperatures(self) -> Array:
         """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
         found = np.full(self.n, np.nan)
-        for group in self.groups:
-            for drive, place in enumerate(group.places):
-                found[place] = group.drives.temperature(drive, self._ask(group))
+        for joint, (group, number) in enumerate(by_joint(self.groups)):
+            found[joint] = group.drives.temperature(number, self._ask(group))
         return found
 
     def read_calibration(self, joint: int) -> Calibration:
         """The calibration that is in force for joint 0 … n−1, in its drive or in the host; raises BusFault."""
         if joint in self._in_host:
             return self._in_host[joint]
-        group, drive = self._drive(joint)
+        group, number = by_joint(self.groups)[joint]
         assert isinstance(group.drives, KeepsCalibration)
-        return group.drives.read_calibration(drive, self._ask(group))
+        return group.drives.read_calibration(number, self._ask(group))
 
     def drive_serial(self, joint: int) -> DriveSerial:
         """What the drive of joint 0 … n−1 is known by, if it keeps its calibration itself; raises BusFault."""
-        group, drive = self._drive(joint)
+        group, number = by_joint(self.groups)[joint]
         if joint in self._in_host or not isinstance(group.drives, TellsSerialNumber):
             return DriveSerial(simulated=self._simulated)
-        return DriveSerial(group.drives.serial_number(drive, self._ask(group)), self._simulated)
+        return DriveSerial(group.drives.serial_number(number, self._ask(group)), self._simulated)
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         """Put a calibration into force for joint 0 … n−1 (`store`: in a drive's flash too); raises BadInput, BusFault.
@@ -125,12 +124,9 @@ class Calibrations:
             self._apply_host()
             self.calibration_changed(joint)
             return calibration
-        group, drive = self._drive(joint)
+        group, number = by_joint(self.groups)[joint]
         assert isinstance(group.drives, KeepsCalibration)
-        return group.drives.write_calibration(drive, self._ask(group), calibration, store)
+        return group.drives.write_calibration(number, self._ask(group), calibration, store)
 
     def calibration_changed(self, joint: int) -> None:
         """Called where the host's calibration of a joint has changed."""
-
-    def _drive(self, joint: int) -> tuple[Group, int]:
-        return next((group, group.places.index(joint)) for group in self.groups if joint in group.places)

@@ -79,10 +79,15 @@ def make_groups(arm: ArmFile, bus: CanBus | None = None) -> tuple[Group, ...]:
     return tuple(sorted(groups, key=lambda group: group.family.traits.cadence == "sync"))
 
 
-def traits_of(groups: Sequence[Group], n: int) -> list[Traits]:
+def by_joint(groups: Sequence[Group]) -> tuple[tuple[Group, int], ...]:
+    """The group of each joint, in joint order, and the number that the joint's drive has in it."""
+    found = {place: (group, number) for group in groups for number, place in enumerate(group.places)}
+    return tuple(found[place] for place in sorted(found))
+
+
+def traits_of(groups: Sequence[Group]) -> list[Traits]:
     """Traits of every joint, in joint order."""
-    found = {place: group.drives.traits(joint) for group in groups for joint, place in enumerate(group.places)}
-    return [found[place] for place in range(n)]
+    return [group.drives.traits(number) for group, number in by_joint(groups)]
 
 
 def state_name(arm: ArmFile, joint: int, code: int) -> str:

@@ -179,7 +179,7 @@ class JointValues:
 
 def values_of(arm: ArmFile, groups: tuple[Group, ...]) -> JointValues:
     """Conversions between the values of an arm's joints and of their drives."""
-    traits = traits_of(groups, len(arm.require_link().joints))
+    traits = traits_of(groups)
     return JointValues(Mounting.of(arm), np.array([each.torque == "current" for each in traits]))
 
 

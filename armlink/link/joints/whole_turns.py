@@ -194,12 +194,8 @@ def positions_before_power(commander: "Commander", set_up: Sequence[float], sinc
     for _ in range(MOST_CYCLES):
         if not outdated():
             break
-        power = [Power.OFF] * commander.n
-        for group in loop.groups:
-            for drive, place in enumerate(group.places):
-                if group.drives.power(drive) in (Power.ON, Power.STOPPED):
-                    power[place] = Power.STOPPED
-        commander.stand(power)
+        powered = [power in (Power.ON, Power.STOPPED) for power in commander.powers]
+        commander.stand([Power.STOPPED if each else Power.OFF for each in powered])
     else:
         names = ", ".join(commander.names[joint] for joint in outdated())
         raise BusFault(f"{names}: no position came in {MOST_CYCLES} cycles: nothing gets power")

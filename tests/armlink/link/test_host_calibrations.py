@@ -14,7 +14,7 @@ FOUND = [None, None, Calibration(1.1, 0.2, record_id=7)]
 @pytest.mark.parametrize("simulated", [False, True])
 def test_joints_that_the_host_calibrates_and_has_no_record_for_are_named(simulated, monkeypatch, caplog):
     traits = [SimpleNamespace(calibration=by) for by in ("host", "drive", "host")]
-    monkeypatch.setattr(calibrations, "traits_of", lambda groups, n: traits)
+    monkeypatch.setattr(calibrations, "traits_of", lambda groups: traits)
     monkeypatch.setattr(calibrations, "calibrations_by_record", lambda arm: FOUND)
     joints = SimpleNamespace(
         arm=SimpleNamespace(name="three"), n=3, groups=(), names=("a", "b", "c"), _apply_host=lambda: None

@@ -24,5 +24,5 @@ def test_where_no_drive_is_stuck_frames_are_lost(power, ready, says, monkeypatch
         ready=lambda drive: ready,
         stuck=lambda drive, target, seconds: f"joint {drive} is stuck",
     )
-    commander = SimpleNamespace(names=("a",), loop=SimpleNamespace(watch=None, groups=()))
-    assert Commander._stuck(commander, Power.ON, [(drives, 0, 0)]) == says
+    commander = SimpleNamespace(names=("a",), loop=SimpleNamespace(watch=None, groups=()), _drives=((drives, 0),))
+    assert Commander._stuck(commander, Power.ON) == says

@@ -18,7 +18,7 @@ from armlink.selftest.self_test import SelfTest
 )
 def test_no_joint_is_driven_where_one_would_keep_on(silence, says, monkeypatch):
     traits = [SimpleNamespace(silence=each) for each in silence]
-    monkeypatch.setattr(self_test, "traits_of", lambda groups, n: traits)
+    monkeypatch.setattr(self_test, "traits_of", lambda groups: traits)
     results = [SimpleNamespace(joint="other", check="calibration")]
     test = SimpleNamespace(
         link=SimpleNamespace(names=("a", "b"), groups=(), n=2),
