@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.records.store import RecordStore
 from gcomp.arm.arm import Arm
 
 sys.path.insert(0, str(Path(__file__).parent))
+from fake_controllers import ARM, record
 from paper_arm import BETA, NAMES
 
 
@@ -29,3 +31,11 @@ def sarcos() -> Arm:
 @pytest.fixture(scope="session")
 def sarcos_beta() -> np.ndarray:
     return np.array(BETA)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> RecordStore:
+    """With the record that the fake controllers hold; files that need another one make their own."""
+    store = RecordStore(str(tmp_path / "records.db"))
+    store.put(record(), ARM, by="ann", reason="sweep")
+    return store

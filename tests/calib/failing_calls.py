@@ -118,6 +118,24 @@ class NotifySocket:
         self._heard.append(content)
 
 
+class OtherCommit:
+    """A database that does `at_commit` before a transaction ends; else it is the real one."""
+
+    def __init__(self, real: sqlite3.Connection) -> None:
+        self.real = real
+
+    def at_commit(self) -> None:
+        raise NotImplementedError
+
+    def execute(self, statement: str, *values: Any) -> object:
+        if statement == "COMMIT":
+            self.at_commit()
+        return self.real.execute(statement, *values)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.real, name)
+
+
 class BusProcess(LoopProcess):
     """The bus process without a process: its end of the pipe is served by the arm, in this thread."""
 
@@ -321,8 +339,7 @@ def watched_drift(folder: Path, fails: Callable[[str, int], bool], patch: Any) -
     """Two minutes in which joint 3 drifts and is recalibrated, while calls fail; then a minute of none."""
     daemon = FailingDaemon(folder, fails, patch)
     daemon.run(40)
-    daemon.fast.gain[2] *= 1.03
-    daemon.fast.offset[2] += 0.3
+    daemon.drift()
     daemon.run(80)
     daemon.failing.fails = lambda dependency, count: False
     daemon.run(60)

@@ -30,6 +30,11 @@ def slow(arm: ArmFile) -> ArmFile:
     return arm.model_copy(update={"link": arm.require_link().model_copy(update={"rate": 1 / PERIOD})})
 
 
+def settings(policy: str, **more: object) -> DaemonSection:
+    """Of a daemon that records nothing."""
+    return DaemonSection.model_validate({"policy": policy, "recording": QUIET, **more})
+
+
 class HeldDisk(Immediate):
     """A disk that answers at once or, while it is `held`, not at all."""
 
@@ -143,6 +148,11 @@ class FastDaemon:
 
     # ---- time
 
+    def drift(self) -> None:
+        """The torque sensor of joint 3 drifts by 3 % and 0.3 N·m."""
+        self.fast.gain[2] *= 1.03
+        self.fast.offset[2] += 0.3
+
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         """Let the arm work for so long, or less."""
         ticked = self.fast.t
@@ -180,10 +190,9 @@ class FastDaemon:
 
 def drifted(folder: Path) -> FastDaemon:
     """Joint 3 has drifted, and its recalibration waits for an approval."""
-    daemon = FastDaemon(folder, 1, DaemonSection.model_validate({"policy": "propose", "recording": QUIET}))
+    daemon = FastDaemon(folder, 1, settings("propose"))
     daemon.run(40)
-    daemon.fast.gain[2] *= 1.03
-    daemon.fast.offset[2] += 0.3
+    daemon.drift()
     daemon.run(80)
     return daemon
 

@@ -1,14 +1,18 @@
 """Records of a two-joint arm, made by hand."""
 
+import sqlite3
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import sqlalchemy as sa
 
 from armlink.arm_file import ArmFile, parse_arm
 from armlink.link.types import Calibration
 from calib.install.journaled_write import Controllers
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
+from calib.records.store import RecordStore
 
 WHEN = datetime(2026, 11, 21, 2, 0, tzinfo=UTC)
 
@@ -56,3 +60,23 @@ def gravity() -> GravityRecord:
         identifiable=(True, True, False, True),
         gravity=(0.0, 0.0, -9.80665),
     )
+
+
+def activate_by_hand(store: RecordStore, record: CalibrationRecord | GravityRecord) -> None:
+    """A record made current as an armlink without bounds did."""
+    store.add(record)
+    with sa.create_engine(store.url).begin() as connection:
+        connection.execute(
+            sa.text(
+                'INSERT INTO activations (record, kind, arm, serial, at, "by", reason)'
+                " VALUES (:record, :kind, :arm, :serial, '2026-11-28T00:00:00+00:00', 'ann', '')"
+            ),
+            {"record": record.id, "kind": record.kind, "arm": record.arm, "serial": record.serial},
+        )
+
+
+def copied(path: Path, to: Path) -> Path:
+    """A copy of a store, as a backup makes it."""
+    with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(to)) as target:
+        source.backup(target)
+    return to

@@ -23,10 +23,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 
 from bounds import exit_status
 from daemon_bench import DaemonBench
-from fast_daemon import QUIET, FastDaemon
+from fast_daemon import FastDaemon, settings
 
 from armlink.arm_file import load_arm
-from calib.daemon.settings import DaemonSection
 
 FOUND_SECONDS, GAIN_LEFT, OFFSET_LEFT, FOLLOWED, TOLD, GROWTH = 60.0, 0.003, 0.05, 0.002, 0.98, 0.01
 """Bounds: median time to find, errors after recalibration, error while following, payloads told, memory."""
@@ -36,7 +35,7 @@ HEAVY = 3.0
 
 def daemon(seed: int, policy: str = "apply") -> FastDaemon:
     folder = Path(tempfile.mkdtemp(prefix="armlink-days-"))
-    return FastDaemon(folder, seed, DaemonSection.model_validate({"policy": policy, "recording": QUIET}))
+    return FastDaemon(folder, seed, settings(policy))
 
 
 def memory() -> float:
@@ -171,9 +170,8 @@ def whole(seed: int) -> DaemonBench:
         {"effect": "friction.coulomb", "joint": each.name, "torque": 0.05 * each.rated_torque} for each in joints
     ]
     section = type(arm.sim).model_validate({**arm.sim.model_dump(), "effects": effects})
-    settings = DaemonSection.model_validate({"policy": "apply", "recording": QUIET})
     folder = Path(tempfile.mkdtemp(prefix="armlink-days-"))
-    return DaemonBench(folder, arm.model_copy(update={"sim": section}), seed, settings)
+    return DaemonBench(folder, arm.model_copy(update={"sim": section}), seed, settings("apply"))
 
 
 def payloads(given: argparse.Namespace) -> list[str]:

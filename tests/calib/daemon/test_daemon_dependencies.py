@@ -5,23 +5,18 @@ import shutil
 import sqlite3
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import pytest
-from failing_calls import DEPENDENCIES, events, watched_drift
-from fast_daemon import QUIET, FastDaemon, drifted, metric
+from failing_calls import DEPENDENCIES, OtherCommit, events, watched_drift
+from fast_daemon import FastDaemon, drifted, metric, settings
+from made_records import activate_by_hand, copied
 from postgres import NoServer, stoppable_server
 
 from armlink.errors import BadInput, BusFault
-from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.api_models import EventItem, State
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
-
-
-def settings(policy: str = "propose") -> DaemonSection:
-    return DaemonSection.model_validate({"policy": policy, "recording": QUIET})
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +60,7 @@ def test_single_failures_of_all_at_once_are_right_again_within_seconds(
 
 
 def test_a_truncated_store_is_said_and_the_records_stay_in_force(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(10)
     records, database = daemon.view.status().records, tmp_path / "records.db"
     daemon.store.close()
@@ -91,7 +86,7 @@ def test_a_truncated_store_is_said_and_the_records_stay_in_force(tmp_path: Path)
 def test_a_postgresql_that_restarts_is_found_again(tmp_path: Path) -> None:
     try:
         with stoppable_server() as server:
-            daemon = FastDaemon(tmp_path, 1, settings(), store=f"{server.url}/postgres")
+            daemon = FastDaemon(tmp_path, 1, settings("propose"), store=f"{server.url}/postgres")
             daemon.run(10)
             records = daemon.view.status().records
             assert records.calibration is not None
@@ -113,7 +108,7 @@ def test_a_postgresql_that_restarts_is_found_again(tmp_path: Path) -> None:
 
 def test_a_store_that_does_not_answer_holds_nobody_up(tmp_path: Path) -> None:
     """As a hung PostgreSQL: the look for records, which runs aside, does not come back."""
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(10)
     later = []
     daemon.run_aside = lambda work, done: later.append((work, done))
@@ -133,7 +128,7 @@ def test_a_store_that_does_not_answer_holds_nobody_up(tmp_path: Path) -> None:
 
 
 def test_a_lock_of_another_program_holds_the_daemon_for_a_moment_only(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(5)
     other = sqlite3.connect(tmp_path / "state" / "journal.db", isolation_level=None)
     other.execute("BEGIN EXCLUSIVE")
@@ -152,7 +147,7 @@ def test_a_lock_of_another_program_holds_the_daemon_for_a_moment_only(tmp_path: 
 
 
 def test_a_state_that_becomes_read_only_is_said_and_loses_no_event(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(5)
     daemon.service.journal._db.execute("PRAGMA query_only=ON")
     daemon.service.events.say("clock", None, "while it was read-only", {})
@@ -179,19 +174,11 @@ def test_a_state_that_is_read_only_at_the_start_is_one_line(tmp_path: Path, monk
         Journal(path)
 
 
-class NoCommit:
+class NoCommit(OtherCommit):
     """A database that takes everything but the end of a transaction."""
 
-    def __init__(self, real: sqlite3.Connection) -> None:
-        self.real = real
-
-    def execute(self, statement: str, *values: Any) -> object:
-        if statement == "COMMIT":
-            raise sqlite3.OperationalError("database or disk is full")
-        return self.real.execute(statement, *values)
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self.real, name)
+    def at_commit(self) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
 
 
 def test_what_cannot_be_committed_is_not_half_kept(tmp_path: Path) -> None:
@@ -211,7 +198,7 @@ def test_a_disk_that_is_full_at_the_start_is_said_and_the_start_is_kept_later(
 ) -> None:
     commit = Journal._commit
     monkeypatch.setattr(Journal, "_commit", lambda *_: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full")))
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(3)
     assert "disk is full" in daemon.view.status().detail
     monkeypatch.setattr(Journal, "_commit", commit)
@@ -228,7 +215,7 @@ def damage(path: Path) -> None:
 
 
 def test_a_damaged_journal_is_set_aside_and_that_is_said(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(30)
     daemon.service.close("end")
     journal = tmp_path / "state" / "journal.db"
@@ -243,7 +230,7 @@ def test_a_damaged_journal_is_set_aside_and_that_is_said(tmp_path: Path) -> None
 
 
 def test_a_journal_that_is_damaged_under_way_is_set_aside_too(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(10)
     daemon.service.journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
     daemon.run(5)
@@ -287,7 +274,7 @@ def test_a_row_that_is_damaged_and_still_a_row_is_damage_of_the_journal(tmp_path
 
 @pytest.mark.parametrize("spoil", ["estimate = '{'", "estimate = '{}'", "estimate = '7'", "time = '2026'", "t = 'x'"])
 def test_a_damaged_row_of_history_is_left_out(tmp_path: Path, spoil: str) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(10)
     for _ in range(3):
         daemon.service.save(history=True)
@@ -304,7 +291,7 @@ def test_a_damaged_row_of_history_is_left_out(tmp_path: Path, spoil: str) -> Non
 
 @pytest.mark.parametrize("state", ["7.5", "[1]", "null", "{"])
 def test_a_damaged_belief_is_none(tmp_path: Path, state: str) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(10)
     daemon.service.close("end")
     spoiled(tmp_path / "state" / "journal.db", f"UPDATE belief SET state = '{state}'")
@@ -342,12 +329,7 @@ def test_a_store_that_is_replaced_by_rename_is_shown_and_followed(tmp_path: Path
     """Controllers were written and their records lost: the daemon went on with the file that had lost its name."""
     daemon, path = drifted(tmp_path), tmp_path / "records.db"
     (proposal,) = daemon.view.proposals()
-    with (
-        contextlib.closing(sqlite3.connect(path)) as old,
-        contextlib.closing(sqlite3.connect(tmp_path / "copy")) as new,
-    ):
-        old.backup(new)
-    (tmp_path / "copy").rename(path)
+    copied(path, tmp_path / "copy").rename(path)
     refused = daemon.view.decisions.approve(proposal.id, "ann").result(0)
     assert (refused.state, "was replaced by another file" in refused.note) == ("failed", True)
     assert not any(call.startswith("write") for call in daemon.sdo)
@@ -383,12 +365,7 @@ def test_a_record_of_no_working_arm_that_is_current_is_told_and_not_observed_aga
     daemon.run(5)
     current, wrong = daemon.good_records()[0], {"created": datetime(2200, 1, 1, tzinfo=UTC)}
     record = current.model_copy(update=wrong)
-    daemon.store.add(record)
-    with contextlib.closing(sqlite3.connect(tmp_path / "records.db")) as db, db:
-        row = (record.id, "calibration", record.arm, record.serial, "", "", "")
-        db.execute(
-            "INSERT INTO activations(record, kind, arm, serial, at, by, reason) VALUES (?, ?, ?, ?, ?, ?, ?)", row
-        )
+    activate_by_hand(daemon.store, record)
     daemon.run(7)
     assert f"record {record.id}: created is 2200-01-01, not 1984 to 2106" in daemon.view.status().detail
     assert daemon.view.status().records.calibration != record.id

@@ -4,17 +4,16 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from fast_daemon import QUIET, START, FastDaemon
+from fast_daemon import START, FastDaemon, settings
 
 from armlink.arm_file import load_arm
 from armlink.errors import Refused
-from calib.daemon.settings import DaemonSection
 from calib.records.records import CalibrationRecord
 
 
 def daemon_of(directory: Path, policy: str = "apply") -> FastDaemon:
     """At work for a minute, with good records in its controllers."""
-    daemon = FastDaemon(directory, 1, DaemonSection.model_validate({"policy": policy, "recording": QUIET}))
+    daemon = FastDaemon(directory, 1, settings(policy))
     daemon.run(60)
     assert not daemon.of_kind("configuration", "refused", "alarm")
     return daemon

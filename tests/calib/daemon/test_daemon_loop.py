@@ -12,7 +12,7 @@ import can
 import numpy as np
 import pytest
 from daemon_bench import DaemonBench
-from fast_daemon import QUIET
+from fast_daemon import settings
 
 from armlink.arm_file import load_arm
 from armlink.bus.in_process import InProcessBus
@@ -27,15 +27,10 @@ from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.arm_loop import ArmLoop
 from calib.daemon.loop.loop_messages import CHANNELS, Batch, Down, LoopOptions, Message, Up
 from calib.daemon.loop.loop_process import BATCHES, LoopProcess
-from calib.daemon.settings import DaemonSection
 from calib.daemon.view.api_models import State
 from calib.motion.random_work import work_targets
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
-
-
-def settings(policy: str, **more: object) -> DaemonSection:
-    return DaemonSection.model_validate({"policy": policy, "recording": QUIET, **more})
 
 
 def test_on_the_simulated_arm_with_its_bus(tmp_path: Path) -> None:

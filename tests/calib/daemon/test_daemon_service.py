@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_bench import run_now
-from fast_daemon import QUIET, FastDaemon
+from fast_daemon import FastDaemon, settings
 
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
@@ -30,16 +30,11 @@ from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord
 
 
-def settings(policy: str = "apply", **more: object) -> DaemonSection:
-    return DaemonSection.model_validate({"policy": policy, "recording": QUIET, **more})
-
-
 def drifted(directory: Path, policy: str, seed: int = 1, **more: object) -> FastDaemon:
     """A daemon whose joint 3 has drifted and been watched until something was made of it."""
     daemon = FastDaemon(directory, seed, settings(policy), **more)
     daemon.run(60)
-    daemon.fast.gain[2] *= 1.03
-    daemon.fast.offset[2] += 0.3
+    daemon.drift()
     daemon.run(120)
     return daemon
 
@@ -273,7 +268,7 @@ def test_after_a_kill_it_knows_everything(tmp_path: Path) -> None:
 
 
 def test_a_kill_loses_at_most_five_seconds_of_the_estimate(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 3, settings())
+    daemon = FastDaemon(tmp_path, 3, settings("apply"))
     daemon.run(50)
     rows = daemon.view.status().rows
     daemon.kill()
@@ -336,7 +331,7 @@ def test_a_bus_that_comes_back_during_a_write_is_compared_after_it(tmp_path: Pat
 
 
 def test_an_error_that_is_no_fault_of_the_bus_is_raised(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
     with pytest.raises(ZeroDivisionError):
         daemon.service.jobs.start(lambda: 1 / 0, lambda outcome: None)
     assert not daemon.service.jobs.busy
@@ -356,7 +351,7 @@ def test_under_propose_readings_of_other_calibrations_are_converted(tmp_path: Pa
 
 
 def test_a_bus_that_comes_and_goes_is_shown_and_does_not_fill_the_journal(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
     daemon.run(5)
     for number in range(200):
         daemon.service.take(Down(f"bus socketcan:can0: gone {number}"))
@@ -369,7 +364,7 @@ def test_a_bus_that_comes_and_goes_is_shown_and_does_not_fill_the_journal(tmp_pa
 
 
 def test_a_joint_that_falls_silent_is_a_fault(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
     daemon.run(5)
     batch = daemon.service.arm_state.batch
     batch.age[3] = 1.7
@@ -379,7 +374,7 @@ def test_a_joint_that_falls_silent_is_a_fault(tmp_path: Path) -> None:
 
 
 def test_a_host_near_the_deadline_is_said_once_and_not_of_few_cycles(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
     daemon.run(5)
     stats = daemon.service.arm_state.batch.stats
     for _ in range(5000):
@@ -399,7 +394,7 @@ def test_a_host_near_the_deadline_is_said_once_and_not_of_few_cycles(tmp_path: P
 
 
 def test_without_records_it_waits_and_begins_when_they_come(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings(), records=False)
+    daemon = FastDaemon(tmp_path, 1, settings("apply"), records=False)
     daemon.run(10)
     status = daemon.view.status()
     assert status.state is State.STARTING
@@ -424,7 +419,7 @@ def test_a_reload_changes_the_policy_and_keeps_what_was_learnt(tmp_path: Path) -
 
 
 def test_a_full_disk_is_shown_and_stops_nothing(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
     daemon.run(10)
     daemon.service.journal._db.execute("PRAGMA query_only=ON")
     daemon.run(30)
@@ -435,12 +430,12 @@ def test_a_full_disk_is_shown_and_stops_nothing(tmp_path: Path) -> None:
 
 
 def test_sweeps_are_by_schedule_or_request_and_only_where_the_bus_is_driven(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings(sweep_every_hours=0.02))
+    daemon = FastDaemon(tmp_path, 1, settings("apply", sweep_every_hours=0.02))
     daemon.run(120, until=lambda: daemon.view.status().state is State.SWEEPING)
     assert daemon.view.status().state is State.SWEEPING
     daemon.run(120, until=lambda: daemon.view.status().state is State.OBSERVING)
     assert [event.kind for event in daemon.of_kind("sweep")][:2] == ["sweep", "sweep"]
-    listening = FastDaemon(tmp_path / "listening", 1, settings(), listen_only=True)
+    listening = FastDaemon(tmp_path / "listening", 1, settings("apply"), listen_only=True)
     listening.service.tours.request("asked for")
     assert "only listens" in listening.of_kind("refused")[0].text
 
@@ -502,7 +497,7 @@ def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
 
 
 def test_history_is_thinned_evenly_and_ends_with_the_newest(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
     daemon.run(400)
     points = daemon.view.history("joint_3")
     assert len(points) >= 6
@@ -517,7 +512,7 @@ def test_history_is_thinned_evenly_and_ends_with_the_newest(tmp_path: Path) -> N
 
 
 def test_history_older_than_a_month_is_thinned_the_rest_stays_whole(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
     journal, old = daemon.service.journal, daemon.wall() - timedelta(days=31)
     for minute in range(100):
         journal.add_history(old + timedelta(minutes=minute), 60.0 * minute, None, {"gain": []})
@@ -531,7 +526,7 @@ def test_history_older_than_a_month_is_thinned_the_rest_stays_whole(tmp_path: Pa
 def test_recordings_are_rotated_within_their_quota_and_load(tmp_path: Path) -> None:
     given = {"minutes": 0.25, "quota_mb": 0.25, "rate": 25}
     daemon = FastDaemon(
-        tmp_path, 1, settings().model_copy(update={"recording": DaemonSection(recording=given).recording})
+        tmp_path, 1, settings("apply").model_copy(update={"recording": DaemonSection(recording=given).recording})
     )
     daemon.run(200)
     daemon.service.close("test")
@@ -593,7 +588,7 @@ async def _first(client: object) -> object:
 def test_a_slow_client_loses_the_oldest_and_holds_nobody_up(tmp_path: Path) -> None:
     import asyncio
 
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("apply"))
     daemon.run(5)
     client = daemon.view.subscribe()
     for _ in range(1000):

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fast_daemon import QUIET, START, FastDaemon, drifted, metric
+from failing_calls import OtherCommit
+from fast_daemon import START, FastDaemon, drifted, metric, settings
 
 from armlink.arm_file import load_arm
 from calib.daemon.loop.loop_messages import Up
@@ -29,10 +30,6 @@ PATIENCE = 60.0
 """On a busy machine [s]."""
 
 
-def settings(policy: str = "propose", **more: object) -> DaemonSection:
-    return DaemonSection.model_validate({"policy": policy, "recording": QUIET, **more})
-
-
 class NoProcess:
     """Stands for the bus process, which says nothing."""
 
@@ -43,20 +40,15 @@ class NoProcess:
         return []
 
 
-class SlowCommit:
+class SlowCommit(OtherCommit):
     """A database whose transactions end only once they may."""
 
     def __init__(self, real: sqlite3.Connection) -> None:
-        self.real, self.may, self.begun, self.gave_up = real, threading.Event(), threading.Event(), False
+        super().__init__(real)
+        self.may, self.gave_up = threading.Event(), False
 
-    def execute(self, statement: str, *values: Any) -> object:
-        if statement == "COMMIT":
-            self.begun.set()
-            self.gave_up = self.gave_up or not self.may.wait(PATIENCE / 6)
-        return self.real.execute(statement, *values)
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self.real, name)
+    def at_commit(self) -> None:
+        self.gave_up = self.gave_up or not self.may.wait(PATIENCE / 6)
 
 
 def waiting(daemon: FastDaemon) -> int:
@@ -89,7 +81,7 @@ def test_the_event_loop_turns_and_answers_while_the_disk_does_not(tmp_path: Path
 
 
 def test_a_disk_that_does_not_answer_shows_and_keeps_all_events_in_order(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(10)
     rows, streamed = daemon.view.status().rows, daemon.service.hub.subscribe()
     daemon.disk.held = True
@@ -179,8 +171,7 @@ def test_an_approval_is_not_written_once_another_record_is_in_force(tmp_path: Pa
 def test_nothing_is_written_automatically_before_it_is_on_disk(tmp_path: Path) -> None:
     daemon = FastDaemon(tmp_path, 1, settings("apply"))
     daemon.run(40)
-    daemon.fast.gain[2] *= 1.03
-    daemon.fast.offset[2] += 0.3
+    daemon.drift()
     daemon.disk.held = True
     daemon.sdo.clear()
     daemon.run(80)
@@ -208,7 +199,7 @@ def test_what_waits_is_bounded_and_decisions_are_never_dropped(tmp_path: Path, m
 
 
 def test_a_row_that_the_schema_refuses_holds_no_other_up(tmp_path: Path) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.disk.held = True
     daemon.service.events.say("clock", None, "before", {})
     daemon.service.journal._write("INSERT INTO events(id) VALUES (?)", 1)
@@ -238,7 +229,7 @@ def test_recordings_that_the_disk_does_not_take_are_left_out_and_begin_again(
 
 
 def test_the_end_does_not_wait_for_ever(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    daemon = FastDaemon(tmp_path, 1, settings())
+    daemon = FastDaemon(tmp_path, 1, settings("propose"))
     daemon.run(10)
     daemon.disk.held = True
     daemon.service.events.say("clock", None, "not on disk", {})

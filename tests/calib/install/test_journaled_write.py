@@ -51,13 +51,6 @@ class Dying(Controllers):
         return super().write_calibration(joint, calibration, store)
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> RecordStore:
-    store = RecordStore(str(tmp_path / "records.db"))
-    store.put(record(), ARM, by="ann", reason="sweep")
-    return store
-
-
 def admitted(new: CalibrationRecord = NEW) -> Admitted:
     """Past the gates, as if every sensor had been exchanged."""
     return Admitted(new, ARM, "none")

@@ -182,13 +182,6 @@ def _restore(store: RecordStore, controllers: Controllers) -> None:
     Recalibrator(ARM, controllers, store, "propose").restore()
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> RecordStore:
-    store = RecordStore(str(tmp_path / "records.db"))
-    store.put(record(), ARM, by="ann", reason="sweep")
-    return store
-
-
 @pytest.mark.parametrize("way", [_install, _failed_check, _recover, _rollback, _recalibrate, _undo, _restore])
 def test_each_way_writes_under_an_open_journal_line_and_ends_it(
     store: RecordStore, way: Callable[[RecordStore, Controllers], None]

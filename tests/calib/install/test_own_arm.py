@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from daemon_bench import DaemonBench
 from fake_controllers import ARM, Controllers, joint, record
-from fast_daemon import QUIET, FastDaemon
+from fast_daemon import FastDaemon, settings
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import Refused
 from armlink.link.link import Link
-from calib.daemon.settings import DaemonSection
 from calib.daemon.view.api_models import State
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted
@@ -24,13 +23,6 @@ from sim_bus.truth import Truth
 
 NEW = record(joints=(joint("shoulder", 1.12), joint("elbow", 1.08)), note="new")
 OTHER = ["1:1:c", "1:1:d"]
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> RecordStore:
-    store = RecordStore(str(tmp_path / "records.db"))
-    store.put(record(), ARM, by="ann", reason="sweep")
-    return store
 
 
 def write(store: RecordStore, controllers: Controllers, new: CalibrationRecord = NEW, arm: ArmFile = ARM) -> None:
@@ -140,8 +132,7 @@ def test_sweeps_from_before_the_arm_had_a_serial_number_are_still_its() -> None:
 
 
 def daemon(folder: Path, store: Path, serial: str, policy: str, first: int, seed: int) -> FastDaemon:
-    settings = DaemonSection.model_validate({"policy": policy, "recording": QUIET})
-    made = FastDaemon(folder, seed, settings, store=str(store), records=False)
+    made = FastDaemon(folder, seed, settings(policy), store=str(store), records=False)
     made.kill()
     made.arm = made.arm.model_copy(update={"serial": serial})
     made.drives = [f"1:1:{first + k}" for k in range(made.fast.n)]
@@ -163,8 +154,7 @@ def test_of_two_arms_of_one_name_on_one_store_none_gets_the_other_s_calibration(
         one = daemon(tmp_path / str(place), tmp_path / "records.db", serial, "apply", first, seed=1)
         held = one.held()
         one.run(60)
-        one.fast.gain[2] *= 1.03
-        one.fast.offset[2] += 0.3
+        one.drift()
         one.run(200, until=lambda one=one: bool(one.of_kind("recalibration", "refused")))
         found.append(len(one.of_kind("recalibration")))
         if not found[-1]:
@@ -178,8 +168,7 @@ def test_of_two_arms_of_one_name_on_one_store_none_gets_the_other_s_calibration(
 def test_without_a_serial_number_a_daemon_observes_and_proposes(tmp_path: Path) -> None:
     one = daemon(tmp_path / "one", tmp_path / "records.db", "unknown", "propose", 0, seed=1)
     one.run(60)
-    one.fast.gain[2] *= 1.03
-    one.fast.offset[2] += 0.3
+    one.drift()
     one.run(200, until=lambda: bool(one.view.proposals()))
     (proposal,) = one.view.proposals()
     assert (proposal.state, proposal.joint) == ("pending", "joint_3")

@@ -37,13 +37,6 @@ def still_gravity() -> GravityRecord:
     )
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> RecordStore:
-    store = RecordStore(str(tmp_path / "records.db"))
-    store.put(record(), ARM, by="ann", reason="sweep")
-    return store
-
-
 def test_composition_makes_the_reading_right_again() -> None:
     """v = K τ + O drifts; the controller sends u = (v − o)/k; the finding has u = g τ + b; the new pair gives τ."""
     torque, (k, o) = np.array([-20.0, 0.0, 35.0]), (1.1, -0.4)

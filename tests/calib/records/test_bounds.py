@@ -10,7 +10,7 @@ import fake_controllers
 import pytest
 import sqlalchemy as sa
 from fake_controllers import Controllers
-from made_records import ARM, arm_file, calibration, gravity
+from made_records import ARM, activate_by_hand, arm_file, calibration, gravity
 
 from armlink.errors import BadInput, Refused
 from calib.install.journaled_write import install
@@ -108,7 +108,7 @@ def test_a_record_of_no_working_arm_is_neither_imported_nor_made_current_nor_tak
     with pytest.raises(Refused, match=said):
         store.put(wrong, ARM, by="ann", reason="sweep")
     assert store.current(type(record), ARM) == store.get(sound)
-    _activate_by_hand(store, wrong)  # as an armlink without bounds did
+    activate_by_hand(store, wrong)  # as an armlink without bounds did
     with pytest.raises(Refused, match=said):
         store.current(type(record), ARM)
     store.rollback(ARM, to=sound, by="ann")
@@ -135,7 +135,7 @@ def test_a_calibration_of_no_working_arm_is_not_in_force_in_the_host(
     record = fake_controllers.record()
     store.put(record, fake_controllers.ARM, by="ann", reason="sweep")
     assert calibrations_in_force(fake_controllers.ARM)[0] is not None
-    _activate_by_hand(store, changed(record, ("joints", 0, "offset"), 51.0))
+    activate_by_hand(store, changed(record, ("joints", 0, "offset"), 51.0))
     with pytest.raises(Refused, match="shoulder: offset is 51 N·m, not -50 to 50"):
         calibrations_in_force(fake_controllers.ARM)
 
@@ -174,15 +174,3 @@ def test_a_row_that_was_changed_in_the_database_is_not_taken(store: RecordStore)
         connection.execute(sa.text("UPDATE records SET body = replace(body, '1.02', '1.12')"))
     with pytest.raises(StoreFault, match=f"record {first} was changed"):
         store.current(CalibrationRecord, ARM)
-
-
-def _activate_by_hand(store: RecordStore, record: AnyRecord) -> None:
-    store.add(record)
-    with sa.create_engine(store.url).begin() as connection:
-        connection.execute(
-            sa.text(
-                'INSERT INTO activations (record, kind, arm, serial, at, "by", reason)'
-                " VALUES (:record, :kind, :arm, :serial, '2026-11-28T00:00:00+00:00', 'ann', '')"
-            ),
-            {"record": record.id, "kind": record.kind, "arm": record.arm, "serial": record.serial},
-        )

@@ -1,7 +1,6 @@
 """The record store's database: PostgreSQL as SQLite, old schemas brought up to date, full disks named."""
 
 import resource
-import sqlite3
 import subprocess
 import sys
 import threading
@@ -11,7 +10,7 @@ from pathlib import Path
 import fake_controllers
 import pytest
 import sqlalchemy as sa
-from made_records import ARM, arm_file, calibration, gravity
+from made_records import ARM, arm_file, calibration, copied, gravity
 from postgres import NoServer, server, stoppable_server
 
 from armlink.errors import BadInput, Refused
@@ -201,11 +200,17 @@ def test_a_server_that_hangs_is_a_failure_after_a_while_and_found_again(monkeypa
         pytest.skip(str(reason))
 
 
+def filled(path: Path) -> RecordStore:
+    """A store with one record, which is current."""
+    store = RecordStore(str(path))
+    store.put(calibration(), ARM, by="ann", reason="sweep")
+    return store
+
+
 def test_a_full_disk_is_said_and_nothing_is_lost(tmp_path: Path) -> None:
     """A file may not grow beyond what it is: as a full disk does, the write fails and what was there stands."""
     path = tmp_path / "records.db"
-    store = RecordStore(str(path))
-    store.put(calibration(), ARM, by="ann", reason="sweep")
+    store = filled(path)
     script = (
         "import resource, sys, made_records as t\n"
         "from armlink.errors import BadInput\n"
@@ -236,19 +241,9 @@ def test_a_full_disk_is_said_and_nothing_is_lost(tmp_path: Path) -> None:
 # ---- a store is its file, not its name
 
 
-def copied(path: Path, to: Path) -> Path:
-    """A copy of a store, as a backup makes it."""
-    source, target = sqlite3.connect(path), sqlite3.connect(to)
-    source.backup(target)
-    source.close()
-    target.close()
-    return to
-
-
 def test_a_store_that_was_replaced_by_rename_is_noticed_before_anything_is_written(tmp_path: Path) -> None:
     path = tmp_path / "records.db"
-    store = RecordStore(str(path))
-    store.put(calibration(), ARM, by="ann", reason="sweep")
+    store = filled(path)
     copied(path, tmp_path / "backup.db").rename(path)
     with pytest.raises(StoreFault, match="was replaced by another file while it was in use: nothing was written"):
         store.put(calibration(1.05), ARM, by="ann", reason="sweep")
@@ -258,8 +253,7 @@ def test_a_store_that_was_replaced_by_rename_is_noticed_before_anything_is_writt
 
 def test_a_store_that_was_replaced_is_noticed_by_whoever_reads_it(tmp_path: Path) -> None:
     path = tmp_path / "records.db"
-    store = RecordStore(str(path))
-    store.put(calibration(), ARM, by="ann", reason="sweep")
+    store = filled(path)
     RecordStore(str(tmp_path / "other.db")).close()
     (tmp_path / "other.db").rename(path)
     with pytest.raises(StoreFault, match="was replaced"):
@@ -287,8 +281,7 @@ def test_a_store_that_is_replaced_within_a_transaction_keeps_nothing_of_it(
 
 def test_a_store_whose_file_is_gone_is_not_begun_anew(tmp_path: Path) -> None:
     path = tmp_path / "records.db"
-    store = RecordStore(str(path))
-    store.put(calibration(), ARM, by="ann", reason="sweep")
+    store = filled(path)
     path.rename(tmp_path / "away.db")
     for _ in range(2):
         with pytest.raises(StoreFault, match=r"its file is gone \(No such file or directory\): put it back"):
@@ -302,8 +295,7 @@ def test_a_store_whose_file_is_gone_is_not_begun_anew(tmp_path: Path) -> None:
 
 def test_a_file_that_is_no_store_in_its_place_is_one_line_until_it_is_restored(tmp_path: Path) -> None:
     path = tmp_path / "records.db"
-    store = RecordStore(str(path))
-    store.put(calibration(), ARM, by="ann", reason="sweep")
+    store = filled(path)
     copied(path, tmp_path / "backup.db")
     (tmp_path / "text").write_text("no database, but longer than the header of one, which has a hundred bytes" * 9)
     (tmp_path / "text").rename(path)
