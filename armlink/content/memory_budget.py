@@ -28,20 +28,17 @@ def memory_budget(path: Path) -> Iterator[None]:
 
     Blocks of several threads wait for one another. Without Linux's /proc there is no bound.
     """
-    budget = min(max(BUDGET_RATIO * size_on_disk(path), LEAST_BUDGET), MOST_BUDGET)
+    budget = min(max(BUDGET_RATIO * _size_on_disk(path), LEAST_BUDGET), MOST_BUDGET)
     try:
         with _LOCK, _at_most(budget):
             yield
     except MemoryError:
-        raise too_large(path, budget) from None
+        raise BadInput(
+            f"{path}: takes more than {budget / 1e9:.1f} GB of memory: not a file that this program reads"
+        ) from None
 
 
-def too_large(path: Path, budget: int) -> BadInput:
-    """What is said of a file that takes more memory than its budget [bytes]."""
-    return BadInput(f"{path}: takes more than {budget / 1e9:.1f} GB of memory: not a file that this program reads")
-
-
-def size_on_disk(path: Path) -> int:
+def _size_on_disk(path: Path) -> int:
     """Bytes of a file, or of the files in a folder and below."""
     try:
         if not path.is_dir():

@@ -15,7 +15,7 @@ from calib.creep.design import Candidate, choose
 from calib.creep.parameters import Doubt
 from calib.plan.choices import POINTS
 from calib.plan.collisions import Geometry
-from calib.plan.plan_limits import ROUNDING, Bounds, refuse_unfit, require_bounds
+from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
 from calib.plan.poses import require_range
 from calib.plan.types import Side, Sweep, SweepPlan
 from gcomp.arm.arm import Arm
@@ -140,7 +140,7 @@ def check_creep_limits(ground: CreepGround, arm_file: ArmFile, plan: SweepPlan) 
     """Raise Refused, naming sweep, joint and value, where a plan of creeps leaves what this one would plan within."""
     ends = np.array([ground.range(joint) for joint in range(ground.arm.n)]).T
     bounds = (ends[0], ends[1])
-    require_bounds(arm_file, plan, Bounds(bounds, bounds, bounds))
+    require_bounds(arm_file, plan, PoseBounds(bounds, bounds, bounds))
     refuse_unfit(arm_file, _unfit(ground, plan, ends))
 
 

@@ -17,8 +17,8 @@ from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.collisions import check_creeps
 from calib.plan.types import Sweep, SweepPlan
-from calib.sweep.dataset import DataWriter, Manifest, PlanLine, StallLine, SweepData, load_data
-from calib.sweep.run import Progress, sparkline
+from calib.sweep.dataset import DataWriter, PlanLine, StallLine, SweepData, load_data
+from calib.sweep.run import Progress, new_manifest, sparkline
 from calib.sweep.stalls import OnStall, bridged, give_up, restart, stall_line
 from gcomp.arrays import Array
 
@@ -48,9 +48,7 @@ def run_creep(
     the sweep is then noted with the reason, and has no readings. Raises BadInput, Refused if too many sweeps do so or
     the model shows beforehand that one would touch something, BusFault; every reading made is on disk.
     """
-    installed = bridged(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
-    drives = bridged(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
-    with DataWriter(out, Manifest.of(arm, reference_mass, installed, drives), resume) as writer:
+    with DataWriter(out, new_manifest(link, arm, reference_mass, on_stall), resume) as writer:
         data = load_data(out)
         mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))
         used = data.plan or plan or plan_creep(arm, seed=seed)

@@ -31,7 +31,6 @@ class Immediate:
     """`Disk` for one thread alone: work is done, and its outcome given, before the call returns."""
 
     def __call__(self, work: Callable[[], T], done: Callable[[T | Exception], None]) -> None:
-        """Do it."""
         try:
             outcome: T | Exception = work()
         except Exception as error:

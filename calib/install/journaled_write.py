@@ -30,7 +30,7 @@ class Controllers(Protocol):
         ...
 
     def drive_serial(self, joint: int) -> DriveSerial:
-        """What the drive of joint j is known by; raises BusFault."""
+        """Serial number of the drive of joint j; raises BusFault."""
         ...
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:

@@ -22,8 +22,8 @@ ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
-class Bounds:
-    """What the poses of a plan may be, each (n,) [rad]."""
+class PoseBounds:
+    """Lower and upper bounds of a plan's poses, each (n,) [rad]."""
 
     moving: tuple[Array, Array]
     """Of joints on their way, scout poses included."""
@@ -39,7 +39,7 @@ def check_limits(arm_file: ArmFile, plan: SweepPlan) -> None:
     ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))]).T
     stops = (limits.lower, limits.upper)
     held = (limits.lower + SERVO_GAP, limits.upper - SERVO_GAP)
-    require_bounds(arm_file, plan, Bounds((ends[0], ends[1]), held, stops))
+    require_bounds(arm_file, plan, PoseBounds((ends[0], ends[1]), held, stops))
     refuse_unfit(arm_file, _of_drives(plan, section, limits, arm_file.joint_names))
 
 
@@ -48,7 +48,7 @@ def check_bias(arm_file: ArmFile, plan: SweepPlan) -> None:
     refuse_unfit(arm_file, (f"sweep {sweep.name}: bias is missing" for sweep in plan.sweeps if sweep.bias is None))
 
 
-def require_bounds(arm_file: ArmFile, plan: SweepPlan, bounds: Bounds) -> None:
+def require_bounds(arm_file: ArmFile, plan: SweepPlan, bounds: PoseBounds) -> None:
     """Raise Refused where a plan has another number of joints, or a pose beyond the bounds."""
     refuse_unfit(arm_file, _of_shape(plan, len(arm_file.joint_names)))
     refuse_unfit(arm_file, _of_poses(plan, bounds, arm_file.joint_names))
@@ -88,7 +88,7 @@ def _of_shape(plan: SweepPlan, n: int) -> Iterator[str]:
             yield f"sweep {sweep.name}: a joint that rests neither on a stop nor in its servo"
 
 
-def _of_poses(plan: SweepPlan, bounds: Bounds, names: Sequence[str]) -> Iterator[str]:
+def _of_poses(plan: SweepPlan, bounds: PoseBounds, names: Sequence[str]) -> Iterator[str]:
     for number, pose in enumerate(plan.scout, start=1):
         yield from _beyond(f"scout pose {number}", np.array(pose), *bounds.moving, names)
     for sweep in plan.sweeps:

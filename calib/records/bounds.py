@@ -60,7 +60,7 @@ CORRELATION_ROUNDING = 1e-6
 """Relative room of a covariance beyond perfect correlation [1]."""
 
 
-class Value(NamedTuple):
+class BoundedValue(NamedTuple):
     """A number of a record with the range that it must lie in."""
 
     what: str
@@ -102,7 +102,7 @@ def _require_date(record: R, now: datetime | None) -> None:
         )
 
 
-def _of_calibration(record: CalibrationRecord, arm: ArmFile) -> Iterator[Value]:
+def _of_calibration(record: CalibrationRecord, arm: ArmFile) -> Iterator[BoundedValue]:
     rated = [LARGEST_TORQUE] * len(record.joints) if arm.link is None else arm.link.rated_torques.tolist()
     bounds: dict[str, float] = {}
     for joint, torque in zip(record.joints, rated, strict=True):
@@ -117,19 +117,20 @@ def _of_calibration(record: CalibrationRecord, arm: ArmFile) -> Iterator[Value]:
             bounds[f"{joint.name}.{parameter}"] = upper
             value = getattr(joint, parameter)
             if value is not None:
-                yield Value(f"{joint.name}: {parameter}", value, lower, upper, unit)
+                yield BoundedValue(f"{joint.name}: {parameter}", value, lower, upper, unit)
         yield from _of_joint(joint, torque)
     yield from _of_covariance(record.covariance, [(name, bounds[name]) for name in record.covariance_of])
 
 
-def _of_joint(joint: JointCalibration, rated: float) -> Iterator[Value]:
-    """What a calibration tells of a joint beside its gains and offsets."""
+def _of_joint(joint: JointCalibration, rated: float) -> Iterator[BoundedValue]:
+    """Scatter, discrepancy and motor: all that a calibration has of a joint beside gains and offsets."""
     if joint.residual_std is not None:
-        yield Value(f"{joint.name}: residual_std", joint.residual_std, 0.0, DOUBT * rated, "N·m")
-    if joint.discrepancy is not None:
-        yield Value(f"{joint.name}: discrepancy.level", joint.discrepancy.level, 0.0, rated, "N·m")
-        yield Value(f"{joint.name}: discrepancy.level_std", joint.discrepancy.level_std, 0.0, DOUBT * rated, "N·m")
-        yield Value(f"{joint.name}: discrepancy.length", joint.discrepancy.length, 0.0, LARGEST_LENGTH, "rad")
+        yield BoundedValue(f"{joint.name}: residual_std", joint.residual_std, 0.0, DOUBT * rated, "N·m")
+    found = joint.discrepancy
+    if found is not None:
+        yield BoundedValue(f"{joint.name}: discrepancy.level", found.level, 0.0, rated, "N·m")
+        yield BoundedValue(f"{joint.name}: discrepancy.level_std", found.level_std, 0.0, DOUBT * rated, "N·m")
+        yield BoundedValue(f"{joint.name}: discrepancy.length", found.length, 0.0, LARGEST_LENGTH, "rad")
     motor = joint.motor
     if motor is None:
         return
@@ -142,36 +143,36 @@ def _of_joint(joint: JointCalibration, rated: float) -> Iterator[Value]:
     if motor.gain_per_kelvin is not None:
         pairs.append(("gain_per_kelvin", motor.gain_per_kelvin, LARGEST_WARMING, "1/K"))
     for key, (value, std), largest, unit in pairs:
-        yield Value(f"{joint.name}: motor.{key}", value, -largest, largest, unit)
-        yield Value(f"{joint.name}: standard deviation of motor.{key}", std, 0.0, DOUBT * largest, unit)
+        yield BoundedValue(f"{joint.name}: motor.{key}", value, -largest, largest, unit)
+        yield BoundedValue(f"{joint.name}: standard deviation of motor.{key}", std, 0.0, DOUBT * largest, unit)
     if motor.temperature is not None:
-        yield Value(f"{joint.name}: motor.temperature", motor.temperature, *TEMPERATURES, "°C")
+        yield BoundedValue(f"{joint.name}: motor.temperature", motor.temperature, *TEMPERATURES, "°C")
 
 
-def _of_gravity(record: GravityRecord, arm: ArmFile) -> Iterator[Value]:
+def _of_gravity(record: GravityRecord, arm: ArmFile) -> Iterator[BoundedValue]:
     largest = LARGEST_MASS_MOMENT
     if arm.link is not None:
         torque = max(max(joint.max_torque, joint.rated_torque) for joint in arm.link.joints)
         largest = BALANCED * torque / math.hypot(*STANDARD_GRAVITY)
     names = [f"{name}: {axis} of the mass moment" for name in record.names for axis in ("x", "y")]
     for name, value in zip(names, record.beta, strict=True):
-        yield Value(name, value, -largest, largest, "kg·m")
-    yield Value("gravity", math.hypot(*record.gravity), 0.0, LARGEST_GRAVITY, "m/s²")
+        yield BoundedValue(name, value, -largest, largest, "kg·m")
+    yield BoundedValue("gravity", math.hypot(*record.gravity), 0.0, LARGEST_GRAVITY, "m/s²")
     yield from _of_covariance(record.covariance, [(name, largest) for name in names])
 
 
-def _of_covariance(rows: npt.ArrayLike, named: list[tuple[str, float]]) -> Iterator[Value]:
+def _of_covariance(rows: npt.ArrayLike, named: list[tuple[str, float]]) -> Iterator[BoundedValue]:
     """Standard deviations up to DOUBT times each value's bound, and correlations of at most 1."""
     if not named:
         return
     covariance = np.asarray(rows, dtype=float)
     variances = np.diag(covariance)
     for (name, bound), variance in zip(named, variances.tolist(), strict=True):
-        yield Value(f"variance of {name}", variance, 0.0, (DOUBT * bound) ** 2)
+        yield BoundedValue(f"variance of {name}", variance, 0.0, (DOUBT * bound) ** 2)
     std = np.sqrt(variances)
     room = np.outer(std, std) * (1 + CORRELATION_ROUNDING)
     for row, column in np.argwhere(np.abs(covariance) > room):
         if row != column:
             limit = float(room[row, column])
             what = f"covariance of {named[row][0]} with {named[column][0]}"
-            yield Value(what, float(covariance[row, column]), -limit, limit)
+            yield BoundedValue(what, float(covariance[row, column]), -limit, limit)

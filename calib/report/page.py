@@ -26,8 +26,7 @@ class Section:
     """One part of a report. Text is escaped by the template, all but what is Markup."""
 
     title: str
-    html: str = ""
-    """Markup, see `html_of`."""
+    html: Markup = field(default_factory=Markup)
     figures: Sequence[Any] = ()
     """plotly figures, shown below one another."""
     tables: Sequence["ReportTable"] = ()
@@ -46,17 +45,14 @@ class ReportTable:
 
 
 def paragraph(text: str) -> Markup:
-    """Text as an HTML paragraph."""
     return html_of("<p>{}</p>", text)
 
 
 def paragraphs(texts: Iterable[str]) -> Markup:
-    """Texts as HTML paragraphs."""
     return Markup().join(paragraph(text) for text in texts)
 
 
 def bullets(texts: Iterable[str]) -> Markup:
-    """Texts as an HTML list."""
     return html_of("<ul>{}</ul>", Markup().join(html_of("<li>{}</li>", text) for text in texts))
 
 

@@ -47,10 +47,7 @@ def run_sweep(
     on disk. After a Stall that `on_stall` accepts the joints are enabled again and the interrupted reading is repeated.
     Raises BadInput, Refused if the arm cannot be swept, BusFault; every reading made is on disk.
     """
-    installed = bridged(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
-    drives = bridged(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
-    manifest = Manifest.of(arm, reference_mass, installed, drives)
-    with DataWriter(out, manifest, resume) as writer:
+    with DataWriter(out, new_manifest(link, arm, reference_mass, on_stall), resume) as writer:
         data = load_data(out)
         mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))
         run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), on_stall)
@@ -77,6 +74,13 @@ def run_sweep(
             run.sweep(sweep)
         run.rest()
     return load_data(out)
+
+
+def new_manifest(link: ArmDriver, arm: ArmFile, reference_mass: float, on_stall: OnStall) -> Manifest:
+    """The manifest of a pass that begins, with what the controllers hold and the drives' numbers; raises BusFault."""
+    installed = bridged(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
+    drives = bridged(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
+    return Manifest.of(arm, reference_mass, installed, drives)
 
 
 def _final_plan(

@@ -45,7 +45,7 @@ class LoopControllers:
         return self._call("read_calibration", Calibration, joint)
 
     def drive_serial(self, joint: int) -> DriveSerial:
-        """What the drive of joint j is known by; raises BusFault."""
+        """Serial number of the drive of joint j; raises BusFault."""
         return self._call("drive_serial", DriveSerial, joint)
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:

@@ -107,7 +107,7 @@ class Journal:
         self._reader = HistoryReader(path)
         self._failed_at, self._asked_at = -float("inf"), float("inf")
         self._took = 0.0
-        """What the last write took [s]."""
+        """Duration of the last write [s]."""
         self._failure = ""
         self._queue: deque[Transaction] = deque()
         self._asked = 0

@@ -12,7 +12,7 @@ from typing import Protocol
 MOST_LOCAL = 256
 """Connections on the Unix socket that are answered."""
 MOST_QUEUED = 512
-"""Connections on the Unix socket that wait for their turn; a further one takes the place of the oldest."""
+"""Connections on the Unix socket that wait for their turn; beyond it the oldest goes of the process that has most."""
 FIRST_SECONDS = 1.0
 """Time for a connection's first request; one that has sent none by then gives way [s]."""
 MOST_TRUSTED = 256
