@@ -368,6 +368,8 @@ class Loop:
         _, position, velocity, motor, sensor, _, power, fault = reading
         if position == position:  # not NaN
             board.reading(joint, position, sensor)
+        elif motor == motor:
+            self.watch.torque_alone(joint)
         if motor == motor:
             board.motor[joint], board.slow_came = motor, True
         if velocity == velocity:

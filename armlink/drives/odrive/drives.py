@@ -62,9 +62,6 @@ class _Known:
     """[rad]."""
     recent: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
     """The newest positions [rad]."""
-    velocity: float = math.nan
-    torque: float = math.nan
-    """That came since the newest estimates [N·m]; it goes with the next ones."""
     came: set[int] = field(default_factory=set)
     """Messages that have come."""
     mode: int = 0
@@ -277,13 +274,11 @@ class ODriveDrives(BasicDrives):
             position, velocity = values
             if not abs(position) < LARGEST_POSITION or not math.isfinite(velocity):
                 return None
-            known.position, known.velocity = position * TURN, velocity * TURN
+            known.position = position * TURN
             known.recent.append(known.position)
-            torque, known.torque = known.torque, math.nan
-            return Reading(joint, known.position, known.velocity, torque)
+            return Reading(joint, known.position, velocity * TURN)
         if message == Message.TORQUES and math.isfinite(values[1]):
-            known.torque = values[1]
-            return None
+            return Reading(joint, motor_torque=values[1])
         if message == Message.TEMPERATURE and all(math.isfinite(value) for value in values):
             return self.note(Reading(joint, temperature=max(values)))
         return None
