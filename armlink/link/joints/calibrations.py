@@ -63,6 +63,13 @@ class Calibrations:
                 self.arm.name,
                 ", ".join(missing),
             )
+        if len(missing) < len(hosted) and not self.arm.has_serial:
+            log.warning(
+                "%s: its serial is %s: the calibration in force may be that of another arm of this name: give each its "
+                "own (serial: …), then calibrate its sweeps again",
+                self.arm.name,
+                self.arm.serial,
+            )
         self._apply_host()
 
     @property
