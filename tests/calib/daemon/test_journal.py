@@ -114,7 +114,7 @@ def test_a_journal_whose_name_another_file_has_taken_goes_on_in_that_one(tmp_pat
         journal.probe()
     assert (journal.trouble, journal.waiting) == ("", 0)
     assert keep("of after") == number + 1
-    kept = {"older copy": ["of before"]}.get(how, []) + ["on the way", "of after"]
+    kept = [*{"older copy": ["of before"]}.get(how, []), "on the way", "of after"]
     assert [event.text for event in journal.events()] == kept
     journal.close()
     with sqlite3.connect(tmp_path / "away.db") as away:
