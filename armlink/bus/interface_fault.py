@@ -10,7 +10,7 @@ logging.getLogger("can").addHandler(logging.NullHandler())  # else what it logs 
 
 
 def interface_fault(error: Exception, name: str, doing: str) -> ArmlinkError:
-    """What to raise for an error of an interface while `doing` something on the bus `name`; our own errors stay."""
+    """The exception for an error of an interface while `doing` something on the bus `name`; our own errors stay."""
     if isinstance(error, ArmlinkError):
         return error
     down = errno.ENETDOWN in (getattr(error, "error_code", None), getattr(error, "errno", None))

@@ -93,7 +93,7 @@ class Drives(Protocol):
         ...
 
     def intrusion(self, can_id: int, data: bytes) -> str:
-        """What a frame is that no drive of ours sends, if it can only be of another host that commands; else empty."""
+        """The name of a frame that no drive of ours sends, if only another host that commands sends it; else empty."""
         ...
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
@@ -122,7 +122,7 @@ class Drives(Protocol):
         ...
 
     def sent(self, joint: int) -> Order | None:
-        """What the bytes of the newest `frames` order this drive, decoded from the bytes: the gate checks it before
+        """This drive's order by the bytes of the newest `frames`, decoded from the bytes: the gate checks it before
         they leave. None where they carry no target (they switch it, ask it, stop it)."""
         ...
 
@@ -195,7 +195,7 @@ class Drives(Protocol):
         ...
 
     def details(self, joint: int, sends: bool) -> Mapping[str, Any]:
-        """What else the family knows of a drive, by name, for the monitor; `sends`: its readings come."""
+        """Further state of a drive, by name, for the monitor; `sends`: its readings come."""
         ...
 
     def poll(self, first: bool) -> list[Frame]:

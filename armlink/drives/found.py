@@ -35,7 +35,7 @@ class FoundDrives(Protocol):
 
 @dataclass(frozen=True)
 class DriveFinding:
-    """What is missing or doubtful about a drive, where, and how to put it right."""
+    """A lack or doubt about a drive, its place, and its remedy."""
 
     level: Literal["error", "warning", "hint"]
     what: str

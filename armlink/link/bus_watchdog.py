@@ -111,7 +111,7 @@ class BusWatch:
         self.strangers, self._counted = 0, self.readings.copy()
 
     def _most_frequent(self) -> str | int:
-        """What came most often in this cycle: a joint's readings, or a frame in words; empty where nothing came."""
+        """The most frequent of this cycle: a joint's readings, or a frame in words; empty where nothing came."""
         joint = max(range(len(self.readings)), key=lambda each: self.readings[each] - self._counted[each])
         can_id, count = max(self.others.items(), key=lambda each: each[1], default=(0, 0))
         if self.readings[joint] - self._counted[joint] > max(count, 1):
@@ -131,7 +131,7 @@ class BusWatch:
 
     @property
     def culprit(self) -> str | int:
-        """What comes most often on a crowded bus, as `_most_frequent`: the probable source of a flood."""
+        """The most frequent on a crowded bus, as `_most_frequent`: the probable source of a flood."""
         most = self._most_frequent() if self.flooded or self._culprit == "" else ""
         return self._culprit if most == "" else most
 

@@ -1,4 +1,4 @@
-"""What a joint did and was told to do, as the judgement of its scales takes it."""
+"""Readings and commands of one joint, as the judgement of its scales takes them."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ from armlink.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class ScaleTrack:
     """Readings of one joint and what was commanded at the time, all (K,), NaN where there was none."""
 
     t: Array

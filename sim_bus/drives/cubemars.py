@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 from armlink.bus.port import EXTENDED, REMOTE
-from armlink.drives.cubemars.frames import NO_COMMAND, Reply, pack_reply
+from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, pack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.mit_packing import Ranges, Special, special_of, unpack_command
 from sim_bus.drives.front import AddressedFront
@@ -77,7 +77,7 @@ class CubeMarsDrive(SimulatedDrive):
         told, coding = self.told(), self.coding
         feedback = told._replace(position=self._shown(told.position))
         temperature = int(MOTOR_TEMPERATURE + self.motor.heating)
-        self.answer(self.reply, pack_reply(Reply(self.address, feedback, temperature, self.error), coding))
+        self.answer(self.reply, pack_reply(CubeMarsReply(self.address, feedback, temperature, self.error), coding))
 
     def trip(self) -> None:
         """CAN timeout: its command becomes one of no torque; motor mode goes on."""

@@ -29,7 +29,7 @@ FALSE_READINGS = {
 
 
 class FalseReadings:
-    """What one joint's frames tell instead of its readings."""
+    """Falsehoods of one joint's frames."""
 
     def __init__(self) -> None:
         """The truth."""
@@ -56,7 +56,7 @@ class FalseReadings:
         return any(f"{how}.{quantity}" in self._faults for how, quantity in product(SECOND_SENDER, quantities))
 
     def told(self, quantity: str, true: float, second: bool = False) -> float:
-        """What is told of a quantity, by the joint itself or by a second node."""
+        """A quantity as the joint itself, or a second node, tells it."""
         faults = self._faults
         if second:
             if (forged := faults.get(f"forged.{quantity}")) is not None:

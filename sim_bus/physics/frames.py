@@ -9,7 +9,7 @@ from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 
 
-class Frames:
+class ModelFrames:
     """Keeps the nominal frames of a compiled model and writes changed ones into it."""
 
     def __init__(self, model: Any, bodies: list[int]) -> None:

@@ -10,7 +10,7 @@ from sim_bus.effects.state import Imperfections
 from sim_bus.physics.mjcf import TINY_INERTIA
 
 
-class Inertials:
+class ModelInertials:
     """Keeps the nominal values of a compiled model and writes changed ones into it."""
 
     def __init__(self, model: Any, bodies: list[int], payload_body: int) -> None:

@@ -16,7 +16,7 @@ EXACT = 1e-13
 """Error of a position reading that is as good as none [rad]."""
 
 
-class Sensors:
+class JointSensors:
     """Readings of the joints' sensors; all arrays (n,)."""
 
     def __init__(self, arm: ArmFile, truth: Truth, imperfections: Imperfections, seed: int) -> None:

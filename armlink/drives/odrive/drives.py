@@ -53,8 +53,8 @@ LARGEST_POSITION = 1e5
 
 
 @dataclass
-class _Known:
-    """What is known of one axis."""
+class _ODriveState:
+    """Newest state of one axis."""
 
     limits: Limits | None = None
     heartbeat: frames.Heartbeat | None = None
@@ -80,7 +80,7 @@ class ODriveDrives(BasicDrives):
         """Nothing is sent."""
         super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
-        self._known = [_Known() for _ in joints]
+        self._known = [_ODriveState() for _ in joints]
         self._joint_of = {settings.node: joint for joint, settings in enumerate(self._settings)}
 
     def routes(self) -> Mapping[int, int]:
@@ -312,7 +312,7 @@ class ODriveDrives(BasicDrives):
         return None if order is None else (joint, order)
 
 
-def _may_ask(known: _Known, what: int, now: float) -> bool:
+def _may_ask(known: _ODriveState, what: int, now: float) -> bool:
     """Whether something may be asked for: not again before the last request for it has had time to show."""
     if known.asked[0] == what and now - known.asked[1] < ASK_AGAIN:
         return False
@@ -320,7 +320,7 @@ def _may_ask(known: _Known, what: int, now: float) -> bool:
     return True
 
 
-def _power(known: _Known) -> Power:
+def _power(known: _ODriveState) -> Power:
     """The state counts, not the error: that can be 0 after a disarm."""
     beat = known.heartbeat
     if beat is None:
@@ -334,7 +334,7 @@ def _power(known: _Known) -> Power:
     return Power.OFF if beat.state == AxisState.IDLE else Power.READY
 
 
-def _fault_text(known: _Known) -> str:
+def _fault_text(known: _ODriveState) -> str:
     error = known.heartbeat.error & ~AxisError.WATCHDOG if known.heartbeat else 0
     return f"{error_names(error)} (axis error {error:#x})" if error else ""
 

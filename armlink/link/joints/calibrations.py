@@ -27,7 +27,7 @@ log = logging.getLogger("armlink")
 
 
 def calibrations_by_record(arm: ArmFile) -> list[Calibration | None]:
-    """What the records of an arm say, joint by joint; None where no record is in force."""
+    """Calibrations by an arm's records, joint by joint; None where no record is in force."""
     for point in contributed("armlink.calibrations"):
         provide: Provider = point.load()
         return list(provide(arm))
@@ -107,7 +107,7 @@ class Calibrations:
         return group.drives.read_calibration(number, self._ask(group))
 
     def drive_serial(self, joint: int) -> DriveSerial:
-        """What the drive of joint 0 … n−1 is known by, if it keeps its calibration itself; raises BusFault."""
+        """Serial number of the drive of joint 0 … n−1, if it keeps its calibration itself; raises BusFault."""
         group, number = by_joint(self.groups)[joint]
         if joint in self._in_host or not isinstance(group.drives, TellsSerialNumber):
             return DriveSerial(simulated=self._simulated)

@@ -12,7 +12,7 @@ from armlink.drives.found import FoundDrive
 from armlink.errors import BusFault
 
 
-class Drives:
+class FoundNodes:
     """The drives of an open bus, by node id."""
 
     def __init__(self, bus: CanBus) -> None:
