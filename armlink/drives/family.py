@@ -26,8 +26,7 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame
 from armlink.drives.board import Board
-from armlink.drives.findings import Result
-from armlink.drives.found import DriveFinding, FoundDrives
+from armlink.drives.findings import DriveFinding, FoundDrives, Result
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits

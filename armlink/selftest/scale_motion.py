@@ -17,8 +17,7 @@ from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.park import speeds, straight
 from armlink.link.types import Command, Sample, Setpoints, Tell
-from armlink.selftest.scales import Evidence, ScaleFinding, gather, judge
-from armlink.selftest.track import ScaleTrack
+from armlink.selftest.scales import Evidence, ScaleFinding, ScaleTrack, gather, judge
 
 REACH = 0.35
 """Distance by which this host moves every joint to both sides [rad]."""

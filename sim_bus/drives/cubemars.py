@@ -7,9 +7,8 @@ from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, pack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.mit_packing import Ranges, Special, special_of, unpack_command
-from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
 
 LOOP_RATE = 40_000.0
 """Cycles of the drive's loop a second: those of the open firmware that it descends from, bgkatz/motorcontrol."""

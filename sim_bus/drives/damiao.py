@@ -19,7 +19,7 @@ from armlink.drives.damiao.frames import (
     pack_value,
     unpack_value,
 )
-from armlink.drives.damiao.models import MODELS
+from armlink.drives.damiao.settings import MODELS
 from armlink.drives.mit_packing import MitCommand, Ranges, Special, special_of, unpack_command
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive

@@ -23,9 +23,14 @@ from armlink.drives.moteus.frames import (
     pack_reply,
     unpack,
 )
-from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import (
+    BUS_VOLTAGE,
+    MOTOR_TEMPERATURE,
+    STAGE_TEMPERATURE,
+    AddressedFront,
+    SimulatedDrive,
+)
 
 TURN = 2 * math.pi
 DEFAULT_TIMEOUT = 0.1

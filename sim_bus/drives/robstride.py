@@ -22,9 +22,8 @@ from armlink.drives.robstride.frames import (
     unpack_motion,
     unpack_value,
 )
-from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
 
 NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 HOST = 0xFD

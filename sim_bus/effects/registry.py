@@ -6,17 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from sim_bus.effects import actuator, base, friction, link, position, timing, torque, transmission
 from sim_bus.effects.effect import EffectSetting, SimulatedEffect, SimulatedParameter
+from sim_bus.effects.forms import EFFECTS
 from sim_bus.effects.state import Imperfections
 
-FAMILIES = (actuator, base, friction, link, position, timing, torque, transmission)
-"""Modules with an `EFFECTS`, one a family."""
 NOT_SIMULATED = {
     "torque.nonlinearity": "the simulated sensor is linear apart from hysteresis, dead band and saturation"
 }
 """Catalogue ids without a forward form, and why."""
-_EFFECTS = {each.id: each for each in sorted((e for family in FAMILIES for e in family.EFFECTS), key=lambda e: e.id)}
+_EFFECTS = {each.id: each for each in sorted(EFFECTS, key=lambda each: each.id)}
 
 
 def effects() -> dict[str, SimulatedEffect]:

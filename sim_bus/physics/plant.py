@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics.cables import Cables
-from sim_bus.physics.frames import ModelFrames
-from sim_bus.physics.friction import dry_friction, unevenness
 from sim_bus.physics.gravity import gravity_torque, inertia, tilt
-from sim_bus.physics.inertials import ModelInertials
+from sim_bus.physics.inertials import ModelFrames, ModelInertials
+from sim_bus.physics.joint_torques import Cables, LateMotors, dry_friction, unevenness
 from sim_bus.physics.mjcf import build_model
-from sim_bus.physics.motor_lag import LateMotors
 from sim_bus.physics.transmission import HARD_GEAR_STEP, Transmissions, rotor_inertia
 from sim_bus.sim_section import sim_section
 

@@ -5,7 +5,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics.friction import coldness
+from sim_bus.physics.joint_torques import coldness
 from sim_bus.sim_section import NOISE_SHARE, sim_section
 from sim_bus.truth import Truth
 

@@ -10,8 +10,7 @@ from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen.cia402 import state_of
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.family import Drives, Family
-from armlink.drives.findings import Result
-from armlink.drives.found import DriveFinding, FoundDrives
+from armlink.drives.findings import DriveFinding, FoundDrives, Result
 from armlink.drives.orders import Limits
 from armlink.drives.traits import Traits
 

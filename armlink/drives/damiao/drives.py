@@ -8,8 +8,8 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.damiao import frames
 from armlink.drives.damiao.frames import READ, WRITE, DamiaoRegister, DamiaoStatus
-from armlink.drives.damiao.models import delivered
 from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_position, read_registers
+from armlink.drives.damiao.settings import delivered
 from armlink.drives.family import Ask
 from armlink.drives.mit_drives import MitDrives, MitKnown
 from armlink.drives.mit_packing import Ranges, Special, feedback_in, special, unwrap

@@ -3,8 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from armlink.arm_file import ArmFile, LinkJoint
+from pydantic import Field
+
+from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.family import Ask
@@ -19,10 +22,29 @@ from armlink.drives.moteus.frames import (
     WRITE,
     MoteusRegister,
 )
-from armlink.drives.moteus.settings import MoteusSettings
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
+
+
+class MoteusSettings(DriveSettings):
+    """A moteus controller, on a bus with `fd: true`."""
+
+    family: Literal["moteus"] = "moteus"
+    id: Annotated[int, Field(ge=1, le=0x7E)]
+    """Controller id (id.id)."""
+    source: Annotated[int, Field(ge=0, le=0x7F)] = 0
+    """Our id, to which it replies."""
+    torque_constant: Positive | None = None
+    """Torque constant at its output [N·m/A], by which the scale check compares torque
+    with current; None: not compared."""
+
+    @property
+    def address(self) -> str:
+        """Its id on the bus."""
+        return f"controller {self.id}"
+
 
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("torque",), cadence="reply", frame="fd")

@@ -8,8 +8,11 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
+from typing import Annotated, Literal
 
-from armlink.arm_file import ArmFile, LinkJoint
+from pydantic import Field
+
+from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import REMOTE, Frame
 from armlink.drives.base import BasicDrives, no_order
@@ -29,8 +32,26 @@ from armlink.drives.odrive.frames import (
     unpack,
 )
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
+
+
+class ODriveSettings(DriveSettings):
+    """One ODrive axis (Pro, S1, Micro; firmware 0.6) in CANSimple; positions and torques are the motor's."""
+
+    family: Literal["odrive"] = "odrive"
+    node: Annotated[int, Field(ge=0, le=0x3E)]
+    """Node id (axis0.config.can.node_id)."""
+    torque_constant: Positive | None = None
+    """Torque constant of the motor, 8.27 / KV [N·m/A], by which the scale check compares torque
+    with current; None: not compared."""
+
+    @property
+    def address(self) -> str:
+        """Its id on the bus."""
+        return f"node {self.node}"
+
 
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="cyclic", frame="11")
@@ -62,6 +83,8 @@ class _ODriveState:
     """[rad]."""
     recent: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
     """The newest positions [rad]."""
+    requested: int = 0
+    """Torques that were asked for, and come besides the cyclic ones."""
     came: set[int] = field(default_factory=set)
     """Messages that have come."""
     mode: int = 0
@@ -251,6 +274,7 @@ class ODriveDrives(BasicDrives):
         constant = self._settings[joint].torque_constant
         if constant is None:
             return None
+        self._known[joint].requested += 1
         torques, currents = self._request(ask, joint, Message.TORQUES), self._request(ask, joint, Message.CURRENT)
         return None if torques is None or currents is None else (torques[1], constant * currents[1])
 
@@ -277,7 +301,9 @@ class ODriveDrives(BasicDrives):
             known.position = position * TURN
             known.recent.append(known.position)
             return Reading(joint, known.position, velocity * TURN)
-        if message == Message.TORQUES and math.isfinite(values[1]):
+        if message == Message.TORQUES and known.requested:
+            known.requested -= 1
+        elif message == Message.TORQUES and math.isfinite(values[1]):
             return Reading(joint, motor_torque=values[1])
         if message == Message.TEMPERATURE and all(math.isfinite(value) for value in values):
             return self.note(Reading(joint, temperature=max(values)))

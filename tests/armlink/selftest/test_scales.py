@@ -7,8 +7,7 @@ from moved_by_hand import ALL, arm_with, judged
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
 from armlink.link.link import Link
-from armlink.selftest.scales import against_current, between_stops, gather, integrated, judge, law
-from armlink.selftest.track import ScaleTrack
+from armlink.selftest.scales import ScaleTrack, against_current, between_stops, gather, integrated, judge, law
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth

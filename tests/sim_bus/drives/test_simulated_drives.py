@@ -19,7 +19,7 @@ from armlink.errors import BadInput
 from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import parse_fault
 from sim_bus.bus.lock_step import LockStepBus
-from sim_bus.drives.fault_kinds import DRIVE_KINDS
+from sim_bus.drives.drive_faults import DRIVE_KINDS
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

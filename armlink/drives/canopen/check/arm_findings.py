@@ -8,7 +8,7 @@ from armlink.drives.canopen.check.found_drives import FoundNodes
 from armlink.drives.canopen.controller_setup import identity_mismatches
 from armlink.drives.canopen.eds_file import expected_identity, of_joints
 from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE
-from armlink.drives.found import DriveFinding
+from armlink.drives.findings import DriveFinding
 
 
 def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[DriveFinding]:

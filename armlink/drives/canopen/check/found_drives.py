@@ -8,7 +8,7 @@ from armlink.drives.canopen.controller_setup import Identity
 from armlink.drives.canopen.eds_file import bundled
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.units import units_from
-from armlink.drives.found import FoundDrive
+from armlink.drives.findings import FoundDrive
 from armlink.errors import BusFault
 
 
