@@ -20,6 +20,7 @@ import serving
 from ends_bench import after_each_step
 
 from armlink.arm_file import Bus
+from armlink.loop.ending import OF_A_SERVICE, OF_ITS_OWN
 
 DRIVES = serving.drives(kd=2.0)
 LINK = {"rate": 100, "deadline": 0.5, "park": {"pose": [0.0], "speed": 0.8}}
@@ -64,10 +65,10 @@ class Pendulum:
     def powered(self) -> bool:
         return bool(self.served.drive.motor.powered)
 
-    def hold_out(self) -> int:
+    def hold_out(self, job: str = JOB) -> int:
         """Start the job; the process id of what makes its cycles."""
         self.job = subprocess.Popen(
-            [sys.executable, "-c", JOB, str(self.path), self.bus, str(OUT)],
+            [sys.executable, "-c", job, str(self.path), self.bus, str(OUT)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -145,6 +146,41 @@ def test_a_job_that_is_stopped_holds_the_arm_and_parks_it_once_it_ends(pendulum:
     assert pendulum.fastest < 1.0
     pendulum.send(signal.SIGINT)
     pendulum.send(signal.SIGCONT)
+    pendulum.require_parked()
+
+
+def test_no_signal_to_the_process_that_makes_the_cycles_ends_it(pendulum: Pendulum) -> None:
+    """`systemctl kill -s USR1` reaches every process of a unit."""
+    loop = pendulum.hold_out()
+    for number in signal.valid_signals() - {*OF_A_SERVICE, *OF_ITS_OWN}:
+        os.kill(loop, number)
+    time.sleep(1.0)
+    assert pendulum.powered
+    assert pendulum.fastest < 0.1
+    pendulum.send(signal.SIGTERM)
+    pendulum.require_parked()
+
+
+def test_a_killed_job_is_missed_where_a_process_that_it_forked_lives_on(pendulum: Pendulum) -> None:
+    forked = "    import multiprocessing, time\n    fork = multiprocessing.get_context('fork')\n"
+    forked += "    fork.Process(target=time.sleep, args=(60,), daemon=True).start()\n    print("
+    pendulum.hold_out(JOB.replace("    print(", forked))
+    assert pendulum.job is not None
+    os.kill(pendulum.job.pid, signal.SIGKILL)
+    pendulum.require_parked()
+
+
+@pytest.mark.long
+def test_a_start_that_parks_first_for_longer_than_a_hang_is_given_may_be_interrupted(pendulum: Pendulum) -> None:
+    content = yaml.safe_load(pendulum.path.read_text())
+    content["link"]["park"]["speed"] = 0.1
+    pendulum.path.write_text(yaml.safe_dump(content))
+    pendulum.hold_out(JOB.replace("    while True:", "    link.start()\n    while True:"))
+    time.sleep(1.0)
+    pendulum.send(signal.SIGINT)
+    assert pendulum.job is not None
+    _, told = pendulum.job.communicate(timeout=60)
+    assert "parked, the power is off" in told
     pendulum.require_parked()
 
 
