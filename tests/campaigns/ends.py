@@ -141,6 +141,8 @@ def main() -> int:
     parser.add_argument("--job", nargs="*", default=["sweep", "float"])
     parser.add_argument("--cause", nargs="*", default=ALL, choices=ALL)
     asked = parser.parse_args()
+    for number in SIGNALS:  # nohup and a shell's background have a program ignore some
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     failed = 0
     for name, job in itertools.product(asked.family, asked.job):
         found = campaign(name, job, asked.cause, asked.draws, asked.seed)
