@@ -78,9 +78,9 @@ def commands(bench: EndsBench, job: str, seed: int) -> Callable[[], None]:
 
 def signalled(step: Callable[[], None], name: str, seconds: float) -> BaseException:
     """What a signal to this process, after so much real time of its job, raises there."""
-    threading.Timer(seconds, os.kill, (os.getpid(), signal.Signals[name])).start()
     try:
         with terminate_as_interrupt():
+            threading.Timer(seconds, os.kill, (os.getpid(), signal.Signals[name])).start()
             while True:
                 step()
     except (KeyboardInterrupt, Refused) as error:
