@@ -15,6 +15,7 @@ import signal
 import sys
 import tempfile
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -45,6 +46,8 @@ CAUSES: dict[str, Callable[[], BaseException | None]] = {
 }
 """`gate`: torque control without torque until the gate refuses, then the end."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+MISSED_SECONDS = 30.0
+"""A job that goes on for so long after its signal has missed it [s of real time]."""
 ALL = [*CAUSES, *(number.name for number in SIGNALS)]
 
 
@@ -81,10 +84,12 @@ def signalled(step: Callable[[], None], name: str, seconds: float) -> BaseExcept
     try:
         with terminate_as_interrupt():
             threading.Timer(seconds, os.kill, (os.getpid(), signal.Signals[name])).start()
-            while True:
+            asked = time.monotonic()
+            while time.monotonic() - asked < MISSED_SECONDS:
                 step()
     except (KeyboardInterrupt, Refused) as error:
         return error
+    raise SystemExit(f"{name} did not interrupt the job")
 
 
 def ended(bench: EndsBench, step: Callable[[], None], cause: str, seconds: float) -> dict[str, Any]:
