@@ -14,9 +14,9 @@ from sim_gap.attribution.residual_laws import ResidualLaw, as_effects, residual_
 from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
 from sim_gap.model.load import SimModel
-from sim_gap.residuals.besides import fast, left_out, slides, slow
+from sim_gap.residuals.disregarded_rows import fast, left_out, slides, slow
+from sim_gap.residuals.location import Location, by_joint, combined, locate
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.where import Location, by_joint, combined, locate
 from sim_gap.search.estimate import Estimate
 
 

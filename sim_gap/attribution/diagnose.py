@@ -19,19 +19,16 @@ from sim_gap.attribution.bodies import CLEARLY, body_of, groups_of, lacking, mou
 from sim_gap.attribution.causes import causes, founded_ones
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.friction_compensation import held_in_commands, missing_in_readings
-from sim_gap.attribution.positions.answer import diagnose_positions
+from sim_gap.attribution.position_answer import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_quiet, is_within
-from sim_gap.checks.check import check_recordings
+from sim_gap.checks.check import check_recordings, unchecked_note
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joints import match_joints
-from sim_gap.checks.one_way import unchecked_note
 from sim_gap.checks.position_command import check_position_only, is_position_only
 from sim_gap.effects.registry import library_without
-from sim_gap.model.arm_joints import hinges_between
-from sim_gap.model.from_arm import ends_of
-from sim_gap.model.load import SimModel, load_compiled, load_model
-from sim_gap.residuals.besides import without_disturbances
+from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model
+from sim_gap.residuals.disregarded_rows import without_disturbances
 from sim_gap.residuals.preprocess import prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore

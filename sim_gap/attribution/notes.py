@@ -10,12 +10,12 @@ from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.laws import LAWS
+from sim_gap.residuals.channel_quality import Stuck
 from sim_gap.residuals.disturbances import AROUND_S
 from sim_gap.residuals.layout import Row
+from sim_gap.residuals.location import Location, locate
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.stuck_channels import Stuck
-from sim_gap.residuals.where import Location, locate
 from sim_gap.search.estimate import NOMINAL, Estimate
 from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants, shares_a_factor
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.residuals.besides import regimes, slides
+from sim_gap.residuals.disregarded_rows import regimes, slides
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import Signals
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square

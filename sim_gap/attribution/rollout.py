@@ -14,10 +14,10 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
 from sim_gap.better_model import forward_effects
+from sim_gap.better_model.corrected_model import spec_of, with_effects
 from sim_gap.better_model.effects_module import joint_effects
 from sim_gap.better_model.export import Written, written
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.better_model.with_effects import spec_of, with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.preprocess import CHANNELS
 from sim_gap.residuals.residual_set import ResidualSet

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sim_gap.better_model import forward_effects as forward
-from sim_gap.better_model.with_effects import offsets
-from sim_gap.effects.sensor_nonlinearity import is_gradual
+from sim_gap.better_model.corrected_model import offsets
+from sim_gap.effects.torque import is_gradual
 from sim_gap.model.load import SimModel
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term

@@ -9,13 +9,11 @@ import numpy as np
 
 from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
-from sim_gap.better_model.coupled_motors import add_to, coupled_motors
+from sim_gap.better_model.corrected_model import add_to, compiled_copy, coupled_motors, spec_of, with_effects
 from sim_gap.better_model.effects_module import joint_effects, module_path, module_text
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import DRIVE, LONGEST_STEP_S, motors_of, put_drive
-from sim_gap.better_model.urdf import URDF, urdf_of
-from sim_gap.better_model.with_effects import compiled_copy, spec_of, with_effects
-from sim_gap.better_model.xml_comment import xml_comment
+from sim_gap.better_model.urdf import URDF, urdf_of, xml_comment
 from sim_gap.model.load import SimModel, linear_part, urdf_behind
 from sim_gap.search.estimate import Estimate
 from sim_gap.search.term import Term

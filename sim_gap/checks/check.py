@@ -7,31 +7,63 @@ option that settles it.
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.changed_order import find_changed_order
+from sim_gap.checks.column_order import find_changed_order
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
+from sim_gap.checks.jumps import find_jumps, find_seam, unwrapped
 from sim_gap.checks.mapping import SURE, find_mapping
 from sim_gap.checks.mounting import as_mounted
-from sim_gap.checks.one_way import goes_one_way
 from sim_gap.checks.rigid_fit import Motion, beside_slow_torques, fit_rigid, motion_of
-from sim_gap.checks.rows.clock import even_times, find_dropped, find_time_unit, without_repeats
-from sim_gap.checks.rows.held_positions import without_held
-from sim_gap.checks.rows.jumps import find_jumps, find_seam, unwrapped
+from sim_gap.checks.sampling import even_times, find_dropped, find_time_unit, without_held, without_repeats
 from sim_gap.checks.small_zero import find_small_zero
-from sim_gap.checks.torque.delay import find_delay, find_short_delay
-from sim_gap.checks.torque.source import (
+from sim_gap.checks.torque_delay import find_delay, find_short_delay
+from sim_gap.checks.torque_source import (
     find_gain_command,
     find_same,
     find_source,
     find_unsigned,
 )
-from sim_gap.checks.torque.unit import find_absent, find_joint_scale, find_outgrown, find_scale
+from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import TRIM_S, Signals, prepare
+
+LEAST_WAY = 1.5
+"""Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
+LEAST_RANGE = 0.1
+"""Range from which a joint moves [rad]."""
+STEP_S = 0.1
+"""Time between the positions whose distances make up the way [s]: noise of closer ones would."""
+
+
+def goes_one_way(recording: Recording) -> bool:
+    """Whether the joints that move go to and fro less than once, or none moves.
+
+    Then every angle and every torque is one smooth curve over time, and a wrong column, sign or zero may fit such a
+    curve as well as the right one does.
+    """
+    t = np.arange(recording.t[0], recording.t[-1], STEP_S)
+    q = np.column_stack([np.interp(t, recording.t[there := np.isfinite(x)], x[there]) for x in recording.position.T])
+    span = np.ptp(q, axis=0)
+    moving = span > LEAST_RANGE
+    if not moving.any():
+        return True
+    return bool(np.median(np.abs(np.diff(q[:, moving], axis=0)).sum(0) / span[moving]) < LEAST_WAY)
+
+
+def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """A sentence if no recording turns back."""
+    if not all(goes_one_way(recording) for recording in recordings):
+        return ()
+    return (
+        "order, signs, zeros and clocks of the columns could not be checked: the joints go one way only, or hardly "
+        "move; record motion to and fro",
+    )
 
 
 def check_recordings(

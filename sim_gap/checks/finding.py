@@ -1,5 +1,6 @@
-"""A finding of the check of mapping, units and clocks."""
+"""A finding of the check of a recording, and options that correct columns."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -34,3 +35,15 @@ class Finding:
     def to_json(self) -> dict[str, Any]:
         """Entry of `checks` in the answer."""
         return {name: value for name, value in vars(self).items() if name != "fall"}
+
+
+def exchange_option(channel: str, holds: Mapping[int, int]) -> str:
+    """The `--map` that gives every joint its column; empty where none can, since some joint's motion is in no column.
+
+    Args:
+        channel: prefix of the columns, such as `dq`.
+        holds: column that is wrong → joint whose motion it holds, both from 0.
+    """
+    if set(holds) != set(holds.values()):
+        return ""
+    return "--map " + ",".join(f"{channel}_{joint + 1}={channel}_{column + 1}" for column, joint in holds.items())

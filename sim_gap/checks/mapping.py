@@ -13,10 +13,10 @@ import numpy as np
 
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
+from sim_gap.checks.column_order import likely_orders
 from sim_gap.checks.finding import Finding
 from sim_gap.checks.hypotheses import Hypothesis, hypotheses, ordered
 from sim_gap.checks.mounting import as_loaded, as_mounted
-from sim_gap.checks.orders import likely_orders
 from sim_gap.checks.rigid_fit import (
     FEW,
     STRONG_SHARE,

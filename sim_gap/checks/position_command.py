@@ -9,10 +9,9 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import TORQUE_CHANNELS, Recording
 from gcomp.arrays import Array
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import Finding, exchange_option
 from sim_gap.checks.joint_range import find_beyond_range, find_counts, find_far
-from sim_gap.checks.rows.clock import even_times, find_dropped, without_repeats
-from sim_gap.checks.rows.held_columns import exchange_option
+from sim_gap.checks.sampling import even_times, find_dropped, without_repeats
 from sim_gap.model.rigid_body import RigidArm
 
 FOLLOWS = 0.5

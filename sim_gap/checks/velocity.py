@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.checks.finding import Finding
-from sim_gap.checks.rows.held_columns import exchange_option
+from sim_gap.checks.finding import Finding, exchange_option
 
 SCALE = 0.7, 1.4
 """Velocity over derivative of the position outside which they disagree."""

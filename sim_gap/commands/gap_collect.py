@@ -28,8 +28,8 @@ def collect(
     from armlink.commands.plain_console import PlainColumn, PlainConsole
     from armlink.errors import BadInput
     from armlink.loop.open import open_arm
-    from sim_gap.experiment.collect import collect as run
-    from sim_gap.experiment.motion_file import load_motion
+    from sim_gap.experiment import collect as run
+    from sim_gap.experiment import load_motion
 
     if out.suffix != ".mcap" or not out.resolve().parent.is_dir():
         raise BadInput(f"--out {out}: expected a .mcap file in an existing folder")

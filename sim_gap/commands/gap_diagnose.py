@@ -147,7 +147,7 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
 
 
 def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
-    from sim_gap.better_model.motor_entries import write_motor_entries
+    from sim_gap.better_model.actuator_entries import write_motor_entries
     from sim_gap.closed_loop.training.actuators import write_actuators
 
     if answer.unit == "rad":

@@ -29,11 +29,10 @@ def diagnose_fleet(
 
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole
-    from sim_gap.fleet.cluster import cluster, open_to_all
-    from sim_gap.fleet.fleet import Answers, diagnose_fleet, find_cases
-    from sim_gap.fleet.fleet import table as table_of
-    from sim_gap.fleet.trends import fleet_outliers, fleet_trends
-    from sim_gap.fleet.trends import rows as rows_of
+    from sim_gap.fleet import Answers, cluster, diagnose_fleet, find_cases, open_to_all
+    from sim_gap.fleet import table as table_of
+    from sim_gap.trends import fleet_outliers, fleet_trends
+    from sim_gap.trends import rows as rows_of
 
     cases = find_cases(folder, sim)
     answers = Answers(out or folder / "answers.jsonl")

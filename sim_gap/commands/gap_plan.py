@@ -29,8 +29,7 @@ def plan(
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole
-    from sim_gap.experiment.excitation import joints_in_doubt, plan_motion
-    from sim_gap.experiment.motion_file import save_motion
+    from sim_gap.experiment import joints_in_doubt, plan_motion, save_motion
 
     joints, sentences = joints_in_doubt(answer) if answer else ([], [])
     motion = plan_motion(load_arm(arm), [*joints, *(joint or [])], poses, seed)

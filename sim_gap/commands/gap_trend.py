@@ -28,9 +28,9 @@ def trend(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole
     from sim_gap.commands.gap_fleet import show_changes
-    from sim_gap.fleet.fleet import Answers, diagnose_case, find_cases
-    from sim_gap.fleet.trends import date_of, fleet_trends, rows
+    from sim_gap.fleet import Answers, diagnose_case, find_cases
     from sim_gap.model.load import load_compiled
+    from sim_gap.trends import date_of, fleet_trends, rows
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
     console = PlainConsole()

@@ -221,3 +221,28 @@ class Effect:
     def reported(self) -> tuple[tuple[str, str], ...]:
         """Name and unit of each reported parameter."""
         return CATALOGUE[self.id].reported
+
+
+SHORTEST_DELAY = 1e-3
+"""Shortest time that counts as a delay or a lag [s]."""
+CLIPPED = 0.2
+"""Prior standard deviation of a clipped signal's coefficient about one: all above the level is cut off."""
+NEAR_ONE = between(0.6, 1.6)
+
+
+def late(effect_id: str, signature: Signature, start: float, longest: float) -> Effect:
+    """An effect whose shape is a time: the search starts at `start` and goes up to `longest` [s]."""
+
+    def allows(coefficients: Array, shape: Shape, _beneath: Beneath) -> bool:
+        return bool(SHORTEST_DELAY < coefficients[0] * shape[0] < longest)
+
+    def relinearise(coefficients: Array, shape: Shape) -> Shape:
+        return (float(np.clip(coefficients[0] * shape[0], SHORTEST_DELAY, longest)),)
+
+    return Effect(
+        effect_id,
+        signature,
+        Plausibility(allows=allows),
+        SearchHints(shapes=((start,),), linearised_at=0, relinearise=relinearise),
+        parameters_of=as_share_of_shape,
+    )

@@ -2,35 +2,11 @@
 
 from collections.abc import Sequence
 
-from sim_gap.effects import (
-    actuator,
-    base,
-    drive,
-    elasticity_backlash,
-    friction,
-    link,
-    position,
-    sensor_nonlinearity,
-    timing,
-    torque,
-    transmission,
-)
+from sim_gap.effects import base, drive, friction, link, position, torque, transmission
 from sim_gap.effects.effect import Effect
 from sim_gap.effects.laws import LAWS
 
-FAMILIES = (
-    friction,
-    link,
-    base,
-    position,
-    torque,
-    sensor_nonlinearity,
-    timing,
-    transmission,
-    elasticity_backlash,
-    actuator,
-    drive,
-)
+FAMILIES = (friction, link, base, position, torque, transmission, drive)
 """Modules with an `EFFECTS`; effects are searched in this order."""
 NOT_DIAGNOSED = {"torque.nonlinearity": "noted as the general law `law.load`, which is not attributed"}
 """Catalogue ids without an inverse form, and why."""

@@ -11,7 +11,7 @@ from sim_gap.closed_loop.training.export import WRITTEN
 from sim_gap.closed_loop.training.replay import Simulated, commanded, less, replay, simulated
 from sim_gap.report.effect_text import WORDS, advice, sentence
 from sim_gap.report.figures import BLUE, GREY, ORANGE
-from sim_gap.report.over_time import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, without
+from sim_gap.report.time_figures import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, without
 
 
 def position_sections(answer: Diagnosis) -> list[Section]:

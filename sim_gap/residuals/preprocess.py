@@ -16,13 +16,18 @@ from scipy.signal import butter, sosfiltfilt, sosfreqz
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.model.rigid_body import CREEP, Motion, RigidArm, Wrenches
-from sim_gap.model.torque_slopes import torque_slopes
-from sim_gap.residuals.channel_noise import band_noise
+from sim_gap.model.rigid_body import CREEP, Motion, RigidArm, Wrenches, torque_slopes
+from sim_gap.residuals.channel_quality import (
+    Spikes,
+    Stuck,
+    around_spikes,
+    band_noise,
+    counted,
+    spikes_of,
+    stuck_intervals,
+)
 from sim_gap.residuals.disturbances import Disturbance
 from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
-from sim_gap.residuals.spikes import Spikes, around_spikes, counted, spikes_of
-from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals
 
 SLIDES, MOST_CREEP = 1.5, 0.2
 """Speed from which a joint of a simulation slides, over that up to which it creeps; the most that it is [rad/s]."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.base import tilted
-from sim_gap.effects.inertials import mounted, moved, point
+from sim_gap.effects.link import mounted, moved, point
 from sim_gap.residuals.layout import Columns, Layout
 from sim_gap.residuals.preprocess import Found, Signals
 from sim_gap.search.term import Term

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from sim_gap.effects.inertials import pseudo_inertia
+from sim_gap.effects.link import pseudo_inertia
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.search.about import inertial_change
 from sim_gap.search.stepwise import Search

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.better_model.corrected_model import body_parameters, mujoco_quaternion, possible, spec_of, split
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
-from sim_gap.better_model.with_effects import body_parameters, mujoco_quaternion, possible, spec_of, split
-from sim_gap.better_model.xml_comment import xml_comment
+from sim_gap.better_model.urdf import xml_comment
 from sim_gap.closed_loop.columns import payload_inertia, shared_effects
 from sim_gap.closed_loop.fit import Fit, improve
 from sim_gap.closed_loop.parameters import EFFECTS

@@ -6,8 +6,7 @@ from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
 from sim_gap.better_model.effects_module import module_path, module_text
 from sim_gap.better_model.samples import write_rows
-from sim_gap.better_model.urdf import URDF, urdf_of
-from sim_gap.better_model.xml_comment import xml_comment
+from sim_gap.better_model.urdf import URDF, urdf_of, xml_comment
 from sim_gap.closed_loop.identify import Identified
 from sim_gap.closed_loop.search import effect_there
 from sim_gap.closed_loop.training.draws import draw

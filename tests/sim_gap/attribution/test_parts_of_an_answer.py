@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from sim_gap.attribution import notes, rollout
-from sim_gap.attribution.causes import ordered
+from sim_gap.attribution.causes import ordered, steadiness
 from sim_gap.attribution.diagnosis import Rollout
-from sim_gap.attribution.positions.answer import _where
-from sim_gap.attribution.positions.notes import running_free
+from sim_gap.attribution.position_answer import _where
+from sim_gap.attribution.position_notes import running_free
 from sim_gap.attribution.residual_laws import ResidualLaw, _Candidate
 from sim_gap.attribution.rollout import RollOuts
-from sim_gap.attribution.steadiness import steadiness
 from sim_gap.better_model.export import _line
 from sim_gap.residuals.layout import Layout
-from sim_gap.residuals.where import Location, _features
+from sim_gap.residuals.location import Location, _features
 from sim_gap.search.estimate import Value
 from sim_gap.search.term import Term
 

@@ -8,9 +8,8 @@ from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution import diagnose
 from sim_gap.attribution.causes import _Scorer, founded_ones
-from sim_gap.attribution.confidence import founded
 from sim_gap.attribution.diagnosis import Cause, Signs
-from sim_gap.attribution.verdict import carries
+from sim_gap.attribution.verdict import carries, founded
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare

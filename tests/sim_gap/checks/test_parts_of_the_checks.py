@@ -10,9 +10,9 @@ from armlink.recording.corrections import Corrections
 from sim_gap.checks import hypotheses
 from sim_gap.checks.joint_range import _degrees
 from sim_gap.checks.rigid_fit import Motion, RigidFit, _partial, fit_models
-from sim_gap.checks.rows.clock import _sample_times
-from sim_gap.checks.torque.delay import REPEATS, SURE, _repeats
-from sim_gap.checks.torque.source import find_unsigned
+from sim_gap.checks.sampling import _sample_times
+from sim_gap.checks.torque_delay import REPEATS, SURE, _repeats
+from sim_gap.checks.torque_source import find_unsigned
 
 NOTHING_STATED = Corrections()
 

@@ -13,8 +13,8 @@ from servo_arm import model_text, record, written
 
 from armlink.errors import BadInput
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.attribution.positions.answer import _lowers, _verdict
-from sim_gap.attribution.positions.notes import _beyond, _faster, _released
+from sim_gap.attribution.position_answer import _lowers, _verdict
+from sim_gap.attribution.position_notes import _beyond, _faster, _released
 from sim_gap.closed_loop.identify import gain_scales
 from sim_gap.closed_loop.training.actuators import write_actuators
 from sim_gap.closed_loop.training.bands import band

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from servo_arm import above_a_table, model_text, record
 
 from armlink.recording.recording import Recording
-from sim_gap.attribution.positions.notes import _touching
+from sim_gap.attribution.position_notes import _touching
 from sim_gap.closed_loop.surface import RELEASE_S, Surface, find_surface, touched
 from sim_gap.closed_loop.training import replay as replays
 from sim_gap.closed_loop.windows import thinned, windows_of

@@ -10,7 +10,7 @@ import pytest
 from servo_arm import model_text, record, written
 
 from armlink.recording.recording import Recording
-from sim_gap.attribution.positions.notes import _ranges
+from sim_gap.attribution.position_notes import _ranges
 from sim_gap.better_model.effects_module import module_text
 from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
 from sim_gap.closed_loop.fit import Fit, improve
