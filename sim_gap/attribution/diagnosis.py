@@ -9,7 +9,7 @@ from gcomp.arrays import Array
 from sim_gap.attribution.friction_compensation import Compensation
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.checks.finding import Finding
-from sim_gap.closed_loop.training.bands import SHARE, Band
+from sim_gap.position_gap.training.bands import SHARE, Band
 from sim_gap.residuals.location import Location
 from sim_gap.search.estimate import Value
 

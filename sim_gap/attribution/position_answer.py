@@ -10,14 +10,14 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.position_notes import notes, running_free
 from sim_gap.checks.finding import Finding
-from sim_gap.closed_loop.identify import Identified, columns_of_effect, identify
-from sim_gap.closed_loop.judge import LEAST_SHRINK, Stage, groups_of
-from sim_gap.closed_loop.parameters import EFFECTS
-from sim_gap.closed_loop.search import PRICE
-from sim_gap.closed_loop.training.export import WRITTEN
-from sim_gap.closed_loop.training.replay import LONGEST_S, SHORT_S, Simulated, less, replay_rms, simulated
-from sim_gap.closed_loop.training.spread import interval, payload_centre
 from sim_gap.model.load import SimModel
+from sim_gap.position_gap.identify import Identified, columns_of_effect, identify
+from sim_gap.position_gap.judge import LEAST_SHRINK, Stage, groups_of
+from sim_gap.position_gap.parameters import EFFECTS
+from sim_gap.position_gap.search import PRICE
+from sim_gap.position_gap.training.export import WRITTEN
+from sim_gap.position_gap.training.replay import LONGEST_S, SHORT_S, Simulated, less, replay_rms, simulated
+from sim_gap.position_gap.training.spread import interval, payload_centre
 from sim_gap.residuals.location import Location
 from sim_gap.search.estimate import Value
 

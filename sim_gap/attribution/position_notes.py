@@ -4,13 +4,12 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Rollout
-from sim_gap.closed_loop.identify import Identified
-from sim_gap.closed_loop.training.bands import SHARE
-from sim_gap.closed_loop.training.export import Exported
-from sim_gap.closed_loop.training.limits import described
-from sim_gap.closed_loop.training.ranges import widened
-from sim_gap.closed_loop.training.spread import interval, undecided_scale
-from sim_gap.closed_loop.windows import Windows
+from sim_gap.position_gap.identify import Identified
+from sim_gap.position_gap.training.bands import SHARE
+from sim_gap.position_gap.training.export import Exported, widened
+from sim_gap.position_gap.training.spread import interval, undecided_scale
+from sim_gap.position_gap.training.unreached_limits import described
+from sim_gap.position_gap.windows import Windows
 
 FAR = 3.0
 """So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""

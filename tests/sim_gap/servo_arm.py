@@ -7,12 +7,12 @@ import mujoco
 import numpy as np
 
 from armlink.recording.recording import Recording
-from sim_gap.closed_loop.columns import with_columns
-from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
-from sim_gap.closed_loop.fit import Fit, improve
-from sim_gap.closed_loop.search import Search
-from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
+from sim_gap.position_gap.columns import with_columns
+from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
+from sim_gap.position_gap.fit import Fit, improve
+from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.windows import windows_of
 
 JOINTS = ("shoulder", "elbow")
 

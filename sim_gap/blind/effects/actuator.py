@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.effects.drawn import Draw, Drawn, added, motor_level, pick, replaced, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 LATE_S = (0.008, 0.016)
 """Delays and lags [s]: two to four sample intervals."""

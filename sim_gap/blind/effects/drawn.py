@@ -7,9 +7,9 @@ import numpy as np
 
 from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array, Mask
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
+from sim_gap.blind.arms import Arm
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 SENSOR_LEAST = 0.12
 MOTOR_LEAST = 0.3

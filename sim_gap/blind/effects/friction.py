@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
+from sim_gap.blind.arms import Arm
 from sim_gap.blind.effects.drawn import Draw, Drawn, added, motor_level, pick, replaced, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 MOVING = 0.02
 """Speed [rad/s] below which friction does not show in the readings."""

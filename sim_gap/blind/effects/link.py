@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
+from sim_gap.blind.arms import Arm
 from sim_gap.blind.effects.drawn import Draw, Drawn, sensor_level
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 XYZ = ("x", "y", "z")
 WEIGHS = 0.1

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, added, pick, replaced, reversals, sensor_level, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 
 def offset(scene: Scene, random: np.random.Generator) -> Drawn | None:

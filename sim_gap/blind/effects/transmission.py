@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import SharedMotor, TrueArm
+from sim_gap.blind.arms import Arm
 from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, replaced, reversals, sensor_level, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import SharedMotor, TrueArm
 
 STEP_S = 5e-4
 """Time step of the plant [s]: springs must be slower."""

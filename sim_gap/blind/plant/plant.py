@@ -12,13 +12,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.arms import mjcf
-from sim_gap.blind.cases.motion import RATE
-from sim_gap.blind.cases.true_arm import TrueArm
+from sim_gap.blind.arms import mjcf, quiet
+from sim_gap.blind.motion import RATE
 from sim_gap.blind.plant.controller import Controller
 from sim_gap.blind.plant.drive import Drives
-from sim_gap.blind.plant.rigid_body import quiet
-from sim_gap.blind.plant.runs import Log, Run
+from sim_gap.blind.true_arm import Log, Run, TrueArm
 
 SUBSTEPS = 4
 STEP = 1.0 / (RATE * SUBSTEPS)

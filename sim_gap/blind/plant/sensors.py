@@ -5,9 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.motion import RATE
-from sim_gap.blind.cases.true_arm import TrueArm
-from sim_gap.blind.plant.runs import Log
+from sim_gap.blind.motion import RATE
+from sim_gap.blind.true_arm import Log, TrueArm
 
 JITTER_S = 4e-4
 LATE_SHARE = 0.003

@@ -10,17 +10,16 @@ import pinocchio as pin
 import pytest
 
 from armlink.recording.files import load_recording
-from sim_gap.blind.cases.arms import Arm, draw_arm
-from sim_gap.blind.cases.make import make_cases
-from sim_gap.blind.cases.motion import KINDS, RATE, Limits, derivatives, trajectory
-from sim_gap.blind.cases.recipe import Recipe
-from sim_gap.blind.cases.scene import Scene
-from sim_gap.blind.cases.true_arm import sound
-from sim_gap.blind.effects.library import DRAWS, EFFECTS
-from sim_gap.blind.plant.friction import Bristles
+from sim_gap.blind.arms import Arm, draw_arm
+from sim_gap.blind.cases import make_cases
+from sim_gap.blind.effects import DRAWS, EFFECTS
+from sim_gap.blind.motion import KINDS, RATE, Limits, derivatives, trajectory
+from sim_gap.blind.plant.drive import Bristles
 from sim_gap.blind.plant.plant import simulate
-from sim_gap.blind.plant.runs import Log, Run
 from sim_gap.blind.plant.sensors import _stays_behind, record
+from sim_gap.blind.recipe import Recipe
+from sim_gap.blind.scene import Scene
+from sim_gap.blind.true_arm import Log, Run, sound
 
 ALL = {
     "link.mass_moment",
@@ -268,7 +267,7 @@ def test_cases_are_the_same_for_the_same_seed(tmp_path: Path) -> None:
 
 def test_a_case_that_no_arm_shows_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(DRAWS, "torque.offset", lambda scene, random: None)
-    monkeypatch.setattr("sim_gap.blind.cases.recipe.ATTEMPTS", 3)
+    monkeypatch.setattr("sim_gap.blind.recipe.ATTEMPTS", 3)
     wanted = [Recipe("case_0000", ("torque.offset",), (6, 1)), Recipe("case_0001", (), (6, 2))]
     make_cases(wanted, tmp_path / "c", tmp_path / "l", train_s=3.0, heldout_s=3.0)
     assert [path.name for path in (tmp_path / "c").iterdir()] == ["case_0001"]

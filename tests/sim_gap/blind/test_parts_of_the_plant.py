@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 
 from sim_gap.blind import bench
-from sim_gap.blind.cases.arms import draw_arm
-from sim_gap.blind.cases.motion import RATE
-from sim_gap.blind.cases.true_arm import TrueArm, sound
-from sim_gap.blind.plant.drive import Drives
-from sim_gap.blind.plant.friction import STIFFEST, Bristles
-from sim_gap.blind.plant.runs import Log
+from sim_gap.blind.arms import draw_arm
+from sim_gap.blind.motion import RATE
+from sim_gap.blind.plant.controller import FINE, ServoLaw, ServoRun, Servos
+from sim_gap.blind.plant.drive import STIFFEST, Bristles, Drives
 from sim_gap.blind.plant.sensors import SENSOR_BITS, record
-from sim_gap.blind.servo.law import FINE, ServoLaw, ServoRun, Servos
-from sim_gap.blind.servo.make import Recipe, draw, recorded
+from sim_gap.blind.servo_cases import Recipe, draw, recorded
+from sim_gap.blind.true_arm import Log, TrueArm, sound
 
 STEP = 5e-4
 """Of the plant [s]."""

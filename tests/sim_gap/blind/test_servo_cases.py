@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 
 from armlink.recording.files import load_recording
-from sim_gap.blind.servo.effects import OF_THE_ARM, OF_THE_SERVO
-from sim_gap.blind.servo.make import Recipe, make_cases, recipes
-from sim_gap.blind.servo.score import score_positions
-from sim_gap.closed_loop.training.replay import Simulated, replay_rms
+from sim_gap.blind.score import score_positions
+from sim_gap.blind.servo_cases import Recipe, make_cases, recipes
+from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO
+from sim_gap.position_gap.training.replay import Simulated, replay_rms
 
 
 def test_every_effect_comes_in_turn() -> None:

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim_gap.blind.cases import recipe
-from sim_gap.blind.cases.recipe import OTHER_PAIR, Recipe
+from sim_gap.blind import recipe
 from sim_gap.blind.effects import actuator, friction, torque, transmission
 from sim_gap.blind.effects.drawn import Drawn
-from sim_gap.blind.judging.tables import _percent
-from sim_gap.blind.servo.effects import integral
+from sim_gap.blind.recipe import OTHER_PAIR, Recipe
+from sim_gap.blind.servo_effects import integral
+from sim_gap.blind.tables import _percent
 
 K = 400
 STEP_S = 0.05
