@@ -43,7 +43,7 @@ TONES, BAND = 4, (0.08, 0.6)
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class PlannedMotion:
     """Position targets of an arm, one per cycle."""
 
     names: tuple[str, ...]
@@ -55,11 +55,10 @@ class Motion:
 
     @property
     def seconds(self) -> float:
-        """Duration [s]."""
         return len(self.target) / self.rate
 
 
-def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: int = 0) -> Motion:
+def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: int = 0) -> PlannedMotion:
     """Each joint (or those named) alone, slow and fast in both directions, with the others in `poses` poses; then all.
 
     Constant speeds from creeping to fast separate the kinds of friction, reversals under two loads separate friction
@@ -131,9 +130,8 @@ class _Shape:
         self.here = rows[-1]
         self.pieces.append(f"all joints together, {TONES} sines each, {seconds:g} s")
 
-    def motion(self) -> Motion:
-        """The whole motion."""
-        return Motion(self.names, self.rate, np.concatenate(self.rows), tuple(self.pieces))
+    def motion(self) -> PlannedMotion:
+        return PlannedMotion(self.names, self.rate, np.concatenate(self.rows), tuple(self.pieces))
 
 
 def joints_in_doubt(answer: Path) -> tuple[list[str], list[str]]:
@@ -155,7 +153,7 @@ ROUNDING = 1.05
 """Factor by which the speed between two rows may exceed max_velocity, for the rounding in a file."""
 
 
-def save_motion(motion: Motion, path: Path) -> None:
+def save_motion(motion: PlannedMotion, path: Path) -> None:
     """Write `.csv`; raises BadInput if it cannot be written."""
     if path.suffix != ".csv":
         raise BadInput(f"{path}: a motion is written as .csv")

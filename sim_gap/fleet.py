@@ -23,7 +23,7 @@ KILLED = 3
 
 
 def open_to_all(scheduler: str | None) -> str:
-    """What to say of a scheduler whose address is not one of TLS; empty where there is nothing to say."""
+    """A warning of a scheduler whose address is not one of TLS; empty for others."""
     if scheduler is None or scheduler.startswith("tls://"):
         return ""
     return f"{scheduler}: without TLS whoever reaches this scheduler can run code on its workers: use tls:// and keys"
@@ -135,14 +135,14 @@ def diagnose_fleet(cases: list[Case], client: Any) -> Iterator[tuple[str, dict[s
         future.release()
 
 
-class _Parameter(BaseModel):
+class _StoredParameter(BaseModel):
     value: FiniteFloat | None
     unit: str
 
 
-class _Cause(BaseModel):
+class _StoredCause(BaseModel):
     effect: str
-    parameters: dict[str, dict[str, _Parameter]]
+    parameters: dict[str, dict[str, _StoredParameter]]
     joints: list[str] = []
     shrink: float | None = None
     confidence: float | None = None
@@ -158,19 +158,19 @@ class _Watched(BaseModel):
     unit: str
 
 
-class _Answer(BaseModel):
+class _StoredAnswer(BaseModel):
     verdict: str = ""
     error: str = ""
-    causes: list[_Cause] = []
-    minor: list[_Cause] = []
+    causes: list[_StoredCause] = []
+    minor: list[_StoredCause] = []
     watched: list[_Watched] = []
 
 
-class _Line(BaseModel):
-    """What table and trends read of the result of one case."""
+class _StoredLine(BaseModel):
+    """The part of a case's result that table and trends read."""
 
     case: str
-    answer: _Answer
+    answer: _StoredAnswer
 
 
 class Answers:
@@ -190,7 +190,7 @@ class Answers:
             raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
         for number, line in enumerate(whole.splitlines(), start=1):
             try:
-                _Line.model_validate_json(line, strict=True)
+                _StoredLine.model_validate_json(line, strict=True)
             except ValidationError as error:
                 if error.errors()[0]["type"] == "json_invalid":
                     continue

@@ -23,7 +23,7 @@ from gcomp.arrays import Array
 from sim_gap.attribution.answer import Internals
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.effects.registry import effects
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 WATCHED = ("friction.coulomb", "friction.viscous", "torque.gain", "actuator.gain", "transmission.backlash")
@@ -48,7 +48,7 @@ def watched(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         for joint in effects()[effect].signature.places(layout)
         if moving[joint] > MOVES
     ]
-    whole = Estimate(fit.store, [*kept, *followed])
+    whole = EffectEstimate(fit.store, [*kept, *followed])
     out = []
     for term in whole.terms:
         if term.effect in WATCHED:
@@ -88,8 +88,6 @@ Key = tuple[str, str, str, str]
 
 @dataclass(frozen=True)
 class Trend:
-    """One parameter of one arm that changes."""
-
     arm: str
     effect: str
     joint: str
@@ -183,7 +181,6 @@ def fleet_outliers(answers: Mapping[str, Mapping[str, Any]]) -> list[Outlier]:
 
 
 def rows(found: Sequence[Trend | Outlier]) -> list[dict[str, Any]]:
-    """The JSON form."""
     return [asdict(one) for one in found]
 
 
@@ -275,7 +272,6 @@ def _window(one: _Series, part: slice) -> float:
 
 
 def _trend(key: Key, one: _Series, noise: float) -> Trend | None:
-    """The change of one series, if there is one."""
     start = _window(one, slice(FIRST))
     seen = LEAST_SEEN * float(np.nanmedian(one.interval)) if one.watched else 0.0
     share = LEAST.get(key[1], LEAST_OTHER)

@@ -9,7 +9,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.position_notes import notes, running_free
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.identify import Identified, columns_of_effect, identify
 from sim_gap.position_gap.judge import LEAST_SHRINK, Stage, groups_of
@@ -42,7 +42,7 @@ def diagnose_positions(
     labels: Sequence[str],
     *,
     withhold: Sequence[str],
-    checks: Sequence[Finding],
+    checks: Sequence[RecordingFinding],
     heldout_is: str,
     progress: Callable[[str], None],
     gains: Sequence[str] = (),

@@ -20,7 +20,7 @@ AT_TIMES = 0.01
 
 
 def notes(found: Identified) -> list[str]:
-    """What to know of the controller, of limits that were not reached, and of what the exported model leaves out."""
+    """Notes on the controller, on limits that were not reached, and on effects that the exported model leaves out."""
     names = found.sim.arm.names
     kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
     out = [f"no torque channel: controller ({kind}) and effects follow from q_cmd and q; the gap is in rad"]

@@ -21,7 +21,7 @@ from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.preprocess import CHANNELS
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 MOST_EFFECTS = 12
@@ -39,7 +39,7 @@ class RollOuts:
         sim: SimModel,
         heldout: ResidualSet,
         recordings: Sequence[Recording],
-        estimate: Estimate,
+        estimate: EffectEstimate,
         laws: Sequence[JointEffect] = (),
     ) -> None:
         """`laws` go with every simulation of effects, none with that of the nominal model."""
@@ -80,9 +80,9 @@ def roll_out(
     sim: SimModel,
     heldout: ResidualSet,
     recordings: Sequence[Recording],
-    estimate: Estimate | None,
+    estimate: EffectEstimate | None,
     causes: Sequence[Cause],
-    nominal: Estimate,
+    nominal: EffectEstimate,
     laws: Sequence[JointEffect] = (),
 ) -> Rollout:
     """Position gap per joint of the nominal model, of the whole correction, and with each cause added or left out.

@@ -42,7 +42,6 @@ def founded(signs: Signs, rivals: int = 0) -> bool:
 
 
 def features(signs: Signs) -> dict[str, float]:
-    """The signs as features of the logistic regression."""
     return {
         "evidence": float(np.log(np.clip(signs.evidence, 0.003, 3.0))),
         "left": float(np.log(np.clip(signs.left, 1e-3, 1.0))),
@@ -54,7 +53,7 @@ def features(signs: Signs) -> dict[str, float]:
 EXPLAINED = 0.3
 """Largest share of the RMS of the gap, above the noise, that remains in an explained diagnosis."""
 NEAR, ROW_LEFT = 2.0, 0.15
-"""What may remain of a row: this many times its margin, or this share of its RMS."""
+"""Most that may remain of a row: this many times its margin, or this share of its RMS."""
 CARRIES = 0.3
 """Fall of the gap by a cause that carries the explanation, as a share of that of the most important one."""
 
@@ -71,7 +70,6 @@ def is_quiet(data: ResidualSet) -> bool:
 
 
 def is_within(data: ResidualSet) -> bool:
-    """Whether every row is within its margin."""
     return all(rms <= data.margin[row] for row, rms in row_rms(data).items())
 
 

@@ -13,7 +13,7 @@ from armlink.errors import BadInput
 from gcomp.arrays import Array
 from sim_gap.better_model.corrected_model import with_effects
 from sim_gap.model.load import SimModel, linear_part
-from sim_gap.search.estimate import Estimate, Value
+from sim_gap.search.estimate import EffectEstimate, Value
 
 ISAAC_LAB = {
     "stiffness": "stiffness",
@@ -122,7 +122,7 @@ LINKS = ("link.", "base.")
 """Effects whose names begin so are of links, which the corrected model has."""
 
 
-def write_motor_entries(sim: SimModel, estimate: Estimate | None, path: Path, step: float = 0.005) -> None:
+def write_motor_entries(sim: SimModel, estimate: EffectEstimate | None, path: Path, step: float = 0.005) -> None:
     """Write the entries for Isaac Lab and mjlab; delays are counted in `step` [s]. Raises BadInput.
 
     Friction, damping and armature are those of the corrected model. A gain of the drive is mjlab's `gear`; Isaac Lab

@@ -15,7 +15,7 @@ from sim_gap.model.load import SimModel, linear_part, read_spec
 from sim_gap.model.rigid_body import inertial_of
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.search.about import inertial_change
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 
@@ -35,7 +35,7 @@ class CoupledMotor:
 
 
 def coupled_motors(
-    sim: SimModel, estimate: Estimate | None, chosen: Sequence[Term] | None = None
+    sim: SimModel, estimate: EffectEstimate | None, chosen: Sequence[Term] | None = None
 ) -> list[CoupledMotor]:
     """Motors coupled to two joints, of an estimate or of some of its terms."""
     every = () if estimate is None else estimate.terms if chosen is None else chosen
@@ -49,7 +49,6 @@ def coupled_motors(
 
 
 def add_to(spec: Any, motors: Sequence[CoupledMotor]) -> None:
-    """Add the motors to a `mujoco.MjSpec`."""
     for number, motor in enumerate(motors, start=1):
         tendon = spec.add_tendon(name=f"motor_{number}_of_{motor.joint}_and_{motor.other}")
         tendon.wrap_joint(motor.joint, 1.0)
@@ -80,8 +79,6 @@ LEFT_KG = 1e-9
 
 @dataclass(frozen=True)
 class CorrectedModel:
-    """A model with effects added."""
-
     model: Any
     """`mujoco.MjModel`."""
     held: tuple[Term, ...]
@@ -93,7 +90,7 @@ class CorrectedModel:
 
 def with_effects(
     sim: SimModel,
-    estimate: Estimate | None,
+    estimate: EffectEstimate | None,
     terms: Sequence[Term] | None = None,
     number: int = 0,
     mount: float = 0.0,
@@ -196,14 +193,12 @@ def _seen_from(model: Any, other: int, body: int, anchor: Array) -> Array:
 
 
 def mujoco_quaternion(out: Array, axes: Array) -> None:
-    """Write the quaternion of a rotation matrix (3, 3)."""
     import mujoco
 
     mujoco.mju_mat2Quat(out, axes.ravel())
 
 
 def exists(inertial: Array) -> bool:
-    """Whether a body with these ten parameters can exist."""
     return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
 
 
@@ -244,7 +239,7 @@ def compiled_copy(spec: Any) -> Any:
     return own
 
 
-def offsets(estimate: Estimate, held: Sequence[Term]) -> dict[int, float]:
+def offsets(estimate: EffectEstimate, held: Sequence[Term]) -> dict[int, float]:
     """Offsets of the position sensors that a model holds, by the joint's place [rad]."""
     return {term.place: float(estimate.of(term)[0]) for term in held if term.effect == "position.offset"}
 

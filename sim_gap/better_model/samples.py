@@ -9,7 +9,7 @@ import numpy as np
 from armlink.content.atomic_file import open_whole, write_whole
 from armlink.errors import BadInput
 from sim_bus.effects.registry import effects as simulated
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 SUFFIXES = (".csv", ".json", ".parquet")
@@ -17,7 +17,9 @@ LEAST_SHARE = 0.01
 """A draw of a parameter that must be above zero is at least this share of its estimate."""
 
 
-def drawn_parameters(estimate: Estimate, names: Sequence[str], count: int, seed: int = 0) -> list[dict[str, float]]:
+def drawn_parameters(
+    estimate: EffectEstimate, names: Sequence[str], count: int, seed: int = 0
+) -> list[dict[str, float]]:
     """Draws of what the arm has, `JOINT.EFFECT.PARAMETER` → value in SI units; effects on the whole arm are `arm.…`.
 
     What only some recordings have, such as a body in the hand, is left out. Values are kept within what the simulated

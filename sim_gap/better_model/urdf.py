@@ -45,7 +45,7 @@ def urdf_of(model: Any, source: Path | None, effects: Sequence[str] = ()) -> tup
 
 
 def _left_out(model: Any) -> list[str]:
-    """What the model has beside links and joints, a line each."""
+    """Parts of the model beside links and joints, a line each."""
     lines = []
     fields = (
         ("armature", model.dof_armature, "kg·m²"),

@@ -14,7 +14,7 @@ GRAVITY = 9.80665
 
 
 @dataclass(frozen=True, eq=False)
-class Arm:
+class BenchArm:
     """A chain of n links; link k hangs on joint k, whose axis runs through the link frame's origin."""
 
     offset: Array
@@ -43,15 +43,13 @@ class Arm:
 
     @property
     def n(self) -> int:
-        """Number of joints."""
         return len(self.mass)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Joint names, base to tip."""
         return tuple(f"joint_{k + 1}" for k in range(self.n))
 
-    def with_added(self, link: int, mass: float, moment: Array, inertia: Array) -> "Arm":
+    def with_added(self, link: int, mass: float, moment: Array, inertia: Array) -> "BenchArm":
         """The arm with mass [kg], first moment [kg·m] and inertia about the link's origin [kg·m²] added to one link."""
         total = self.mass[link] + mass
         first = self.mass[link] * self.com[link] + moment
@@ -61,14 +59,14 @@ class Arm:
         arm.mass[link], arm.com[link], arm.inertia[link] = total, com, about_origin - total * _steiner(com)
         return arm
 
-    def with_moved(self, link: int, moment: Array) -> "Arm":
+    def with_moved(self, link: int, moment: Array) -> "BenchArm":
         """The arm with the centre of mass of one link moved so that its first moment grows by `moment` [kg·m]."""
         arm = replace(self, com=self.com.copy())
         arm.com[link] += moment / self.mass[link]
         return arm
 
 
-def draw_arm(random: np.random.Generator, joints: int | None = None) -> Arm:
+def draw_arm(random: np.random.Generator, joints: int | None = None) -> BenchArm:
     """Draw a nominal arm of `joints` joints, by default 3 to 7."""
     n = int(random.integers(3, 8)) if joints is None else joints
     length = np.linspace(random.uniform(0.25, 0.45), random.uniform(0.08, 0.2), n) * random.uniform(0.7, 1.3, n)
@@ -83,7 +81,7 @@ def draw_arm(random: np.random.Generator, joints: int | None = None) -> Arm:
     half = random.uniform(1.2, 2.6, n)
     centre = random.uniform(-0.3, 0.3, n)
     lossy = random.random() < 0.4  # some models come with measured friction
-    return Arm(
+    return BenchArm(
         offset=np.array([p.T @ place for p, place in zip(parent, places, strict=True)]),
         rotation=np.array([p.T @ turn @ own for p, turn, own in zip(parent, twist, frame, strict=True)]),
         axis=frame[:, 2, :].copy(),  # ownᵀ z
@@ -99,7 +97,7 @@ def draw_arm(random: np.random.Generator, joints: int | None = None) -> Arm:
     )
 
 
-def perturbed(arm: Arm, random: np.random.Generator) -> Arm:
+def perturbed(arm: BenchArm, random: np.random.Generator) -> BenchArm:
     """The arm with manufacturing errors: mass moments and rotors about 1 %, inertias 2 %, masses 0.3 %."""
     n, small = arm.n, np.clip(random.normal(0.0, 0.5, (3, arm.n)), -1.0, 1.0)
     return replace(
@@ -111,7 +109,7 @@ def perturbed(arm: Arm, random: np.random.Generator) -> Arm:
     )
 
 
-def mjcf(arm: Arm, shared_rotors: tuple[tuple[int, int, float, float], ...] = ()) -> str:
+def mjcf(arm: BenchArm, shared_rotors: tuple[tuple[int, int, float, float], ...] = ()) -> str:
     """The arm as MJCF text.
 
     `shared_rotors` lists (i, j, coefficient, inertia): a rotor that turns by q_i + coefficient·q_j.
@@ -200,7 +198,7 @@ def _steiner(point: Array) -> Array:
     return np.asarray(point @ point * np.eye(3) - np.outer(point, point))
 
 
-def compiled(arm: Arm) -> Any:
+def compiled(arm: BenchArm) -> Any:
     """The arm's links and rotors as a MuJoCo model without friction, damping or limits."""
     import mujoco
 

@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.arms import Arm, compiled, inverse, mjcf
+from sim_gap.blind.arms import BenchArm, compiled, inverse, mjcf
 from sim_gap.blind.plant.plant import simulate
 from sim_gap.blind.plant.sensors import record
-from sim_gap.blind.recipe import Drawing, Recipe, draw, label, recipes
+from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, label, recipes
 from sim_gap.blind.true_arm import Log
 
 BAND_HZ = 6.0
@@ -28,7 +28,7 @@ MOVING = 0.03
 """Motor channels count only above this speed [rad/s]: at rest friction is undetermined."""
 
 
-def gap(arm: Arm, columns: dict[str, Array]) -> dict[str, list[float]]:
+def gap(arm: BenchArm, columns: dict[str, Array]) -> dict[str, list[float]]:
     """RMS [N·m] per joint of `tau`, `tau_motor` and `tau_cmd` against the nominal model, below 6 Hz."""
     from scipy.signal import butter, sosfiltfilt
 
@@ -83,7 +83,7 @@ DECIMALS = {"t": 6, "q": 7, "dq": 6, "q_cmd": 7}
 
 
 def make_cases(
-    wanted: Sequence[Recipe],
+    wanted: Sequence[CaseRecipe],
     out: Path,
     labels: Path,
     train_s: float = TRAIN_S,
@@ -125,7 +125,7 @@ class Judged:
     good: bool
 
 
-def _judged(drawing: Drawing, logs: list[Log], rate: float) -> Judged:
+def _judged(drawing: CaseDrawing, logs: list[Log], rate: float) -> Judged:
     """Compare the held-out recording with those without each effect."""
     runs = (drawing.heldout, *drawing.without)
     recordings = [
@@ -152,7 +152,7 @@ def _steady(command: Array, log: Log) -> bool:
     return bool(np.abs(log.position - command).max() < FOLLOWED and not oscillating.any())
 
 
-def _write(drawing: Drawing, judged: Judged, train: Log, folder: Path, labels: Path, rate: float) -> None:
+def _write(drawing: CaseDrawing, judged: Judged, train: Log, folder: Path, labels: Path, rate: float) -> None:
     run, name = drawing.train, drawing.recipe.name
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "sim.xml").write_text(mjcf(drawing.nominal), encoding="utf-8")
@@ -163,12 +163,11 @@ def _write(drawing: Drawing, judged: Judged, train: Log, folder: Path, labels: P
     (labels / f"{name}.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
 
 
-def _random(drawing: Drawing, number: int) -> np.random.Generator:
+def _random(drawing: CaseDrawing, number: int) -> np.random.Generator:
     return np.random.default_rng([*drawing.recipe.seed, drawing.attempt, 1000 + number])
 
 
 def _chosen(columns: dict[str, Values], wanted: dict[str, bool]) -> dict[str, Values]:
-    """The columns that the recording has."""
     dropped = {name for name, key in (("q_cmd", "position_command"), ("tau_cmd", "torque_command")) if not wanted[key]}
     return {name: values for name, values in columns.items() if name not in dropped}
 
@@ -192,7 +191,7 @@ Make = Callable[[Sequence[Any], Path, Path, float, float], None]
 
 
 def parse_words(description: str) -> argparse.Namespace:
-    """What `gap bench` says to a maker of cases."""
+    """Options that `gap bench` gives to a maker of cases."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cases", type=int, default=150)
@@ -206,7 +205,6 @@ def parse_words(description: str) -> argparse.Namespace:
 
 
 def make_all(make: Make, wanted: Sequence[Any], given: argparse.Namespace) -> None:
-    """All cases of a check, by several processes."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     size = max(1, min(BATCH, -(-len(wanted) // given.workers)))
     with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
@@ -219,7 +217,6 @@ def make_all(make: Make, wanted: Sequence[Any], given: argparse.Namespace) -> No
 
 
 def main() -> None:
-    """Make all cases of a check."""
     given = parse_words(str(__doc__))
     low, _, high = given.effects.partition("-")
     make_all(make_cases, recipes(given.seed, given.cases, (int(low), int(high)) if high else None), given)

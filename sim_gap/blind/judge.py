@@ -30,8 +30,6 @@ class ParameterError:
 
 @dataclass(frozen=True)
 class Judgement:
-    """One case judged."""
-
     case: str
     kind: str
     truth: tuple[str, ...]

@@ -15,7 +15,7 @@ SLOWEST, LONGEST_REST_S, NEAREST = 0.4, 0.9, 0.01
 
 
 @dataclass(frozen=True)
-class Limits:
+class MotionLimits:
     """Limits of a trajectory, (n,) each: rad, rad, rad/s, rad/s²."""
 
     lower: Array
@@ -34,7 +34,7 @@ class Limits:
         return 0.42 * (self.upper - self.lower)
 
 
-def trajectory(kinds: tuple[str, ...], duration: float, limits: Limits, random: np.random.Generator) -> Array:
+def trajectory(kinds: tuple[str, ...], duration: float, limits: MotionLimits, random: np.random.Generator) -> Array:
     """Positions (K, n) [rad] at `RATE` over `duration` seconds, equal parts of each kind, at rest at both ends."""
     makers = {"sines": _sines, "points": _points, "sweeps": _sweeps, "chirp": _chirp}
     rows = round(duration * RATE)
@@ -53,7 +53,7 @@ def derivatives(q: Array) -> tuple[Array, Array]:
     return v, np.gradient(v, 1.0 / RATE, axis=0)
 
 
-def _sines(t: Array, limits: Limits, random: np.random.Generator) -> Array:
+def _sines(t: Array, limits: MotionLimits, random: np.random.Generator) -> Array:
     n, waves = len(limits.lower), 7
     frequency = np.exp(random.uniform(np.log(0.03), np.log(0.7), (waves, n)))
     phase = random.uniform(0.0, 2 * np.pi, (waves, n))
@@ -62,7 +62,7 @@ def _sines(t: Array, limits: Limits, random: np.random.Generator) -> Array:
     return _scaled(x * _window(t)[:, None], limits)
 
 
-def _points(t: Array, limits: Limits, random: np.random.Generator) -> Array:
+def _points(t: Array, limits: MotionLimits, random: np.random.Generator) -> Array:
     n = len(limits.lower)
     out = np.empty((len(t), n))
     here, now = np.zeros(n), 0
@@ -93,14 +93,14 @@ def _points(t: Array, limits: Limits, random: np.random.Generator) -> Array:
     return out
 
 
-def _seconds(way: Array, limits: Limits, share: float) -> float:
+def _seconds(way: Array, limits: MotionLimits, share: float) -> float:
     """Duration of a quintic move at a share of the limits; its peaks are 1.875 d/T and 5.7735 d/T²."""
     distance = np.abs(way)
     fast = np.maximum(1.875 * distance / limits.velocity, np.sqrt(5.7735 * distance / limits.acceleration))
     return max(0.5, float(fast.max()) / share)
 
 
-def _sweeps(t: Array, limits: Limits, random: np.random.Generator) -> Array:
+def _sweeps(t: Array, limits: MotionLimits, random: np.random.Generator) -> Array:
     """Triangles with rounded corners, each joint at its own, slowly varying pace."""
     n = len(limits.lower)
     pace = random.uniform(0.04, 0.14, n) * (1.0 + 0.6 * np.sin(2 * np.pi * t[:, None] / random.uniform(15.0, 40.0, n)))
@@ -109,7 +109,7 @@ def _sweeps(t: Array, limits: Limits, random: np.random.Generator) -> Array:
     return _scaled(x * _window(t)[:, None], limits)
 
 
-def _chirp(t: Array, limits: Limits, random: np.random.Generator) -> Array:
+def _chirp(t: Array, limits: MotionLimits, random: np.random.Generator) -> Array:
     """0.5 to 9 Hz at a nearly constant acceleration."""
     low, high = 0.5, 9.0
     frequency = low * (high / low) ** (t / t[-1])
@@ -126,7 +126,7 @@ def _window(t: Array) -> Array:
     return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
 
 
-def _scaled(x: Array, limits: Limits) -> Array:
+def _scaled(x: Array, limits: MotionLimits) -> Array:
     """Scaled per joint to the limits of reach, velocity and acceleration."""
     v, a = derivatives(x)
     use = [limits.reach / np.abs(x).max(0), limits.velocity / np.abs(v).max(0), limits.acceleration / np.abs(a).max(0)]

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.arms import Arm, draw_arm
+from sim_gap.blind.arms import BenchArm, draw_arm
 from sim_gap.blind.effects import DRAWS, EFFECTS
 from sim_gap.blind.effects.drawn import Drawn
-from sim_gap.blind.motion import KINDS, Limits, trajectory
+from sim_gap.blind.motion import KINDS, MotionLimits, trajectory
 from sim_gap.blind.scene import Scene
-from sim_gap.blind.true_arm import Run, sound
+from sim_gap.blind.true_arm import PlantRun, sound
 
 ATTEMPTS = 600
 """Number of arms drawn for a case before it is left out; backlash, the rarest, takes some hundred."""
@@ -32,7 +32,7 @@ INDISTINCT = (
 
 
 @dataclass(frozen=True)
-class Recipe:
+class CaseRecipe:
     """One case before it is drawn: its effects by id; or the number of effects of a `several` case."""
 
     name: str
@@ -48,16 +48,16 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class CaseDrawing:
     """One case drawn: the nominal arm, its effects, and the runs of the true arm."""
 
-    recipe: Recipe
-    nominal: Arm
+    recipe: CaseRecipe
+    nominal: BenchArm
     drawn: tuple[Drawn, ...]
     motions: dict[str, tuple[str, ...]]
-    train: Run
-    heldout: Run
-    without: tuple[Run, ...]
+    train: PlantRun
+    heldout: PlantRun
+    without: tuple[PlantRun, ...]
     """The held-out motion of the same arm without each effect in turn (of several: with each alone), then without any;
     one run for one effect."""
     attempt: int
@@ -66,7 +66,7 @@ class Drawing:
     """Optional columns: `velocity`, `position_command`, `torque_command`."""
 
 
-def recipes(seed: int, count: int, several: tuple[int, int] | None = None) -> list[Recipe]:
+def recipes(seed: int, count: int, several: tuple[int, int] | None = None) -> list[CaseRecipe]:
     """`count` cases: every effect in turn, and among them arms without an effect and with two effects.
 
     With `several`, every case has a number of effects between these two, both included.
@@ -74,21 +74,21 @@ def recipes(seed: int, count: int, several: tuple[int, int] | None = None) -> li
     random = np.random.default_rng([seed, 0])
     if several:
         numbers = random.integers(several[0], several[1] + 1, count).tolist()
-        return [Recipe(f"case_{k:04d}", (), (seed, k + 1), number) for k, number in enumerate(numbers)]
+        return [CaseRecipe(f"case_{k:04d}", (), (seed, k + 1), number) for k, number in enumerate(numbers)]
     none, two = round(NONE_SHARE * count), round(TWO_SHARE * count)
     order = [*random.permutation(EFFECTS).tolist()]
     singles = [(order[k % len(order)],) for k in range(count - none - two)]
     pairs = [_pair(random) for _ in range(two)]
     mixed: list[tuple[str, ...]] = [*singles, *pairs, *([()] * none)]
     shuffled = [mixed[k] for k in random.permutation(len(mixed))]
-    return [Recipe(f"case_{k:04d}", effects, (seed, k + 1)) for k, effects in enumerate(shuffled)]
+    return [CaseRecipe(f"case_{k:04d}", effects, (seed, k + 1)) for k, effects in enumerate(shuffled)]
 
 
 def _pair(random: np.random.Generator) -> tuple[str, ...]:
     return tuple(random.choice(EFFECTS, 2, replace=False).tolist())
 
 
-def draw(recipe: Recipe, train_s: float, heldout_s: float, first: int = 0) -> Drawing | None:
+def draw(recipe: CaseRecipe, train_s: float, heldout_s: float, first: int = 0) -> CaseDrawing | None:
     """Draw one case; arms that cannot show its effects are drawn again, None if there is none in `ATTEMPTS`.
 
     `first` is the number of the first attempt.
@@ -144,14 +144,14 @@ def _distinct(first: Drawn, second: Drawn, tip: str) -> bool:
 
 
 def _assemble(
-    recipe: Recipe,
+    recipe: CaseRecipe,
     scene: Scene,
     drawn: tuple[Drawn, ...],
     motions: dict[str, tuple[str, ...]],
     command: Array,
     random: np.random.Generator,
     attempt: int,
-) -> Drawing:
+) -> CaseDrawing:
     nominal = scene.arm
     for effect in drawn:
         nominal = effect.nominal(nominal) if effect.nominal else nominal
@@ -164,12 +164,12 @@ def _assemble(
         effect.apply(whole)
     bandwidth = whole.bandwidth  # the same controller for all runs
 
-    def run(effects: tuple[Drawn, ...], number: int) -> Run:
+    def run(effects: tuple[Drawn, ...], number: int) -> PlantRun:
         truth = sound(nominal, scene.rated, np.random.default_rng(seed))
         for effect in effects:
             effect.apply(truth)
         truth.bandwidth = bandwidth
-        return Run(truth, (scene.command, command)[number], feed[number], scene.inertia, seed + number)
+        return PlantRun(truth, (scene.command, command)[number], feed[number], scene.inertia, seed + number)
 
     columns = {name: bool(random.random() < share) for name, share in (("velocity", 0.5), ("position_command", 0.8))}
     late = any(effect.startswith("actuator") for effect in recipe.effects)
@@ -177,13 +177,13 @@ def _assemble(
     less = [tuple(d for d in drawn if d is not left) for left in drawn] if len(drawn) == 2 else []
     less = [(each,) for each in drawn] if recipe.several else less
     without = tuple(run(effects, 1) for effects in (*less, ()))
-    return Drawing(recipe, nominal, drawn, motions, run(drawn, 0), run(drawn, 1), without, attempt, columns)
+    return CaseDrawing(recipe, nominal, drawn, motions, run(drawn, 0), run(drawn, 1), without, attempt, columns)
 
 
-def _limits(arm: Arm, random: np.random.Generator) -> Limits:
+def _limits(arm: BenchArm, random: np.random.Generator) -> MotionLimits:
     velocity = np.linspace(random.uniform(0.8, 1.3), random.uniform(1.5, 2.6), arm.n)
     acceleration = np.linspace(random.uniform(2.5, 4.0), random.uniform(6.0, 10.0), arm.n)
-    return Limits(arm.lower, arm.upper, velocity, acceleration)
+    return MotionLimits(arm.lower, arm.upper, velocity, acceleration)
 
 
 def _compatible(first: Drawn, second: Drawn) -> bool:
@@ -194,7 +194,7 @@ def _compatible(first: Drawn, second: Drawn) -> bool:
     return not (same and (first.effect in rewriting or second.effect in rewriting))
 
 
-def label(drawing: Drawing) -> dict[str, Any]:
+def label(drawing: CaseDrawing) -> dict[str, Any]:
     """The true effects of the case, for the score; gaps are added once it has run."""
     chirp, nominal = "chirp" in drawing.motions["train"], drawing.nominal
     effects = [

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.arms import Arm, compiled, controlled_inertia, inverse
+from sim_gap.blind.arms import BenchArm, compiled, controlled_inertia, inverse
 from sim_gap.blind.motion import RATE, derivatives
 
 THIN = 25
@@ -18,18 +18,16 @@ THIN = 25
 class Scene:
     """A nominal arm and its commanded training motion."""
 
-    arm: Arm
+    arm: BenchArm
     command: Array
     """(K, n) [rad] at `motion.RATE`."""
 
     @property
     def seconds(self) -> float:
-        """Length of the motion [s]."""
         return len(self.command) / RATE
 
     @cached_property
     def model(self) -> Any:
-        """The nominal arm, compiled."""
         return compiled(self.arm)
 
     @cached_property
@@ -74,12 +72,12 @@ class Scene:
             out[:, :, j] = (inverse(self.model, q + step, v, a) - inverse(self.model, q - step, v, a)) / 2e-4
         return out
 
-    def change(self, other: Arm) -> Array:
+    def change(self, other: BenchArm) -> Array:
         """Change of the link-side torque with another arm in place of this one, (K', n)."""
         model = compiled(other)
         return inverse(model, *self.motion) - other.armature * self.motion[2] - self.torque
 
-    def change_at_rest(self, other: Arm) -> Array:
+    def change_at_rest(self, other: BenchArm) -> Array:
         """Change of the gravity torque with another arm in place of this one, (K', n)."""
         still = np.zeros_like(self.motion[0])
         return inverse(compiled(other), self.motion[0], still, still) - self.gravity
@@ -90,5 +88,4 @@ class Scene:
 
 
 def rms(x: Array) -> Array:
-    """Root mean square over rows."""
     return np.asarray(np.sqrt(np.mean(np.square(x), axis=0)))

@@ -38,7 +38,6 @@ def score(answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping
 
 
 def answer_name(case: str, withheld: str = "") -> str:
-    """Name of an answer's file, without suffix."""
     return f"{case}{WITHHELD}{withheld}" if withheld else case
 
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.arms import Arm, draw_arm, mjcf
+from sim_gap.blind.arms import BenchArm, draw_arm, mjcf
 from sim_gap.blind.cases import largest_fall, make_all, parse_words, withheld, write_csv
 from sim_gap.blind.effects.drawn import Values
-from sim_gap.blind.motion import KINDS, RATE, Limits, trajectory
+from sim_gap.blind.motion import KINDS, RATE, MotionLimits, trajectory
 from sim_gap.blind.plant.controller import ServoLaw, ServoRun, Servos
 from sim_gap.blind.plant.plant import simulate
 from sim_gap.blind.scene import Scene
-from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO, UNKNOWN, Change, drawn
+from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO, UNKNOWN, ServoChange, drawn
 from sim_gap.blind.true_arm import Log, sound
 
 ROUNDS, ATTEMPTS = 4, 200
@@ -31,9 +31,7 @@ JITTER_S = 4e-4
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """One case before it is drawn."""
-
+class ServoRecipe:
     name: str
     effect: str
     """Empty for none."""
@@ -43,21 +41,21 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class ServoDrawing:
     """One case drawn: the nominal arm and servo, the effect, and the runs."""
 
-    recipe: Recipe
-    nominal: Arm
+    recipe: ServoRecipe
+    nominal: BenchArm
     law: ServoLaw
     limit: Array
-    change: Change | None
+    change: ServoChange | None
     hz: float
     runs: tuple[ServoRun, ...]
     """Training; held-out motion of the arm, without the effect, and of the nominal model."""
     motions: dict[str, tuple[str, ...]]
 
 
-def recipes(seed: int, count: int) -> list[Recipe]:
+def recipes(seed: int, count: int) -> list[ServoRecipe]:
     """`count` cases, every effect in turn."""
     random = np.random.default_rng([seed, 7])
     known = random.random(count) > UNKNOWN_SHARE
@@ -70,18 +68,18 @@ def recipes(seed: int, count: int) -> list[Recipe]:
             order = orders[kind]
             effect = str(order[next_of[kind] % len(order)])
             next_of[kind] += 1
-        out.append(Recipe(f"case_{k:04d}", effect, kind, (seed, k + 1)))
+        out.append(ServoRecipe(f"case_{k:04d}", effect, kind, (seed, k + 1)))
     return out
 
 
-def draw(recipe: Recipe, lengths: tuple[float, float], first: int) -> Drawing | None:
+def draw(recipe: ServoRecipe, lengths: tuple[float, float], first: int) -> ServoDrawing | None:
     """Draw one case; arms that cannot show its effect are drawn again."""
     for attempt in range(first, first + ATTEMPTS):
         random = np.random.default_rng([*recipe.seed, attempt, 3])
         arm = draw_arm(random, int(random.integers(2, 4)))
         n = arm.n
         velocity = np.linspace(random.uniform(1.0, 1.8), random.uniform(2.0, 3.0), n)
-        limits = Limits(arm.lower, arm.upper, velocity, 4.0 * velocity)
+        limits = MotionLimits(arm.lower, arm.upper, velocity, 4.0 * velocity)
         held = str(random.choice(KINDS))
         training = (*(kind for kind in KINDS if kind != held), *(("chirp",) * bool(random.random() < 0.5)))
         scene = Scene(arm, trajectory(training, lengths[0], limits, random))
@@ -102,14 +100,14 @@ def _law(stiffness: Array, damping: Array) -> ServoLaw:
 
 
 def _assemble(
-    recipe: Recipe,
+    recipe: ServoRecipe,
     scene: Scene,
     law: ServoLaw,
-    change: Change | None,
+    change: ServoChange | None,
     other: Array,
     random: np.random.Generator,
     motions: dict[str, tuple[str, ...]],
-) -> Drawing:
+) -> ServoDrawing:
     nominal = scene.arm
     if change is not None and change.drawn is not None and change.drawn.nominal is not None:
         nominal = change.drawn.nominal(nominal)
@@ -133,7 +131,7 @@ def _assemble(
         return ServoRun(truth, paths[number], np.zeros_like(paths[number]), scene.inertia, seed + number, own)
 
     runs = run(0, wrong=True), run(1, wrong=True), run(1, wrong=False), run(1, wrong=False, perfect=True)
-    return Drawing(recipe, nominal, law, limit, change, hz, runs, motions)
+    return ServoDrawing(recipe, nominal, law, limit, change, hz, runs, motions)
 
 
 def _held(path: Array, hz: float) -> Array:
@@ -142,7 +140,7 @@ def _held(path: Array, hz: float) -> Array:
     return np.asarray(path[np.arange(len(path)) // step * step])
 
 
-def servo_mjcf(drawing: Drawing) -> str:
+def servo_mjcf(drawing: ServoDrawing) -> str:
     """The nominal arm, with its position actuators if they are known."""
     text = mjcf(drawing.nominal)
     if not drawing.recipe.known:
@@ -168,7 +166,7 @@ def recorded(run: ServoRun, log: Log, hz: float, random: np.random.Generator) ->
     return {"t": t, "q": q, "q_cmd": sent}
 
 
-def judged(drawing: Drawing, logs: Sequence[Log]) -> tuple[dict[str, Any], bool]:
+def judged(drawing: ServoDrawing, logs: Sequence[Log]) -> tuple[dict[str, Any], bool]:
     """Gap against the nominal model with and without the effect [rad], and whether the case is good."""
     rows = slice(round(SETTLE_S * RATE), None)
     real, without, ideal = (log.position[rows] for log in logs)
@@ -185,7 +183,7 @@ def _steady(run: ServoRun, log: Log) -> bool:
     return bool(np.abs(log.position - run.command).max() < FOLLOWED)
 
 
-def make_cases(wanted: Sequence[Recipe], out: Path, labels: Path, train_s: float, heldout_s: float) -> None:
+def make_cases(wanted: Sequence[ServoRecipe], out: Path, labels: Path, train_s: float, heldout_s: float) -> None:
     """Draw, simulate and write cases; one that does not show its effect is drawn again, and left out in the end."""
     labels.mkdir(parents=True, exist_ok=True)
     todo = dict.fromkeys(wanted, 0)
@@ -210,7 +208,7 @@ def make_cases(wanted: Sequence[Recipe], out: Path, labels: Path, train_s: float
             return
 
 
-def _write(drawing: Drawing, train: Log, held: Log, more: dict[str, Any], folder: Path, labels: Path) -> None:
+def _write(drawing: ServoDrawing, train: Log, held: Log, more: dict[str, Any], folder: Path, labels: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "sim.xml").write_text(servo_mjcf(drawing), encoding="utf-8")
     for number, (name, log) in enumerate((("train", train), ("heldout", held))):
@@ -231,7 +229,7 @@ def _write(drawing: Drawing, train: Log, held: Log, more: dict[str, Any], folder
     )
 
 
-def _truth(change: Change, drawing: Drawing) -> dict[str, Any]:
+def _truth(change: ServoChange, drawing: ServoDrawing) -> dict[str, Any]:
     joints = [name for name in change.parameters if name != "arm"]
     return {
         "effect": change.effect,
@@ -244,7 +242,7 @@ def _truth(change: Change, drawing: Drawing) -> dict[str, Any]:
     }
 
 
-def _whole(change: Change, drawing: Drawing, joint: str) -> Values:
+def _whole(change: ServoChange, drawing: ServoDrawing, joint: str) -> Values:
     """Parameters of one joint as they are answered: all of its friction and inertia, with what the model has of it."""
     run, j = drawing.runs[0], drawing.nominal.names.index(joint)
     damping = run.truth.viscous + (run.law.damping if drawing.recipe.known else 0.0)
@@ -260,7 +258,6 @@ def _whole(change: Change, drawing: Drawing, joint: str) -> Values:
 
 
 def main() -> None:
-    """Make all cases of a check."""
     given = parse_words(str(__doc__))
     make_all(make_cases, recipes(given.seed, given.cases), given)
     (given.labels / "withhold.txt").write_text("\n".join(withheld(given.labels, 1)[::3]), encoding="utf-8")

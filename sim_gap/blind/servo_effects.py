@@ -1,4 +1,4 @@
-"""What is wrong with a servo arm: effects of the controller, and those of the joints and links that positions show."""
+"""Effects of a servo arm: those of the controller, and those of joints and links that positions show."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -30,9 +30,7 @@ OF_THE_ARM = (
 
 
 @dataclass(frozen=True)
-class Change:
-    """One effect on one servo arm."""
-
+class ServoChange:
     effect: str
     parameters: dict[str, Values]
     arm: Callable[[TrueArm], None] = lambda true: None
@@ -43,11 +41,10 @@ class Change:
     implied: tuple[str, ...] = field(default=())
 
 
-Draw = Callable[[Scene, ServoLaw, np.random.Generator], Change | None]
+Draw = Callable[[Scene, ServoLaw, np.random.Generator], ServoChange | None]
 
 
-def stiffness(scene: Scene, law: ServoLaw, random: np.random.Generator) -> Change:
-    """A gain other than the model's."""
+def stiffness(scene: Scene, law: ServoLaw, random: np.random.Generator) -> ServoChange:
     j = int(random.integers(scene.arm.n))
     factor = float(np.exp(sign(random) * random.uniform(0.25, 0.6)))
     value = float(law.stiffness[j] * factor)
@@ -55,20 +52,20 @@ def stiffness(scene: Scene, law: ServoLaw, random: np.random.Generator) -> Chang
     def apply(true: ServoLaw) -> None:
         true.stiffness[j] *= factor
 
-    return Change("controller.stiffness", {scene.arm.names[j]: {"kp": value}}, law=apply)
+    return ServoChange("controller.stiffness", {scene.arm.names[j]: {"kp": value}}, law=apply)
 
 
-def delay(scene: Scene, law: ServoLaw, random: np.random.Generator) -> Change:
+def delay(scene: Scene, law: ServoLaw, random: np.random.Generator) -> ServoChange:
     """A command that arrives late at every joint."""
     time = float(random.uniform(0.015, 0.06))
 
     def apply(true: ServoLaw) -> None:
         true.delay[:] = time
 
-    return Change("controller.delay", {name: {"time": time} for name in scene.arm.names}, law=apply)
+    return ServoChange("controller.delay", {name: {"time": time} for name in scene.arm.names}, law=apply)
 
 
-def slew(scene: Scene, law: ServoLaw, random: np.random.Generator) -> Change:
+def slew(scene: Scene, law: ServoLaw, random: np.random.Generator) -> ServoChange:
     """A command whose rate is limited below the fastest motion."""
     j = int(random.integers(scene.arm.n))
     limit = float(np.quantile(np.abs(scene.motion[1][:, j]), random.uniform(0.8, 0.95)))
@@ -76,10 +73,10 @@ def slew(scene: Scene, law: ServoLaw, random: np.random.Generator) -> Change:
     def apply(true: ServoLaw) -> None:
         true.slew[j] = limit
 
-    return Change("controller.slew", {scene.arm.names[j]: {"limit": limit}}, law=apply)
+    return ServoChange("controller.slew", {scene.arm.names[j]: {"limit": limit}}, law=apply)
 
 
-def dead_zone(scene: Scene, law: ServoLaw, random: np.random.Generator) -> Change | None:
+def dead_zone(scene: Scene, law: ServoLaw, random: np.random.Generator) -> ServoChange | None:
     """A servo that does not answer to small errors."""
     usual = rms(scene.torque + scene.rotor_torque) / law.stiffness
     wanted = np.maximum(random.uniform(0.25, 0.6) * usual, 0.006)
@@ -91,10 +88,10 @@ def dead_zone(scene: Scene, law: ServoLaw, random: np.random.Generator) -> Chang
     def apply(true: ServoLaw) -> None:
         true.dead[j] = width
 
-    return Change("controller.dead_zone", {scene.arm.names[j]: {"width": width}}, law=apply)
+    return ServoChange("controller.dead_zone", {scene.arm.names[j]: {"width": width}}, law=apply)
 
 
-def integral(scene: Scene, law: ServoLaw, random: np.random.Generator) -> Change:
+def integral(scene: Scene, law: ServoLaw, random: np.random.Generator) -> ServoChange:
     """An integral part that the model's actuator has not."""
     j = int(random.integers(scene.arm.n))
     value = float(law.stiffness[j] * random.uniform(0.5, 2.0))
@@ -102,7 +99,7 @@ def integral(scene: Scene, law: ServoLaw, random: np.random.Generator) -> Change
     def apply(true: ServoLaw) -> None:
         true.integral[j] = value
 
-    return Change("controller.integral", {scene.arm.names[j]: {"ki": value}}, law=apply)
+    return ServoChange("controller.integral", {scene.arm.names[j]: {"ki": value}}, law=apply)
 
 
 OF_THE_SERVO: dict[str, Draw] = {
@@ -121,14 +118,14 @@ UNKNOWN = (
 does damping, which a servo makes as well as friction does."""
 
 
-def drawn(effect: str, scene: Scene, law: ServoLaw, random: np.random.Generator) -> Change | None:
+def drawn(effect: str, scene: Scene, law: ServoLaw, random: np.random.Generator) -> ServoChange | None:
     """One effect at a size that shows, None if this arm cannot show it."""
     if effect in OF_THE_SERVO:
         return OF_THE_SERVO[effect](scene, law, random)
     found = DRAWS[effect](scene, random)
     if found is None:
         return None
-    return Change(
+    return ServoChange(
         effect,
         found.parameters,
         arm=found.apply,

@@ -25,7 +25,6 @@ ROWS = (
 
 
 def show(result: Mapping[str, Any], console: Console) -> None:
-    """Print shares, effects and calibration of a score."""
     table = Table("figure", "value", title=f"blind check, {result['label_withheld']['cases']} cases")
     for text, *path in ROWS:
         value: Any = result
@@ -37,7 +36,6 @@ def show(result: Mapping[str, Any], console: Console) -> None:
 
 
 def show_positions(result: Mapping[str, Any], console: Console) -> None:
-    """Print the score of a check on positions alone."""
     console.print(
         f"{result['answers']} answers, {result['tellable']} of them on one effect that can be told: right first or "
         f"confounded {_percent(result['named_where_tellable'])}, a false cause above 0.8 "
@@ -48,7 +46,6 @@ def show_positions(result: Mapping[str, Any], console: Console) -> None:
 
 
 def _show_effects(result: Mapping[str, Any], console: Console) -> None:
-    """Print effects, calibration and bounds of a score."""
     table = Table("effect", "cases", "right first", "named", "median error", "first named instead")
     for effect, line in result["by_effect"].items():
         others = {name: k for name, k in result["confusion"].get(effect, {}).items() if name != effect}
@@ -65,7 +62,6 @@ def _show_effects(result: Mapping[str, Any], console: Console) -> None:
 
 
 def show_real(result: Mapping[str, Any], console: Console) -> None:
-    """Print the answers of a bench of real arms and their shares."""
     table = Table("case", "without", "verdict", "first", "confidence", "false above 0.8", "not named")
     for row in result["cases"]:
         sure = "–" if row["confidence"] is None else f"{row['confidence']:.2f}"

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gcomp.arrays import Array, Mask
-from sim_gap.blind.arms import Arm, perturbed
+from sim_gap.blind.arms import BenchArm, perturbed
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class SharedMotor:
 class TrueArm:
     """One arm with its imperfections. Arrays are (n,) unless noted otherwise; SI units."""
 
-    arm: Arm
+    arm: BenchArm
     """True links, rotors and gravity; its damping and frictionloss are not used (see `coulomb`, `viscous`)."""
     coulomb: Array
     viscous: Array
@@ -69,7 +69,6 @@ class TrueArm:
 
     @property
     def n(self) -> int:
-        """Number of joints."""
         return self.arm.n
 
     @property
@@ -83,7 +82,7 @@ class TrueArm:
         return float(2 * np.pi / 2**self.encoder_bits)
 
 
-def sound(nominal: Arm, rated: Array, random: np.random.Generator) -> TrueArm:
+def sound(nominal: BenchArm, rated: Array, random: np.random.Generator) -> TrueArm:
     """The arm without effects: small errors of all nominal parameters, a little friction, sensor noise."""
     n = nominal.n
     zero, one, never = np.zeros(n), np.ones(n), np.full(n, np.inf)
@@ -125,7 +124,7 @@ def sound(nominal: Arm, rated: Array, random: np.random.Generator) -> TrueArm:
 
 
 @dataclass(frozen=True)
-class Run:
+class PlantRun:
     """One arm and the trajectory that it is to follow."""
 
     truth: TrueArm

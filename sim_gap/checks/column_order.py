@@ -8,9 +8,9 @@ import numpy as np
 
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, hypotheses, permuted
-from sim_gap.checks.rigid_fit import FEW, Motion, changed, fit_model, fit_models, least_costs, rows_of
+from sim_gap.checks.rigid_fit import FEW, ChannelMotion, changed, fit_model, fit_models, least_costs, rows_of
 from sim_gap.checks.torque_unit import find_absent
 from sim_gap.model.rigid_body import RigidArm
 
@@ -22,7 +22,7 @@ ROUGHLY, LIKELY = 200, 6
 """Orders that are kept by least squares alone, and of these by fits with physical signs."""
 
 
-def likely_orders(arm: RigidArm, motion: Motion) -> list[tuple[tuple[int, ...], bool, bool]]:
+def likely_orders(arm: RigidArm, motion: ChannelMotion) -> list[tuple[tuple[int, ...], bool, bool]]:
     """Orders that fit the model best, each with whether columns of the positions have it, and those of the torques.
 
     None for an arm of many joints.
@@ -43,7 +43,7 @@ def likely_orders(arm: RigidArm, motion: Motion) -> list[tuple[tuple[int, ...], 
     return found
 
 
-def _torque_orders(arm: RigidArm, few: Motion, orders: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
+def _torque_orders(arm: RigidArm, few: ChannelMotion, orders: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
     """The likely orders of the torques alone: what is left of a joint's reading does not depend on the others'."""
     model, n = arm.carried(few.q, few.v, few.a), arm.n
     rolled = [np.roll(np.arange(n), -k).tolist() for k in range(n)]
@@ -66,7 +66,7 @@ TRIED, LOCATED = np.linspace(0.25, 0.75, 3), np.linspace(0.05, 0.95, 37)
 """Shares of the rows after which the order is tried to change, and those among which that place is then sought."""
 
 
-def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
+def find_changed_order(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> list[RecordingFinding]:
     """An order of the torque columns that the rows before or after some place alone have; `arm` is as mounted."""
     model = arm.carried(motion.q, motion.v, motion.a)
     orders = [h for h in hypotheses(arm, motion, stated, ()) if h.kind == "order"]
@@ -88,12 +88,12 @@ def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections) -> li
     part = f"{'after' if late else 'before'} {share:.0%} of the recording"
     evidence = f"{part} alone {own.what}: then the logarithm of what the model leaves falls by {fall:.1f}"
     option = f"give both parts as recordings of their own, the {'later' if late else 'earlier'} with {own.option}"
-    return [Finding("order", motion.channel, arm.names[own.joints[0]], evidence, option, False, fall)]
+    return [RecordingFinding("order", motion.channel, arm.names[own.joints[0]], evidence, option, False, fall)]
 
 
 def _absent_from_a_half(
-    arm: RigidArm, motion: Motion, model: Array, whole: float, stated: Corrections
-) -> list[Finding]:
+    arm: RigidArm, motion: ChannelMotion, model: Array, whole: float, stated: Corrections
+) -> list[RecordingFinding]:
     """Joints whose torque is absent from one half of the rows, where the model explains the other far better.
 
     `whole` is the cost of all rows.
@@ -112,7 +112,7 @@ def _absent_from_a_half(
     return []
 
 
-def _in_part(motion: Motion, order: Hypothesis, late: bool, share: float) -> Motion:
+def _in_part(motion: ChannelMotion, order: Hypothesis, late: bool, share: float) -> ChannelMotion:
     """The motion with an order of its readings before, or after, a share of the rows."""
     row = round(share * len(motion.q))
     before, after = (motion, order.change(motion)) if late else (order.change(motion), motion)

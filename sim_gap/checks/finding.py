@@ -10,7 +10,7 @@ Kind = Literal[
 
 
 @dataclass(frozen=True)
-class Finding:
+class RecordingFinding:
     """One thing that is wrong with the data as they stand, and the option that corrects it."""
 
     finding: Kind
@@ -27,13 +27,11 @@ class Finding:
     """Fall of the logarithm of what the model leaves unexplained, summed over the joints."""
 
     def sentence(self) -> str:
-        """One line for people."""
         where = f"{self.channel} of {'all joints' if self.joint == 'all' else self.joint}"
         done = "corrected" if self.corrected else "not corrected"
         return f"{where}: {self.evidence} ({self.finding}, {done}: {self.option})"
 
     def to_json(self) -> dict[str, Any]:
-        """Entry of `checks` in the answer."""
         return {name: value for name, value in vars(self).items() if name != "fall"}
 
 

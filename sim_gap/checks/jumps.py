@@ -8,7 +8,7 @@ from scipy.signal import medfilt
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.rigid_fit import TURNING
 from sim_gap.checks.sampling import filled
 
@@ -33,7 +33,7 @@ TOGETHER = "pieces put together, or rows missing whose time the clock does not s
 SETTLED = "give each piece as a recording of its own, or --clock t=0 if it is right"
 
 
-def unwrapped(recording: Recording) -> tuple[Recording, list[Finding]]:
+def unwrapped(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     """The recording with joints that turn on where their positions wrap around."""
     found, position = [], recording.position.copy()
     for j, q in enumerate(position.T):
@@ -44,12 +44,14 @@ def unwrapped(recording: Recording) -> tuple[Recording, list[Finding]]:
                 continue
             position[:, j] = q - turn * np.concatenate([[0.0], np.cumsum(turns)])
             evidence = f"wraps around a whole turn, {np.count_nonzero(turns)} times: turned on from there"
-            found.append(Finding("zero", "q", recording.names[j], evidence, "record it without wrapping", True))
+            found.append(
+                RecordingFinding("zero", "q", recording.names[j], evidence, "record it without wrapping", True)
+            )
             break
     return (replace(recording, position=position), found) if found else (recording, [])
 
 
-def find_jumps(recording: Recording, stated: Corrections) -> list[Finding]:
+def find_jumps(recording: Recording, stated: Corrections) -> list[RecordingFinding]:
     """Places at which positions jump: pieces put together, or rows that are missing while the clock goes on."""
     if "t" in stated.clock:
         return []
@@ -62,7 +64,7 @@ def find_jumps(recording: Recording, stated: Corrections) -> list[Finding]:
         evidence = (
             f"jumps by {jumps[row]:.2f} rad from one row to the next at t = {recording.t[row + 1]:.2f} s: {TOGETHER}"
         )
-        found.append(Finding("dropped", "q", recording.names[j], evidence, SETTLED, False))
+        found.append(RecordingFinding("dropped", "q", recording.names[j], evidence, SETTLED, False))
     return found
 
 
@@ -83,7 +85,7 @@ def _jumps(t: Array, q: Array) -> Array:
     return np.where((np.abs(steps) > JUMP) & (speed > TIMES * usual) & hard, steps, 0.0)
 
 
-def find_seam(recording: Recording, stated: Corrections) -> list[Finding]:
+def find_seam(recording: Recording, stated: Corrections) -> list[RecordingFinding]:
     """A row after which several joints go on from elsewhere and at another velocity: pieces whose ends are near."""
     if "t" in stated.clock or recording.velocity is None or recording.t.size < 10 * NEAR:
         return []
@@ -104,7 +106,7 @@ def find_seam(recording: Recording, stated: Corrections) -> list[Finding]:
         f"and {', '.join(joints[1:])} go farther than their velocities before and after allow, which jump, at "
         f"t = {t[row + 3]:.2f} s: {TOGETHER}"
     )
-    return [Finding("dropped", "q", joints[0], evidence, SETTLED, False)]
+    return [RecordingFinding("dropped", "q", joints[0], evidence, SETTLED, False)]
 
 
 def _over_the_rest(size: Array) -> Array:

@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 from armlink.recording.corrections import TIME_UNITS, Corrections
 from armlink.recording.recording import Recording, slice_rows
 from gcomp.arrays import Array, Mask
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import RecordingFinding
 
 JITTER = 0.2
 """Standard deviation of the steps over their median from which the times may be those of receipt."""
@@ -28,7 +28,7 @@ CREEP, TRAVEL = 0.02, 0.5
 joint that travels in 53 recordings of real arms reaches twenty times as much."""
 
 
-def find_time_unit(recording: Recording, stated: Corrections) -> list[Finding]:
+def find_time_unit(recording: Recording, stated: Corrections) -> list[RecordingFinding]:
     """Times in milliseconds or less, by which arms that travel would do nothing but creep."""
     if "t" in stated.units or recording.t.size < 50:
         return []
@@ -42,11 +42,13 @@ def find_time_unit(recording: Recording, stated: Corrections) -> list[Finding]:
     unit = next((unit for unit, seconds in TIME_UNITS.items() if fastest / seconds > CREEP), "ns")
     what = f"positions travel {travel:.2g} rad in {np.ptp(recording.t):.3g} s, none faster than {fastest:.2g} rad/s"
     return [
-        Finding("clock", "t", "all", f"{what}: times in {unit}?", f"--units t={unit}, or t=s if it is right", False)
+        RecordingFinding(
+            "clock", "t", "all", f"{what}: times in {unit}?", f"--units t={unit}, or t=s if it is right", False
+        )
     ]
 
 
-def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, list[Finding]]:
+def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, list[RecordingFinding]]:
     """The recording on the sample times that its times of receipt scatter about, if they do."""
     if "t" in stated.clock or recording.t.size < 50:
         return recording, []
@@ -66,7 +68,7 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
         f"ms, on which the positions are {before / max(after, 1e-12):.1f} times as smooth: times of receipt"
     )
     values = {**vars(recording), "t": sampled}
-    return Recording(**values), [Finding("jitter", "t", "all", evidence, "--clock t=0 (keep the times)", True)]
+    return Recording(**values), [RecordingFinding("jitter", "t", "all", evidence, "--clock t=0 (keep the times)", True)]
 
 
 def _sample_times(t: Array) -> Array | None:
@@ -122,7 +124,7 @@ def _roughness(t: Array, position: Array) -> float:
     return float((np.sqrt(np.mean(off**2, axis=0)) / spread).sum())
 
 
-def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:
+def without_repeats(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     """The recording without rows that repeat the one before while the arm moves."""
     columns = np.column_stack(list(recording.channels().values()))
     same = np.concatenate([[False], np.all((columns[1:] == columns[:-1]) | ~np.isfinite(columns[1:]), axis=1)])
@@ -132,10 +134,10 @@ def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:
         return recording, []
     evidence = f"{share:.0%} of the rows in motion repeat the row before in every channel: old messages read again"
     kept = slice_rows(recording, ~(same & moving))
-    return kept, [Finding("duplicate", "t", "all", evidence, "record each message once", True)]
+    return kept, [RecordingFinding("duplicate", "t", "all", evidence, "record each message once", True)]
 
 
-def find_dropped(recording: Recording) -> list[Finding]:
+def find_dropped(recording: Recording) -> list[RecordingFinding]:
     """Samples of an even clock that are missing; the others keep their times."""
     steps = np.diff(recording.t)
     if steps.size < 50:
@@ -147,7 +149,9 @@ def find_dropped(recording: Recording) -> list[Finding]:
     if missing < DROPPED or np.mean(np.abs(periods - whole) < NEAR) < EVEN:
         return []
     evidence = f"{missing:.0%} of the samples are missing, up to {whole.max() - 1.0:.0f} one after the other"
-    return [Finding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)]
+    return [
+        RecordingFinding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)
+    ]
 
 
 def fast_rows(position: Array) -> Mask:
@@ -167,7 +171,7 @@ HELD = 0.3
 """Share of the rows in fast motion that repeat all positions, from which they are held."""
 
 
-def without_held(recording: Recording) -> tuple[Recording, list[Finding]]:
+def without_held(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     """The recording with positions that were read less often than the rows come, and repeated, filled in between."""
     same = _repeats(recording.position) & fast_rows(recording.position)
     share = float(same.sum()) / max(float(fast_rows(recording.position).sum()), 1.0)
@@ -178,7 +182,7 @@ def without_held(recording: Recording) -> tuple[Recording, list[Finding]]:
         velocity = filled(recording.t, velocity, known)
     position = filled(recording.t, recording.position, known)
     evidence = f"repeats in {share:.0%} of the rows in motion while torques change: read less often; filled in between"
-    found = Finding("duplicate", "q", "all", evidence, "record at the rate at which positions are read", True)
+    found = RecordingFinding("duplicate", "q", "all", evidence, "record at the rate at which positions are read", True)
     return replace(recording, position=position, velocity=velocity), [found]
 
 

@@ -8,8 +8,8 @@ from scipy.interpolate import CubicSpline
 
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
-from sim_gap.checks.finding import Finding
-from sim_gap.checks.rigid_fit import FEW, FLOOR, Motion, fit_model, fit_models
+from sim_gap.checks.finding import RecordingFinding
+from sim_gap.checks.rigid_fit import FEW, FLOOR, ChannelMotion, fit_model, fit_models
 from sim_gap.model.rigid_body import RigidArm
 
 LAG, LAG_STEP = 1.5, 0.02
@@ -35,7 +35,9 @@ ALL = 0.5
 """Least median of the joints' own delays, over the common one: play in one joint bends the torque of another alone."""
 
 
-def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) -> tuple[list[Finding], float]:
+def find_delay(
+    arm: RigidArm, motion: ChannelMotion, rate: float, stated: Corrections
+) -> tuple[list[RecordingFinding], float]:
     """A torque channel whose clock is far off that of the positions, and by how much the cost falls with it.
 
     `rate` is that of the motion's rows [Hz].
@@ -61,7 +63,7 @@ def find_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) 
     return [_clock(motion.channel, lag)], fall
 
 
-def _between_rows(model: Array, motion: Motion, rows: int) -> float:
+def _between_rows(model: Array, motion: ChannelMotion, rows: int) -> float:
     """The delay in rows at which the cost is least, by the parabola through a minimum and its neighbours."""
     before, least, after = (_delayed_cost(model, motion, k) for k in (rows - 1, rows, rows + 1))
     bend = before - 2.0 * least + after
@@ -76,7 +78,7 @@ def _repeats(costs: Mapping[float, float], lag: float, fall: float) -> bool:
     return any(abs(at - lag) > APART and costs[at] - costs[lag] < REPEATS * max(fall, SURE) for at in minima)
 
 
-def _delayed_cost(model: Array, motion: Motion, rows: int, step: int = 1) -> float:
+def _delayed_cost(model: Array, motion: ChannelMotion, rows: int, step: int = 1) -> float:
     """Cost with the reading taken `rows` later than the motion, on every `step`-th row."""
     ahead, behind = max(0, -rows), max(0, rows)
     n = len(model) - abs(rows)
@@ -90,7 +92,7 @@ def _delayed_cost(model: Array, motion: Motion, rows: int, step: int = 1) -> flo
     return float(fit_model(model[ahead : ahead + n : step], moved).cost.sum())
 
 
-def find_short_delay(arm: RigidArm, motion: Motion, rate: float, stated: Corrections) -> list[Finding]:
+def find_short_delay(arm: RigidArm, motion: ChannelMotion, rate: float, stated: Corrections) -> list[RecordingFinding]:
     """A delay of a row or two that all motors' torques show, or link sensors that are early: a clock's, and no drive's.
 
     `rate` is that of the motion's rows [Hz].
@@ -118,7 +120,7 @@ def find_short_delay(arm: RigidArm, motion: Motion, rate: float, stated: Correct
     return [_clock(motion.channel, lag)]
 
 
-def _interpolated_costs(arm: RigidArm, motion: Motion, t: Array, rows: slice, lags: Array) -> Array:
+def _interpolated_costs(arm: RigidArm, motion: ChannelMotion, t: Array, rows: slice, lags: Array) -> Array:
     """Cost of every joint with the reading of some `rows` taken later than the motion by each of `lags` [s], (L, n).
 
     `t` are the times of all rows [s]. The motion is interpolated and not the reading, whose noise would be less between
@@ -132,6 +134,6 @@ def _interpolated_costs(arm: RigidArm, motion: Motion, t: Array, rows: slice, la
     return np.array([fit.cost for fit in fit_models(pairs)])
 
 
-def _clock(channel: str, lag: float) -> Finding:
+def _clock(channel: str, lag: float) -> RecordingFinding:
     evidence = f"is {abs(lag):.2f} s {'late' if lag > 0 else 'early'} against the positions"
-    return Finding("clock", channel, "all", evidence, f"--clock {channel}={-lag:.3f}", True)
+    return RecordingFinding("clock", channel, "all", evidence, f"--clock {channel}={-lag:.3f}", True)

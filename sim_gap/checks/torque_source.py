@@ -4,11 +4,11 @@ import numpy as np
 
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.mapping import FITS
-from sim_gap.checks.rigid_fit import Motion, RigidFit, changed, fit_model
+from sim_gap.checks.rigid_fit import ChannelMotion, RigidFit, changed, fit_model
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import PreparedSignals
 
 GEAR_FRICTION = 0.13
 """Friction over torque (root sum of squares over the joints that move) from which a channel is a motor's: link sensors
@@ -26,7 +26,7 @@ TOUCHES = 0.05
 zero, as rectified readings do; sound ones of real arms, a sensor with an offset, stay above 0.2."""
 
 
-def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
+def find_unsigned(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> list[RecordingFinding]:
     """Readings that are never negative although the model's torque changes its sign."""
     model = arm.carried(motion.q, motion.v, motion.a)
     plain_fit = fit_model(model, motion)
@@ -50,20 +50,20 @@ def find_unsigned(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Fi
             how = f"it follows its amount ({folded:.2f})" if follows or not touches else "it turns round at zero"
             evidence = f"never changes its sign, though the model's torque does; {how}"
             option = f"record signed torque, or --sign {motion.channel}_{j + 1}=1 if it is right"
-            found.append(Finding("unsigned", motion.channel, arm.names[j], evidence, option, False))
+            found.append(RecordingFinding("unsigned", motion.channel, arm.names[j], evidence, option, False))
     return found
 
 
-def find_same(recording: Recording, stated: Corrections) -> list[Finding]:
+def find_same(recording: Recording, stated: Corrections) -> list[RecordingFinding]:
     """A channel taken for a link sensor's that repeats the motors': arms without sensors have one reading of torque."""
     link, motor = recording.torque, recording.motor_torque
     if stated.effort or link is None or motor is None or not np.array_equal(link, motor, equal_nan=True):
         return []
     evidence = "is that of tau_motor in every sample: these drives have one reading of torque, their motors'"
-    return [Finding("effort_source", "tau", "all", evidence, "--effort-is motor", True)]
+    return [RecordingFinding("effort_source", "tau", "all", evidence, "--effort-is motor", True)]
 
 
-def find_gain_command(recording: Recording, stated: Corrections) -> list[Finding]:
+def find_gain_command(recording: Recording, stated: Corrections) -> list[RecordingFinding]:
     """Commanded torque that is the law of drives with gains at the row's readings: kp (q_cmd − q) + kd (…) + τ.
 
     The drive follows the position within its cycle, and the command may be another one already: the law then differs
@@ -83,10 +83,12 @@ def find_gain_command(recording: Recording, stated: Corrections) -> list[Finding
     if 2 * lawful <= recording.position.shape[1]:
         return []
     evidence = "is kp (q_cmd − q) of its own row, of which the drive's time within the cycle is not known; left out"
-    return [Finding("clock", "tau_cmd", "all", evidence, "--clock tau_cmd=0 (keep it)", True)]
+    return [RecordingFinding("clock", "tau_cmd", "all", evidence, "--clock tau_cmd=0 (keep it)", True)]
 
 
-def find_source(fit: RigidFit, s: Signals, motion: Motion, stated: Corrections) -> list[Finding]:
+def find_source(
+    fit: RigidFit, s: PreparedSignals, motion: ChannelMotion, stated: Corrections
+) -> list[RecordingFinding]:
     """A channel taken for a link sensor's that holds the friction of gears: a motor's.
 
     One joint that has all that friction is asked about: it may be in another unit.
@@ -104,10 +106,12 @@ def find_source(fit: RigidFit, s: Signals, motion: Motion, stated: Corrections) 
     evidence = (
         f"holds friction of {share:.0%} of its torque, which a link-side sensor does not feel: it is a motor's effort"
     )
-    return [Finding("effort_source", "tau", "all", evidence, "--effort-is motor", "tau_motor" not in s.reading)]
+    return [
+        RecordingFinding("effort_source", "tau", "all", evidence, "--effort-is motor", "tau_motor" not in s.reading)
+    ]
 
 
-def _odd_joint(j: int, fit: RigidFit, s: Signals, stated: Corrections) -> list[Finding]:
+def _odd_joint(j: int, fit: RigidFit, s: PreparedSignals, stated: Corrections) -> list[RecordingFinding]:
     """A joint's reading that holds friction, unlike those of the others' link sensors."""
     column = f"tau_{j + 1}"
     if stated.states("units", column):
@@ -117,4 +121,4 @@ def _odd_joint(j: int, fit: RigidFit, s: Signals, stated: Corrections) -> list[F
         "feel, and no other joint does: amperes, or a motor's effort?"
     )
     option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
-    return [Finding("scale", "tau", s.arm.names[j], evidence, option, False)]
+    return [RecordingFinding("scale", "tau", s.arm.names[j], evidence, option, False)]

@@ -5,9 +5,9 @@ from numpy.typing import NDArray
 
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.mounting import as_loaded
-from sim_gap.checks.rigid_fit import STRONG_CORRELATION, Motion, RigidFit, fit_rigid
+from sim_gap.checks.rigid_fit import STRONG_CORRELATION, ChannelMotion, RigidFit, fit_rigid
 from sim_gap.model.rigid_body import RigidArm
 
 SCALE = 0.42, 2.4
@@ -37,7 +37,7 @@ SLIM = 0.03
 unit: at a slim wrist a tool, a hose or a spring may be more."""
 
 
-def find_scale(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:
+def find_scale(arm: RigidArm, fit: RigidFit, motion: ChannelMotion, stated: Corrections) -> list[RecordingFinding]:
     """A channel in another unit: the model's torque comes back with a coefficient that no arm has.
 
     One strong joint alone may carry a load: others that follow the model are asked too, a unit is that of all.
@@ -55,10 +55,10 @@ def find_scale(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections
     joints = ", ".join(f"{arm.names[j]} {fit.scale[j]:.3g}" for j in np.flatnonzero(strong))
     evidence = f"reads the model's torque times {joints}: amperes, or another unit?"
     option = f"--units {motion.channel}=A:K (N·m/A at the joint, or one each: K1;K2;…), or {motion.channel}=N·m"
-    return [Finding("scale", motion.channel, "all", evidence, option, False)]
+    return [RecordingFinding("scale", motion.channel, "all", evidence, option, False)]
 
 
-def find_joint_scale(arm: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
+def find_joint_scale(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> list[RecordingFinding]:
     """Joints that follow the model's torque in another unit than the others: one driver gives amperes, say.
 
     A load at the tip counts many times at a slim wrist. It is fitted to all readings, and to those of the other joints
@@ -84,7 +84,7 @@ def find_joint_scale(arm: RigidArm, motion: Motion, stated: Corrections) -> list
             f"reads the model's torque times {alone.scale[j]:.3g}, unlike the other joints: amperes, or another unit?"
         )
         option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
-        found.append(Finding("scale", motion.channel, arm.names[j], evidence, option, False))
+        found.append(RecordingFinding("scale", motion.channel, arm.names[j], evidence, option, False))
     return found if len(found) <= np.count_nonzero(follows & ~odd) else []
 
 
@@ -94,7 +94,9 @@ def _follows(fit: RigidFit) -> NDArray[np.bool_]:
     return (fit.correlation > STRONG_CORRELATION) | hidden
 
 
-def find_outgrown(arm: RigidArm, mounted: RigidArm, motion: Motion, stated: Corrections) -> list[Finding]:
+def find_outgrown(
+    arm: RigidArm, mounted: RigidArm, motion: ChannelMotion, stated: Corrections
+) -> list[RecordingFinding]:
     """Joints with friction alone that read more than any joint between them and the base does: in a smaller unit."""
     spread, model = motion.reading.std(0), mounted.carried(motion.q, motion.v, motion.a).std(0)
     found = []
@@ -106,11 +108,11 @@ def find_outgrown(arm: RigidArm, mounted: RigidArm, motion: Motion, stated: Corr
                 f"nearer the base has more than {largest:.3g} N·m: milliamperes, or another unit?"
             )
             option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
-            found.append(Finding("scale", motion.channel, arm.names[j], evidence, option, False))
+            found.append(RecordingFinding("scale", motion.channel, arm.names[j], evidence, option, False))
     return found
 
 
-def find_absent(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Corrections) -> list[Finding]:
+def find_absent(arm: RigidArm, fit: RigidFit, motion: ChannelMotion, stated: Corrections) -> list[RecordingFinding]:
     """Joints whose link-side sensor should read several times all that it does: the column of another joint.
 
     A column that varies with another joint's motion may fit as well as the joint's own, by a spring or a rotor that no
@@ -126,7 +128,7 @@ def find_absent(arm: RigidArm, fit: RigidFit, motion: Motion, stated: Correction
             "much and is not in it: another joint's column?"
         )
         option = f"--map {motion.channel}_{j + 1}=COLUMN, or --units {motion.channel}=N·m if it is right"
-        found.append(Finding("order", motion.channel, arm.names[j], evidence, option, False))
+        found.append(RecordingFinding("order", motion.channel, arm.names[j], evidence, option, False))
     return found
 
 

@@ -174,7 +174,6 @@ class WeakHold:
         self._position = pose.copy()
 
     def command(self, sample: Sample) -> Command:
-        """Torque for the newest sample."""
         np.copyto(self._position, sample.position, where=np.isfinite(sample.position))
         speed = np.nan_to_num(sample.velocity)
         torque = self._model.one(self._position + self._zero) + self._kp * (self._pose - self._position)

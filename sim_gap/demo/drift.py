@@ -24,8 +24,6 @@ QUIET_SECONDS, WORK_SECONDS, WATCHED_SECONDS = 30.0, 300.0, 15.0
 
 @dataclass(frozen=True, eq=False)
 class DriftCourse:
-    """Course of the drift."""
-
     joint: int
     gain: float
     offset: float
@@ -42,7 +40,6 @@ class DriftCourse:
     history: WatchHistory
 
     def sentence(self, names: tuple[str, ...]) -> str:
-        """The outcome in a sentence."""
         drifted = f"{names[self.joint]} drifted by {self.gain - 1:+.0%} gain and {self.offset:+.2f} N·m"
         if self.detected is None:
             return f"{drifted}: not detected"

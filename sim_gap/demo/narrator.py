@@ -24,11 +24,9 @@ class Narrator:
 
     @property
     def elapsed(self) -> float:
-        """Wall time since the start [s]."""
         return time.monotonic() - self._began
 
     def say(self, text: str, style: str = "") -> None:
-        """Print one line."""
         line = Text.assemble((f"{self.elapsed:5.0f} s", "dim"), "  ", (printable_text(text), style))
         self.console.print(line, soft_wrap=True)
 

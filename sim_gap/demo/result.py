@@ -26,7 +26,7 @@ class DemoResult:
     """With the truth as it was after the sweeps."""
     seed: int
     sensors: SensorFit | CreepCalibration
-    """What the sweeps tell: of torque sensors, or of drives without."""
+    """Calibration of torque sensors, or of drives without."""
     gravity_check: GravityCheck
     verify: Verification
     gap: Diagnosis
@@ -40,12 +40,10 @@ class DemoResult:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Joints, base to tip."""
         return self.bench.link.names
 
     @property
     def truth(self) -> Truth:
-        """Of the sensors."""
         return self.bench.truth
 
     @property

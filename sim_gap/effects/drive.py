@@ -14,7 +14,7 @@ from sim_gap.effects.effect import (
     CLIPPED,
     NEAR_ONE,
     Beneath,
-    Effect,
+    InverseEffect,
     Plausibility,
     SearchHints,
     Shape,
@@ -24,7 +24,7 @@ from sim_gap.effects.effect import (
     between,
     late,
 )
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import PreparedSignals
 
 LONGEST = 0.2
 """Longest time that counts as a lag or delay [s]."""
@@ -62,7 +62,7 @@ def _clipped(command: Array, limit: float, _rate: float) -> Array:
     return np.asarray(command - np.clip(command, -limit, limit))
 
 
-def _levels(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+def _levels(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     """Levels that the command exceeds during some of the time [N·m]."""
     commands = np.concatenate([np.abs(s.reading["tau_cmd"][:, place]) for s in signals])
     shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
@@ -70,7 +70,7 @@ def _levels(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
 
 
 EFFECTS = (
-    Effect(  # the whole nominal motor torque: known rotor inertia and friction are scaled too
+    InverseEffect(  # the whole nominal motor torque: known rotor inertia and friction are scaled too
         "actuator.gain",
         Signature.at_motor(lambda s, j, _: s.motor_model[:, j], "motor", "drive"),
         Plausibility(
@@ -78,14 +78,14 @@ EFFECTS = (
         ),
         parameters_of=_gain,
     ),
-    Effect(
+    InverseEffect(
         "actuator.rotor_inertia",
         Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
         Plausibility(prior_penalty=0, allows=_above_nominal),
     ),
     late("actuator.lag", _missing(_lag), 0.01, LONGEST),
     late("actuator.delay", _missing(_delay), 0.01, LONGEST),
-    Effect(
+    InverseEffect(
         "actuator.saturation",
         _missing(_clipped),
         Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE),

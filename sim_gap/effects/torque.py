@@ -11,7 +11,7 @@ from gcomp.arrays import Array
 from sim_gap.effects.effect import (
     CLIPPED,
     NEAR_ONE,
-    Effect,
+    InverseEffect,
     Plausibility,
     SearchHints,
     Shape,
@@ -23,7 +23,7 @@ from sim_gap.effects.effect import (
     between,
     late,
 )
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import PreparedSignals
 
 GRADUAL = (0.25, 0.75, 1.25, 1.75)
 """Half widths of the plays of a hysteresis that sets in gradually, as in strain gauges, as shares of their mean."""
@@ -31,12 +31,12 @@ PLAY_HZ = 50.0
 """Rate at which a play operator is evaluated; smooth torques change little from one sample to the next."""
 
 
-def largest(signals: Sequence[Signals], joint: int, share: float = 0.98) -> float:
+def largest(signals: Sequence[PreparedSignals], joint: int, share: float = 0.98) -> float:
     """Quantile of a joint's absolute model torque [N·m]."""
     return float(np.quantile(np.concatenate([np.abs(s.model[:, joint]) for s in signals]), share))
 
 
-def _other_joints(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+def _other_joints(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     return tuple((float(source + 1),) for source in range(signals[0].n) if source != place)
 
 
@@ -45,12 +45,12 @@ def _distorted(distort: Callable[[Array, Shape, float], Array]) -> Signature:
     return Signature.at_sensor(lambda s, joint, shape: distort(s.passed_on[:, joint], shape, s.rate), side="distortion")
 
 
-def _shares(*shares: float) -> Callable[[Sequence[Signals], int], tuple[Shape, ...]]:
+def _shares(*shares: float) -> Callable[[Sequence[PreparedSignals], int], tuple[Shape, ...]]:
     """Starting levels as shares of the joint's usual largest torque."""
     return lambda signals, place: tuple((share * largest(signals, place),) for share in shares)
 
 
-def _exceeded(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+def _exceeded(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     """Levels that the torque exceeds during some of the time [N·m]."""
     shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
     return tuple((largest(signals, place, share),) for share in shares)
@@ -86,34 +86,34 @@ def play(x: Array, half: float, rate: float) -> Array:
     return np.asarray(np.interp(np.arange(len(x)), np.arange(len(coarse)) * step, out))
 
 
-def _delayed(signals: Signals, joint: int, shape: Shape) -> Array:
+def _delayed(signals: PreparedSignals, joint: int, shape: Shape) -> Array:
     torque = signals.model[:, joint]
     return np.asarray(np.interp(signals.t - shape[0], signals.t, torque) - torque)
 
 
 CUT_OFF = Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE)
-"""What a level cuts off is lost altogether."""
+"""Of a level, beyond which all is cut off."""
 EFFECTS = (
-    Effect(  # without a sensor, an offset of the motor's torque
+    InverseEffect(  # without a sensor, an offset of the motor's torque
         "torque.offset",
         Signature.at_sensor(lambda s, _joint, _shape: np.ones(len(s.t)), "any"),
         Plausibility(prior_penalty=0, background_std=0.02, background_nm=True),
     ),
-    Effect(
+    InverseEffect(
         "torque.gain",
         Signature.at_sensor(lambda s, joint, _shape: s.sensed[:, joint]),
         Plausibility(prior_penalty=0, background_std=0.002, allows=between(-0.5, 1.0)),
         parameters_of=as_gain,
     ),
-    Effect("torque.drift", Signature.at_sensor(lambda s, _joint, _shape: s.t), needs=("torque.offset",)),
-    Effect(
+    InverseEffect("torque.drift", Signature.at_sensor(lambda s, _joint, _shape: s.t), needs=("torque.offset",)),
+    InverseEffect(
         "torque.crosstalk",
         Signature.at_sensor(lambda s, _joint, shape: s.model[:, int(shape[0]) - 1], side="distortion"),
         Plausibility(allows=between(-0.5, 0.5)),
         SearchHints(shapes_for=_other_joints, discrete=frozenset({0})),
         parameters_of=as_fitted_and_shape,
     ),
-    Effect(  # the width is the deviation after a long way
+    InverseEffect(  # the width is the deviation after a long way
         "torque.hysteresis",
         _distorted(_stays_behind),
         Plausibility(allows=NEAR_ONE),
@@ -122,14 +122,14 @@ EFFECTS = (
         ),
         parameters_of=as_share_of_shape,
     ),
-    Effect(  # the width is what is lost beyond the band
+    InverseEffect(  # the width is what is lost beyond the band
         "torque.deadband",
         _distorted(lambda torque, shape, _rate: -np.clip(torque, -shape[0], shape[0])),
         CUT_OFF,
         SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4, 0.8)),
         parameters_of=as_share_of_shape,
     ),
-    Effect(
+    InverseEffect(
         "torque.saturation",
         _distorted(lambda torque, shape, _rate: np.clip(torque, -shape[0], shape[0]) - torque),
         CUT_OFF,

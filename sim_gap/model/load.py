@@ -50,7 +50,6 @@ def nominal_model(path: Path) -> Any:
 
 
 def hinges_of(model: Any) -> dict[str, int]:
-    """Hinges of a compiled model by name, in its order."""
     import mujoco
 
     hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
@@ -121,7 +120,6 @@ class SimModel:
 
     @property
     def n(self) -> int:
-        """Number of joints."""
         return len(self.joints)
 
 

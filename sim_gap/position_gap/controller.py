@@ -9,9 +9,9 @@ import numpy as np
 
 from gcomp.arrays import Array, Mask
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.fit import Fit, batch, evaluate, improve, residuals
+from sim_gap.position_gap.fit import LoopFit, batch, evaluate, improve, residuals
 from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, Scales
-from sim_gap.position_gap.search import PRICE, Search
+from sim_gap.position_gap.search import PRICE, LoopSearch
 from sim_gap.position_gap.selection import Progress
 from sim_gap.position_gap.windows import Windows, thinned_moving
 
@@ -50,7 +50,6 @@ class Nominal:
 
     @property
     def complete(self) -> bool:
-        """Whether every joint has one."""
         return bool(np.isfinite(self.kp).all())
 
 
@@ -107,7 +106,7 @@ def scales_of(data: Windows) -> Scales:
     return Scales(torque, torque / np.maximum(speed, 0.05), inertia, np.maximum(error, 1e-4))
 
 
-def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Search, Fit, str]:
+def starting_fit(search: LoopSearch, own: Nominal, progress: Progress) -> tuple[LoopSearch, LoopFit, str]:
     """A fit of controller, Coulomb and viscous friction; the search that keeps that controller; the controller's name.
 
     With position actuators in the model the controller is of their kind; without, the simplest of `KINDS` that does not
@@ -123,7 +122,7 @@ def starting_fit(search: Search, own: Nominal, progress: Progress) -> tuple[Sear
     search = replace(search, resting=frozenset(np.flatnonzero(at_rest).tolist()))
     search = replace(search, nominal=_holding(search, at_rest & ~np.isfinite(own.kp)))
     few = replace(search, data=thinned_moving(search.data, FEW))
-    fits: dict[str, Fit] = {}
+    fits: dict[str, LoopFit] = {}
     scores: dict[str, float] = {}
     for kind, parts in kinds.items():
         progress(f"controller: {kind}")
@@ -156,7 +155,7 @@ def rests(data: Windows) -> Mask:
     return np.asarray(on.any(axis=(0, 2)) & (ends[0] - ends[1] < RESTS_RAD))
 
 
-def _holding(search: Search, joints: Mask) -> dict[str, Array]:
+def _holding(search: LoopSearch, joints: Mask) -> dict[str, Array]:
     """The nominal values, with a controller at joints (J,) that rest and have none: critically damped, and as stiff as
     gravity and the error at rest tell, within bounds; a simulation has to hold them.
     """
@@ -170,7 +169,7 @@ def _holding(search: Search, joints: Mask) -> dict[str, Array]:
     return held
 
 
-def _at_rest(search: Search, fit: Fit) -> Fit:
+def _at_rest(search: LoopSearch, fit: LoopFit) -> LoopFit:
     """The fit with the nominal values at the joints that rest."""
     if not search.resting:
         return fit
@@ -186,7 +185,7 @@ def _at_rest(search: Search, fit: Fit) -> Fit:
     )
 
 
-def _as_excluded(search: Search, fit: Fit, needed: Sequence[str]) -> Fit:
+def _as_excluded(search: LoopSearch, fit: LoopFit, needed: Sequence[str]) -> LoopFit:
     """The fit with parameters of excluded effects as the model has them, apart from those `needed`."""
     own = [name for effect in search.excluded & EFFECTS.keys() for name in EFFECTS[effect].parameters]
     held = [name for name in own if name not in needed]
@@ -194,7 +193,7 @@ def _as_excluded(search: Search, fit: Fit, needed: Sequence[str]) -> Fit:
     return replace(fit.with_values(**{name: search.nominal[name].copy() for name in held}), active=active, rms=None)
 
 
-def _from_grid(search: Search, parts: Sequence[str]) -> Fit:
+def _from_grid(search: LoopSearch, parts: Sequence[str]) -> LoopFit:
     """The best stiffness of a coarse grid at every joint, with damping and friction that go with it."""
     data, nominal, on = search.data, search.nominal, search.data.served
     e, v = on * (data.command - data.recorded), data.v
@@ -232,4 +231,4 @@ def _from_grid(search: Search, parts: Sequence[str]) -> Fit:
     best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
     active = ("kp", *(part for part in parts if part != "feed"), "coulomb", "viscous")
-    return evaluate(data, Fit(point, (active,) * data.joints))
+    return evaluate(data, LoopFit(point, (active,) * data.joints))

@@ -15,13 +15,13 @@ from scipy.stats import t
 
 from gcomp.arrays import Array
 from sim_gap.position_gap.columns import UNIT, shared_effects
-from sim_gap.position_gap.fit import Fit, improve
+from sim_gap.position_gap.fit import LoopFit, improve
 from sim_gap.position_gap.parameters import EFFECTS, WITH_TORQUE
 from sim_gap.position_gap.search import (
     INDEPENDENT_S,
     PRICE,
     Group,
-    Search,
+    LoopSearch,
     effects_at,
     merged,
     price,
@@ -37,7 +37,7 @@ PLAIN = "friction.coulomb", "friction.viscous"
 ITERATIONS = 12
 
 
-def plainest(search: Search, fit: Fit) -> Iterator[Fit]:
+def plainest(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
     """The fit with these alone at each joint that has anything else; nothing if none has."""
     kept = [
         effect for effect in EFFECTS if effect in search.kept or (effect in PLAIN and effect not in search.excluded)
@@ -67,7 +67,7 @@ SHARES = 0.7, 0.4
 ROTORS = "actuator.rotor_inertia"
 
 
-def at_other_scales(search: Search, fit: Fit) -> Iterator[Fit]:
+def at_other_scales(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
     """The fit from each smaller scale, the rotors that the model states free; none if there are none to free."""
     if ROTORS in search.excluded:
         return
@@ -97,13 +97,13 @@ class Other:
 
     group: Group
     """The effect, of one joint or of the whole arm."""
-    fit: Fit
+    fit: LoopFit
     """Fitted again at that joint, or at all."""
     likely: float
     """Probability that this is the right one of both."""
 
 
-def settled(search: Search, fit: Fit, progress: Progress) -> tuple[Fit, list[Other]]:
+def settled(search: LoopSearch, fit: LoopFit, progress: Progress) -> tuple[LoopFit, list[Other]]:
     """The fit without effects that pay in a recording or two and not in the others, and the other choices."""
     dropped: list[Other] = []
     for _ in range(ROUNDS):
@@ -127,7 +127,7 @@ def _best_of(others: list[Other]) -> list[Other]:
     return [max(each, key=lambda other: other.likely) for each in groups]
 
 
-def _others(search: Search, fit: Fit, progress: Progress) -> Iterator[Other]:
+def _others(search: LoopSearch, fit: LoopFit, progress: Progress) -> Iterator[Other]:
     """The fit without each effect that may be taken out."""
     for j, effect, other in without_each(search, fit, removable_at(search, fit)):
         least = float(price(search, len(EFFECTS[effect].parameters))[j])
@@ -144,7 +144,7 @@ def _others(search: Search, fit: Fit, progress: Progress) -> Iterator[Other]:
         yield from _of_each_joint(search, fit, other, PLAINEST)
 
 
-def _of_each_joint(search: Search, fit: Fit, other: Fit, called: str) -> Iterator[Other]:
+def _of_each_joint(search: LoopSearch, fit: LoopFit, other: LoopFit, called: str) -> Iterator[Other]:
     """Another fit with other effects, at each joint that it differs at; of all, if something couples them."""
     if fit.shared:
         more = PRICE * (size_of(fit) - size_of(other))
@@ -156,7 +156,7 @@ def _of_each_joint(search: Search, fit: Fit, other: Fit, called: str) -> Iterato
             yield Other((called, (j,)), merged(fit, other, j), _doubt(search, fit, other, (j,), more))
 
 
-def _doubt(search: Search, fit: Fit, other: Fit, joints: Iterable[int], least: float) -> float:
+def _doubt(search: LoopSearch, fit: LoopFit, other: LoopFit, joints: Iterable[int], least: float) -> float:
     """Probability that the score would not fall by `least` over many more windows, or recordings, like these."""
     assert fit.rms is not None
     assert other.rms is not None

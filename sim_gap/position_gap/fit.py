@@ -22,7 +22,7 @@ Point = Mapping[str, Array]
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class LoopFit:
     """Parameters of all joints, those that were fitted, and what they leave."""
 
     point: dict[str, Array]
@@ -33,12 +33,11 @@ class Fit:
     rms: Array | None = None
     """RMS of the residual per joint and window [rad], (J, W)."""
 
-    def with_values(self, **values: Array) -> "Fit":
-        """The same with other values of some parameters."""
+    def with_values(self, **values: Array) -> "LoopFit":
         return replace(self, point={**self.point, **values})
 
 
-def coordinate(fit: Fit, scales: Scales, joint: int, name: str) -> float:
+def coordinate(fit: LoopFit, scales: Scales, joint: int, name: str) -> float:
     """A fit's value of a parameter in its own coordinate; `joint` is −1 for the whole arm."""
     value = float(fit.point[name][max(joint, 0)])
     if joint < 0:
@@ -63,13 +62,12 @@ def batch(points: Sequence[Point]) -> dict[str, Array]:
     return {name: np.stack([point[name] for point in points]) for name in points[0]}
 
 
-def evaluate(data: Windows, fit: Fit) -> Fit:
-    """The fit with its RMS on these data."""
+def evaluate(data: Windows, fit: LoopFit) -> LoopFit:
     return replace(fit, rms=root_mean_squares(data, residuals(data, batch([fit.point])))[0])
 
 
 def jacobian(
-    data: Windows, fit: Fit, scales: Scales, names: Sequence[Sequence[str]], shared: Sequence[str] = ()
+    data: Windows, fit: LoopFit, scales: Scales, names: Sequence[Sequence[str]], shared: Sequence[str] = ()
 ) -> tuple[Array, list[Array]]:
     """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the parameters' own coordinates.
 
@@ -107,7 +105,7 @@ def _difference(name: str, value: float, scales: Scales, joint: int) -> float:
     return -step if moved(name, value, step, scales, joint) >= PARAMETERS[name].high else step
 
 
-def improve(data: Windows, fit: Fit, scales: Scales, iterations: int = 6) -> Fit:
+def improve(data: Windows, fit: LoopFit, scales: Scales, iterations: int = 6) -> LoopFit:
     """Gauss-Newton steps from a fit until nothing falls; joints are independent unless `shared` couples them."""
     moving = [j for j, own in enumerate(fit.active) if own]
     if not fit.shared and len(moving) < data.joints:
@@ -139,11 +137,11 @@ def improve(data: Windows, fit: Fit, scales: Scales, iterations: int = 6) -> Fit
     return evaluate(data, fit)
 
 
-def _improved_part(data: Windows, fit: Fit, scales: Scales, iterations: int, joints: list[int]) -> Fit:
+def _improved_part(data: Windows, fit: LoopFit, scales: Scales, iterations: int, joints: list[int]) -> LoopFit:
     """The fit improved at the joints that have parameters to fit; the others are as they were."""
     if not joints:
         return fit if fit.rms is not None else evaluate(data, fit)
-    some = Fit({name: values[joints] for name, values in fit.point.items()}, tuple(fit.active[j] for j in joints))
+    some = LoopFit({name: values[joints] for name, values in fit.point.items()}, tuple(fit.active[j] for j in joints))
     sizes = Scales(**{name: values[joints] for name, values in vars(scales).items()})
     better = improve(of_joints(data, joints), some, sizes, iterations)
     assert better.rms is not None
@@ -158,7 +156,7 @@ def _improved_part(data: Windows, fit: Fit, scales: Scales, iterations: int, joi
 
 def _stepped(
     data: Windows,
-    fit: Fit,
+    fit: LoopFit,
     names: Sequence[Sequence[str]],
     now: Array,
     slopes: list[Array],
@@ -170,7 +168,7 @@ def _stepped(
 
 
 def stepped(
-    data: Windows, fit: Fit, scales: Scales, names: Sequence[Sequence[str]], steps: Sequence[Array], common: Array
+    data: Windows, fit: LoopFit, scales: Scales, names: Sequence[Sequence[str]], steps: Sequence[Array], common: Array
 ) -> dict[str, Array]:
     """The point after steps of each joint's own parameters and of the shared ones.
 

@@ -14,10 +14,10 @@ from sim_gap.model.load import SimModel
 from sim_gap.position_gap.columns import shared_effects, with_columns
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of, starting_fit
 from sim_gap.position_gap.doubt import settled
-from sim_gap.position_gap.fit import Fit, evaluate, improve
+from sim_gap.position_gap.fit import LoopFit, evaluate, improve
 from sim_gap.position_gap.judge import Stage, groups_of, rms_on, stages
 from sim_gap.position_gap.nominal_motion import OwnMotion, nominal_solver, other_solver, own_motion, priced, solvers
-from sim_gap.position_gap.search import Search, balanced, counted, effects_at, merged, taken_out, without
+from sim_gap.position_gap.search import LoopSearch, balanced, counted, effects_at, merged, taken_out, without
 from sim_gap.position_gap.selection import select_about
 from sim_gap.position_gap.sound import Sound, sound
 from sim_gap.position_gap.surface import Surface, find_surface, touched
@@ -40,19 +40,17 @@ this share of the tracking error."""
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """Everything behind a position-only diagnosis."""
-
     sim: SimModel
-    search: Search
-    fit: Fit
+    search: LoopSearch
+    fit: LoopFit
     heldout: Windows
     controller: str
     nominal_has_controller: bool
     stages: tuple[Stage, ...]
     spread: Covariance
-    """What is not known of the parameters: within recordings and from one to the next."""
+    """Covariance of the parameters within recordings and from one to the next."""
     within: Covariance
-    """What is not known within recordings alone: by it an effect is told from none."""
+    """Covariance within recordings alone: by it an effect is told from none."""
     band: Band
     train_before: Array
     train_after: Array
@@ -66,7 +64,7 @@ class Identified:
     moved_before: Array
     """RMS gap of the nominal model that MuJoCo moves along the held-out commands [rad]; NaN if the controller had to be
     found, or none is commanded long enough."""
-    native: Fit
+    native: LoopFit
     export: Exported | None
     """The model to be used alone; None if the model did not come from a file."""
     beside: Exported | None
@@ -76,7 +74,7 @@ class Identified:
     gains: tuple[float, ...]
     """The controller's gains in each of them over those in the first training recording."""
     surface: Surface | None
-    """What the arm presses on in some recordings; those moments are not in the windows."""
+    """Surface that the arm presses on in some recordings; those moments are not in the windows."""
     touched: tuple[Mask, ...]
     """Rows of each recording at which it does, train first."""
 
@@ -113,7 +111,7 @@ def identify(
     nominal = nominal_point(fitted, own)
     scales, floor = scales_of(fitted), noise_floor(fitted)
     never = frozenset(withhold) | _frozen(sim, fitted)
-    search = Search(balanced(data), scales, nominal, floor, never)
+    search = LoopSearch(balanced(data), scales, nominal, floor, never)
     kinds = solvers(sim, search) if own.complete else []
     apart = tuple(touched(surface, sim.arm, recording) for recording in recordings)
     itself, moved = None, np.full(sim.n, np.nan)
@@ -201,10 +199,10 @@ def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
     return [found[i] / found[0] for i in range(len(labels))]
 
 
-def _bare(search: Search, fit: Fit, complete: bool) -> Fit:
+def _bare(search: LoopSearch, fit: LoopFit, complete: bool) -> LoopFit:
     """The nominal model with its own controller, or with that of the fit, fitted again without any effect."""
     if complete:
-        return Fit({name: values.copy() for name, values in search.nominal.items()}, ((),) * search.data.joints)
+        return LoopFit({name: values.copy() for name, values in search.nominal.items()}, ((),) * search.data.joints)
     for group in groups_of(fit, search):
         fit = taken_out(search, fit, group)
     return improve(search.data, replace(fit, rms=None), search.scales, 6)
@@ -218,7 +216,7 @@ def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:
     return frozenset(never if bool((data.served < 0.5).any()) else never | {"actuator.back_emf"})
 
 
-def not_worse(search: Search, fit: Fit, gap: Array) -> Fit:
+def not_worse(search: LoopSearch, fit: LoopFit, gap: Array) -> LoopFit:
     """The fit with the nominal model's own values at each joint at which they leave less of the training motion, or no
     more than twice the noise floor, or whose `gap` of the model that MuJoCo moves is no more (J,) [rad]."""
     bare = fit
@@ -240,7 +238,7 @@ def noise_floor(data: Windows) -> Array:
     return np.asarray(np.maximum(np.sqrt(np.mean(rest**2, axis=(0, 2))), LEAST_FLOOR))
 
 
-def _margin(search: Search, fit: Fit) -> Array:
+def _margin(search: LoopSearch, fit: LoopFit) -> Array:
     """RMS from which it is a gap, per joint (J,) [rad]."""
     torque = np.minimum(TORQUE_MARGIN, SHARE_MARGIN * search.scales.torque)
     matters = np.minimum(torque / fit.point["kp"], SHARE_MARGIN * search.scales.angle)

@@ -1,4 +1,4 @@
-"""What each effect is worth: what it lowers on held-out data."""
+"""Worth of each effect: the gap that it lowers on held-out data."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -6,17 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import Fit, evaluate, improve
+from sim_gap.position_gap.fit import LoopFit, evaluate, improve
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.rivals import rivals_of
-from sim_gap.position_gap.search import Group, Search, effect_there, shared_of, taken_out
+from sim_gap.position_gap.search import Group, LoopSearch, effect_there, shared_of, taken_out
 from sim_gap.position_gap.windows import Windows
 
 LEAST_SHRINK = 0.05
 """Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
 
 
-def groups_of(fit: Fit, search: Search) -> list[Group]:
+def groups_of(fit: LoopFit, search: LoopSearch) -> list[Group]:
     """Effects of the fit, without the controller that a model without actuators leaves open."""
     own = [
         (effect, tuple(j for j in range(search.data.joints) if effect_there(fit, effect, j)))
@@ -26,7 +26,7 @@ def groups_of(fit: Fit, search: Search) -> list[Group]:
     return [group for group in own if group[1]] + [(effect, ()) for effect in shared_of(fit, search)]
 
 
-def rms_on(data: Windows, fit: Fit) -> Array:
+def rms_on(data: Windows, fit: LoopFit) -> Array:
     """RMS of the position gap of each joint [rad], (J,)."""
     return joint_rms(data, _rms(data, fit))
 
@@ -46,21 +46,21 @@ class Stage:
     after: Array
     """(J,) [rad]."""
     share: Array
-    """What it lowers in its place or as the last of all, whichever is more, as a share of the RMS, (J,)."""
+    """Fall of the RMS in its place or as the last of all, whichever is more, as a share of it, (J,)."""
     evidence: float
     """Fall of the training score that nothing else would have brought."""
     rivals: tuple[str, ...]
     """Effects that would do as well."""
 
 
-def stages(search: Search, fit: Fit, heldout: Windows, matters: Array) -> list[Stage]:
+def stages(search: LoopSearch, fit: LoopFit, heldout: Windows, matters: Array) -> list[Stage]:
     """The groups in order of what each lowers when it is added to the nominal model and those above it.
 
     `matters` is the gap that counts as one at each joint, (J,) [rad].
     """
     groups = groups_of(fit, search)
 
-    def with_only(some: Sequence[Group]) -> Fit:
+    def with_only(some: Sequence[Group]) -> LoopFit:
         """The fit without the other groups, the rest fitted again from where it is."""
         left = fit
         for group in groups:
@@ -82,14 +82,14 @@ def stages(search: Search, fit: Fit, heldout: Windows, matters: Array) -> list[S
     return out
 
 
-def _rms(data: Windows, fit: Fit) -> Array:
+def _rms(data: Windows, fit: LoopFit) -> Array:
     """RMS of every joint and window, (J, W) [rad]."""
     found = evaluate(data, fit).rms
     assert found is not None
     return found
 
 
-def _shrink(search: Search, data: Windows, before: Array, after: Array) -> Array:
+def _shrink(search: LoopSearch, data: Windows, before: Array, after: Array) -> Array:
     """Relative fall of each joint's RMS, over all windows or in the typical one, whichever is larger, (J,).
 
     Where held-out motion shows what no training motion did, such as a motor at its limit, a few windows make up the RMS
@@ -104,19 +104,19 @@ def _shrink(search: Search, data: Windows, before: Array, after: Array) -> Array
 
 
 def _ordered(
-    search: Search,
+    search: LoopSearch,
     groups: Sequence[Group],
-    with_only: Callable[[Sequence[Group]], Fit],
-    current: Fit,
+    with_only: Callable[[Sequence[Group]], LoopFit],
+    current: LoopFit,
     margin: Array,
-) -> Iterator[tuple[Group, Fit]]:
+) -> Iterator[tuple[Group, LoopFit]]:
     """The groups, each the one that lowers the training gap most beside those before it, with the fit up to there.
 
     A group that was worth less than another beside fewer groups is not tried again until that one is worth less too,
     or until an effect that it needs is there.
     """
     worth = {group: float("inf") for group in groups}
-    fresh: dict[Group, Fit] = {}
+    fresh: dict[Group, LoopFit] = {}
     chosen: list[Group] = []
     while worth:
         group = max(worth, key=lambda each: worth[each])
@@ -136,7 +136,7 @@ def _needs(group: Group) -> tuple[str, ...]:
     return EFFECTS[group[0]].needs if group[0] in EFFECTS else ()
 
 
-def _worth(search: Search, current: Fit, trial: Fit, margin: Array) -> float:
+def _worth(search: LoopSearch, current: LoopFit, trial: LoopFit, margin: Array) -> float:
     """Largest fall of a joint's RMS in units of what matters there, by a group."""
     assert current.rms is not None
     assert trial.rms is not None

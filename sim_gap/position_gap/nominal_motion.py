@@ -20,18 +20,18 @@ from gcomp.arrays import Array, Mask
 from sim_gap.model.load import SimModel
 from sim_gap.model.solver_friction import creep_speeds, creep_times
 from sim_gap.position_gap.columns import with_columns
-from sim_gap.position_gap.fit import Fit, Point, evaluate, improve
+from sim_gap.position_gap.fit import LoopFit, Point, evaluate, improve
 from sim_gap.position_gap.judge import rms_on
-from sim_gap.position_gap.search import PRICE, Search, size_of
+from sim_gap.position_gap.search import PRICE, LoopSearch, size_of
 from sim_gap.position_gap.selection import pruned
 from sim_gap.position_gap.tracks import period_of, smoothing
 from sim_gap.position_gap.training.replay import OPENING_S, Simulated, commanded, judged, replay
 from sim_gap.position_gap.windows import thinned, windows_of
 
 
-def solvers(sim: SimModel, search: Search) -> list[dict[str, Array]]:
-    """What recordings may have of a solver, (J,) each: nothing, and what MuJoCo's does with the nominal model, without
-    and with its friction, as far as it does anything.
+def solvers(sim: SimModel, search: LoopSearch) -> list[dict[str, Array]]:
+    """Effects of a solver that recordings may have, (J,) each: none, and those of MuJoCo's with the nominal model,
+    without and with its friction, as far as it does anything.
     """
     import mujoco
 
@@ -46,15 +46,15 @@ def solvers(sim: SimModel, search: Search) -> list[dict[str, Array]]:
     return kinds + ([{**steps, "creep": speeds, "creep_lag": lag}] if np.any(speeds) else [])
 
 
-def nominal_solver(search: Search, kinds: Sequence[Point]) -> Search:
+def nominal_solver(search: LoopSearch, kinds: Sequence[Point]) -> LoopSearch:
     """The search with the nominal model moved as the first of some solvers, or as another that leaves clearly less."""
     points = [{**search.nominal, **kind} for kind in kinds]
     none = ((),) * search.data.joints
-    scores = [float(search.score(evaluate(search.data, Fit(point, none))).sum()) for point in points]
+    scores = [float(search.score(evaluate(search.data, LoopFit(point, none))).sum()) for point in points]
     return replace(search, nominal=points[_clearly_best(search, scores)])
 
 
-def other_solver(search: Search, fit: Fit, kinds: Sequence[Point]) -> dict[str, Array] | None:
+def other_solver(search: LoopSearch, fit: LoopFit, kinds: Sequence[Point]) -> dict[str, Array] | None:
     """The other solver with which effects are worth choosing again; None without such.
 
     A delay, inertia and friction at every joint may stand for a solver: it is worth it where with the solver as many
@@ -73,12 +73,11 @@ def other_solver(search: Search, fit: Fit, kinds: Sequence[Point]) -> dict[str, 
     return dict(min(better, key=lambda each: each[0])[1]) if better else None
 
 
-def priced(search: Search, fit: Fit) -> float:
-    """Score of a fit with what its parameters cost."""
+def priced(search: LoopSearch, fit: LoopFit) -> float:
     return float(search.score(fit).sum()) + PRICE * size_of(fit)
 
 
-def _clearly_best(search: Search, scores: Sequence[float]) -> int:
+def _clearly_best(search: LoopSearch, scores: Sequence[float]) -> int:
     """Number of the least of some scores, or 0 if it is not clearly less than the first."""
     best = int(np.argmin(scores))
     return best if scores[best] < scores[0] - PRICE * search.data.joints else 0
@@ -97,7 +96,7 @@ one that swings where the arm does not is no such motion."""
 
 @dataclass(frozen=True, eq=False)
 class OwnMotion:
-    """What MuJoCo makes of the nominal model along the commands of each recording."""
+    """Motion that MuJoCo makes of the nominal model along the commands of each recording."""
 
     sim: SimModel
     made: tuple[Recording, ...]
@@ -118,7 +117,7 @@ class OwnMotion:
         """Numbers of the recordings that are long enough and in which the model moves no rougher than the arm."""
         return np.flatnonzero(np.isfinite(self.gaps).all(axis=1) & (self.rougher < ROUGHER).all(axis=1))
 
-    def floor(self, search: Search, kinds: Sequence[Point]) -> Array:
+    def floor(self, search: LoopSearch, kinds: Sequence[Point]) -> Array:
         """RMS below which nothing can be seen, (n,) [rad], from that of the measured positions about their smooth
         course, in `search`, less what the model's own motion has of that: of rows 30 ms apart it is nearly all."""
         if not self.alike.size:
@@ -128,7 +127,7 @@ class OwnMotion:
         noise = np.minimum(np.maximum(rest, noise), search.floor)
         return np.asarray(np.maximum(noise, self.missed(search, kinds)))
 
-    def missed(self, search: Search, kinds: Sequence[Point]) -> Array:
+    def missed(self, search: LoopSearch, kinds: Sequence[Point]) -> Array:
         """RMS by which the simulation of each joint by itself misses this motion where it is `alike`, (n,) [rad]."""
         some, scales = [self.made[k] for k in self.alike], [self.scales[k] for k in self.alike]
         if not some:
@@ -137,7 +136,7 @@ class OwnMotion:
         data = with_columns(thinned(data, TRIED))
         exact = replace(search, data=data, floor=np.full(self.sim.n, EXACT))
         as_it_moves = nominal_solver(exact, kinds).nominal
-        return rms_on(data, Fit(as_it_moves, ((),) * data.joints))
+        return rms_on(data, LoopFit(as_it_moves, ((),) * data.joints))
 
 
 def own_motion(

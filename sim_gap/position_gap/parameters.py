@@ -9,9 +9,7 @@ from gcomp.arrays import Array
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """One parameter of a joint's simulation."""
-
+class LoopParameter:
     name: str
     unit: str
     neutral: float
@@ -27,26 +25,26 @@ class Parameter:
 PARAMETERS = {
     p.name: p
     for p in (
-        Parameter("kp", "N·m/rad", 0.0, 1.0, 1e-4),
-        Parameter("kd", "N·m·s/rad", 0.0, 0.05),
-        Parameter("ki", "N·m/(rad·s)", 0.0, 0.5),
-        Parameter("feed", "1", 0.0, 1.0, 0.0, 1.5),
-        Parameter("delay", "s", 0.0, 0.01, -0.05, 0.4),
-        Parameter("slew", "rad/s", np.inf, 1.0, 0.02),
-        Parameter("dead", "rad", 0.0, 0.5, 0.0, 0.2, "angle"),
-        Parameter("limit", "N·m", np.inf, 1.0, 1e-3, np.inf, "torque"),
-        Parameter("coulomb", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
-        Parameter("viscous", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),
-        Parameter("back_emf", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),
-        Parameter("stribeck", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
-        Parameter("stribeck_velocity", "rad/s", 0.1, 0.1, 0.01, 1.0),
-        Parameter("creep", "rad/s", 0.0, 0.02, 0.0, 0.5),
-        Parameter("load", "N·m/(N·m)", 0.0, 0.1, 0.0, 2.0),
-        Parameter("asymmetry", "1", 0.0, 0.1, -0.95, 0.95),
-        Parameter("armature", "kg·m²", 0.0, 0.3, 0.0, np.inf, "inertia"),
-        Parameter("spring", "N·m/rad", 0.0, 0.1, 0.0, np.inf, "torque"),
-        Parameter("offset", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
-        Parameter("gain", "1", 1.0, 0.05, 0.2, 3.0),
+        LoopParameter("kp", "N·m/rad", 0.0, 1.0, 1e-4),
+        LoopParameter("kd", "N·m·s/rad", 0.0, 0.05),
+        LoopParameter("ki", "N·m/(rad·s)", 0.0, 0.5),
+        LoopParameter("feed", "1", 0.0, 1.0, 0.0, 1.5),
+        LoopParameter("delay", "s", 0.0, 0.01, -0.05, 0.4),
+        LoopParameter("slew", "rad/s", np.inf, 1.0, 0.02),
+        LoopParameter("dead", "rad", 0.0, 0.5, 0.0, 0.2, "angle"),
+        LoopParameter("limit", "N·m", np.inf, 1.0, 1e-3, np.inf, "torque"),
+        LoopParameter("coulomb", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
+        LoopParameter("viscous", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),
+        LoopParameter("back_emf", "N·m·s/rad", 0.0, 0.2, 0.0, np.inf, "damping"),
+        LoopParameter("stribeck", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
+        LoopParameter("stribeck_velocity", "rad/s", 0.1, 0.1, 0.01, 1.0),
+        LoopParameter("creep", "rad/s", 0.0, 0.02, 0.0, 0.5),
+        LoopParameter("load", "N·m/(N·m)", 0.0, 0.1, 0.0, 2.0),
+        LoopParameter("asymmetry", "1", 0.0, 0.1, -0.95, 0.95),
+        LoopParameter("armature", "kg·m²", 0.0, 0.3, 0.0, np.inf, "inertia"),
+        LoopParameter("spring", "N·m/rad", 0.0, 0.1, 0.0, np.inf, "torque"),
+        LoopParameter("offset", "N·m", 0.0, 0.1, -np.inf, np.inf, "torque"),
+        LoopParameter("gain", "1", 1.0, 0.05, 0.2, 3.0),
     )
 }
 
@@ -135,5 +133,5 @@ def relative(name: str, value: float, scales: Scales, joint: int) -> float:
 
 
 def with_gain(own: Sequence[str]) -> tuple[str, ...]:
-    """What of a joint's parameters goes with its gain where all torques change together; none without a gain."""
+    """Those of a joint's parameters that go with its gain where all torques change together; none without a gain."""
     return tuple(name for name in own if name in WITH_TORQUE and name != "kp") if "kp" in own else ()

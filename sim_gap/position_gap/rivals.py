@@ -7,13 +7,13 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.position_gap.columns import shared_effects
-from sim_gap.position_gap.fit import Fit, improve, jacobian
+from sim_gap.position_gap.fit import LoopFit, improve, jacobian
 from sim_gap.position_gap.parameters import EFFECTS
-from sim_gap.position_gap.search import PRICE, Group, Search, taken_out, with_effect
+from sim_gap.position_gap.search import PRICE, Group, LoopSearch, taken_out, with_effect
 from sim_gap.position_gap.selection import expected_shared, ranked
 
 
-def rivals_of(search: Search, fit: Fit, group: Group, bare: Fit) -> tuple[float, tuple[str, ...]]:
+def rivals_of(search: LoopSearch, fit: LoopFit, group: Group, bare: LoopFit) -> tuple[float, tuple[str, ...]]:
     """Loss of the score with the best other effect in a group's place, and those effects that lose next to nothing.
 
     `bare` is the fit without the group.
@@ -48,7 +48,7 @@ def rivals_of(search: Search, fit: Fit, group: Group, bare: Fit) -> tuple[float,
     return least, tuple(dict.fromkeys(close))
 
 
-def _of_the_arm(search: Search, fit: Fit, group: Group, bare: Fit) -> Iterator[tuple[str, float]]:
+def _of_the_arm(search: LoopSearch, fit: LoopFit, group: Group, bare: LoopFit) -> Iterator[tuple[str, float]]:
     """The effects of the whole arm in place of a group that acts as a torque along the motion, each with the loss of
     the score with it there.
 
@@ -83,8 +83,8 @@ def _of_the_arm(search: Search, fit: Fit, group: Group, bare: Fit) -> Iterator[t
         yield other, float((search.score(trial) - search.score(fit)).sum())
 
 
-def _torque_of(search: Search, fit: Fit, group: Group) -> Array | None:
-    """What a group takes of the torque along the recorded motion, (T, J, W); None of one that is no such torque."""
+def _torque_of(search: LoopSearch, fit: LoopFit, group: Group) -> Array | None:
+    """Torque of a group along the recorded motion, (T, J, W); None of one that is no such torque."""
     effect, joints = group
     data = search.data
     zero = np.zeros_like(data.recorded)
@@ -115,7 +115,7 @@ _ALWAYS = {
 """Effects that positions alone never separate."""
 
 
-def _scale_rivals(search: Search, fit: Fit) -> tuple[str, ...]:
+def _scale_rivals(search: LoopSearch, fit: LoopFit) -> tuple[str, ...]:
     """`actuator.rotor_inertia` if some joint's gain can be half as large again with all else fitted around it."""
     point = {name: x.copy() for name, x in fit.point.items()}
     active = [tuple(dict.fromkeys((*(n for n in own if n != "kp"), "armature"))) for own in fit.active]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from sim_gap.position_gap.columns import shared_effects
-from sim_gap.position_gap.fit import Fit, batch, evaluate, residuals
+from sim_gap.position_gap.fit import LoopFit, batch, evaluate, residuals
 from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.position_gap.windows import Windows
 
@@ -36,8 +36,8 @@ Group = tuple[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
-    """What the competition works on."""
+class LoopSearch:
+    """Data and nominal parameters of a competition of effects."""
 
     data: Windows
     scales: Scales
@@ -54,7 +54,7 @@ class Search:
     open_controller: bool = False
     """Whether the nominal model has no controller, so that the fitted one is no cause of a gap."""
 
-    def score(self, fit: Fit) -> Array:
+    def score(self, fit: LoopFit) -> Array:
         """Half the logarithm of the mean square, times independent samples, per joint (J,); less is better."""
         assert fit.rms is not None
         count = self.data.weight.sum(0)
@@ -62,8 +62,7 @@ class Search:
         return np.asarray(0.5 * self.samples * np.log(mean + self.floor**2))
 
     def size_of(self, name: str) -> Array:
-        """What levels of a limit are counted in, (J,): the command's highest speed, if it moves at all, or the usual
-        size of it."""
+        """Unit of the levels of a limit, (J,): the command's highest speed, if it moves at all, or the usual size."""
         if name != "slew":
             return self.scales.of(name)
         return np.asarray(np.maximum(np.abs(self.data.speed).max(axis=(0, 2)), PARAMETERS["slew"].low))
@@ -75,17 +74,16 @@ class Search:
         return np.asarray(judged / INDEPENDENT_S)
 
 
-def size_of(fit: Fit) -> int:
-    """Number of parameters of a fit."""
+def size_of(fit: LoopFit) -> int:
     return sum(len(own) for own in fit.active) + len(fit.shared)
 
 
-def price(search: Search, count: int) -> Array:
+def price(search: LoopSearch, count: int) -> Array:
     """Least fall of the score for `count` more parameters, per joint (J,)."""
     return np.asarray(np.maximum(PRICE * count, search.samples * LEAST_FALL))
 
 
-def with_effect(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
+def with_effect(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> LoopFit:
     """The fit with an effect at one joint, at the size at which it is tried."""
     names = EFFECTS[effect].parameters
     active = list(fit.active)
@@ -100,7 +98,7 @@ def with_effect(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
     return replace(fit, active=tuple(active), point=point, rms=None)
 
 
-def level_of(search: Search, fit: Fit, name: str) -> Array:
+def level_of(search: LoopSearch, fit: LoopFit, name: str) -> Array:
     """The best of some levels of a limit or an integral part at every joint, (J,): a limit that is never reached has no
     slope to follow, and one that is always reached leads nowhere; an integral part that is next to none holds the
     torque at the start and does nothing else.
@@ -121,20 +119,20 @@ def level_of(search: Search, fit: Fit, name: str) -> Array:
     return np.asarray(between[_best_level(search, fit, name, between), joints])
 
 
-def _best_level(search: Search, fit: Fit, name: str, levels: Array) -> NDArray[np.intp]:
+def _best_level(search: LoopSearch, fit: LoopFit, name: str, levels: Array) -> NDArray[np.intp]:
     """Number of the level of a parameter, of (L, J), that leaves least at each joint, (J,)."""
     gaps = residuals(search.data, batch([{**fit.point, name: level} for level in levels]))
     return np.asarray(np.einsum("ptjw,ptjw->pj", gaps, gaps).argmin(axis=0))
 
 
-def start_of(search: Search, name: str, joint: int) -> float:
+def start_of(search: LoopSearch, name: str, joint: int) -> float:
     """Value at which a parameter that is no limit enters a fit."""
     if name in ("stribeck_velocity", "gain"):
         return PARAMETERS[name].neutral
     return float(np.clip(search.scales.of(name)[joint], PARAMETERS[name].low, PARAMETERS[name].high))
 
 
-def without(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
+def without(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> LoopFit:
     """The fit without an effect at one joint: its parameters are those of the nominal model."""
     names = EFFECTS[effect].parameters
     point = {name: values.copy() for name, values in fit.point.items()}
@@ -145,8 +143,7 @@ def without(search: Search, fit: Fit, effect: str, joint: int) -> Fit:
     return replace(fit, point=point, active=tuple(active), rms=None)
 
 
-def taken_out(search: Search, fit: Fit, group: Group) -> Fit:
-    """The fit without a group."""
+def taken_out(search: LoopSearch, fit: LoopFit, group: Group) -> LoopFit:
     effect, joints = group
     if not joints:
         names = set(shared_effects(search.data.arm)[effect])
@@ -157,8 +154,7 @@ def taken_out(search: Search, fit: Fit, group: Group) -> Fit:
     return fit
 
 
-def effect_there(fit: Fit, effect: str, joint: int) -> bool:
-    """Whether a joint has an effect among its fitted parameters."""
+def effect_there(fit: LoopFit, effect: str, joint: int) -> bool:
     return EFFECTS[effect].parameters[0] in fit.active[joint]
 
 
@@ -168,23 +164,20 @@ def acts(point: Mapping[str, Array], effect: str, joint: int) -> bool:
     return bool(point[first][joint] != PARAMETERS[first].neutral)
 
 
-def effects_at(fit: Fit, joint: int) -> list[str]:
-    """Effects that are fitted at a joint."""
+def effects_at(fit: LoopFit, joint: int) -> list[str]:
     return [effect for effect in EFFECTS if effect_there(fit, effect, joint)]
 
 
-def shared_of(fit: Fit, search: Search) -> list[str]:
-    """Effects of the whole arm that a fit has."""
+def shared_of(fit: LoopFit, search: LoopSearch) -> list[str]:
     return [e for e, names in shared_effects(search.data.arm).items() if set(names) & set(fit.shared)]
 
 
-def only(fit: Fit, tried: dict[int, str]) -> Fit:
+def only(fit: LoopFit, tried: dict[int, str]) -> LoopFit:
     """The fit with the parameters of other joints held."""
     return replace(fit, active=tuple(own if j in tried else () for j, own in enumerate(fit.active)), shared=())
 
 
-def merged(fit: Fit, other: Fit, joint: int) -> Fit:
-    """The fit with one joint's parameters from another."""
+def merged(fit: LoopFit, other: LoopFit, joint: int) -> LoopFit:
     point = {name: values.copy() for name, values in fit.point.items()}
     for name in point:
         point[name][joint] = other.point[name][joint]
@@ -194,10 +187,10 @@ def merged(fit: Fit, other: Fit, joint: int) -> Fit:
 
 
 LEAST_COUNT = 0.02
-"""What a window counts at least, over one of the other kind."""
+"""Least weight of a window, over one of the other kind."""
 
 
-def counted(search: Search, data: Windows, fit: Fit | None = None) -> Windows:
+def counted(search: LoopSearch, data: Windows, fit: LoopFit | None = None) -> Windows:
     """The windows as a search counts them: both kinds as much, and nothing of joints that rest, of which any friction
     holds the place."""
     data = balanced(data, fit)
@@ -207,7 +200,7 @@ def counted(search: Search, data: Windows, fit: Fit | None = None) -> Windows:
     return replace(data, weight=data.weight * np.array(moves, float)[:, None])
 
 
-def balanced(data: Windows, fit: Fit | None = None) -> Windows:
+def balanced(data: Windows, fit: LoopFit | None = None) -> Windows:
     """The windows, with each in which a joint's servo is mostly off counted less, such that both kinds leave as much.
 
     What they leave is what the fit leaves of them; without a fit, the way to the command, and the motion while there is

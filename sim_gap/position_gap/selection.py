@@ -10,13 +10,13 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.position_gap.columns import shared_effects
-from sim_gap.position_gap.fit import Fit, batch, evaluate, improve, jacobian, residuals
+from sim_gap.position_gap.fit import LoopFit, batch, evaluate, improve, jacobian, residuals
 from sim_gap.position_gap.parameters import EFFECTS, LOGARITHMIC, PARAMETERS
 from sim_gap.position_gap.search import (
     LEAST_FALL,
     LEVELS,
     PRICE,
-    Search,
+    LoopSearch,
     acts,
     effect_there,
     effects_at,
@@ -33,13 +33,13 @@ DOUBTFUL = 4.0
 """Expected loss, in prices, up to which it is tried whether an effect is needed."""
 
 
-def pruned(search: Search, fit: Fit) -> Fit:
+def pruned(search: LoopSearch, fit: LoopFit) -> LoopFit:
     """The fit without effects whose removal costs less than their price."""
     for _ in range(2):
         before, best, changed = search.score(fit), fit, False
         doubtful = _doubtful(search, fit)
         removable = [[e for e in each if (j, e) in doubtful] for j, each in enumerate(removable_at(search, fit))]
-        losses: list[list[tuple[float, str, Fit]]] = [[] for _ in removable]
+        losses: list[list[tuple[float, str, LoopFit]]] = [[] for _ in removable]
         for j, effect, trial in without_each(search, fit, removable):
             losses[j].append((float((search.score(trial) - before)[j]), effect, trial))
         for j, each in enumerate(losses):
@@ -53,7 +53,7 @@ def pruned(search: Search, fit: Fit) -> Fit:
     return fit
 
 
-def without_each(search: Search, fit: Fit, removable: list[list[str]]) -> Iterator[tuple[int, str, Fit]]:
+def without_each(search: LoopSearch, fit: LoopFit, removable: list[list[str]]) -> Iterator[tuple[int, str, LoopFit]]:
     """Joint, effect and the fit without it, that joint fitted again; for every effect of each joint's list."""
     for rank in range(max((len(each) for each in removable), default=0)):
         tried = {j: each[rank] for j, each in enumerate(removable) if rank < len(each)}
@@ -66,7 +66,7 @@ def without_each(search: Search, fit: Fit, removable: list[list[str]]) -> Iterat
             yield j, effect, trial
 
 
-def _doubtful(search: Search, fit: Fit) -> set[tuple[int, str]]:
+def _doubtful(search: LoopSearch, fit: LoopFit) -> set[tuple[int, str]]:
     """Effects whose removal is expected to cost less than some times their price, from the slopes of the fit."""
     now, slopes = jacobian(search.data, fit, search.scales, fit.active)
     found = set[tuple[int, str]]()
@@ -88,7 +88,7 @@ def _doubtful(search: Search, fit: Fit) -> set[tuple[int, str]]:
     return found
 
 
-def _distance(search: Search, fit: Fit, name: str, joint: int) -> float:
+def _distance(search: LoopSearch, fit: LoopFit, name: str, joint: int) -> float:
     """Distance of a parameter from the nominal one, in its own coordinate."""
     value, nominal = float(fit.point[name][joint]), float(search.nominal[name][joint])
     if name in LOGARITHMIC:
@@ -96,17 +96,17 @@ def _distance(search: Search, fit: Fit, name: str, joint: int) -> float:
     return (value - nominal) / float(search.scales.of(name)[joint])
 
 
-def removable_at(search: Search, fit: Fit) -> list[list[str]]:
+def removable_at(search: LoopSearch, fit: LoopFit) -> list[list[str]]:
     """Effects of each joint that may be taken out."""
     return [[e for e in effects_at(fit, j) if _removable(search, fit, e, j)] for j in range(search.data.joints)]
 
 
-def _removable(search: Search, fit: Fit, effect: str, joint: int) -> bool:
+def _removable(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> bool:
     needed = any(effect in EFFECTS[other].needs for other in effects_at(fit, joint))
     return effect not in search.kept and (not needed or acts(search.nominal, effect, joint))
 
 
-def ranked(search: Search, fit: Fit, own: Sequence[str]) -> list[list[tuple[float, str]]]:
+def ranked(search: LoopSearch, fit: LoopFit, own: Sequence[str]) -> list[list[tuple[float, str]]]:
     """Candidates of each joint with the expected fall of its score, best first."""
     now, slopes = jacobian(search.data, fit, search.scales, fit.active, fit.shared)
     falls: list[list[tuple[float, str]]] = [[] for _ in range(search.data.joints)]
@@ -128,13 +128,13 @@ def ranked(search: Search, fit: Fit, own: Sequence[str]) -> list[list[tuple[floa
     return [sorted(each, reverse=True) for each in falls]
 
 
-def _one_sided(fit: Fit, effect: str, joint: int) -> bool:
+def _one_sided(fit: LoopFit, effect: str, joint: int) -> bool:
     """Whether the effect's first parameter can only grow from where it is, or is a limit."""
     first = PARAMETERS[EFFECTS[effect].parameters[0]]
     return bool(fit.point[first.name][joint] <= first.low or np.isinf(first.neutral))
 
 
-def _change(search: Search, fit: Fit, effect: str) -> list[dict[str, Array]]:
+def _change(search: LoopSearch, fit: LoopFit, effect: str) -> list[dict[str, Array]]:
     """Points that differ from the fit by one parameter of the effect at every joint."""
     out = []
     for name in EFFECTS[effect].parameters:
@@ -171,7 +171,7 @@ def _explained(residual: Array, known: Array, columns: Array, signed: bool) -> f
 
 
 def expected_shared(
-    search: Search, fit: Fit, now: Array, slopes: list[Array], columns: tuple[str, ...], names: tuple[str, ...]
+    search: LoopSearch, fit: LoopFit, now: Array, slopes: list[Array], columns: tuple[str, ...], names: tuple[str, ...]
 ) -> float:
     """Expected fall of the score by coefficients that all joints share."""
     total = len(names)
@@ -203,7 +203,7 @@ ROUNDS = 6
 Progress = Callable[[str], None]
 
 
-def select(search: Search, fit: Fit, progress: Progress = lambda text: None) -> Fit:
+def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> LoopFit:
     """Add effects while they pay, joint by joint and for the whole arm, then take out what is not needed."""
     own = [e for e in EFFECTS if e not in search.excluded]
     fit = improve(search.data, fit, search.scales)
@@ -224,7 +224,7 @@ def select(search: Search, fit: Fit, progress: Progress = lambda text: None) -> 
     return pruned(search, fit)
 
 
-def select_about(search: Search, fit: Fit, progress: Progress = lambda text: None) -> Fit:
+def select_about(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> LoopFit:
     """The better of two selections: from `fit`, whose gains and friction are free, and from the nominal model as it is.
 
     A free gain with damping takes the place of a delay, of a limit or of friction, which then are not looked for any
@@ -235,11 +235,11 @@ def select_about(search: Search, fit: Fit, progress: Progress = lambda text: Non
         return found
     progress("from the model's own controller")
     own = {name: values.copy() for name, values in search.nominal.items()}
-    other = select(replace(search, kept=frozenset()), Fit(own, ((),) * search.data.joints), progress)
+    other = select(replace(search, kept=frozenset()), LoopFit(own, ((),) * search.data.joints), progress)
     return _better(search, found, other)
 
 
-def _better(search: Search, one: Fit, other: Fit) -> Fit:
+def _better(search: LoopSearch, one: LoopFit, other: LoopFit) -> LoopFit:
     """Of two fits that with the lower score, each parameter at its price; joint by joint where nothing couples them."""
     scores = np.array([search.score(fit) + PRICE * np.array([len(own) for own in fit.active]) for fit in (one, other)])
     if one.shared or other.shared:
@@ -251,8 +251,8 @@ def _better(search: Search, one: Fit, other: Fit) -> Fit:
 
 
 def _own_round(
-    search: Search, fit: Fit, candidates: list[list[tuple[float, str]]], open_joints: set[int]
-) -> tuple[Fit, set[int]]:
+    search: LoopSearch, fit: LoopFit, candidates: list[list[tuple[float, str]]], open_joints: set[int]
+) -> tuple[LoopFit, set[int]]:
     """Fit the best candidates of every joint and keep the best where it pays."""
     before = search.score(fit)
     best, best_score, changed = fit, before.copy(), set[int]()
@@ -275,12 +275,14 @@ def _own_round(
     return (evaluate(search.data, best) if changed else fit), changed
 
 
-def _restored(fit: Fit, tried: dict[int, str], joint: int) -> tuple[str, ...]:
+def _restored(fit: LoopFit, tried: dict[int, str], joint: int) -> tuple[str, ...]:
     extra = EFFECTS[tried[joint]].parameters if joint in tried else ()
     return (*fit.active[joint], *extra)
 
 
-def _shared_round(search: Search, fit: Fit, whole: dict[str, tuple[str, ...]], best_own: float) -> Fit | None:
+def _shared_round(
+    search: LoopSearch, fit: LoopFit, whole: dict[str, tuple[str, ...]], best_own: float
+) -> LoopFit | None:
     """The fit with the best effect of the whole arm, if that pays and no joint's own effect is better."""
     there = {effect: tuple(n for n in names if n in search.data.columns) for effect, names in whole.items()}
     there = {effect: names for effect, names in there.items() if names and names[0] not in fit.shared}

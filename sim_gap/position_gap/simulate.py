@@ -76,7 +76,7 @@ class _Joints:
         return self.given[name] if name in self.given else np.full(self.shape, neutral)
 
     def steps(self, first: int, last: int) -> Iterator[tuple[Array, ...]]:
-        """What does not depend on the motion, for each of some steps, (P, J, W) or such that it broadcasts.
+        """Terms that do not depend on the motion, for each of some steps, (P, J, W) or such that they broadcast.
 
         The command; the controller's torque beside that of error, its integral and velocity; the torque per torque of
         the controller; of the links' torque and all else that is constant, the part at the recorded angle and the

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import Fit, jacobian
+from sim_gap.position_gap.fit import LoopFit, jacobian
 from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.parameters import moved
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.windows import Windows
 
 ERROR = 0.01
@@ -46,7 +46,7 @@ class Sound:
     """Whether a sound arm may have these errors, and they leave nothing that matters."""
 
 
-def errors_of(search: Search) -> list[dict[str, float]]:
+def errors_of(search: LoopSearch) -> list[dict[str, float]]:
     """Standard deviation of each parameter of a sound arm in its own coordinate, of joints and links."""
     data, nominal, scales = search.data, search.nominal, search.scales
     friction = np.minimum(FRICTION_NM, FRICTION_SHARE * scales.torque)
@@ -65,7 +65,7 @@ def errors_of(search: Search) -> list[dict[str, float]]:
     return [*own, {name: size for name, size in links.items() if name in data.columns}]
 
 
-def sound(search: Search, heldout: Windows, margin: Array) -> Sound:
+def sound(search: LoopSearch, heldout: Windows, margin: Array) -> Sound:
     """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
     sizes = errors_of(search)
     deviations = np.array([size for each in sizes for size in each.values()])
@@ -112,7 +112,7 @@ def _correlation(sizes: list[dict[str, float]]) -> Array:
     return np.asarray(np.diag(1.0 - share * late) + share * np.outer(late, late))
 
 
-def _fit(search: Search, sizes: list[dict[str, float]], errors: Array) -> Fit:
+def _fit(search: LoopSearch, sizes: list[dict[str, float]], errors: Array) -> LoopFit:
     """The nominal model with errors, in standard deviations."""
     point = {name: values.copy() for name, values in search.nominal.items()}
     left = iter(errors)
@@ -121,11 +121,11 @@ def _fit(search: Search, sizes: list[dict[str, float]], errors: Array) -> Fit:
             point[name][j] = moved(name, point[name][j], size * next(left), search.scales, j)
     for name, size in sizes[-1].items():
         point[name] = point[name] + size * next(left)
-    return Fit(point, ((),) * search.data.joints)
+    return LoopFit(point, ((),) * search.data.joints)
 
 
 def _weighed(
-    search: Search, fit: Fit, sizes: list[dict[str, float]], deviations: Array
+    search: LoopSearch, fit: LoopFit, sizes: list[dict[str, float]], deviations: Array
 ) -> tuple[list[Array], list[Array]]:
     """Of each joint the gap of a fit (N,) and its change by one standard deviation of each parameter (K, N), such that
     their norms are RMS values [rad]."""

@@ -25,8 +25,8 @@ REST = 0.03
 JOINTS = 2
 """Least number of joints that must show a surface: at one alone, a stop looks the same."""
 SURE, ALSO = (0.6, 2.0), (0.35, 1.5)
-"""What shows it at one joint, and at the others: the share of the squared error below it that a surface takes, and the
-error that it makes over what is usual."""
+"""Signs of it at one joint, and at the others: the share of the squared error below it that a surface takes, and the
+error that it makes over the usual one."""
 MOST = 0.3
 """Largest share of the samples that touch: what happens more often is a property of the arm."""
 FEWEST = 20
@@ -109,9 +109,9 @@ class _Looked:
     q: Array
     command: Array
     besides: list[Array]
-    """What controller, friction and gravity do to the error of each joint: an orthonormal basis, (K, m) each."""
+    """Error of each joint by controller, friction and gravity: an orthonormal basis, (K, m) each."""
     error: Array
-    """What they leave of it over its RMS, (K, n)."""
+    """Error that they leave over its RMS, (K, n)."""
 
     @classmethod
     def of(cls, arm: RigidArm, recordings: Sequence[Recording]) -> "_Looked":
@@ -142,7 +142,7 @@ class _Looked:
 
 
 class _Under:
-    """What a surface under one link makes of the errors; x = (point in the link's frame, height), (4,) [m]."""
+    """Errors that a surface under one link makes; x = (point in the link's frame, height), (4,) [m]."""
 
     def __init__(self, looked: _Looked, link: int) -> None:
         self.looked, self.link, arm = looked, link, looked.arm
@@ -155,7 +155,7 @@ class _Under:
         self.near = NEAR * max(length, SHORTEST_M)
 
     def surface(self) -> tuple[float, Surface] | None:
-        """What a surface takes of the squared errors, and the surface; None if none is clearly there."""
+        """Part of the squared errors that a surface takes, and the surface; None if none is clearly there."""
         scale = [self.near, self.near, self.near, 0.3 * self.near]
         levels = np.quantile(self.origin + self.centre @ self.up, FIRST_HEIGHTS)
         starts = [np.append(self.centre, level) for level in levels]

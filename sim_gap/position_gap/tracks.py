@@ -18,7 +18,7 @@ MODEL_HZ = 50.0
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class RecordingTrack:
     """One recording on the even time base of the simulation, (K, n) each."""
 
     t: Array
@@ -48,7 +48,7 @@ def smoothing(period: float, dt: float) -> Callable[[Array], Array]:
     return low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period, 0.4 / dt), 1.0 / dt)
 
 
-def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Track:
+def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> RecordingTrack:
     """Motion, command and the model's torques along both, on an even time base."""
     if recording.position_command is None or not np.isfinite(recording.position_command).any():
         raise BadInput(f"{label}: neither a torque channel nor a commanded position: record tau_1 … or q_cmd_1 …")
@@ -76,7 +76,7 @@ def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Trac
     inertia, slope = own[:, : arm.n], own[:, arm.n :]
     whole = along(arm.torque, q, v, a)
     needed = whole + arm.spring_torque(q) + arm.nominal_joint_torque(v, a, still)
-    return Track(
+    return RecordingTrack(
         t,
         {
             "command": held,

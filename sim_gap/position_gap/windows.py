@@ -18,7 +18,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.position_gap.surface import Surface
-from sim_gap.position_gap.tracks import Track, in_one_order, period_of, track_of
+from sim_gap.position_gap.tracks import RecordingTrack, in_one_order, period_of, track_of
 
 STEP_S = 0.0051
 """Longest step of the simulation [s]; the recording's period is a multiple of the step."""
@@ -60,7 +60,7 @@ class Windows:
     measured: Array
     """Measured position, (To, J, W) [rad]."""
     weight: Array
-    """What a sample counts, (To, J, W): 0 where nothing was measured, else 1, or less (`balance`)."""
+    """Weight of a sample, (To, J, W): 0 where nothing was measured, else 1, or less (`search.balanced`)."""
     start: Array
     """Position and velocity at the first step, (2, J, W)."""
     error_sum: Array
@@ -91,17 +91,14 @@ class Windows:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
         return int(self.command.shape[1])
 
     @property
     def count(self) -> int:
-        """Number of windows."""
         return int(self.command.shape[2])
 
     @property
     def of_one_recording(self) -> bool:
-        """Whether all windows are of a single recording."""
         return len(np.unique(self.recording)) == 1
 
 
@@ -137,7 +134,9 @@ def windows_of(
     return Windows(dt=dt, stride=stride, warm=warm, period=period, arm=arm, recording=number_of, scale=scale, **stacked)
 
 
-def _cut(arm: RigidArm, track: Track, number: int, warm: int, length: int, stride: int) -> list[dict[str, Array]]:
+def _cut(
+    arm: RigidArm, track: RecordingTrack, number: int, warm: int, length: int, stride: int
+) -> list[dict[str, Array]]:
     """Windows of one recording; the last is padded and counts only as long as it goes."""
     dt = float(track.t[1] - track.t[0])
     rows, total = len(track.t), warm + length
@@ -198,13 +197,11 @@ def _even(total: int, count: int) -> NDArray[np.intp]:
 
 
 def of_windows(data: Windows, chosen: NDArray[np.intp]) -> Windows:
-    """Some of the windows, by their numbers."""
     values: dict[str, Any] = {name: x[..., chosen] for name, x in vars(data).items() if isinstance(x, np.ndarray)}
     return replace(data, **values, columns={name: x[..., chosen] for name, x in data.columns.items()})
 
 
 def of_joints(data: Windows, joints: Sequence[int]) -> Windows:
-    """The windows of some joints."""
     chosen = list(joints)
     arrays = {name: x for name, x in vars(data).items() if isinstance(x, np.ndarray) and x.ndim >= 2}
     values: dict[str, Any] = {name: x[..., chosen, :] for name, x in arrays.items()}

@@ -13,7 +13,7 @@ from sim_gap.report.effect_text import CHANNEL_WORDS
 from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, stacked, thinned
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 AGAINST = {
@@ -81,17 +81,16 @@ def abscissa(data: ResidualSet, joint: int, quantity: str) -> Array:
 
 
 def is_of(term: Term, cause: Cause, names: tuple[str, ...]) -> bool:
-    """Whether a term is a part of a cause at joints of these names."""
     return term.effect == cause.effect and ("arm" in cause.parameters or names[term.place] in cause.joints)
 
 
-def _sums(data: ResidualSet, estimate: Estimate, terms: tuple[Term, ...]) -> dict[Row, Array]:
+def _sums(data: ResidualSet, estimate: EffectEstimate, terms: tuple[Term, ...]) -> dict[Row, Array]:
     out: dict[Row, Array] = estimate.predict(data, terms=terms)
     return {row: np.asarray(values) for row, values in out.items()}
 
 
 def law_figure(answer: Diagnosis, law: ResidualLaw) -> Any:
-    """What the effects leave of the law's row on held-out data, over its quantity; the law with its band."""
+    """Residual that the effects leave of the law's row on held-out data, over its quantity; the law with its band."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
     row, joint = (law.channel, law.joint), answer.names[law.joint]
     left = (data.values if estimate is None else left_over(data, estimate.predict(data)))[row]

@@ -24,7 +24,6 @@ def sections(answer: Diagnosis) -> list[Section]:
 
 
 def write_report(answer: Diagnosis, path: Path, title: str = "Sim-to-real gap", subtitle: str = "") -> None:
-    """Write one self-contained HTML file."""
     render(path, title, sections(answer), subtitle)
 
 
@@ -114,7 +113,6 @@ def _over_time(answer: Diagnosis) -> list[Section]:
 
 
 def _causes(answer: Diagnosis) -> list[Section]:
-    """A figure for every cause."""
     figures = [cause_figure(answer, cause) for cause in answer.causes]
     shown = [figure for figure in figures if figure is not None]
     if not shown:
@@ -127,7 +125,6 @@ def _causes(answer: Diagnosis) -> list[Section]:
 
 
 def _laws(answer: Diagnosis) -> list[Section]:
-    """A figure for every law outside the library."""
     if not answer.laws:
         return []
     text = (

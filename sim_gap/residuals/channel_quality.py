@@ -79,7 +79,6 @@ def spikes_of(t: Array, values: Array) -> Mask:
 
 
 def _spikes(t: Array, values: Array) -> Mask:
-    """Those of one joint, (K,)."""
     out = np.zeros(len(values), bool)
     there = np.flatnonzero(np.isfinite(values))
     if len(there) < 100:

@@ -11,7 +11,7 @@ from sim_gap.residuals.channel_quality import spectrum
 from sim_gap.residuals.disturbances import calm, disturbances, far_off
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.location import Location
-from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, Signals
+from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 
 AT_REST = 0.05
@@ -172,7 +172,7 @@ def _resonance(frequency: Array, density: Array) -> tuple[float, float] | None:
     return best
 
 
-def _known(data: ResidualSet, s: Signals, row: Row) -> Mask:
+def _known(data: ResidualSet, s: PreparedSignals, row: Row) -> Mask:
     there = s.filtered(s.known[row[0]][:, row[1]]) > 0.9
     reference = data.layout.reference(row)
     return there & (s.filtered(s.known[reference][:, row[1]]) > 0.9) if reference else there

@@ -7,7 +7,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 
 CLEAR = 0.25
@@ -54,7 +54,7 @@ def locate(
     return sorted(out, key=lambda location: -location.rms / max(location.noise, 1e-9))
 
 
-def _features(s: Signals) -> dict[str, Array]:
+def _features(s: PreparedSignals) -> dict[str, Array]:
     """Columns by regime, filtered, (K, n, p)."""
     t = np.broadcast_to((s.t / max(float(s.t[-1]), 1.0))[:, None], s.q.shape)
     near_reversal = np.exp(-((s.v / 0.05) ** 2))

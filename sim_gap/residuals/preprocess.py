@@ -16,7 +16,7 @@ from scipy.signal import butter, sosfiltfilt, sosfreqz
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.model.rigid_body import CREEP, Motion, RigidArm, Wrenches, torque_slopes
+from sim_gap.model.rigid_body import CREEP, LinkMotion, RigidArm, Wrenches, torque_slopes
 from sim_gap.residuals.channel_quality import (
     Spikes,
     Stuck,
@@ -54,7 +54,7 @@ CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_com
 
 
 @dataclass(frozen=True, eq=False)
-class Signals:
+class PreparedSignals:
     """One recording at an even work rate, with the nominal model's torque along its motion."""
 
     label: str
@@ -90,16 +90,14 @@ class Signals:
     disturbances: tuple[Disturbance, ...] = ()
     """Moments at which something touched the arm, or torques were misread; there they are not `known`."""
     found: "Found | None" = None
-    """What an estimate has found, if q, v, a and arm are those of the estimate."""
+    """The estimate's torques, if q, v, a and arm are those of the estimate."""
 
     @property
     def n(self) -> int:
-        """Number of joints."""
         return int(self.q.shape[1])
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Torque channels present."""
         return tuple(self.reading)
 
     @cached_property
@@ -134,7 +132,7 @@ class Signals:
         return self.model if self.found is None else self.model + self.found.bent
 
     @property
-    def read(self) -> "Signals":
+    def read(self) -> "PreparedSignals":
         """The signals as they were read: positions without the corrections of an estimate."""
         return self if self.found is None else self.found.read
 
@@ -152,7 +150,7 @@ class Signals:
         return self.arm.link_regressor(self._motion, link)
 
     @cached_property
-    def _motion(self) -> Motion:
+    def _motion(self) -> LinkMotion:
         return self.arm.motion(self.q, self.v, self.a)
 
     @cached_property
@@ -243,16 +241,16 @@ class Signals:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What an estimate adds to the torques along a recording."""
+    """Torques that an estimate adds along a recording."""
 
-    read: Signals
+    read: PreparedSignals
     """The signals before the estimate."""
     link: Array
     """Torque of the links and of springs across the joints [N·m], (K, n)."""
     lost: Array
     """Torque between link and motor beside the nominal model's: friction, rotors, ripple [N·m], (K, n)."""
     bent: Array
-    """What the sensor adds by hysteresis, crosstalk and the like, before gain and offset [N·m], (K, n)."""
+    """Torque that the sensor adds by hysteresis, crosstalk and the like, before gain and offset [N·m], (K, n)."""
     springs: Array | float = 0.0
     """Share of `link` that springs across the joints have [N·m], (K, n)."""
 
@@ -274,7 +272,7 @@ def prepare(
     number: int = 0,
     groups: tuple[str, ...] = (),
     start: float | None = None,
-) -> Signals:
+) -> PreparedSignals:
     """Prepare a recording for the comparison with `arm`. Raises BadInput if it cannot be used, with the reason.
 
     `start` is the time at which the recording that this is a part of began [s]; times count from there.
@@ -319,7 +317,9 @@ def prepare(
     known = {channel: there * ~near for channel, there in known.items()}
     clock = times - (times[0] if start is None else start)
     temperature = _warmth(recording, times)
-    signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, temperature, number, groups)
+    signals = PreparedSignals(
+        label, rate, band, clock, q, v, a, reading, known, noise, arm, temperature, number, groups
+    )
     return _without_stuck(replace(signals, spikes=counted(spikes, channels)), recording)
 
 
@@ -333,7 +333,7 @@ def _warmth(recording: Recording, times: Array) -> Array | None:
     return np.stack(parts, axis=1)
 
 
-def _without_stuck(s: Signals, recording: Recording) -> Signals:
+def _without_stuck(s: PreparedSignals, recording: Recording) -> PreparedSignals:
     """The signals with stuck readings marked as not known."""
     known, found = dict(s.known), []
     for channel in s.channels:

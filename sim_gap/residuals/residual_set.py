@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
 from gcomp.arrays import Array, Mask
-from sim_gap.residuals.layout import Layout, Row, layout_of
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.layout import ChannelLayout, Row, layout_of
+from sim_gap.residuals.preprocess import PreparedSignals
 
 BEFORE_S, AFTER_S = 0.4, 0.6
 """Time left out before and after a change of sign of the torque [s]."""
@@ -24,7 +24,7 @@ LEAST_LEFT = 0.2
 """Share of a recording that must remain."""
 
 
-def near_impacts(s: Signals, channel: str, residual: Array) -> dict[int, Mask]:
+def near_impacts(s: PreparedSignals, channel: str, residual: Array) -> dict[int, Mask]:
     """Joints whose gear hits at their torque reversals, and the samples near those, (k,) each.
 
     `residual` is that of the link-side sensor `channel`, (k, n), at the rate of the comparison.
@@ -71,12 +71,11 @@ BLOCK_S = 2.0
 class ResidualSet:
     """Recordings with a common layout. Arrays are at the decimated rate, recordings concatenated."""
 
-    signals: tuple[Signals, ...]
-    layout: Layout
+    signals: tuple[PreparedSignals, ...]
+    layout: ChannelLayout
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Channel and joint of each residual."""
         return self.layout.rows
 
     @cached_property
@@ -96,10 +95,9 @@ class ResidualSet:
 
     @cached_property
     def _stacked(self) -> list[dict[Row, Array]]:
-        """`values` of each recording."""
         return [self._differences(s) for s in self.signals]
 
-    def _differences(self, s: Signals) -> dict[Row, Array]:
+    def _differences(self, s: PreparedSignals) -> dict[Row, Array]:
         layout = self.layout
         out: dict[Row, Array] = {}
         joints = s.arm.nominal_joint_torque(s.v, s.a, s.direction)
@@ -185,7 +183,7 @@ class ResidualSet:
         build = max(float(self.usual_torque.max()), self.signals[0].arm.stretched_torque)
         return torque * min(1.0, build / SMALL_ARM_NM)
 
-    def _floor(self, s: Signals, row: Row, rest: Array) -> float:
+    def _floor(self, s: PreparedSignals, row: Row, rest: Array) -> float:
         channel, joint = row
         reference = self.layout.reference(row)
         noise = float(np.linalg.norm([s.noise[name][joint] for name in (channel, reference) if name]))
@@ -241,13 +239,15 @@ class ResidualSet:
         return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), least) for row in self.rows}
 
 
-def residual_sets(train: Sequence[Signals], heldout: Sequence[Signals]) -> tuple[ResidualSet, ResidualSet]:
+def residual_sets(
+    train: Sequence[PreparedSignals], heldout: Sequence[PreparedSignals]
+) -> tuple[ResidualSet, ResidualSet]:
     """Residuals of the training and of the held-out recordings, in a common layout."""
     layout = layout_of([*train, *heldout])
     return ResidualSet(tuple(train), layout), ResidualSet(tuple(heldout), layout)
 
 
-def sliding(s: Signals) -> Mask:
+def sliding(s: PreparedSignals) -> Mask:
     """Samples at which each joint slides before and after, so that its friction is fully developed, (k, n).
 
     Around rest and reversals friction builds up over some distance. If a joint hardly does anything else, these samples

@@ -52,7 +52,6 @@ class ColumnStore:
         pins: Values | None = None,
         slopes: "ColumnStore | None" = None,
     ) -> "ColumnStore":
-        """The columns about other values."""
         return ColumnStore(self.data, values, self.nominal or self, pins, slopes=slopes)
 
     def beside(self, near: "ColumnStore | None") -> "ColumnStore":
@@ -97,7 +96,6 @@ class ColumnStore:
 
     @cached_property
     def about(self) -> list[About]:
-        """Each recording about the estimate."""
         return [about(s, self.data.layout, self.values) for s in self.data.signals]
 
     def release(self) -> None:
@@ -118,7 +116,7 @@ class ColumnStore:
         return self._columns[term]
 
     def offset(self, term: Term) -> Columns:
-        """What a nonlinear term is beside its columns times its coefficients, (K, 1) per row; empty if it is linear."""
+        """Part of a nonlinear term beside its columns times its coefficients, (K, 1) per row; empty if it is linear."""
         if term not in self._columns:
             self._compute(term)
         return self._offsets[term]
@@ -169,7 +167,7 @@ class ColumnStore:
         return self.slopes._columns.get(term)
 
     def _beside(self, term: Term) -> Columns:
-        """What a term is beside derivatives that are not about its estimate, (K, 1) per row."""
+        """Part of a term beside derivatives that are not about its estimate, (K, 1) per row."""
         own, layout = self._columns[term], self.data.layout
         parts = []
         for one in self.about:

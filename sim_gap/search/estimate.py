@@ -13,7 +13,7 @@ from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.normal_equations import CORRELATED, NormalEquations
-from sim_gap.search.stepwise import Search
+from sim_gap.search.stepwise import StepwiseSearch
 from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import shares_a_factor
 
@@ -30,15 +30,13 @@ length."""
 
 @dataclass(frozen=True)
 class Value:
-    """One reported parameter."""
-
     value: float
     low: float
     high: float
     unit: str
 
 
-class Estimate:
+class EffectEstimate:
     """Terms fitted to a training set."""
 
     def __init__(self, store: ColumnStore, terms: list[Term]) -> None:
@@ -46,12 +44,11 @@ class Estimate:
         self.store = store
         self.normal = NormalEquations(store, terms)
         self.terms = tuple(self.normal.terms)
-        self.search = Search(self.normal, list(self.terms))
+        self.search = StepwiseSearch(self.normal, list(self.terms))
         self.index, self.coefficients = self.search.weighted.fit(self.terms)
         self._elsewhere: ColumnStore | None = None
 
     def of(self, term: Term) -> Array:
-        """Coefficients of one term."""
         return self.coefficients[self.normal.at[term]]
 
     def subset(self, terms: list[Term]) -> Array:
@@ -82,7 +79,6 @@ class Estimate:
 
     @cached_property
     def _shaped(self) -> list[Term]:
-        """Terms with a fitted entry of the shape."""
         return [term for term in self.terms if term.free is not None]
 
     def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
@@ -174,7 +170,6 @@ class Estimate:
         return float(stdtrit(self._freedom, 0.975))
 
     def parameters(self, term: Term) -> dict[str, Value]:
-        """Reported parameters with 95 % intervals."""
         reported, start, chosen = self._reported(term)
         centre, steps = reported(start), 1e-5 * np.maximum(np.abs(start), 1e-3)
         slopes = [

@@ -14,7 +14,7 @@ from gcomp.arrays import Array
 from sim_gap.effects.link import pseudo_inertia
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.search.about import inertial_change
-from sim_gap.search.stepwise import Search
+from sim_gap.search.stepwise import StepwiseSearch
 from sim_gap.search.term import Term
 
 BARRIERS = (1e-1, 1e-2, 1e-3, 1e-4)
@@ -28,7 +28,7 @@ Matrix = Callable[[Array], Array]
 Places = NDArray[np.intp]
 
 
-def pins(search: Search, arm: RigidArm) -> dict[Term, Array]:
+def pins(search: StepwiseSearch, arm: RigidArm) -> dict[Term, Array]:
     """Coefficients of the terms that a fit would give to links that cannot exist, at the closest that can."""
     index, coefficients = search.weighted.fit(search.active)
     values = {term: coefficients[np.isin(index, search.normal.at[term])] for term in search.active}
@@ -82,7 +82,7 @@ def _positive(matrix: Array) -> bool:
     return bool(np.linalg.eigvalsh(matrix).min() > MARGIN * max(float(np.trace(matrix)), 0.0))
 
 
-def _alone(search: Search, index: Places, at: Places) -> Array:
+def _alone(search: StepwiseSearch, index: Places, at: Places) -> Array:
     """Curvature of the weighted squares in the coefficients `at`, all others of the fit adapting, (p, p)."""
     weighted = search.weighted
     rest = np.setdiff1d(index, at).astype(int)

@@ -11,7 +11,7 @@ from gcomp.arrays import Array
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.feasible import pins
 from sim_gap.search.normal_equations import NormalEquations
-from sim_gap.search.stepwise import Search
+from sim_gap.search.stepwise import StepwiseSearch
 from sim_gap.search.term import Term
 
 STEPS = 10
@@ -42,13 +42,13 @@ def converged(
     slopes: ColumnStore | None = None
     for _ in range(STEPS):
         store = nominal.at(values, slopes=slopes)
-        search = Search(NormalEquations(store, terms), terms)
+        search = StepwiseSearch(NormalEquations(store, terms), terms)
         now = score(store, values, search.normal)
         halved = 0
         while values and now > best + WORSE and halved < HALVED:
             values = {t: 0.5 * (c + kept.get(t, 0.0 * c)) for t, c in values.items()}
             store = nominal.at(values, slopes=slopes)
-            search = Search(NormalEquations(store, terms), terms)
+            search = StepwiseSearch(NormalEquations(store, terms), terms)
             now, halved = score(store, values, search.normal), halved + 1
         if values:
             best, kept, slopes = now, values, slopes or store
@@ -66,7 +66,7 @@ def converged(
     return nominal.at(values, {term: c for term, c in held.items() if term in values}), terms
 
 
-def _step(search: Search) -> tuple[list[Term], Values]:
+def _step(search: StepwiseSearch) -> tuple[list[Term], Values]:
     """The terms of a fit, nonlinear ones at the size fitted, and their coefficients."""
     index, coefficients = search.weighted.fit(search.active)
     whole = np.zeros(search.normal.size)
@@ -99,7 +99,7 @@ def score(store: ColumnStore, values: Values, normal: NormalEquations) -> float:
     return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
 
 
-def _change(search: Search, old: Values, new: Values) -> float:
+def _change(search: StepwiseSearch, old: Values, new: Values) -> float:
     """Largest change of a row's prediction by a step, as a share of the residual beside it and the relevance floor."""
     normal = search.normal
     change = np.zeros(normal.size)

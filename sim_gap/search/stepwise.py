@@ -27,7 +27,7 @@ MUCH = 3.0
 
 
 @dataclass
-class Search:
+class StepwiseSearch:
     """Stepwise search over one set of normal equations."""
 
     normal: NormalEquations
@@ -69,7 +69,6 @@ class Search:
         return terms
 
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
-        """The first of the terms with implausible coefficients."""
         return next(impossible(self.normal, terms, self.weighted.fit(terms)[1]), None) if terms else None
 
     def accept(self, chosen: list[Term], simpler: bool = False) -> bool:
@@ -96,7 +95,9 @@ class Search:
         """
         for key in lost:
             shapes = [term for term in self.normal.terms if term.key == key]
-            trials = [Search(self.normal, self.with_beneath(term, self.active), usual=self.usual) for term in shapes]
+            trials = [
+                StepwiseSearch(self.normal, self.with_beneath(term, self.active), usual=self.usual) for term in shapes
+            ]
             best = min(trials, key=lambda trial: trial.score, default=self)
             if best.score < self.score:
                 self.active, self.weighted, self.score = best.active, best.weighted, best.score

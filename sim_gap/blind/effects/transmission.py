@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.arms import Arm
+from sim_gap.blind.arms import BenchArm
 from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, replaced, reversals, sensor_level, sign
 from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.true_arm import SharedMotor, TrueArm
@@ -100,7 +100,7 @@ def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
     coulomb, viscous = 1.5 * level, 0.8 * level / float(rms(speed))
     rotor = 0.5 * level / float(rms(push))
 
-    def nominal(arm: Arm) -> Arm:
+    def nominal(arm: BenchArm) -> BenchArm:
         out = replace(
             arm, armature=arm.armature.copy(), damping=arm.damping.copy(), frictionloss=arm.frictionloss.copy()
         )

@@ -11,7 +11,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.blind.motion import RATE
 from sim_gap.blind.plant.drive import padded
-from sim_gap.blind.true_arm import Run
+from sim_gap.blind.true_arm import PlantRun
 
 BLOCK = 256
 VELOCITY_HZ = 40.0
@@ -20,10 +20,10 @@ DAMPING_RATIO = 0.9
 INTEGRAL_S = 1.5
 
 
-class Controller:
+class PidControllers:
     """Torque commands for many arms at `motion.RATE`, (k, width)."""
 
-    def __init__(self, runs: Sequence[Run], reading: Array, width: int) -> None:
+    def __init__(self, runs: Sequence[PlantRun], reading: Array, width: int) -> None:
         """`reading` (B, width): initial readings [rad]."""
         self.runs = runs
         inertia = padded([run.inertia for run in runs], width)
@@ -86,16 +86,14 @@ class ServoLaw:
 
 
 @dataclass(frozen=True)
-class ServoRun(Run):
-    """A run whose command is held by servos."""
-
+class ServoRun(PlantRun):
     law: ServoLaw
 
 
 class Servos:
     """Torque commands of many arms at `motion.RATE`."""
 
-    def __init__(self, runs: Sequence[Run], reading: Array, width: int) -> None:
+    def __init__(self, runs: Sequence[PlantRun], reading: Array, width: int) -> None:
         """`reading` (B, width): initial readings [rad]."""
         self.runs = runs
         laws = [run.law for run in runs if isinstance(run, ServoRun)]

@@ -69,7 +69,7 @@ SPRING_DAMPING = 0.04
 """Damping ratio of an elastic transmission."""
 
 
-class Drives:
+class PlantDrives:
     """State of all drives, (B, width); methods act on the first k arms, k being the length of their arguments."""
 
     def __init__(

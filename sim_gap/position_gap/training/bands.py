@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import Fit, batch, jacobian, root_mean_squares
+from sim_gap.position_gap.fit import LoopFit, batch, jacobian, root_mean_squares
 from sim_gap.position_gap.judge import joint_rms
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.simulate import simulate
-from sim_gap.position_gap.training.jackknife import LeftOut, gaps_left_out
+from sim_gap.position_gap.training.jackknife import LeftOutFits, gaps_left_out
 from sim_gap.position_gap.training.spread import Covariance
 from sim_gap.position_gap.training.unreached_limits import LIMITS, Unreached
 from sim_gap.position_gap.windows import Windows
@@ -48,7 +48,7 @@ class Band:
     """RMS of half of its width on the training motion, about a single simulation [rad]: how far draws go."""
 
 
-def band(search: Search, fit: Fit, spread: Covariance, others: LeftOut, heldout: Windows) -> Band:
+def band(search: LoopSearch, fit: LoopFit, spread: Covariance, others: LeftOutFits, heldout: Windows) -> Band:
     """The band that follows from the training windows of `search`, judged on the held-out ones."""
     data = search.data
     left, groups = gaps_left_out(search, others), others.groups
@@ -74,7 +74,7 @@ def band(search: Search, fit: Fit, spread: Covariance, others: LeftOut, heldout:
     return Band((within * heldout.weight).sum((0, 2)) / counts, width, wider * unexplained, reach)
 
 
-def _with_limits(fit: Fit, limits: Sequence[Unreached]) -> list[dict[str, Array]]:
+def _with_limits(fit: LoopFit, limits: Sequence[Unreached]) -> list[dict[str, Array]]:
     """The fit's point with each kind of limit at levels from the least that is admitted at every joint."""
     out = []
     for name in LIMITS:
@@ -118,7 +118,7 @@ def _lasting(left: Array, weight: Array) -> Array:
     return np.asarray((1.0 - np.minimum(noise / np.maximum(variance, 1e-300), 1.0)) ** 2)
 
 
-def _variance(search: Search, fit: Fit, spread: Covariance, data: Windows) -> Array:
+def _variance(search: LoopSearch, fit: LoopFit, spread: Covariance, data: Windows) -> Array:
     """Variance of the simulated positions by what is not known of the parameters, (To, J, W) [rad²].
 
     It is linear, so that parameters of which only ratios are known leave nothing open where they move nothing.

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import Fit, Point, batch, residuals, stepped
-from sim_gap.position_gap.search import Search, merged
+from sim_gap.position_gap.fit import LoopFit, Point, batch, residuals, stepped
+from sim_gap.position_gap.search import LoopSearch, merged
 from sim_gap.position_gap.training.spread import Alternative, Covariance
 from sim_gap.position_gap.training.unreached_limits import LIMITS, draw_limits
 from sim_gap.position_gap.windows import thinned
@@ -21,7 +21,7 @@ HALVINGS = 5
 
 
 def draw(
-    search: Search, fit: Fit, spread: Covariance, count: int, seed: int = 0, reach: Array | None = None
+    search: LoopSearch, fit: LoopFit, spread: Covariance, count: int, seed: int = 0, reach: Array | None = None
 ) -> list[dict[str, float]]:
     """Draws of all parameters from their joint distribution, within their bounds, and of the limits that no recording
     reaches: `joint.name` → value. An effect that is in doubt is absent from its share of them.
@@ -45,7 +45,13 @@ def draw(
 
 
 def _within(
-    search: Search, fit: Fit, spread: Covariance, about: Sequence[Fit], steps: Array, points: list[Point], reach: Array
+    search: LoopSearch,
+    fit: LoopFit,
+    spread: Covariance,
+    about: Sequence[LoopFit],
+    steps: Array,
+    points: list[Point],
+    reach: Array,
 ) -> list[Point]:
     """The points, with the steps halved of each joint that goes further than `reach`; of all, where they share some."""
     data = thinned(search.data, WATCHED)
@@ -71,7 +77,7 @@ def _within(
     return points
 
 
-def _stepped(search: Search, fit: Fit, spread: Covariance, about: Fit, steps: Array) -> Point:
+def _stepped(search: LoopSearch, fit: LoopFit, spread: Covariance, about: LoopFit, steps: Array) -> Point:
     """The point after `steps` from where the fit `about` has the parameters; effects that it lacks stay absent."""
     joints = range(search.data.joints)
     there = [
@@ -86,11 +92,11 @@ def _stepped(search: Search, fit: Fit, spread: Covariance, about: Fit, steps: Ar
     return {name: point[name] for name in fit.point}
 
 
-def _label(search: Search, joint: int, name: str) -> str:
+def _label(search: LoopSearch, joint: int, name: str) -> str:
     return name if joint < 0 else f"{search.data.arm.names[joint]}.{name}"
 
 
-def _points(fit: Fit, spread: Covariance, count: int, random: np.random.Generator) -> list[Fit]:
+def _points(fit: LoopFit, spread: Covariance, count: int, random: np.random.Generator) -> list[LoopFit]:
     """The fit that each draw is about: for the whole arm or at each joint by itself, as likely as it is."""
     there = [other for other in spread.others if _told(fit, spread, other)]
     out = []
@@ -104,7 +110,7 @@ def _points(fit: Fit, spread: Covariance, count: int, random: np.random.Generato
     return out
 
 
-def _told(fit: Fit, spread: Covariance, other: Alternative) -> bool:
+def _told(fit: LoopFit, spread: Covariance, other: Alternative) -> bool:
     """Whether a draw about another fit has a number for all that it has: nothing more than the fit but what is known of
     to some extent anyway, and a limit where the fit has one."""
     joints = range(len(fit.active)) if other.joint < 0 else (other.joint,)

@@ -20,9 +20,9 @@ from sim_gap.effects.base import tilted
 from sim_gap.model.load import SimModel
 from sim_gap.model.solver_friction import solver_parameters
 from sim_gap.position_gap.columns import payload_inertia, shared_effects
-from sim_gap.position_gap.fit import Fit, improve
+from sim_gap.position_gap.fit import LoopFit, improve
 from sim_gap.position_gap.parameters import EFFECTS
-from sim_gap.position_gap.search import Search, effect_there, taken_out, without
+from sim_gap.position_gap.search import LoopSearch, effect_there, taken_out, without
 
 BEYOND = 0.02
 """Distance beyond the end of its range from which a joint of the model would have to go on [rad]; stops are soft."""
@@ -41,7 +41,6 @@ def wide_enough(sim: SimModel, recordings: Sequence[Recording]) -> SimModel:
 
 
 def widened(sim: SimModel) -> list[int]:
-    """Joints whose range is wider than the model's."""
     own = sim.mujoco_model.jnt_range[list(sim.joints)]
     limited = sim.mujoco_model.jnt_limited[list(sim.joints)].astype(bool)
     wider = (sim.arm.range[:, 0] < own[:, 0]) | (sim.arm.range[:, 1] > own[:, 1])
@@ -89,13 +88,13 @@ class Exported:
 
     xml: str
     lines: tuple[str, ...]
-    fit: Fit
+    fit: LoopFit
     """Parameters that it was written with."""
     effects: tuple[JointEffect, ...] = ()
     """Those that a module applies beside it."""
 
 
-def native_fit(search: Search, fit: Fit, held: Collection[str] = NATIVE) -> Fit:
+def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE) -> LoopFit:
     """The fit with what a simulator holds alone, the rest fitted around it again."""
     bare = fit
     for effect in EFFECTS:
@@ -118,7 +117,9 @@ def native_fit(search: Search, fit: Fit, held: Collection[str] = NATIVE) -> Fit:
     return improve(search.data, replace(bare, active=tuple(wanted), rms=None), search.scales, 6)
 
 
-def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collection[str] = NATIVE) -> Exported:
+def exported(
+    sim: SimModel, search: LoopSearch, fit: LoopFit, native: LoopFit, held: Collection[str] = NATIVE
+) -> Exported:
     """MJCF of the native fit, which has the effects `held`, and the effects of the whole fit that it leaves out."""
     spec = spec_of(sim)
     left = sorted(
@@ -151,14 +152,14 @@ def exported(sim: SimModel, search: Search, fit: Fit, native: Fit, held: Collect
     return Exported(comment + spec.to_xml(), tuple(left), native)
 
 
-def with_module(sim: SimModel, search: Search, fit: Fit) -> Exported | None:
+def with_module(sim: SimModel, search: LoopSearch, fit: LoopFit) -> Exported | None:
     """MJCF that is to be used with a module for friction that MJCF cannot hold; None if there is no such friction."""
     if not any(effect_there(fit, effect, j) for effect in IN_MODULE for j in range(sim.n)):
         return None
     return written_with_module(sim, search, fit, native_fit(search, fit, WRITTEN))
 
 
-def written_with_module(sim: SimModel, search: Search, fit: Fit, native: Fit) -> Exported:
+def written_with_module(sim: SimModel, search: LoopSearch, fit: LoopFit, native: LoopFit) -> Exported:
     """MJCF of a native fit, with the effects that a module applies beside it and those of the whole fit left out."""
     effects: list[JointEffect] = []
     for effect in IN_MODULE:
@@ -171,7 +172,7 @@ def written_with_module(sim: SimModel, search: Search, fit: Fit, native: Fit) ->
     return replace(exported(sim, search, fit, native, WRITTEN), effects=tuple(effects))
 
 
-def _shared_beside(search: Search, fit: Fit, held: Collection[str]) -> list[str]:
+def _shared_beside(search: LoopSearch, fit: LoopFit, held: Collection[str]) -> list[str]:
     """Effects of the whole arm in a fit that are not among those held."""
     return [
         effect
@@ -186,7 +187,7 @@ def _implicit() -> Any:
     return mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
-def _set_joint(joint: Any, fit: Fit, j: int, unit: float) -> None:
+def _set_joint(joint: Any, fit: LoopFit, j: int, unit: float) -> None:
     """Give a joint of a file what the fit has; angles of joints in the file's `unit`."""
     joint.frictionloss, joint.armature = float(fit.point["coulomb"][j]), float(fit.point["armature"][j])
     joint.damping[0] = float(fit.point["viscous"][j] - _of_servo(fit, j))
@@ -196,7 +197,7 @@ def _set_joint(joint: Any, fit: Fit, j: int, unit: float) -> None:
         joint.springref = -unit * float(fit.point["offset"][j]) / stiffness
 
 
-def _set_friction(spec: Any, sim: SimModel, fit: Fit) -> None:
+def _set_friction(spec: Any, sim: SimModel, fit: LoopFit) -> None:
     """Let the joints of a file rest under friction, or creep as fast as the fit has them: with MuJoCo's usual solver
     parameters a joint creeps to where no friction is needed, within a tenth of a second on a small arm.
     """
@@ -207,12 +208,12 @@ def _set_friction(spec: Any, sim: SimModel, fit: Fit) -> None:
         joint.solref_friction, joint.solimp_friction = values
 
 
-def _of_servo(fit: Fit, j: int) -> float:
+def _of_servo(fit: LoopFit, j: int) -> float:
     """Part of the damping that the model's own actuator makes."""
     return float(min(fit.point["kv"][j], fit.point["viscous"][j]))
 
 
-def _set_actuator(spec: Any, joint: str, fit: Fit, j: int) -> Any:
+def _set_actuator(spec: Any, joint: str, fit: LoopFit, j: int) -> Any:
     """One position actuator at a joint, in the place of those that it has."""
     import mujoco
 
@@ -243,7 +244,7 @@ def _set_actuator(spec: Any, joint: str, fit: Fit, j: int) -> Any:
     return made
 
 
-def _link_changes(search: Search, fit: Fit) -> dict[int, Array]:
+def _link_changes(search: LoopSearch, fit: LoopFit) -> dict[int, Array]:
     """Change of the ten inertial parameters of each link, about its joint and in its frame."""
     n = search.data.joints
     changes: dict[int, Array] = {}

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import Fit, batch, improve, jacobian, residuals
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.fit import LoopFit, batch, improve, jacobian, residuals
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.windows import Windows, of_windows
 
 ALONE = 0.03
@@ -32,7 +32,7 @@ class Terms:
     """(W, K)."""
 
 
-def terms_of(search: Search, fit: Fit) -> Terms:
+def terms_of(search: LoopSearch, fit: LoopFit) -> Terms:
     """Normal equations of each window of the search about a fit."""
     now, slopes = jacobian(search.data, fit, search.scales, fit.active, fit.shared)
     names = [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
@@ -72,12 +72,12 @@ FOLDS, STEPS = 3, 3
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
+class LeftOutFits:
     """A fit without each group of training windows: without each recording, or each third of a single one."""
 
     groups: NDArray[np.intp]
     """Number of the group of each window, (W,)."""
-    fits: tuple[Fit, ...]
+    fits: tuple[LoopFit, ...]
     """The fit without each group, in their order."""
 
 
@@ -86,7 +86,7 @@ def recordings_or_thirds(data: Windows) -> NDArray[np.intp]:
     return np.arange(data.count) * FOLDS // data.count if data.of_one_recording else data.recording
 
 
-def left_out(search: Search, fit: Fit) -> LeftOut:
+def left_out(search: LoopSearch, fit: LoopFit) -> LeftOutFits:
     """A fit to all other windows for each group of them."""
     data, groups = search.data, recordings_or_thirds(search.data)
     fits = []
@@ -95,11 +95,11 @@ def left_out(search: Search, fit: Fit) -> LeftOut:
         fits.append(
             improve(of_windows(data, others), replace(fit, rms=None), search.scales, STEPS) if len(others) else fit
         )
-    return LeftOut(groups, tuple(fits))
+    return LeftOutFits(groups, tuple(fits))
 
 
-def gaps_left_out(search: Search, left: LeftOut) -> Array:
-    """What is left of each training window by the fit without its group, (To, J, W) [rad]."""
+def gaps_left_out(search: LoopSearch, left: LeftOutFits) -> Array:
+    """Gap that the fit without its group leaves of each training window, (To, J, W) [rad]."""
     out = np.zeros_like(search.data.measured)
     for group, alone in zip(np.unique(left.groups), left.fits, strict=True):
         own = np.flatnonzero(left.groups == group)

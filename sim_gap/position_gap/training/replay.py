@@ -12,7 +12,7 @@ from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.better_model.native_drives import hold
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.search import Group, Search, taken_out
+from sim_gap.position_gap.search import Group, LoopSearch, taken_out
 from sim_gap.position_gap.training.export import Exported, written_with_module
 
 OPENING_S = 1.0
@@ -23,7 +23,7 @@ LONGEST_S, SHORT_S = 60.0, 15.0
 
 @dataclass(frozen=True)
 class Simulated:
-    """What is replayed: a compiled model, its joints, and the module's effects on it, if any."""
+    """A compiled model to replay, its joints, and the module's effects on it, if any."""
 
     model: Any
     joints: tuple[int, ...]
@@ -48,8 +48,8 @@ def simulated(sim: SimModel, made: Exported) -> Simulated:
     return Simulated(model, tuple(sim.joints), Effects(model, made.effects, sim.arm.names) if made.effects else None)
 
 
-def less(sim: SimModel, search: Search, made: Exported, groups: Sequence[Group]) -> Simulated:
-    """What was written less some effects, the others as they are."""
+def less(sim: SimModel, search: LoopSearch, made: Exported, groups: Sequence[Group]) -> Simulated:
+    """The written model less some effects, the others as they are."""
     fit = made.fit
     for group in groups:
         fit = taken_out(search, fit, group)

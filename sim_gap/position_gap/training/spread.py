@@ -1,4 +1,4 @@
-"""What recordings leave open of the parameters: covariance, intervals, and the fits of other choices of effects.
+"""Spread of the parameters that recordings leave open: covariance, intervals, and the fits of other choices of effects.
 
 A position alone shows ratios: of gain, friction and inertia, whose common scale rests on a little inertia. Along such a
 direction the score is flat, a fit stops anywhere, and a fit without one recording stops beside it. So parameters are
@@ -21,10 +21,10 @@ from scipy.stats import norm, t
 from gcomp.arrays import Array
 from sim_gap.position_gap.columns import UNIT
 from sim_gap.position_gap.doubt import LEAST_FREEDOM, Other
-from sim_gap.position_gap.fit import Fit, coordinate
+from sim_gap.position_gap.fit import LoopFit, coordinate
 from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.parameters import FARTHEST, PARAMETERS, moved, relative
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.sound import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
 from sim_gap.position_gap.training.jackknife import jackknifed, recordings_or_thirds, terms_of
 from sim_gap.position_gap.training.unreached_limits import LIMITS, Unreached
@@ -43,7 +43,7 @@ class Alternative:
     """−1: all joints, and the parameters of the whole arm."""
     odds: float
     """Probability over that of the fit itself."""
-    fit: Fit
+    fit: LoopFit
 
 
 def alternatives(others: Sequence[Other]) -> tuple[Alternative, ...]:
@@ -78,7 +78,7 @@ OTHERWISE = 8.0
 command, up to that of a value that the model states (STATED): of 25 recordings of an SO-101, each fitted alone, 93 % of
 the differences are within two such intervals."""
 SCALED = ("kd", "coulomb", "viscous", "armature")
-"""What a gain is told by the ratio to."""
+"""Parameters whose ratio to a gain is known."""
 STATED = 0.5
 """Relative standard deviation of a value of SCALED that the model states and no fit has contradicted."""
 ALIKE = 0.9
@@ -114,8 +114,8 @@ class Covariance:
         return self.matrix[np.ix_(at, at)]
 
 
-def covariance(search: Search, fit: Fit) -> Covariance:
-    """What windows and recordings leave open of the fitted parameters and of the stated ones that a gain rests on.
+def covariance(search: LoopSearch, fit: LoopFit) -> Covariance:
+    """Covariance, by windows and recordings, of the fitted parameters and of the stated ones that a gain rests on.
 
     It counts how far they would move if all that may be off in a sound arm were fitted beside them.
     """
@@ -137,7 +137,7 @@ def covariance(search: Search, fit: Fit) -> Covariance:
     return Covariance(names, matrix)
 
 
-def _told(fit: Fit, joint: int, name: str) -> bool:
+def _told(fit: LoopFit, joint: int, name: str) -> bool:
     """Whether a parameter was fitted, or sets the scale of a fitted gain."""
     if joint < 0:
         return name in fit.shared
@@ -145,7 +145,7 @@ def _told(fit: Fit, joint: int, name: str) -> bool:
     return name in own or ("kp" in own and name in SCALED and float(fit.point[name][joint]) > 0.0)
 
 
-def covariance_within(search: Search, fit: Fit) -> Covariance:
+def covariance_within(search: LoopSearch, fit: LoopFit) -> Covariance:
     """Sandwich covariance of the fitted parameters over the windows, all else as it is: what tells an effect from none.
 
     Directions that the windows hardly show are held.
@@ -160,7 +160,7 @@ def covariance_within(search: Search, fit: Fit) -> Covariance:
     return Covariance(terms.names, matrix + _systematic(search, fit, terms.names))
 
 
-def freed(search: Search, fit: Fit) -> Fit:
+def freed(search: LoopSearch, fit: LoopFit) -> LoopFit:
     """The fit with all free that may be off in a sound arm, with the stated values that set the scale of a fitted gain,
     and with the mass moments of all links where something of the whole arm was fitted."""
     open_at = (_open(search, fit, j, own) for j, own in enumerate(errors_of(search)[:-1]))
@@ -171,7 +171,7 @@ def freed(search: Search, fit: Fit) -> Fit:
     return replace(fit, point=point, active=active, shared=shared)
 
 
-def _open(search: Search, fit: Fit, joint: int, errors: Mapping[str, float]) -> dict[str, float]:
+def _open(search: LoopSearch, fit: LoopFit, joint: int, errors: Mapping[str, float]) -> dict[str, float]:
     """Standard deviation of each parameter of a joint that was not fitted and is not known, in its own coordinate."""
     out = {name: size for name, size in errors.items() if name not in fit.active[joint]}
     for name in SCALED if "kp" in fit.active[joint] else ():
@@ -181,7 +181,7 @@ def _open(search: Search, fit: Fit, joint: int, errors: Mapping[str, float]) -> 
     return out
 
 
-def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
+def _stated(search: LoopSearch, fit: LoopFit, names: Sequence[tuple[int, str]]) -> Array:
     """Inverse covariance of the parameters before any recording, (K, K).
 
     What a model states of the same parameter of several joints is of one source, such as one rotor for all: it is off
@@ -200,11 +200,11 @@ def _stated(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array
     return np.linalg.inv(np.outer(sizes, sizes) * np.where(together, ALIKE, 0.0) + np.diag(sizes**2 * (1.0 - ALIKE)))
 
 
-def _systematic(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
+def _systematic(search: LoopSearch, fit: LoopFit, names: Sequence[tuple[int, str]]) -> Array:
     return np.diag((SYSTEMATIC * _values(search, fit, names)) ** 2)
 
 
-def _of_one_motion(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
+def _of_one_motion(search: LoopSearch, fit: LoopFit, names: Sequence[tuple[int, str]]) -> Array:
     """Variances by what another motion would show where a single one was recorded, (K, K).
 
     Other motion turns what the fit leaves of the way to the command into other parameters.
@@ -216,8 +216,8 @@ def _of_one_motion(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -
     return np.diag((share * _values(search, fit, names)) ** 2)
 
 
-def _values(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array:
-    """What a parameter's own coordinate changes by per relative change of it, (K,)."""
+def _values(search: LoopSearch, fit: LoopFit, names: Sequence[tuple[int, str]]) -> Array:
+    """Change of a parameter's own coordinate per relative change of it, (K,)."""
     return np.array(
         [
             coordinate(fit, search.scales, j, name) if j < 0 else relative(name, fit.point[name][j], search.scales, j)
@@ -226,7 +226,7 @@ def _values(search: Search, fit: Fit, names: Sequence[tuple[int, str]]) -> Array
     )
 
 
-def _besides(search: Search, names: Sequence[tuple[int, str]]) -> Array:
+def _besides(search: LoopSearch, names: Sequence[tuple[int, str]]) -> Array:
     """Variances by what sound arms have besides of friction and of lateness, (K, K)."""
     friction = np.minimum(FRICTION_NM, FRICTION_SHARE * search.scales.torque)
     sizes = {"coulomb": friction, "delay": np.full_like(friction, np.hypot(LATE_S, APART_S))}
@@ -234,7 +234,7 @@ def _besides(search: Search, names: Sequence[tuple[int, str]]) -> Array:
     return np.diag(np.square(own))
 
 
-def shifted(search: Search, fit: Fit, spread: Covariance, joint: int, name: str) -> tuple[Array, Array]:
+def shifted(search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, name: str) -> tuple[Array, Array]:
     """Where the other fits have a parameter, from where the fit has it, in its own coordinate, and their odds.
 
     Fits that have no such effect say nothing of its size.
@@ -249,7 +249,7 @@ def shifted(search: Search, fit: Fit, spread: Covariance, joint: int, name: str)
     return shifts, odds
 
 
-def undecided_scale(search: Search, fit: Fit, spread: Covariance) -> list[int]:
+def undecided_scale(search: LoopSearch, fit: LoopFit, spread: Covariance) -> list[int]:
     """Joints of which only ratios of gain, friction and inertia can be told."""
     out = []
     for j, own in enumerate(fit.active):
@@ -268,7 +268,9 @@ def vague_limits(spread: Covariance) -> list[tuple[int, str]]:
     return [at for at, size in zip(spread.names, deviations, strict=True) if at[1] in LIMITS and size > FARTHEST]
 
 
-def interval(search: Search, fit: Fit, spread: Covariance, joint: int, name: str) -> tuple[float, float, float, str]:
+def interval(
+    search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, name: str
+) -> tuple[float, float, float, str]:
     """Value, ends of its 95 % interval, and unit; of a limit that no motion reaches, where it may lie."""
     for limit in spread.limits:
         if (limit.joint, limit.name) == (joint, name):
@@ -284,7 +286,7 @@ def interval(search: Search, fit: Fit, spread: Covariance, joint: int, name: str
     return value, low, high, PARAMETERS[name].unit
 
 
-def payload_centre(fit: Fit, spread: Covariance, column: str) -> tuple[float, float, float, str]:
+def payload_centre(fit: LoopFit, spread: Covariance, column: str) -> tuple[float, float, float, str]:
     """A coordinate of a payload's centre of mass, from its mass moment: value, ends of its 95 % interval, unit."""
     mass, moment = (float(fit.point[name][0]) for name in ("payload.mass", column))
     divisor = float(np.copysign(max(abs(mass), LIGHTEST), mass))

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import Fit, batch, evaluate, residuals, root_mean_squares
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.fit import LoopFit, batch, evaluate, residuals, root_mean_squares
+from sim_gap.position_gap.search import LoopSearch
 
 HEADROOM = 10.0
 """Ratio of the highest level of the prior to the least that the training motion admits: recordings use between a tenth
@@ -42,7 +42,7 @@ class Unreached:
     """Lowest level that the training motion admits."""
 
 
-def unreached(search: Search, fit: Fit, vague: Collection[tuple[int, str]] = ()) -> tuple[Unreached, ...]:
+def unreached(search: LoopSearch, fit: LoopFit, vague: Collection[tuple[int, str]] = ()) -> tuple[Unreached, ...]:
     """The limits that neither the model states nor the fit has, where some level of them is admitted; and of those that
     the fit has the `vague` ones (joint, name), where no level above it costs much. Nothing of joints that rest."""
     out: list[Unreached] = []
@@ -74,12 +74,12 @@ def _first_admitted(lost: Array) -> NDArray[np.intp]:
     return np.where(costly.any(0), len(lost) - np.argmax(costly[::-1], axis=0), 0)
 
 
-def _losses(search: Search, fit: Fit, name: str, levels: Array) -> Array:
+def _losses(search: LoopSearch, fit: LoopFit, name: str, levels: Array) -> Array:
     """Loss of each joint's score with a limit at each level, all else as it is, (L, J)."""
     left = residuals(search.data, batch([{**fit.point, name: level} for level in levels]))
     base = search.score(evaluate(search.data, fit))
     each = root_mean_squares(search.data, left)
-    return np.stack([search.score(Fit(fit.point, fit.active, rms=rms)) - base for rms in each])
+    return np.stack([search.score(LoopFit(fit.point, fit.active, rms=rms)) - base for rms in each])
 
 
 def draw_limits(limits: Sequence[Unreached], count: int, random: np.random.Generator) -> list[Array]:

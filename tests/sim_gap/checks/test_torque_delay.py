@@ -8,7 +8,7 @@ import pytest
 from wrong_arms import THREE, motion
 
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
-from sim_gap.checks.rigid_fit import Motion
+from sim_gap.checks.rigid_fit import ChannelMotion
 from sim_gap.checks.torque_delay import find_delay, find_short_delay
 from sim_gap.model.load import load_model
 
@@ -22,7 +22,7 @@ def late(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray):
     torque = arm.torque(q, v, a)
     shifted = np.stack([np.interp(t - LATE, t, column) for column in torque.T], axis=1)
     random = np.random.default_rng(1)
-    return arm, Motion(q, v, a, shifted + 0.01 * random.normal(size=q.shape), "tau")
+    return arm, ChannelMotion(q, v, a, shifted + 0.01 * random.normal(size=q.shape), "tau")
 
 
 def test_a_late_channel_is_found():
@@ -37,7 +37,7 @@ def test_a_motor_may_follow_late_by_some_hundredths_of_a_second_and_never_early(
     t, q, v, a = motion(3, 60.0, 50.0, seed=3)
     t, v, a = 0.5 * t, 2.0 * v, 4.0 * a
     torque = np.stack([np.interp(t - late_s, t, column) for column in arm.torque(q, v, a).T], axis=1)
-    assert len(find_delay(arm, Motion(q, v, a, torque, "tau_motor"), 100.0, AS_IT_IS)[0]) == found
+    assert len(find_delay(arm, ChannelMotion(q, v, a, torque, "tau_motor"), 100.0, AS_IT_IS)[0]) == found
 
 
 def test_a_motion_that_repeats_does_not_tell_by_how_many_periods():
@@ -49,7 +49,7 @@ def test_a_motion_that_repeats_does_not_tell_by_how_many_periods():
     assert not findings
 
 
-def read_late(by_s: tuple[float, float, float], channel: str = "tau_motor") -> Motion:
+def read_late(by_s: tuple[float, float, float], channel: str = "tau_motor") -> ChannelMotion:
     """Motion of three joints with friction, of which each motor's torque is read late by its own time."""
     arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
     t, q, v, a = motion(3, 60.0, 50.0, seed=3)
@@ -58,7 +58,7 @@ def read_late(by_s: tuple[float, float, float], channel: str = "tau_motor") -> M
     torque += 0.3 * torque.std(axis=0) * np.tanh(v / 0.02)
     late = np.stack([np.interp(t - by, t, x) for by, x in zip(by_s, torque.T, strict=True)], axis=1)
     noise = 0.05 * torque.std(axis=0) * np.random.default_rng(4).normal(size=q.shape)
-    return Motion(q, v, a, late + noise, channel)
+    return ChannelMotion(q, v, a, late + noise, channel)
 
 
 @pytest.mark.parametrize("by_s", [-0.02, 0.02])
@@ -96,5 +96,5 @@ def test_a_link_sensor_may_be_late_and_never_early(by_s: float, found: int):
 
 def test_few_rows_show_no_short_delay():
     arm, read = load_model(mujoco.MjModel.from_xml_string(THREE)).arm, read_late((0.02, 0.02, 0.02))
-    few = Motion(read.q[:30], read.v[:30], read.a[:30], read.reading[:30], "tau_motor")
+    few = ChannelMotion(read.q[:30], read.v[:30], read.a[:30], read.reading[:30], "tau_motor")
     assert not find_short_delay(arm, few, 100.0, AS_IT_IS)

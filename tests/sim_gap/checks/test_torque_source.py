@@ -11,7 +11,7 @@ from wrong_arms import THREE, motion
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
-from sim_gap.checks.rigid_fit import Motion, RigidFit, fit_rigid
+from sim_gap.checks.rigid_fit import ChannelMotion, RigidFit, fit_rigid
 from sim_gap.checks.torque_source import find_gain_command, find_same, find_source, find_unsigned
 from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.model.load import load_model
@@ -29,7 +29,7 @@ def test_a_unit_of_one_joint_is_found_although_friction_hides_its_torque(factor:
     noise = 1.2 * torque[:, 0].std() * np.convolve(random.normal(size=len(q)), np.ones(9) / 3.0, "same")
     torque[:, 0] += 5.0 * torque[:, 0].std() * np.tanh(v[:, 0] / 0.02) + noise
     torque[:, 0] *= factor
-    read = Motion(q, v, a, torque, "tau_motor")
+    read = ChannelMotion(q, v, a, torque, "tau_motor")
     assert len(find_joint_scale(arm, read, AS_IT_IS)) == found
 
 
@@ -41,7 +41,7 @@ def test_a_load_at_the_last_joint_is_no_unit(others: tuple[float, float], found:
     correlation, explained = np.array([0.93, 0.98, 0.99]), np.full(3, 0.99)
     fit = RigidFit(explained, scale, correlation, own, np.zeros(3), spread)
     assert fit.strong.tolist() == [False, False, True]
-    read = Motion(*np.zeros((4, 10, 3)), "tau")
+    read = ChannelMotion(*np.zeros((4, 10, 3)), "tau")
     assert len(find_scale(arm, fit, read, AS_IT_IS)) == found
 
 
@@ -55,7 +55,7 @@ def test_friction_is_looked_for_in_joints_that_move(friction: float, found: int)
         q[:, still], v[:, still], a[:, still] = 0.3 + 1e-4 * tremble, 7e-4 * tremble, 0.0
     read = arm.torque(q, v, a) + friction * np.sign(v) * [1.0, 0.0, 0.0]
     read[:, 1:] += 0.5 * tremble[:, None]
-    moved = Motion(q, v, a, read, "tau")
+    moved = ChannelMotion(q, v, a, read, "tau")
     findings = find_source(fit_rigid(arm, moved), SimpleNamespace(reading={"tau"}), moved, AS_IT_IS)
     assert len(findings) == found
 
@@ -70,11 +70,11 @@ def test_a_link_sensor_without_the_models_torque_is_asked_about(column: int):
     for channel, count in (("tau", 1), ("tau_motor", 0)):
         wrong = read.copy()
         wrong[:, column] = small
-        moved = Motion(q, v, a, wrong, channel)
+        moved = ChannelMotion(q, v, a, wrong, channel)
         found = find_absent(arm, fit_rigid(arm, moved), moved, AS_IT_IS)
         assert len(found) == count
         assert all(each.joint == arm.names[column] and not each.corrected for each in found)
-    sound = Motion(q, v, a, read + small[:, None], "tau")
+    sound = ChannelMotion(q, v, a, read + small[:, None], "tau")
     assert not find_absent(arm, fit_rigid(arm, sound), sound, AS_IT_IS)
 
 
@@ -89,7 +89,7 @@ def test_an_unsigned_reading_is_found_beside_noise_and_one_with_an_offset_is_not
     joint = int(np.argmin(np.abs(read.mean(0) / read.std(0))))
     own = read[:, joint] + noise * read[:, joint].std() * np.random.default_rng(4).normal(size=len(q))
     read[:, joint] = np.abs(own) + 1e-3 if unsigned else own - own.min() + 0.1
-    found = find_unsigned(arm, Motion(q, v, a, read, "tau"), AS_IT_IS)
+    found = find_unsigned(arm, ChannelMotion(q, v, a, read, "tau"), AS_IT_IS)
     assert [each.joint for each in found] == [arm.names[joint]] * count
 
 
@@ -101,7 +101,7 @@ def test_an_unsigned_reading_that_does_not_follow_the_model_turns_round_at_zero(
     read = arm.torque(q, v, a)
     own = 0.3 * np.abs(v[:, 2]) + 0.7 * v[:, 2].clip(0.0)
     read[:, 2] = own + raised_by * own.std()
-    found = find_unsigned(arm, Motion(q, v, a, read, "tau"), AS_IT_IS)
+    found = find_unsigned(arm, ChannelMotion(q, v, a, read, "tau"), AS_IT_IS)
     assert [each.joint for each in found] == [arm.names[2]] * count
 
 
@@ -110,10 +110,10 @@ def test_a_joint_of_friction_alone_that_reads_more_than_those_before_it_is_asked
     arm = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
     _, q, v, a = motion(3, 60.0, RATE, seed=3)
     read = arm.torque(q, v, a) + friction * np.sign(v) * [0.0, 0.0, 1.0]
-    found = find_outgrown(arm, arm, Motion(q, v, a, read, "tau_motor"), AS_IT_IS)
+    found = find_outgrown(arm, arm, ChannelMotion(q, v, a, read, "tau_motor"), AS_IT_IS)
     assert [each.joint for each in found] == ["joint_3"] * count
     stated = parse_corrections(units=["tau_motor_3=N·m"])
-    assert not find_outgrown(arm, arm, Motion(q, v, a, read, "tau_motor"), stated)
+    assert not find_outgrown(arm, arm, ChannelMotion(q, v, a, read, "tau_motor"), stated)
 
 
 def of_motors(kp: float) -> Recording:
@@ -169,5 +169,5 @@ def test_a_wrist_on_which_something_pulls_tells_no_unit(factor: float, found: in
     if found == 0:
         read[:, 2] *= 80.0
         read[:, :2] += np.random.default_rng(1).normal(0.0, 3.0 * read[:, :2].std(), (len(q), 2))
-    moved = Motion(q, v, a, read, "tau_motor")
+    moved = ChannelMotion(q, v, a, read, "tau_motor")
     assert len(find_scale(arm, fit_rigid(arm, moved), moved, AS_IT_IS)) == found

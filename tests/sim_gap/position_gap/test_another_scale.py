@@ -10,25 +10,25 @@ from servo_arm import model_text, record
 from sim_gap.model.load import load_model
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
 from sim_gap.position_gap.doubt import at_other_scales, settled
-from sim_gap.position_gap.fit import Fit, improve
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.fit import LoopFit, improve
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.windows import windows_of
 
 GAIN, ROTOR = 12.0, 0.02
 REAL = model_text(kp=GAIN, friction=0.15)
 
 
-def fitted_with(rotor: float) -> tuple[Search, Fit]:
+def fitted_with(rotor: float) -> tuple[LoopSearch, LoopFit]:
     """A fit of gain and friction about a model that states such rotors [kg·m²]."""
     sim = load_model(mujoco.MjModel.from_xml_string(REAL.replace(f'armature="{ROTOR}"', f'armature="{rotor}"')))
     data = windows_of(sim.arm, [record(REAL, seed, 14.0, fast=2.0) for seed in (1, 2)], ["one", "two"])
-    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 4e-4))
+    search = LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 4e-4))
     names = ("kp", "coulomb", "viscous")
-    return search, improve(data, Fit(search.nominal, (names, names)), search.scales, 12)
+    return search, improve(data, LoopFit(search.nominal, (names, names)), search.scales, 12)
 
 
 @pytest.fixture(scope="module")
-def stated_too_heavy() -> tuple[Search, Fit]:
+def stated_too_heavy() -> tuple[LoopSearch, LoopFit]:
     return fitted_with(4 * ROTOR)
 
 

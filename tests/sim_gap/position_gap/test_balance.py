@@ -11,7 +11,7 @@ from servo_arm import model_text, record, written
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.model.load import load_model
 from sim_gap.position_gap.controller import nominal_controller, nominal_point
-from sim_gap.position_gap.fit import Fit, evaluate
+from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.search import LEAST_COUNT, balanced
 from sim_gap.position_gap.windows import Windows, windows_of
 
@@ -22,15 +22,15 @@ MOTORS = STIFFER.replace("<position", "<motor").replace(f' kp="{8.0 * GAIN}"', "
 
 
 @pytest.fixture(scope="module")
-def swinging() -> tuple[Windows, Fit]:
+def swinging() -> tuple[Windows, LoopFit]:
     sim = load_model(mujoco.MjModel.from_xml_string(REAL))
     made = [record(REAL, 1, 18.0), record(REAL, 2, 12.0, released=4.0)]
     data = windows_of(sim.arm, made, ["held", "released"])
     point = nominal_point(data, nominal_controller(sim))
-    return data, Fit({**point, "kp": 1.1 * point["kp"], "viscous": point["viscous"] + 0.02}, ((), ()))
+    return data, LoopFit({**point, "kp": 1.1 * point["kp"], "viscous": point["viscous"] + 0.02}, ((), ()))
 
 
-def left(data: Windows, fit: Fit, off: np.ndarray) -> np.ndarray:
+def left(data: Windows, fit: LoopFit, off: np.ndarray) -> np.ndarray:
     """Mean square that a fit leaves of both kinds of windows as they are counted, (2, J)."""
     rms = evaluate(data, fit).rms
     count = data.weight.sum(0)

@@ -7,8 +7,8 @@ import pytest
 from servo_arm import fitted
 
 from sim_gap.position_gap.doubt import Other, _tail, plainest, settled
-from sim_gap.position_gap.fit import Fit, improve
-from sim_gap.position_gap.search import PRICE, Search, effect_there, taken_out, with_effect
+from sim_gap.position_gap.fit import LoopFit, improve
+from sim_gap.position_gap.search import PRICE, LoopSearch, effect_there, taken_out, with_effect
 from sim_gap.position_gap.training.draws import draw
 from sim_gap.position_gap.training.spread import (
     Covariance,
@@ -21,7 +21,7 @@ from sim_gap.position_gap.training.spread import (
 
 
 @pytest.fixture(scope="module")
-def several() -> tuple[Search, Fit]:
+def several() -> tuple[LoopSearch, LoopFit]:
     """Four recordings of an arm with friction, beside a model without."""
     search, fit = fitted(0.2, 0.2, 0.2, 0.2)
     return replace(search, nominal={**search.nominal, "coulomb": np.zeros(2)}), fit

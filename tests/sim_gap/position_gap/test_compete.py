@@ -13,10 +13,10 @@ from armlink.recording.recording import Recording
 from sim_gap.model.load import load_model
 from sim_gap.position_gap import controller, judge
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of, starting_fit
-from sim_gap.position_gap.fit import Fit, batch, improve
+from sim_gap.position_gap.fit import LoopFit, batch, improve
 from sim_gap.position_gap.judge import _ordered
 from sim_gap.position_gap.parameters import EFFECTS
-from sim_gap.position_gap.search import Search, level_of, with_effect
+from sim_gap.position_gap.search import LoopSearch, level_of, with_effect
 from sim_gap.position_gap.selection import select_about
 from sim_gap.position_gap.simulate import simulate
 from sim_gap.position_gap.windows import windows_of
@@ -28,14 +28,14 @@ LOOKED_FOR = {"controller.stiffness", "controller.delay", "friction.viscous", "f
 
 def started(
     text: str, recording: Recording, more: Collection[str] = (), withheld: Collection[str] = ()
-) -> tuple[Search, Fit]:
+) -> tuple[LoopSearch, LoopFit]:
     """The search on one recording, and the fit that it starts with."""
     sim = load_model(mujoco.MjModel.from_xml_string(text), recording.names, recording.n)
     data = windows_of(sim.arm, [recording], ["r.csv"])
     own = nominal_controller(sim)
     floor = np.full(recording.n, 2e-4)
     never = set(EFFECTS) - LOOKED_FOR - {*more} | {*withheld}
-    search = Search(data, scales_of(data), nominal_point(data, own), floor, frozenset(never))
+    search = LoopSearch(data, scales_of(data), nominal_point(data, own), floor, frozenset(never))
     search, fit, _ = starting_fit(search, own, lambda text: None)
     return search, fit
 
@@ -58,7 +58,7 @@ def test_a_limit_is_tried_at_the_level_that_fits() -> None:
     real = WEIGHTLESS.replace('<position name="shoulder"', '<position forcerange="-0.35 0.35" name="shoulder"')
     known = WEIGHTLESS.replace('<position name="shoulder"', '<position forcerange="-50 50" name="shoulder"')
     search, _ = started(known, record(real, 2, 14.0))
-    nominal = Fit(search.nominal, ((), ()))
+    nominal = LoopFit(search.nominal, ((), ()))
     assert level_of(search, nominal, "limit")[0] == pytest.approx(0.35, rel=0.2)
     assert with_effect(search, nominal, "actuator.saturation", 0).point["limit"][0] < 0.6
 
@@ -75,7 +75,7 @@ def test_what_is_withheld_is_as_in_the_model_from_the_start() -> None:
 def test_an_integral_part_is_tried_at_the_level_that_fits() -> None:
     """A small one only holds the torque at the start: from there no slope leads to one that counts."""
     search, _ = started(WEIGHTLESS, record(WEIGHTLESS, 2, 14.0), {"controller.integral"})
-    nominal = Fit(search.nominal, ((), ()))
+    nominal = LoopFit(search.nominal, ((), ()))
     moved = simulate(search.data, batch([{**search.nominal, "ki": np.full(2, INTEGRAL)}]))[0]
     search = replace(search, data=replace(search.data, measured=moved))
     assert (np.abs(np.log(level_of(search, nominal, "ki") / INTEGRAL)) < np.log(2.5)).all()

@@ -9,8 +9,8 @@ from servo_arm import model_text, record
 
 from sim_gap.model.load import load_model
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
-from sim_gap.position_gap.fit import Fit, improve
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.fit import LoopFit, improve
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.training import bands, unreached_limits
 from sim_gap.position_gap.training.bands import band
 from sim_gap.position_gap.training.draws import draw
@@ -23,16 +23,16 @@ TEXT = model_text(kp=GAIN, friction=0.2)
 FOUND = ("kp", "coulomb", "viscous")
 
 
-def of(text: str) -> tuple[Search, Fit]:
+def of(text: str) -> tuple[LoopSearch, LoopFit]:
     """Search and fit of a training recording of the arm without limits."""
     sim = load_model(mujoco.MjModel.from_xml_string(text))
     data = windows_of(sim.arm, [record(TEXT, 1, 14.0)], ["run"])
-    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
-    return search, improve(data, Fit(search.nominal, (FOUND, FOUND)), search.scales)
+    search = LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
+    return search, improve(data, LoopFit(search.nominal, (FOUND, FOUND)), search.scales)
 
 
 @pytest.fixture(scope="module")
-def arm() -> tuple[Search, Fit]:
+def arm() -> tuple[LoopSearch, LoopFit]:
     return of(TEXT)
 
 

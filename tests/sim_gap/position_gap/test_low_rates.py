@@ -13,7 +13,7 @@ from sim_gap.position_gap.columns import with_columns
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
 from sim_gap.position_gap.identify import noise_floor
 from sim_gap.position_gap.nominal_motion import own_motion, solvers
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.windows import windows_of
 
 STIFF = model_text(kp=40.0, friction=0.0, damping=0.6)
@@ -29,7 +29,7 @@ def test_what_is_missed_of_motion_between_rows_is_found_on_the_models_own(
     sim = load_model(mujoco.MjModel.from_xml_string(STIFF))
     recording = record(STIFF, 1, 20.0, rate)
     data = with_columns(windows_of(sim.arm, [recording], ["run"]))
-    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, READ))
+    search = LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, READ))
     own = own_motion(sim, [recording], [1.0], [np.zeros(len(recording.t), bool)])
     assert np.all(own.gaps < 1.2 * READ)
     missed = own.missed(search, solvers(sim, search))
@@ -46,7 +46,7 @@ def test_a_recording_too_short_to_move_along_says_nothing() -> None:
     sim = load_model(mujoco.MjModel.from_xml_string(STIFF))
     recording = record(STIFF, 1, 1.5)
     data = with_columns(windows_of(sim.arm, [record(STIFF, 1, 10.0)], ["run"]))
-    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, READ))
+    search = LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, READ))
     own = own_motion(sim, [recording], [1.0], [np.zeros(len(recording.t), bool)])
     assert np.all(np.isinf(own.gaps))
     np.testing.assert_array_equal(own.missed(search, solvers(sim, search)), 0.0)

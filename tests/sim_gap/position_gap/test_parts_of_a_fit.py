@@ -15,10 +15,10 @@ from sim_gap.position_gap import judge, rivals, selection
 from sim_gap.position_gap import search as edits
 from sim_gap.position_gap.columns import shared_effects, with_columns
 from sim_gap.position_gap.controller import _from_grid, nominal_controller, nominal_point, scales_of
-from sim_gap.position_gap.fit import Fit, batch, coordinate, evaluate, improve, jacobian, residuals
+from sim_gap.position_gap.fit import LoopFit, batch, coordinate, evaluate, improve, jacobian, residuals
 from sim_gap.position_gap.identify import _frozen, not_worse
 from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, WITH_TORQUE, Scales, relative
-from sim_gap.position_gap.search import PRICE, Search, level_of
+from sim_gap.position_gap.search import PRICE, LoopSearch, level_of
 from sim_gap.position_gap.selection import _explained, _shared_round, ranked, select
 from sim_gap.position_gap.simulate import simulate
 from sim_gap.position_gap.tracks import held_command
@@ -37,21 +37,21 @@ def data() -> Windows:
 
 
 @pytest.fixture(scope="module")
-def search(data: Windows) -> Search:
+def search(data: Windows) -> LoopSearch:
     """About the model with its gains unknown."""
     bare = load_model(mujoco.MjModel.from_xml_string(TEXT.partition("<actuator>")[0] + "</mujoco>"))
     point = nominal_point(data, nominal_controller(bare))
-    return Search(data, scales_of(data), point, np.full(2, 1e-4))
+    return LoopSearch(data, scales_of(data), point, np.full(2, 1e-4))
 
 
-def test_the_grid_finds_a_stiffness_near_the_servos(search: Search) -> None:
+def test_the_grid_finds_a_stiffness_near_the_servos(search: LoopSearch) -> None:
     """Its points are a factor of two apart."""
     found = _from_grid(search, ("delay",)).point
     assert np.abs(np.log2(found["kp"] / 15.0)).max() < 1.2
     assert (found["feed"] == 0.0).all()
 
 
-def test_the_grid_centres_on_the_torque_that_the_error_has_to_make(search: Search, monkeypatch) -> None:
+def test_the_grid_centres_on_the_torque_that_the_error_has_to_make(search: LoopSearch, monkeypatch) -> None:
     """With feed-forward on what that leaves, which is next to nothing of gravity's torque."""
     asked: dict[str, np.ndarray] = {}
 
@@ -80,7 +80,7 @@ def test_a_parameters_slope_is_that_at_its_value(data: Windows) -> None:
     scales = Scales(one, one, 0.02 * one, 0.05 * one)
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
     point = nominal_point(data, nominal_controller(sim))
-    fit = Fit(point, (("viscous",), ("viscous",)))
+    fit = LoopFit(point, (("viscous",), ("viscous",)))
     _, slopes = jacobian(data, fit, scales, fit.active)
     for j in range(2):
         ends = []
@@ -118,8 +118,8 @@ def test_a_joint_whose_command_rests_has_levels_of_a_slew_limit_all_the_same(dat
     still = data.speed.copy()
     still[:, 1] = 0.0
     point = nominal_point(data, nominal_controller(sim))
-    search = Search(replace(data, speed=still), scales_of(data), point, np.full(2, 3e-4))
-    level = level_of(search, Fit(point, ((), ())), "slew")
+    search = LoopSearch(replace(data, speed=still), scales_of(data), point, np.full(2, 3e-4))
+    level = level_of(search, LoopFit(point, ((), ())), "slew")
     assert (level >= 0.1 * PARAMETERS["slew"].low).all()
     assert level[0] > 10.0 * level[1]
 
@@ -128,7 +128,7 @@ def test_slopes_add_up_to_that_by_the_common_scale_of_all_torques(data: Windows)
     """Sticking and slipping roughen each difference: of friction and gain alone they would add up to much more."""
     scales, names = scales_of(data), ("kp", "coulomb", "viscous", "armature", "delay")
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
-    fit = Fit(nominal_point(data, nominal_controller(sim)), (names, names))
+    fit = LoopFit(nominal_point(data, nominal_controller(sim)), (names, names))
     _, slopes = jacobian(data, fit, scales, fit.active)
     scaled = {name: values * (np.exp(0.01) if name in WITH_TORQUE else 1.0) for name, values in fit.point.items()}
     gaps = residuals(data, batch([fit.point, scaled]))
@@ -143,7 +143,7 @@ def test_a_parameter_at_its_highest_value_has_a_slope_too(data: Windows) -> None
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
     one = np.ones(2)
     point = {**nominal_point(data, nominal_controller(sim)), "load": np.full(2, PARAMETERS["load"].high)}
-    fit = Fit(point, (("load",), ("load",)))
+    fit = LoopFit(point, (("load",), ("load",)))
     _, slopes = jacobian(data, fit, Scales(one, one, 0.02 * one, 0.05 * one), fit.active)
     assert all(np.linalg.norm(slope) > 0.0 for slope in slopes)
 
@@ -165,19 +165,19 @@ def test_a_joint_that_moves_in_few_windows_moves_in_one_that_is_fitted(data: Win
 def test_a_joint_that_is_left_worse_than_by_the_model_keeps_the_models_values(data: Windows) -> None:
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
     point = nominal_point(data, nominal_controller(sim))
-    search = Search(data, scales_of(data), point, np.full(2, 3e-4))
+    search = LoopSearch(data, scales_of(data), point, np.full(2, 3e-4))
     stuck = {**point, "kp": point["kp"] * [1.0, 0.1]}
-    fit = not_worse(search, evaluate(data, Fit(stuck, (("kp",), ("kp",)))), np.full(2, np.inf))
+    fit = not_worse(search, evaluate(data, LoopFit(stuck, (("kp",), ("kp",)))), np.full(2, np.inf))
     np.testing.assert_array_equal(fit.point["kp"], point["kp"])
     assert fit.active == (("kp",), ())
-    np.testing.assert_array_equal(fit.rms, evaluate(data, Fit(point, ((), ()))).rms)
+    np.testing.assert_array_equal(fit.rms, evaluate(data, LoopFit(point, ((), ()))).rms)
 
 
 def test_a_joint_that_mujoco_moves_as_it_was_measured_keeps_the_models_values(data: Windows) -> None:
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
     point = {**nominal_point(data, nominal_controller(sim)), "coulomb": np.zeros(2)}
-    search = Search(data, scales_of(data), point, np.full(2, 3e-4))
-    fit = improve(data, Fit(point, (("coulomb",), ("coulomb",))), scales_of(data))
+    search = LoopSearch(data, scales_of(data), point, np.full(2, 3e-4))
+    fit = improve(data, LoopFit(point, (("coulomb",), ("coulomb",))), scales_of(data))
     assert np.all(fit.point["coulomb"] > 0.1)
     kept = not_worse(search, fit, np.array([5e-4, 7e-4]))
     assert kept.point["coulomb"].tolist() == [0.0, fit.point["coulomb"][1]]
@@ -187,9 +187,9 @@ def test_what_the_whole_arm_has_stays_where_a_joint_takes_the_models_values(data
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
     seen = with_columns(data)
     point = nominal_point(seen, nominal_controller(sim))
-    search = Search(seen, scales_of(seen), point, np.full(2, 3e-4))
+    search = LoopSearch(seen, scales_of(seen), point, np.full(2, 3e-4))
     stuck = {**point, "kp": point["kp"] * [1.0, 0.1], "moment1.x": np.full(2, 0.001)}
-    fit = not_worse(search, evaluate(seen, Fit(stuck, (("kp",), ("kp",)), ("moment1.x",))), np.full(2, np.inf))
+    fit = not_worse(search, evaluate(seen, LoopFit(stuck, (("kp",), ("kp",)), ("moment1.x",))), np.full(2, np.inf))
     np.testing.assert_array_equal(fit.point["kp"], point["kp"])
     np.testing.assert_array_equal(fit.point["moment1.x"], [0.001, 0.001])
     assert fit.shared == ("moment1.x",)
@@ -203,7 +203,7 @@ def test_a_tilt_turns_the_base_about_its_own_axes() -> None:
     data = with_columns(windows_of(sim.arm, [record(real, 1, 14.0)], ["run"]))
     point = {**nominal_point(data, nominal_controller(sim)), "tilt.angle_2": np.zeros(2)}
     assert "tilt.angle_1" not in data.columns  # both joints turn about y
-    fit = improve(data, Fit(point, ((), ()), ("tilt.angle_2",)), scales_of(data))
+    fit = improve(data, LoopFit(point, ((), ()), ("tilt.angle_2",)), scales_of(data))
     assert fit.point["tilt.angle_2"][0] == pytest.approx(0.1, rel=0.06)
 
 
@@ -212,10 +212,10 @@ def test_a_mass_moment_that_no_arm_can_have_is_not_taken() -> None:
     heavier = TEXT.replace('<inertial pos="0.08 0 0" mass="0.3"', '<inertial pos="0.16 0 0" mass="0.3"')
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
     data = with_columns(windows_of(sim.arm, [record(heavier, 1, 14.0)], ["run"]))
-    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
+    search = LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
     effect = "link.mass_moment@elbow"
     whole = {effect: shared_effects(sim.arm)[effect]}
-    fit = evaluate(data, Fit(search.nominal, ((), ())))
+    fit = evaluate(data, LoopFit(search.nominal, ((), ())))
     found = _shared_round(search, fit, whole, 0.0)
     assert found is not None
     assert found.point["moment1.x"][0] == pytest.approx(0.3 * 0.08, rel=0.15)
@@ -289,7 +289,7 @@ def test_a_coefficient_of_the_whole_arm_is_one_and_a_joints_is_in_its_own_scale(
 def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -> None:
     monkeypatch.setattr(edits, "shared_effects", lambda arm: {"base.tilt": ("tilt.x", "tilt.y"), "other": ("z",)})
     names = ("tilt.x", "tilt.y", "z")
-    fit = Fit({name: np.array([0.3]) for name in (*names, "kp")}, ((),), names)
+    fit = LoopFit({name: np.array([0.3]) for name in (*names, "kp")}, ((),), names)
     bare = edits.taken_out(SimpleNamespace(data=SimpleNamespace(arm=None)), fit, ("base.tilt", ()))
     assert {name: float(x[0]) for name, x in bare.point.items()} == {"tilt.x": 0.0, "tilt.y": 0.0, "z": 0.3, "kp": 0.3}
     assert bare.shared == ("z",)
@@ -308,7 +308,7 @@ def test_the_spread_of_a_parameter_is_that_of_least_squares(monkeypatch) -> None
     data = SimpleNamespace(count=400, joints=1, recording=np.arange(400) // 10, columns={}, arm=arm)
     data.of_one_recording = False
     search = SimpleNamespace(data=data, scales=Scales(*np.ones((4, 1))), samples=np.array([400.0]))
-    fit = Fit({"kp": np.array([15.0]), **{name: np.zeros(1) for name in spread.SCALED}}, (("kp",),))
+    fit = LoopFit({"kp": np.array([15.0]), **{name: np.zeros(1) for name in spread.SCALED}}, (("kp",),))
     for estimate, times in ((spread.covariance, 2.0), (spread.covariance_within, 1.0)):
         found = estimate(search, fit).matrix[0, 0] - spread.SYSTEMATIC**2
         assert found == pytest.approx(times * 1e-4 / (x**2).sum(), rel=0.25)
@@ -318,7 +318,9 @@ def test_of_one_motion_what_is_left_of_the_way_to_the_command_is_what_another_ma
     """A twentieth of it at the first joint, nothing at the second, half at the third, of which no more is unknown than
     of what a model states; nothing where several recordings show it."""
     monkeypatch.setattr(spread, "rms_on", lambda data, fit: np.array([0.001, 0.0, 0.01]))
-    fit = Fit({"kp": np.array([15.0, 10.0, 5.0]), "coulomb": np.array([0.3, 0.2, 0.1])}, (("kp", "coulomb"), ("kp",)))
+    fit = LoopFit(
+        {"kp": np.array([15.0, 10.0, 5.0]), "coulomb": np.array([0.3, 0.2, 0.1])}, (("kp", "coulomb"), ("kp",))
+    )
     torque, one = np.full(3, 0.5), np.ones(3)
     scales = Scales(torque, one, one, np.full(3, 0.02))
     search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True), scales=scales)
@@ -346,20 +348,20 @@ def test_a_gain_is_a_logarithm_away_from_the_nominal_one() -> None:
 def test_the_common_scale_is_open_if_half_as_much_again_fits_as_well(monkeypatch, lost: float, named: tuple) -> None:
     monkeypatch.setattr(rivals, "improve", lambda data, fit, scales, iterations: fit)
     names = ("kp", "coulomb", "viscous", "kd", "ki", "stribeck", "armature", "dead")
-    fit = Fit({name: np.array([2.0, 2.0]) for name in names}, (("kp",), ("kp",)))
+    fit = LoopFit({name: np.array([2.0, 2.0]) for name in names}, (("kp",), ("kp",)))
     scores = iter([np.array([1.0 + 3.0 * PRICE, 1.0 + lost]), np.array([1.0, 1.0])])
     search = SimpleNamespace(data=None, scales=None, score=lambda fit: next(scores))
     assert rivals._scale_rivals(search, fit) == named
 
 
-def _searched(text: str, seen: Recording, *looked_for: str) -> tuple[Search, Fit]:
+def _searched(text: str, seen: Recording, *looked_for: str) -> tuple[LoopSearch, LoopFit]:
     """The search of some effects from the model with its own controller, and the fit of that model."""
     sim = load_model(mujoco.MjModel.from_xml_string(text))
     data = with_columns(windows_of(sim.arm, [seen], ["run"]))
     point = nominal_point(data, nominal_controller(sim))
     without = frozenset({*EFFECTS, "position.offset", "link.payload", "link.mass_moment", "base.tilt"} - {*looked_for})
-    search = Search(data, scales_of(data), point, np.full(2, 2e-4), without)
-    return search, evaluate(data, Fit(point, ((), ())))
+    search = LoopSearch(data, scales_of(data), point, np.full(2, 2e-4), without)
+    return search, evaluate(data, LoopFit(point, ((), ())))
 
 
 def test_a_spring_that_a_moved_mass_would_replace_is_confounded_with_it() -> None:
@@ -406,7 +408,7 @@ def test_a_rival_is_measured_by_all_that_is_lost_without_the_effect(monkeypatch,
     scores = {"fit": base, "bare": base + 30.0 * PRICE, "trial": base + 2.0 * PRICE}
     search = SimpleNamespace(data=None, scales=None, excluded=frozenset(), score=lambda fit: scores[fit.name])
     monkeypatch.setattr(rivals, "ranked", lambda search, fit, own: [[(1.0, "controller.delay")]] * 2)
-    monkeypatch.setattr(rivals, "with_effect", lambda search, fit, other, place: Fit({}, ((), ())))
+    monkeypatch.setattr(rivals, "with_effect", lambda search, fit, other, place: LoopFit({}, ((), ())))
     monkeypatch.setattr(rivals, "improve", lambda *given: SimpleNamespace(rms=1, name="trial"))
     monkeypatch.setattr(rivals, "_of_the_arm", lambda *given: [])
     least, close = rivals.rivals_of(search, fit, group, bare)
@@ -450,7 +452,7 @@ def test_friction_that_a_simulator_cannot_hold_is_added_to_coulombs(monkeypatch)
         "kd": 0.0,
         "feed": 0.0,
     }
-    fit = Fit({name: np.array([value]) for name, value in own.items()}, (("coulomb", "stribeck", "load"),))
+    fit = LoopFit({name: np.array([value]) for name, value in own.items()}, (("coulomb", "stribeck", "load"),))
     data = SimpleNamespace(joints=1, load=np.full((5, 1, 2), 4.0), arm=SimpleNamespace(names=()))
     nominal = dict.fromkeys(own, nothing)
     monkeypatch.setattr(export, "improve", lambda data, fit, scales, iterations: fit)
@@ -472,8 +474,8 @@ def test_what_needs_coulomb_friction_is_tried_where_the_model_has_it(data: Windo
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
     point = nominal_point(data, nominal_controller(sim))
     point["coulomb"] = np.array([0.2, 0.0])
-    about = Search(data, scales_of(data), point, np.full(2, 1e-4))
-    bare = evaluate(data, Fit(point, ((), ())))
+    about = LoopSearch(data, scales_of(data), point, np.full(2, 1e-4))
+    bare = evaluate(data, LoopFit(point, ((), ())))
     first, second = ranked(about, bare, ["friction.asymmetric", "friction.stribeck"])
     assert {effect for _, effect in first} == {"friction.asymmetric", "friction.stribeck"}
     assert second == []

@@ -9,7 +9,7 @@ from sim_gap.model.load import load_model
 from sim_gap.model.rigid_body import inertial_of
 from sim_gap.position_gap.columns import PAYLOAD_INERTIA, payload_inertia, with_columns
 from sim_gap.position_gap.controller import nominal_controller, nominal_point
-from sim_gap.position_gap.fit import Fit, evaluate
+from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.judge import joint_rms
 from sim_gap.position_gap.windows import windows_of
 
@@ -40,10 +40,10 @@ def test_it_moves_as_in_mujoco() -> None:
     early = np.full(2, 0.5 * SIM.mujoco_model.opt.timestep)
     values = {"payload.mass": np.full(2, mass), "payload.x": np.full(2, mass * place), "early": early}
     point = {**nominal_point(data, nominal_controller(SIM)), **values}
-    left = joint_rms(data, evaluate(data, Fit(point, ((), ()))).rms)
+    left = joint_rms(data, evaluate(data, LoopFit(point, ((), ()))).rms)
     for name in PAYLOAD_INERTIA:
         data.columns.pop(name, None)
-    without = joint_rms(data, evaluate(data, Fit(point, ((), ()))).rms)
+    without = joint_rms(data, evaluate(data, LoopFit(point, ((), ()))).rms)
     assert (without > 3.0 * left).all()
 
 

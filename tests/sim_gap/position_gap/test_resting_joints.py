@@ -14,7 +14,7 @@ from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.model.load import load_model
 from sim_gap.position_gap.columns import with_columns
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, rests, scales_of, starting_fit
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.windows import windows_of
 
 GAIN, MODEL_GAIN = 15.0, 120.0
@@ -87,7 +87,7 @@ def test_a_model_without_servos_gets_one_that_holds_the_resting_joint_and_moves_
     data = with_columns(windows_of(sim.arm, [still(record(text, 1, 18.0))], ["run"]))
     own = nominal_controller(sim)
     excluded = frozenset({"actuator.back_emf"})
-    search = Search(data, scales_of(data), nominal_point(data, own), np.full(2, 3e-4), excluded)
+    search = LoopSearch(data, scales_of(data), nominal_point(data, own), np.full(2, 3e-4), excluded)
     search, fit, _ = starting_fit(search, own, lambda text: None)
     assert search.resting == {1}
     assert search.open_controller

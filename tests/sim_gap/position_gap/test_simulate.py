@@ -6,7 +6,7 @@ from servo_arm import model_text, record
 from sim_gap.model.load import load_model
 from sim_gap.model.solver_friction import creep_speeds
 from sim_gap.position_gap.controller import nominal_controller, nominal_point
-from sim_gap.position_gap.fit import Fit, batch, evaluate, jacobian
+from sim_gap.position_gap.fit import LoopFit, batch, evaluate, jacobian
 from sim_gap.position_gap.judge import joint_rms
 from sim_gap.position_gap.parameters import Scales, moved
 from sim_gap.position_gap.rivals import _like
@@ -28,7 +28,7 @@ FADING = "stribeck", "stribeck_velocity"
 
 def test_agrees_with_mujoco_on_a_servo_with_friction() -> None:
     data, point = _windows()
-    found = evaluate(data, Fit(point, ((), ())))
+    found = evaluate(data, LoopFit(point, ((), ())))
     moved = np.sqrt(np.mean((data.command - data.recorded) ** 2, axis=(0, 2)))
     assert (joint_rms(data, found.rms) < np.maximum(0.03 * moved, 1.5e-3)).all()
 
@@ -42,7 +42,8 @@ def test_agrees_with_mujoco_on_friction_under_which_a_joint_creeps() -> None:
     point = {**nominal_point(data, nominal_controller(sim)), "delay": early}
     speeds = creep_speeds(sim.mujoco_model, [0, 1])
     creeping, resting = (
-        joint_rms(data, evaluate(data, Fit({**point, "creep": each}, ((), ()))).rms) for each in (speeds, 0.0 * speeds)
+        joint_rms(data, evaluate(data, LoopFit({**point, "creep": each}, ((), ()))).rms)
+        for each in (speeds, 0.0 * speeds)
     )
     assert (creeping < 6e-4).all()
     assert (creeping < 0.8 * resting).all()
@@ -77,14 +78,14 @@ def test_agrees_with_mujoco_on_friction_that_fades_with_the_velocity(rotor: floa
     data = windows_of(sim.arm, [record(text, 1, 21.0, breakaway=breakaway)], ["run"])
     point = nominal_point(data, nominal_controller(sim))
     known = {name: np.full(2, value) for name, value in zip(FADING, breakaway, strict=True)}
-    left, without = (joint_rms(data, evaluate(data, Fit({**point, **more}, ((), ()))).rms) for more in (known, {}))
+    left, without = (joint_rms(data, evaluate(data, LoopFit({**point, **more}, ((), ()))).rms) for more in (known, {}))
     assert (left < 0.0021).all()
     assert (left < 0.6 * without).all()
 
 
 def test_another_gain_shows() -> None:
     data, point = _windows(model_text(kp=30.0, friction=0.2))
-    found = evaluate(data, Fit(point, ((), ())))
+    found = evaluate(data, LoopFit(point, ((), ())))
     assert (joint_rms(data, found.rms) > 0.01).all()
 
 
@@ -92,9 +93,9 @@ def test_slopes_are_those_of_the_residual() -> None:
     data, point = _windows()
     one = np.ones(2)
     scales = Scales(one, one, 0.02 * one, 0.05 * one)
-    fit = Fit(point, (("kp", "viscous"), ("kp", "viscous")))
+    fit = LoopFit(point, (("kp", "viscous"), ("kp", "viscous")))
     now, slopes = jacobian(data, fit, scales, fit.active)
-    ahead = Fit({**point, "kp": point["kp"] * np.exp(0.03)}, fit.active)
+    ahead = LoopFit({**point, "kp": point["kp"] * np.exp(0.03)}, fit.active)
     change = jacobian(data, ahead, scales, ((), ()))[0] - now
     for j in range(2):
         expected = 0.03 * slopes[j][0]
@@ -117,10 +118,10 @@ def test_damping_of_an_actuator_acts_within_its_limit() -> None:
     sim = load_model(mujoco.MjModel.from_xml_string(text))
     data = windows_of(sim.arm, [record(text, 1, 20.0)], ["run"])
     point = nominal_point(data, nominal_controller(sim))
-    rms = joint_rms(data, evaluate(data, Fit(point, ((), ()))).rms)
+    rms = joint_rms(data, evaluate(data, LoopFit(point, ((), ()))).rms)
     moved = np.sqrt(np.mean((data.command - data.recorded) ** 2, axis=(0, 2)))
     assert (rms < np.maximum(0.05 * moved, 2e-3)).all()
-    outside = joint_rms(data, evaluate(data, Fit({**point, "kv": np.zeros(2)}, ((), ()))).rms)
+    outside = joint_rms(data, evaluate(data, LoopFit({**point, "kv": np.zeros(2)}, ((), ()))).rms)
     assert (outside > 3.0 * rms).any()
 
 
@@ -135,9 +136,9 @@ def test_a_pid_with_slew_limit_and_delay_moves_as_mujocos_does() -> None:
     data = windows_of(sim.arm, [record(text, 1, 20.0)], ["run"])
     point = nominal_point(data, nominal_controller(sim))
     off = {"slew": np.full(2, np.inf), "delay": np.zeros(2)}
-    own = joint_rms(data, evaluate(data, Fit(point, ((), ()))).rms)
+    own = joint_rms(data, evaluate(data, LoopFit(point, ((), ()))).rms)
     for name, values in off.items():
-        without = joint_rms(data, evaluate(data, Fit({**point, name: values}, ((), ()))).rms)
+        without = joint_rms(data, evaluate(data, LoopFit({**point, name: values}, ((), ()))).rms)
         assert (without > 3.0 * own).any(), name
     assert (own < 0.004).all()
 

@@ -8,10 +8,10 @@ from servo_arm import model_text, record
 from sim_gap.model.load import SimModel, load_model
 from sim_gap.position_gap.columns import with_columns
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
-from sim_gap.position_gap.fit import Fit, evaluate, improve
+from sim_gap.position_gap.fit import LoopFit, evaluate, improve
 from sim_gap.position_gap.judge import joint_rms
 from sim_gap.position_gap.nominal_motion import nominal_solver, other_solver, solvers
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.windows import windows_of
 
 STEP = 0.004
@@ -24,15 +24,15 @@ def arm(step: float = STEP, method: str = "Euler", servo: float = 0.6) -> str:
     return text.replace('kp="40.0"', f'kp="40.0" kv="{servo}"')
 
 
-def search_on(text: str, nominal: str) -> tuple[SimModel, Search]:
+def search_on(text: str, nominal: str) -> tuple[SimModel, LoopSearch]:
     """What the effects compete on: a recording of an arm, beside a model."""
     sim = load_model(mujoco.MjModel.from_xml_string(nominal))
     data = with_columns(windows_of(sim.arm, [record(text, 1, 20.0)], ["run"]))
-    return sim, Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 5e-4))
+    return sim, LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 5e-4))
 
 
-def left(search: Search) -> np.ndarray:
-    fit = evaluate(search.data, Fit(search.nominal, ((), ())))
+def left(search: LoopSearch) -> np.ndarray:
+    fit = evaluate(search.data, LoopFit(search.nominal, ((), ())))
     assert fit.rms is not None
     return joint_rms(search.data, fit.rms)
 
@@ -62,7 +62,7 @@ def test_where_a_solver_does_nothing_there_is_none_to_choose() -> None:
     kinds = solvers(sim, search)
     assert len(kinds) == 1
     search = nominal_solver(search, kinds)
-    assert other_solver(search, evaluate(search.data, Fit(search.nominal, ((), ()))), kinds) is None
+    assert other_solver(search, evaluate(search.data, LoopFit(search.nominal, ((), ()))), kinds) is None
     sim, search = search_on(arm(), arm().replace('frictionloss="0.15"', ""))
     assert len(solvers(sim, search)) == 2
 
@@ -73,7 +73,7 @@ def test_delay_and_inertia_that_stand_for_a_solver_are_seen_to() -> None:
     kinds = solvers(sim, search)
     search = nominal_solver(search, kinds[:1])
     own = ("delay", "armature", "coulomb")
-    fit = improve(search.data, Fit(search.nominal, (own, own)), search.scales, 8)
+    fit = improve(search.data, LoopFit(search.nominal, (own, own)), search.scales, 8)
     solver = other_solver(search, fit, kinds)
     assert solver is not None
     assert np.all(solver["early"] == 0.5 * STEP)

@@ -6,10 +6,10 @@ from servo_arm import model_text, record
 from sim_gap.model.load import load_model
 from sim_gap.position_gap.columns import with_columns
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
-from sim_gap.position_gap.fit import Fit, evaluate
+from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.identify import _margin, noise_floor
 from sim_gap.position_gap.judge import rms_on
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.sound import probable, sound
 from sim_gap.position_gap.windows import windows_of
 
@@ -25,8 +25,8 @@ def split(model, real: str):
     """The gap of the nominal model against an arm, split, with its margin and the RMS that it has [rad]."""
     train, heldout = (with_columns(windows_of(model.arm, [record(real, seed, 26.0)], ["run"])) for seed in (1, 2))
     nominal = nominal_point(train, nominal_controller(model))
-    search = Search(train, scales_of(train), nominal, noise_floor(train))
-    fit = evaluate(train, Fit(nominal, ((),) * 2))
+    search = LoopSearch(train, scales_of(train), nominal, noise_floor(train))
+    fit = evaluate(train, LoopFit(nominal, ((),) * 2))
     margin = _margin(search, fit)
     return sound(search, heldout, margin), margin, rms_on(train, fit)
 

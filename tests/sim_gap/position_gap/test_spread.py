@@ -7,8 +7,8 @@ import pytest
 from servo_arm import JOINTS, fitted
 
 from sim_gap.position_gap import sound
-from sim_gap.position_gap.fit import Fit, batch, improve, residuals
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.fit import LoopFit, batch, improve, residuals
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.training import spread
 from sim_gap.position_gap.training.draws import draw
 from sim_gap.position_gap.training.jackknife import Terms, jackknifed
@@ -18,12 +18,12 @@ FRICTION = 0.15, 0.35
 
 
 @pytest.fixture(scope="module")
-def several() -> tuple[Search, Fit]:
+def several() -> tuple[LoopSearch, LoopFit]:
     return fitted(*FRICTION, *FRICTION)
 
 
 @pytest.fixture(scope="module")
-def weightless() -> tuple[Search, Fit]:
+def weightless() -> tuple[LoopSearch, LoopFit]:
     return fitted(0.2, 0.2, weightless=True)
 
 
@@ -128,7 +128,7 @@ def test_a_value_that_the_model_states_is_open_where_a_gain_rests_on_it(weightle
 
 def test_of_a_payload_the_centre_is_told_and_not_the_moment() -> None:
     """Of 0.4 ± 0.02 kg and 0.08 ± 0.002 kg·m independent of it: 0.2 m, and relative deviations add in squares."""
-    fit = Fit({"payload.mass": np.array([0.4]), "payload.x": np.array([0.08])}, (), ("payload.mass", "payload.x"))
+    fit = LoopFit({"payload.mass": np.array([0.4]), "payload.x": np.array([0.08])}, (), ("payload.mass", "payload.x"))
     found = Covariance([(-1, "payload.mass"), (-1, "payload.x")], np.diag([0.02**2, 0.002**2]))
     centre, low, high, unit = spread.payload_centre(fit, found, "payload.x")
     assert (centre, unit) == (pytest.approx(0.2), "m")

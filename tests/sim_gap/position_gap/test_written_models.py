@@ -14,8 +14,8 @@ from sim_gap.attribution.position_notes import _ranges
 from sim_gap.better_model.effects_module import module_text
 from sim_gap.model.load import SimModel, load_model
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
-from sim_gap.position_gap.fit import Fit, improve
-from sim_gap.position_gap.search import Search
+from sim_gap.position_gap.fit import LoopFit, improve
+from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.training.export import (
     IN_MODULE,
     Exported,
@@ -34,13 +34,13 @@ OTHER = record(TEXT, 3, 21.0, load=LOAD)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> tuple[SimModel, Search, Fit]:
+def made(tmp_path_factory) -> tuple[SimModel, LoopSearch, LoopFit]:
     """An arm whose gears rub under load, and the fit that knows it."""
     sim = load_model(written(tmp_path_factory.mktemp("arm"), TEXT))
     data = windows_of(sim.arm, [record(TEXT, seed, 14.0, load=LOAD) for seed in (1, 2)], ["one", "two"])
-    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
+    search = LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
     known = ("kp", "coulomb", "viscous", "load")
-    return sim, search, improve(data, Fit(search.nominal, (known, known)), search.scales)
+    return sim, search, improve(data, LoopFit(search.nominal, (known, known)), search.scales)
 
 
 def loaded(sim: SimModel, beside: Exported) -> Simulated:
