@@ -1,4 +1,4 @@
-"""What commands say to people and ask them, on standard error: the one way of text to a terminal.
+"""Text and questions of commands, on standard error: the one way of text to a terminal.
 
 Names come from devices, models and recordings. No text is markup, and what is not printable is shown as its escape,
 so that nothing in a name can colour, link, move the cursor, turn the direction of reading or feign a line.

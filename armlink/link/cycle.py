@@ -60,7 +60,7 @@ class Commander:
         self._mute_cycles = 0
         """Cycles of `keep` in a row in which nothing could be sent."""
         self.motion = MotionWatch(self.n, period)
-        """What the readings prove about the motion."""
+        """Bounds of the joints' speeds by their readings."""
         self._seen_now: list[Seen] = []
         self._due = 0.0
         self.unhurried = False

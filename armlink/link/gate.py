@@ -105,7 +105,7 @@ class Seen(NamedTuple):
 
 
 class Corroboration(NamedTuple):
-    """What a joint's other readings and its order say where one reading would be believed alone."""
+    """Bounds on a reading by a joint's other readings and its order: none is believed alone."""
 
     proven: float = 0.0
     """Speed that its positions prove [rad/s]; 0 where they prove none."""
@@ -250,7 +250,7 @@ def _passed(limits: JointLimits, torque: float, position: float, mode: int, powe
 
 
 def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
-    """What in an order, as its bytes tell it, is beyond a limit, in words; empty if nothing. The last check of all.
+    """The value of an order, by its bytes, that is beyond a limit, in words; empty if none. The last check of all.
 
     `passed` is the order that the bytes stand for: outside the window a target may lie only where the gate led it.
     """

@@ -23,7 +23,7 @@ from armlink.link.bus_load import overload
 from armlink.link.bus_watchdog import MOST_FRAMES
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.ends import Cause, cause_of, end
+from armlink.link.ends import EndCause, cause_of, end
 from armlink.link.faults import bus_fault
 from armlink.link.gate import JointLimits, start_from
 from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, require_ranges, target_window
@@ -85,7 +85,7 @@ class Link(Calibrations):
         """Requests to drives, outside of cycles or between them."""
         self.calibrate_host(simulated=self._lock_step)
         self.setups: list[Setup] = []
-        """What start() found, in joint order."""
+        """Results of start(), in joint order."""
         self._cycling = self._enabled = self._held = False
         self._since = 0.0
         self.position_step = np.full(self.n, np.inf)
@@ -113,7 +113,7 @@ class Link(Calibrations):
     def _say(self, text: str) -> None:
         log.debug("%s: %s", self.arm.name, text)
 
-    def close(self, cause: Cause = Cause.DONE, tell: Tell | None = None) -> None:
+    def close(self, cause: EndCause = EndCause.DONE, tell: Tell | None = None) -> None:
         """Bring the arm to its end (`armlink.link.ends`), and close the bus; `tell` is told what is being done.
 
         Ctrl-C no longer raises meanwhile; pressed twice it lets the arm go.
@@ -206,7 +206,7 @@ class Link(Calibrations):
         `to_enable`; BusFault, BadInput.
         """
         if self.falls:
-            end(self, Cause.DONE, self._say)
+            end(self, EndCause.DONE, self._say)
         self._hold = self._hold or ArmHold(self.bus, self.addresses)
         missing = [
             f"{self.names[group.places[joint]]} ({self.section.joints[group.places[joint]].settings.address})"
@@ -295,7 +295,7 @@ class Link(Calibrations):
         return [drive_limits(row, window, self.period, self.section.deadline) for row, window in pairs]
 
     def guard_rules(self) -> dict[str, Any]:
-        """What a guard of the bus may pass to these drives, as `armlink.guard.bus_guard` takes it; sets nothing.
+        """Frames that a guard of the bus may pass to these drives, as `armlink.guard.bus_guard` takes it; sets nothing.
 
         Raises BusFault where a drive does not answer, BadInput for drives that no guard can check.
         """
@@ -324,7 +324,7 @@ class Link(Calibrations):
         return gate_limits(wanted, gains, self.values.reach(joint, wanted.max_torque))
 
     def calibration_changed(self, joint: int) -> None:
-        """What the gate lets pass follows the host's calibration."""
+        """The gate's limits follow the host's calibration."""
         if self.setups:
             self.commander.limits[joint] = self._gate_limits(joint)
 
@@ -416,7 +416,7 @@ class Link(Calibrations):
         return sample
 
     def _mind_overload(self, error: BaseException) -> None:
-        """What no drive is to blame for: a bus that cannot carry the cycle."""
+        """Raise for a bus that cannot carry the cycle, which no drive is to blame for."""
         if self._overloaded and isinstance(error, BusFault) and not isinstance(error, HostLate):
             error.args = (f"{error}; {self._overloaded}",)
 

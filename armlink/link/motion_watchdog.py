@@ -1,4 +1,4 @@
-"""What the readings of n joints prove about their motion: no reading is believed alone.
+"""Bounds of n joints' speeds, and contradictions, by their readings: no reading is believed alone.
 
 Two readings tell how a joint moves: the velocity that its drive reports, and the differences of its positions. Each is
 taken for what it can prove. A sample was taken no earlier than it was asked for and no later than it was here; two
@@ -27,8 +27,8 @@ ROWS = LAGS[-1] + 1
 PRESENT = 4
 """The first so many lags tell of the present: a mean over up to eight cycles."""
 REACTION_CYCLES = 3
-"""What is not stopped by this reading is stopped by the next: the reading is a cycle old, the next comes a cycle later,
-and an order acts within a third."""
+"""A joint that this reading does not stop is stopped by the next: the reading is a cycle old, the next comes a cycle
+later, and an order acts within a third."""
 MEMORY = 0.5
 """Ways by positions and by velocities are compared over this time [s]: long against a drive's filter, and so short that
 a velocity reading's zero error (half a step of 12 bits, 0.02 rad/s) comes to no more than WAY."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from armlink.link.ends import Cause
+from armlink.link.ends import EndCause
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.messages import Drop, End, Told
 from armlink.termination import Dropped
@@ -50,7 +50,7 @@ class Ending:
 
 
 def telling(channel: Channel, aside: Callable[[Any], None] = lambda message: None) -> Callable[[str], None]:
-    """What tells the job how far the end of its arm is, as long as the job is there; raises Dropped when it says so.
+    """Tell the job how far the end of its arm is, as long as the job is there; raises Dropped when it says so.
 
     `aside` takes whatever else the job says meanwhile.
     """
@@ -70,7 +70,7 @@ def telling(channel: Channel, aside: Callable[[Any], None] = lambda message: Non
     return tell
 
 
-def see_out(channel: Channel, runs: Callable[[], bool], cause: Cause, tell: Callable[[str], None]) -> bool:
+def see_out(channel: Channel, runs: Callable[[], bool], cause: EndCause, tell: Callable[[str], None]) -> bool:
     """Have the process at the other end bring its arm to the end, and wait until it has ended; whether it has.
 
     `tell` is told what it does, and may raise Dropped: the arm is then let go. `runs` tells whether the process runs.

@@ -19,14 +19,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 
 from armlink.errors import ArmlinkError, BusFault, Refused, Stall
-from armlink.link.ends import Cause
+from armlink.link.ends import EndCause
 from armlink.link.gate import TORQUE_MODES
 from armlink.link.guard import Crossed
 from armlink.link.link import Link
 from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.ending import Ending, telling
-from armlink.loop.messages import Alive, Answer, Call, Cut, End, Open, Play, Run, Stopped, Told, pack
+from armlink.loop.messages import Alive, Call, Cut, End, LoopAnswer, Open, Play, RunController, Stopped, Told, pack
 from armlink.loop.realtime import prepare
 
 IDLE = 0.05
@@ -66,7 +66,7 @@ class DriveLoop:
         """A controller that is on its way."""
         self._heard = time.monotonic()
 
-    def run(self, ending: Ending) -> Cause:
+    def run(self, ending: Ending) -> EndCause:
         """Until the job says how the arm is to end, or SIGTERM is for this process alone; raises Closed where the job
         has gone."""
         while not ending.due:
@@ -83,7 +83,7 @@ class DriveLoop:
             else:
                 self._channel.flush()
                 self._channel.wait(IDLE)
-        return Cause.INTERRUPTED
+        return EndCause.INTERRUPTED
 
     def _handle(self, message: object) -> None:
         match message:
@@ -91,14 +91,14 @@ class DriveLoop:
                 self._call(message)
             case End():
                 self._end = message
-            case Play() | Run() if not self._link.enabled:
+            case Play() | RunController() if not self._link.enabled:
                 self._channel.put(Stopped(self._fault))
             case Play(id, setpoints):
                 if id != self._id:
                     self._begin(id)
                 self._chunks.append(setpoints)
                 self._rows += len(setpoints)
-            case Run(id, controller):
+            case RunController(id, controller):
                 self._begin(id)
                 self._unpickled = self._beside.submit(pickle.loads, controller)
             case Cut() if self._controlled:  # its last torque is right for its last sample alone
@@ -119,14 +119,16 @@ class DriveLoop:
         try:
             kwargs = dict(call.kwargs)
             if callable(call.what):
-                answer = Answer(call.id, call.what(link, lambda text: self._tell(call.id, text), *call.args, **kwargs))
+                answer = LoopAnswer(
+                    call.id, call.what(link, lambda text: self._tell(call.id, text), *call.args, **kwargs)
+                )
             else:
                 found = getattr(link, call.what)
-                answer = Answer(call.id, found(*call.args, **kwargs) if callable(found) else found)
+                answer = LoopAnswer(call.id, found(*call.args, **kwargs) if callable(found) else found)
         except ArmlinkError as error:
-            answer = Answer(call.id, error=error)
+            answer = LoopAnswer(call.id, error=error)
         except KeyboardInterrupt:
-            answer = Answer(call.id, error=Refused("interrupted"))
+            answer = LoopAnswer(call.id, error=Refused("interrupted"))
         if link.enabled and (callable(call.what) or call.what in ENABLING):
             self._begin(0)
             self._last = link.last
@@ -212,16 +214,16 @@ def main(number: int) -> None:
         try:
             link = Link.open(first.arm, first.bus)
         except ArmlinkError as error:
-            channel.put(Answer(0, error=error))
+            channel.put(LoopAnswer(0, error=error))
             channel.flush(1.0)
             return
-        cause = Cause.FAILED
+        cause = EndCause.FAILED
         try:
-            channel.put(Answer(0, prepare()))
+            channel.put(LoopAnswer(0, prepare()))
             sys.setswitchinterval(SWITCH)
             cause = DriveLoop(channel, link).run(ending)
         except Closed:
-            cause = Cause.LOST
+            cause = EndCause.LOST
         finally:
             link.close(cause, telling(channel))
     except Closed:

@@ -7,9 +7,14 @@ from functools import partial
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import AxisError, AxisState, Message, identifier, pack, unpack
-from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import (
+    BUS_VOLTAGE,
+    MOTOR_TEMPERATURE,
+    STAGE_TEMPERATURE,
+    AddressedFront,
+    SimulatedDrive,
+)
 
 TURN = 2 * math.pi
 HEARTBEAT_PERIOD = 0.1

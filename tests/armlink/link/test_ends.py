@@ -12,7 +12,7 @@ from ends_bench import EXTRA_SPEED, FALLING, EndsBench
 
 from armlink.arm_file import bundled_arms, parse_arm
 from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence, Stall
-from armlink.link.ends import ENDS, Cause, cause_of
+from armlink.link.ends import ENDS, EndCause, cause_of
 from armlink.link.guard import Crossed
 from armlink.termination import Presses, said
 
@@ -151,7 +151,7 @@ def test_only_two_presses_within_two_seconds_let_the_arm_go(monkeypatch, caplog)
     presses.press()
     bench = EndsBench("six-damiao")
     with caplog.at_level(logging.INFO, "armlink"):
-        bench.link.close(Cause.INTERRUPTED, said("arm", presses))
+        bench.link.close(EndCause.INTERRUPTED, said("arm", presses))
     assert all(bench.powered), "told to stop, which damps until the drives miss their host"
     bench.sim.advance(0.5)
     assert not any(bench.powered)
@@ -172,8 +172,8 @@ def test_a_link_that_holds_the_arm_takes_up_its_work_again():
 
 def test_the_table_of_ends_is_the_page_s():
     page = (Path(__file__).parents[3] / "docs" / "safety.md").read_text(encoding="utf-8")
-    for cause in Cause:
+    for cause in EndCause:
         holds, falls = ENDS[cause]
         row = rf"\| {re.escape(cause.value)} \| {re.escape(holds.value)} \| {re.escape(falls.value)} \|"
         assert re.search(row, page), f"docs/safety.md has no row for: {cause.value}"
-    assert {cause_of(error) for error in ERRORS.values()} < set(Cause)
+    assert {cause_of(error) for error in ERRORS.values()} < set(EndCause)

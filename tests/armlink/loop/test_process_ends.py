@@ -163,15 +163,24 @@ def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulu
     pendulum.job.communicate(timeout=30)
 
 
-def test_a_daemon_that_is_stopped_parks_the_arm_first(pendulum: Pendulum, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("park_speed", "longest"),
+    [(0.8, 60.0), pytest.param(0.05, 120.0, marks=pytest.mark.long)],  # the second takes longer than a hang is given
+)
+def test_a_daemon_that_is_stopped_parks_the_arm_first(
+    pendulum: Pendulum, park_speed: float, longest: float, tmp_path: Path
+) -> None:
+    content = yaml.safe_load(pendulum.path.read_text())
+    content["link"]["park"]["speed"] = park_speed
+    pendulum.path.write_text(yaml.safe_dump(content))
     pendulum.served.do(lambda: pendulum.served.arm.turn_by_hand(0, OUT))
     command = [Path(sys.executable).parent / "armlink", "daemon", pendulum.path, "--state", tmp_path / "state"]
-    pendulum.fastest = 0.0
-    with subprocess.Popen(
-        [*command, "--store", tmp_path / "records.db"], stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as daemon:
+    with (tmp_path / "log").open("w") as log, subprocess.Popen(
+        [*command, "--store", tmp_path / "records.db"], stderr=log, start_new_session=True
+    ) as daemon:  # fmt: skip
         assert serving.wait_for(lambda: pendulum.powered and (tmp_path / "state" / "api.sock").exists(), 60.0)
         pendulum.fastest = 0.0
         os.killpg(daemon.pid, signal.SIGTERM)
-        assert daemon.wait(60) == 0
+        assert daemon.wait(longest) == 0
     pendulum.require_parked()
+    assert "hangs" not in (tmp_path / "log").read_text()
