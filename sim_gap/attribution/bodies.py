@@ -79,8 +79,6 @@ def placed(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
 
 TURNED = 0.25
 """Least angle by which a body counts as mounted in another way [rad]."""
-ANGLES = 12
-"""Number of angles that are tried first."""
 CLEARLY = 0.5
 """Fall of Σ ½ log(R² + floor²) over the rows from which it does."""
 ALIKE = 0.5
@@ -104,8 +102,8 @@ def _mounted(estimate: EffectEstimate, s: PreparedSignals, layout: ChannelLayout
     def left(angle: float) -> float:
         return _left(estimate, ResidualSet((replace(s, mount=angle),), layout))
 
-    step = 2.0 * np.pi / ANGLES
-    start = min((step * k for k in range(ANGLES)), key=left)
+    step = 2.0 * np.pi / 12
+    start = min((step * k for k in range(12)), key=left)
     angle = golden(left, start - step, start + step)
     angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
     return left(angle), replace(s, mount=angle)

@@ -13,8 +13,6 @@ from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.stepwise import StepwiseSearch
 from sim_gap.search.term import Term
 
-TRIED = 3
-"""Number of laws tried in place of a term: the best of a first screening."""
 CONTAINED = 1e-6
 """A cause is a case of a law if at most this share of the power of its columns is outside the span of the law's."""
 
@@ -52,7 +50,7 @@ class LawTest:
         for term in own:
             rest = search.without(term, rest)
         laws = [law for law in self.laws if not self._holds(law, own)]
-        for _, law in search.weighted.screen(rest, laws)[:TRIED]:
+        for _, law in search.weighted.screen(rest, laws)[:3]:
             beside = [term for term in rest if term.place == law.place and not term.form.signature.whole_arm]
             score, _ = search.pruned(search.possible([*rest, law]), beside)
             best = min(best, StandIn(score - search.score, law.effect), key=lambda each: each.worse)

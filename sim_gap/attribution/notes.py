@@ -21,8 +21,6 @@ from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_cons
 
 ALIKE = 0.05
 """A general law that scores worse than a cause by less than this is noted."""
-MOST_ROWS = 3
-"""Number of rows with a remaining gap that are noted."""
 
 
 def notes(
@@ -154,7 +152,7 @@ def _remaining(data: ResidualSet, left: dict[Row, Array]) -> tuple[str, ...]:
     return tuple(
         f"{at.joint}: {at.rms:.2g} N·m of {at.channel} remain (noise {at.noise:.2g}), "
         + ("without a known regime" if at.regime == "other" else f"correlated with {at.regime} ({at.share:.0%})")
-        for at in (locate(data, left, above)[:MOST_ROWS] if above else [])
+        for at in (locate(data, left, above)[:3] if above else [])
     )
 
 

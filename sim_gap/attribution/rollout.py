@@ -24,8 +24,6 @@ from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
-MOST_EFFECTS = 12
-"""Number of effects, the most important first, that are also added and left out alone."""
 FEW_WINDOWS = 6
 """Number of windows of each of these."""
 NAME = "model.xml"
@@ -96,7 +94,7 @@ def roll_out(
         return Rollout(horizon, before, before)
     after = runs.of(estimate.terms, windows)
     out = []
-    for cause in causes[:MOST_EFFECTS]:
+    for cause in causes[:12]:  # most important first
         own = [term for term in estimate.terms if term.effect == cause.effect]
         rest = [term for term in estimate.terms if term not in own and not {t.key for t in own} & {*term.beneath}]
         needed = [term for term in estimate.terms if any(term.key in t.beneath for t in own)]

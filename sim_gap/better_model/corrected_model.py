@@ -72,7 +72,6 @@ HELD = {
 """Effects that a MuJoCo model can hold, and the element that holds them."""
 OF_READING = ("position.gain", "position.eccentricity")
 """Errors of a reading that a MuJoCo model cannot hold; an offset beside them is left to the module, too."""
-SMALLEST_INERTIA = 1e-6
 LEFT_KG = 1e-9
 """Mass and inertia left in a body whose inertials are counted to the body that it is fixed to."""
 
@@ -275,7 +274,7 @@ def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
 
 def possible(principal: Array) -> Array:
     """The closest physical principal moments of inertia (none exceeds the sum of the other two), (3,)."""
-    spread = np.maximum(0.5 * principal.sum() - principal, SMALLEST_INERTIA)
+    spread = np.maximum(0.5 * principal.sum() - principal, 1e-6)  # kg·m²
     return np.asarray(spread.sum() - spread)
 
 

@@ -78,8 +78,6 @@ def _hashes(folder: Path) -> dict[str, str]:
 
 MAKER, SERVO_MAKER = "sim_gap.blind.cases", "sim_gap.blind.servo_cases"
 """Modules that make the cases, of arms with torque channels and of arms with servos."""
-SERVO_LENGTHS = 36.0, 18.0
-"""Training and held-out recordings of arms with servos [s]."""
 MOST_EFFECTS = 10
 """Largest number of effects in one case."""
 Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], dict[str, Any]]
@@ -111,7 +109,7 @@ def run_bench(
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):
         raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
-    lengths = lengths or (SERVO_LENGTHS if positions else (TRAIN_S, HELDOUT_S))
+    lengths = lengths or ((36.0, 18.0) if positions else (TRAIN_S, HELDOUT_S))
     started = time.monotonic()
     progress("making cases", 0, cases)
     maker = SERVO_MAKER if positions else MAKER

@@ -19,9 +19,6 @@ from sim_gap.blind.plant.sensors import record
 from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, label, recipes
 from sim_gap.blind.true_arm import Log
 
-BAND_HZ = 6.0
-SMOOTH_SPEED = 0.02
-"""Speed over which nominal friction changes sign [rad/s]."""
 VISIBLE_RATIO, VISIBLE_LEAST = 3.0, 0.08
 """Least factor on some held-out RMS, and least increase of it [N·m], by a visible effect."""
 MOVING = 0.03
@@ -34,13 +31,13 @@ def gap(arm: BenchArm, columns: dict[str, Array]) -> dict[str, list[float]]:
 
     t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RATE)
     even = {k: _even(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
-    low = butter(4, BAND_HZ, fs=RATE, output="sos")
+    low = butter(4, 6.0, fs=RATE, output="sos")
     q = sosfiltfilt(butter(4, 15.0, fs=RATE, output="sos"), even["q"], axis=0)
     v = np.gradient(q, 1.0 / RATE, axis=0)
     a = np.gradient(v, 1.0 / RATE, axis=0)
     motor = inverse(compiled(arm), q, v, a)
     link = motor - arm.armature * a
-    motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / SMOOTH_SPEED)
+    motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / 0.02)  # rad/s
     out = {}
     for channel, model in (("tau", link), ("tau_motor", motor), ("tau_cmd", motor)):
         rest = sosfiltfilt(low, even[channel] - model, axis=0)[100:-100]
@@ -72,8 +69,6 @@ def _even(t: Array, own: Array, values: Array) -> Array:
 
 
 Values = TypeVar("Values")
-BATCH = 12
-"""Number of cases simulated together in one process."""
 TRAIN_S, HELDOUT_S, RATE = 120.0, 40.0, 250.0
 ROUNDS = 4
 """Number of drawings of a case that does not show its effects."""
@@ -206,7 +201,7 @@ def parse_words(description: str) -> argparse.Namespace:
 
 def make_all(make: Make, wanted: Sequence[Any], given: argparse.Namespace) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    size = max(1, min(BATCH, -(-len(wanted) // given.workers)))
+    size = max(1, min(12, -(-len(wanted) // given.workers)))  # simulated together in one process
     with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
         jobs = [
             pool.submit(make, wanted[first : first + size], given.out, given.labels, given.train_s, given.heldout_s)

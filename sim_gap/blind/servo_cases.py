@@ -26,7 +26,6 @@ VISIBLE_RATIO, VISIBLE_COUNTS = 3.0, 2.0
 """Least factor on a joint's gap, and least increase of it in counts of the encoder, by an effect that shows."""
 FOLLOWED = 0.6
 """Largest deviation from the command of an arm under control [rad]."""
-SETTLE_S = 1.0
 JITTER_S = 4e-4
 
 
@@ -168,7 +167,7 @@ def recorded(run: ServoRun, log: Log, hz: float, random: np.random.Generator) ->
 
 def judged(drawing: ServoDrawing, logs: Sequence[Log]) -> tuple[dict[str, Any], bool]:
     """Gap against the nominal model with and without the effect [rad], and whether the case is good."""
-    rows = slice(round(SETTLE_S * RATE), None)
+    rows = slice(round(1.0 * RATE), None)
     real, without, ideal = (log.position[rows] for log in logs)
     gaps = [{"q": np.sqrt(np.mean((each - ideal) ** 2, axis=0)).tolist()} for each in (real, without)]
     steady = all(_steady(run, log) for run, log in zip(drawing.runs[1:], logs, strict=True))

@@ -16,8 +16,6 @@ from sim_gap.model.rigid_body import RigidArm
 
 MOST = 7
 """Joints up to which all orders are tried, of which there are 5,040."""
-ROWS = 50
-"""Rows that tell how well an order fits."""
 ROUGHLY, LIKELY = 200, 6
 """Orders that are kept by least squares alone, and of these by fits with physical signs."""
 
@@ -29,7 +27,7 @@ def likely_orders(arm: RigidArm, motion: ChannelMotion) -> list[tuple[tuple[int,
     """
     if arm.n > MOST:
         return []
-    few = rows_of(motion, slice(None, None, max(1, len(motion.q) // ROWS)))
+    few = rows_of(motion, slice(None, None, max(1, len(motion.q) // 50)))
     orders = list(permutations(range(arm.n)))[1:]
     moved = [permuted(order, ("q", "v", "a"))(few) for order in orders]
     made = arm.carried(*(np.concatenate([getattr(each, name) for each in moved]) for name in ("q", "v", "a")))

@@ -14,8 +14,6 @@ STEP, STEPS = 0.1, 4
 """Angles that are tried, either way: their step [rad], and how many."""
 LEAST = 0.15
 """Smallest angle that is asked about [rad]; a smaller one is an effect of an arm."""
-ROUNDS = 3
-"""Times that tilt and load are fitted in turn with the angle: fitted to wrong angles they take their part of them."""
 FIRST, LIKELY = 0.2, 0.2
 """Angle that is tried first, and the fall from which the others are."""
 CLEAR = 0.4
@@ -42,7 +40,7 @@ def find_small_zero(
     cost, j, angle = min(least_cost(loaded, few, j) for j in likely)
     if start - cost < CLEAR:
         return []
-    for _ in range(ROUNDS):
+    for _ in range(3):  # fitted to wrong angles, tilt and load take their part of them
         right = _as_it_is(arm, _moved(motion, j, angle))
         cost, _, angle = least_cost(right, few, j)
     fall = float(start - cost)

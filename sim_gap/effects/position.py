@@ -23,7 +23,6 @@ from sim_gap.effects.effect import (
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
 
-EPSILON = 1e-4
 PART_OF_TURN = 2.0
 """Range [rad] from which an error with a period of one turn can be separated from a gain."""
 WORST_GAIN, WORST_ECCENTRICITY = 0.15, 0.2
@@ -38,7 +37,7 @@ def responses(signals: PreparedSignals, layout: ChannelLayout, joint: int, moves
 
     The secant over `size` of the first coefficient, or the derivative if that is zero.
     """
-    if abs(size) > EPSILON:
+    if abs(size) > 1e-4:
         moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
         for x, move in zip(moved, moves[:, 0].T, strict=True):
             x[:, joint] += size * move

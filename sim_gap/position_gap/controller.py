@@ -15,12 +15,6 @@ from sim_gap.position_gap.search import PRICE, LoopSearch
 from sim_gap.position_gap.selection import Progress
 from sim_gap.position_gap.windows import Windows, thinned_moving
 
-STUCK = 0.0, 0.4
-"""Least Coulomb friction that is tried with each, as a share of the gain times the RMS error."""
-FEW = 8
-"""Windows on which controllers are compared."""
-GRID = 12
-"""Stiffnesses that are tried at the start."""
 RESTS_RAD = 0.002
 """Way of a command over all recordings below which it rests [rad]."""
 HOLDS_HZ = 5.0, 30.0
@@ -121,7 +115,7 @@ def starting_fit(search: LoopSearch, own: Nominal, progress: Progress) -> tuple[
     at_rest = rests(search.data)
     search = replace(search, resting=frozenset(np.flatnonzero(at_rest).tolist()))
     search = replace(search, nominal=_holding(search, at_rest & ~np.isfinite(own.kp)))
-    few = replace(search, data=thinned_moving(search.data, FEW))
+    few = replace(search, data=thinned_moving(search.data, 8))  # windows on which controllers are compared
     fits: dict[str, LoopFit] = {}
     scores: dict[str, float] = {}
     for kind, parts in kinds.items():
@@ -203,7 +197,7 @@ def _from_grid(search: LoopSearch, parts: Sequence[str]) -> LoopFit:
     size = asked / np.maximum(np.sqrt(np.mean(e**2, axis=(0, 2))), 1e-6)
     centre = np.maximum(size, search.scales.inertia * 25.0)
     points = []
-    for factor, stuck in product(np.geomspace(0.02, 50.0, GRID), STUCK):
+    for factor, stuck in product(np.geomspace(0.02, 50.0, 12), (0.0, 0.4)):
         kp = centre * factor
         point = {name: values.copy() for name, values in nominal.items()}
         point["kp"] = kp

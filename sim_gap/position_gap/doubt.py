@@ -62,8 +62,6 @@ def plainest(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
     yield improve(search.data, replace(other, point=point, active=active, rms=None), search.scales, ITERATIONS)
 
 
-SHARES = 0.7, 0.4
-"""Scales at which a fit begins again, over its own."""
 ROTORS = "actuator.rotor_inertia"
 
 
@@ -76,7 +74,7 @@ def at_other_scales(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
     if not any(free):
         return
     active = tuple((*own, "armature") if loose else own for own, loose in zip(fit.active, free, strict=True))
-    for share in SHARES:
+    for share in (0.7, 0.4):
         part = np.where(free, share, 1.0)
         point = {name: values * part if name in WITH_TORQUE else values.copy() for name, values in fit.point.items()}
         point |= {name: share * fit.point[name] for name in fit.shared if UNIT[name.partition(".")[2]] != "rad"}

@@ -199,7 +199,6 @@ def expected_shared(
 
 TRIES = 2
 """Candidates per joint that are fitted in a round."""
-ROUNDS = 6
 Progress = Callable[[str], None]
 
 
@@ -209,7 +208,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     fit = improve(search.data, fit, search.scales)
     whole = {e: names for e, names in shared_effects(search.data.arm).items() if e.split("@")[0] not in search.excluded}
     open_joints = set(range(search.data.joints)) - search.resting
-    for round_number in range(ROUNDS):
+    for round_number in range(6):
         progress(f"round {round_number + 1}: {sum(len(each) for each in fit.active) + len(fit.shared)} parameters")
         candidates = ranked(search, fit, own)
         best_own = max((each[0][0] for j, each in enumerate(candidates) if each and j in open_joints), default=0.0)

@@ -30,8 +30,6 @@ PROBABLE = 0.99
 """Share of sound arms whose errors are less improbable."""
 LEAST_SHOWN = 0.5
 """Least share of its variance by which an error is judged by itself: what shows less takes on what others leave."""
-STEPS = 3
-"""Gauss-Newton steps to the most probable errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +70,7 @@ def sound(search: LoopSearch, heldout: Windows, margin: Array) -> Sound:
     errors, usual = np.zeros(deviations.size), np.zeros(search.data.joints)
     usually = _correlation(sizes)
     spread, prior = usually, np.linalg.inv(usually)
-    for step in range(STEPS):
+    for step in range(3):
         gaps, changes = _weighed(search, _fit(search, sizes, errors), sizes, deviations)
         usual = usual if step else np.array([np.linalg.norm(x) for x in changes])
         normal, right = prior.copy(), np.zeros(errors.size)

@@ -12,7 +12,6 @@ from sim_gap.attribution.diagnosis import Diagnosis, Rollout
 from sim_gap.residuals.residual_set import ResidualSet
 
 GREY, ORANGE, BLUE, LIGHT = "#9aa7b3", "#d9622b", "#1f5fa8", "#cfd8e0"
-POINTS = 600
 BELOW_TITLE = {"orientation": "h", "y": 1.02, "x": 1, "xanchor": "right", "yanchor": "bottom"}
 """Place of a figure's legend."""
 
@@ -102,7 +101,7 @@ def stacked(data: ResidualSet, name: str) -> Array:
 def thinned(valid: Mask) -> NDArray[np.intp]:
     """Indices of the samples that are drawn: some hundreds of the valid ones."""
     rows = np.flatnonzero(valid)
-    return rows[:: max(1, len(rows) // POINTS)]
+    return rows[:: max(1, len(rows) // 600)]
 
 
 def _panel(figure: Any, row: int, column: int, x: Array, residual: Array, explained: Array | None) -> None:

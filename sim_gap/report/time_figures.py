@@ -13,7 +13,6 @@ from sim_gap.report.figures import BELOW_TITLE, BLUE, ORANGE
 
 SHOWN_S = 15.0
 """Length of the data that are shown [s]."""
-POINTS = 750
 MOST_LEFT_OUT = 6
 """Causes without which the corrected model is drawn too."""
 COLOURS = ("#2e8b57", "#8e5ea2", "#b8860b", "#c2527a", "#3b9aa8", "#7a7a3a")
@@ -36,7 +35,7 @@ def lines_over_time(t: Array, names: Sequence[str], lines: Sequence[Line], unit:
     figure = make_subplots(
         rows=rows, cols=1, shared_xaxes=True, subplot_titles=list(names), vertical_spacing=0.2 / rows
     )
-    every = max(1, len(t) // POINTS)
+    every = max(1, len(t) // 750)
     for label, values, colour, shown in lines:
         for j in range(rows):
             figure.add_scatter(

@@ -14,13 +14,10 @@ from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.stepwise import StepwiseSearch
 from sim_gap.search.term import Term
 
-STEPS = 10
-"""Most steps."""
 AGREED = 5e-3
 """Largest change of a row's prediction by a step, as a share of the residual beside it and the relevance floor."""
 WORSE = 1e-3
 """Increase of the score from which a step is halved."""
-HALVED = 3
 SLOW = 0.5
 """Change of a step, as a share of the last one's, from which derivatives are evaluated again."""
 
@@ -40,12 +37,12 @@ def converged(
     best, kept, held, last = np.inf, values, Values(), np.inf
     arm = nominal.data.signals[0].arm
     slopes: ColumnStore | None = None
-    for _ in range(STEPS):
+    for _ in range(10):  # steps at most
         store = nominal.at(values, slopes=slopes)
         search = StepwiseSearch(NormalEquations(store, terms), terms)
         now = score(store, values, search.normal)
         halved = 0
-        while values and now > best + WORSE and halved < HALVED:
+        while values and now > best + WORSE and halved < 3:
             values = {t: 0.5 * (c + kept.get(t, 0.0 * c)) for t, c in values.items()}
             store = nominal.at(values, slopes=slopes)
             search = StepwiseSearch(NormalEquations(store, terms), terms)

@@ -17,8 +17,6 @@ from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
 
 MOMENTS, BODY = "link.mass_moment", "link.payload"
-SEVERAL = 2
-"""Number of links with a mass moment from which one body may be meant."""
 
 
 def one_body(store: ColumnStore, search: StepwiseSearch, offered: Sequence[Term]) -> list[Term] | None:
@@ -31,7 +29,7 @@ def one_body(store: ColumnStore, search: StepwiseSearch, offered: Sequence[Term]
     active = search.active
     bodies = [term for term in offered if term.effect == BODY and not term.shape]
     moments = [term for term in active if term.effect == MOMENTS]
-    if len(moments) < SEVERAL or not bodies or any(term.effect == BODY for term in active):
+    if len(moments) < 2 or not bodies or any(term.effect == BODY for term in active):
         return None
     about, kept = converged(store, [*(term for term in active if term not in moments), bodies[0]])
     found = StepwiseSearch(NormalEquations(about, kept), kept)

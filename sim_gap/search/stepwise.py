@@ -14,8 +14,6 @@ from sim_gap.search.term import Term
 Scored = tuple[float, list[Term]]
 """Score of a set of terms, lower is better, and the terms."""
 
-SHORTLIST = 10
-MOST_TERMS = 60
 TRIES = 3
 """How often one effect at one place may be added during a search."""
 OWED = 0.06
@@ -143,7 +141,7 @@ class StepwiseSearch:
             tried = {term.key for term in first}
             lists = [[pair for pair in each if pair[1].key not in tried] for each in lists]
         chosen = self._best(judged, self.score - self.least)
-        return chosen is not None and len(chosen) <= MOST_TERMS and self.accept(chosen)
+        return chosen is not None and len(chosen) <= 60 and self.accept(chosen)
 
     def backward(self) -> bool:
         """Drop the term that is missed least, if the rest scores better without it."""
@@ -256,6 +254,6 @@ def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:
         seen[term.key] = seen.get(term.key, 0) + 1
         if seen[term.key] <= 2:
             out.append((fall, term))
-        if len(out) == SHORTLIST:
+        if len(out) == 10:
             break
     return out

@@ -12,8 +12,6 @@ from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.true_arm import TrueArm
 
 XYZ = ("x", "y", "z")
-WEIGHS = 0.1
-"""Share of a moved mass's torque that is its weight, below which it shows as an inertia alone."""
 UPRIGHT = "the axis is upright: a moved mass shows by its inertia alone"
 INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
 
@@ -35,7 +33,7 @@ def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:
         if np.linalg.norm(moment) / arm.mass[link] > shift:
             continue
         moved = arm.with_moved(link, moment)
-        weighs = float(rms(scene.change_at_rest(moved))[link]) > WEIGHS * float(rms(scene.change(moved))[link])
+        weighs = float(rms(scene.change_at_rest(moved))[link]) > 0.1 * float(rms(scene.change(moved))[link])
 
         def apply(true: TrueArm, link: int = link, moment: Array = moment) -> None:
             true.arm = true.arm.with_moved(link, moment)

@@ -12,8 +12,6 @@ from sim_gap.blind.true_arm import SharedMotor, TrueArm
 
 STEP_S = 5e-4
 """Time step of the plant [s]: springs must be slower."""
-ELASTIC_LEAST = 0.25
-"""Least RMS torque caused by the deflection of an elastic joint [N·m]."""
 
 
 def ripple(scene: Scene, random: np.random.Generator) -> Drawn | None:
@@ -57,7 +55,7 @@ def elasticity(scene: Scene, random: np.random.Generator) -> Drawn | None:
     stiffness_of = rms(scene.torque) / random.uniform(0.015, 0.04)  # from the RMS deflection [rad]
     resonance, stiffest = (2 * np.pi * 4.0) ** 2 * scene.inertia, _stiffest(scene)
     shown = _turn_felt(scene, scene.torque / stiffness_of)
-    fit = (shown > ELASTIC_LEAST) & (stiffness_of > resonance) & (stiffness_of < stiffest)
+    fit = (shown > 0.25) & (stiffness_of > resonance) & (stiffness_of < stiffest)  # N·m of deflection
     if not fit.any():
         return None
     j = int(random.choice(np.flatnonzero(fit)))

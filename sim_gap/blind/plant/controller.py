@@ -14,10 +14,7 @@ from sim_gap.blind.plant.drive import padded
 from sim_gap.blind.true_arm import PlantRun
 
 BLOCK = 256
-VELOCITY_HZ = 40.0
-"""Low pass of the controller's velocity [Hz]."""
 DAMPING_RATIO = 0.9
-INTEGRAL_S = 1.5
 
 
 class PidControllers:
@@ -29,10 +26,10 @@ class PidControllers:
         inertia = padded([run.inertia for run in runs], width)
         omega = padded([run.truth.bandwidth for run in runs], width)
         self.stiffness, self.damping = inertia * omega**2, 2 * DAMPING_RATIO * inertia * omega
-        self.integral = self.stiffness / INTEGRAL_S
+        self.integral = self.stiffness / 1.5  # s
         self.resolution = np.array([[run.truth.encoder_step] for run in runs])
         self.random = [np.random.default_rng([run.seed, 1]) for run in runs]
-        self.smooth = 1.0 - np.exp(-2 * np.pi * VELOCITY_HZ / RATE)
+        self.smooth = 1.0 - np.exp(-2 * np.pi * 40.0 / RATE)  # low pass of the velocity [Hz]
         self.before = reading.copy()
         self.velocity, self.error_sum = np.zeros_like(reading), np.zeros_like(reading)
         self.position, self.speed, self.feed, self.noise = (np.zeros((BLOCK, len(runs), width)) for _ in range(4))
@@ -63,8 +60,6 @@ class PidControllers:
             self.noise[:, b, :n] = 0.4 * self.random[b].standard_normal((BLOCK, n))
 
 
-SERVO_VELOCITY_HZ = 200.0
-"""Low pass of the servo's velocity [Hz]."""
 FINE = 1e-6
 """Resolution of the servo's own position [rad]."""
 
@@ -102,7 +97,7 @@ class Servos:
         )
         self.step = padded([law.slew for law in laws], width, np.inf) / RATE
         self.late = padded([law.delay for law in laws], width) * RATE
-        self.smooth = 1.0 - np.exp(-2 * np.pi * SERVO_VELOCITY_HZ / RATE)
+        self.smooth = 1.0 - np.exp(-2 * np.pi * 200.0 / RATE)  # low pass of the velocity [Hz]
         self.before, self.target = reading.copy(), reading.copy()
         self.velocity, self.error_sum = np.zeros_like(reading), np.zeros_like(reading)
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from gcomp.arrays import Array, Mask
 from sim_gap.blind.true_arm import TrueArm
 
-ELASTIC_SHARE = 0.7
 STIFFEST = 0.05
 """σ₀ h²/(inertia) is at most this, for a stable step."""
 
@@ -49,7 +48,7 @@ class Bristles:
         longest = level / self.bristle[:k] + 1e-12
         z = self.bend[:k]
         ratio = z * np.sign(v) / longest
-        slip = np.clip((ratio - ELASTIC_SHARE) / (1.0 - ELASTIC_SHARE), 0.0, 1.0)
+        slip = np.clip((ratio - 0.7) / (1.0 - 0.7), 0.0, 1.0)
         slip *= slip * (3.0 - 2.0 * slip)
         rate = v * (1.0 - slip * np.abs(ratio))
         z += self.step * rate
@@ -63,10 +62,6 @@ def padded(rows: Sequence[Array], width: int, fill: float = 0.0) -> Array:
     for row, values in zip(out, rows, strict=True):
         row[: len(values)] = values
     return out
-
-
-SPRING_DAMPING = 0.04
-"""Damping ratio of an elastic transmission."""
 
 
 class PlantDrives:
@@ -111,7 +106,7 @@ class PlantDrives:
         self.stiffness = np.array([truths[b].stiffness[j] for b, j in rows])
         self.half_play = np.array([0.5 * truths[b].backlash[j] for b, j in rows])
         self.rotor = np.array([truths[b].arm.armature[j] for b, j in rows])
-        self.spring_damping = 2.0 * SPRING_DAMPING * np.sqrt(self.stiffness * self.rotor)
+        self.spring_damping = 2.0 * 0.04 * np.sqrt(self.stiffness * self.rotor)  # damping ratio 0.04
         torque = self.current[self.soft.all]
         self.motor_angle = angle[self.soft.all] + torque / self.stiffness + self.half_play * np.sign(torque)
         self.motor_half, self.motor_speed, self.motor_push = (np.zeros(len(rows)) for _ in range(3))

@@ -12,13 +12,6 @@ from sim_gap.position_gap.training.spread import Alternative, Covariance
 from sim_gap.position_gap.training.unreached_limits import LIMITS, draw_limits
 from sim_gap.position_gap.windows import thinned
 
-WATCHED = 16
-"""Windows along which the motion of draws is compared with that of the fit, at most."""
-TOGETHER = 32
-"""Draws that are simulated at once."""
-HALVINGS = 5
-"""Times that the steps of a draw are halved, at most."""
-
 
 def draw(
     search: LoopSearch, fit: LoopFit, spread: Covariance, count: int, seed: int = 0, reach: Array | None = None
@@ -54,15 +47,15 @@ def _within(
     reach: Array,
 ) -> list[Point]:
     """The points, with the steps halved of each joint that goes further than `reach`; of all, where they share some."""
-    data = thinned(search.data, WATCHED)
+    data = thinned(search.data, 16)
     count = np.maximum(data.weight.sum((0, 2)), 1.0)
     unmoved = residuals(data, batch([fit.point]))[0]
     points, share = list(points), np.ones((len(points), data.joints))
     waiting: Sequence[int] = range(len(points))
     owner = np.array([j for j, _ in spread.names])
-    for _ in range(HALVINGS):
+    for _ in range(5):  # halvings
         far = np.zeros_like(share, bool)
-        for some in np.array_split(waiting, max(len(waiting) // TOGETHER, 1)):
+        for some in np.array_split(waiting, max(len(waiting) // 32, 1)):  # simulated at once
             apart = residuals(data, batch([points[i] for i in some])) - unmoved
             far[some] = np.sqrt(np.einsum("ptjw,ptjw->pj", apart, apart) / count) > reach
         if fit.shared:

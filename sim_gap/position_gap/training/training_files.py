@@ -82,15 +82,12 @@ def module_model(path: Path) -> Path:
     return path.with_name(f"{path.stem}_effects.xml")
 
 
-DRAWS = 400
-"""Draws of the parameters from which the range of a delay is taken."""
-RANGE = 0.05, 0.95
 ABOUT = "Friction of other kinds is taken into Coulomb and viscous friction; that joints creep under it is left out."
 
 
 def write_actuators(found: Identified, path: Path, step: float = 0.005) -> None:
     """Write the entries for Isaac Lab and mjlab; delays are counted in `step` [s]. Raises BadInput."""
-    drawn = draw(found.search, found.fit, found.spread, DRAWS, reach=found.band.reach)
+    drawn = draw(found.search, found.fit, found.spread, 400, reach=found.band.reach)
     rows = {name: _entry(found, j, step, drawn) for j, name in enumerate(found.sim.arm.names)}
     left = found.export.lines if found.export is not None else ()
     write_entries(rows, path, step, about=ABOUT, left=left)
@@ -116,5 +113,5 @@ def _delays(found: Identified, j: int, rows: Sequence[Mapping[str, float]]) -> A
     """Ends of the range of a joint's delay [s], (2,): that of 90 % of its draws, about the exported model's."""
     name = f"{found.sim.arm.names[j]}.delay"
     drawn = [row[name] for row in rows if name in row]
-    about = np.quantile(drawn, RANGE) - found.fit.point["delay"][j] if drawn else np.zeros(2)
+    about = np.quantile(drawn, (0.05, 0.95)) - found.fit.point["delay"][j] if drawn else np.zeros(2)
     return np.asarray(found.native.point["delay"][j] + about)
