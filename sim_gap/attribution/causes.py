@@ -269,11 +269,7 @@ def _is_held_out(term: Term, heldout: ResidualSet) -> bool:
 
 
 def _cause(
-    step: CauseStep,
-    terms: tuple[Term, ...],
-    scorer: _Scorer,
-    against: tuple[Rivals, LawTest],
-    names: tuple[str, ...],
+    step: CauseStep, terms: tuple[Term, ...], scorer: _Scorer, against: tuple[Rivals, LawTest], names: tuple[str, ...]
 ) -> Cause:
     """One cause from terms of a step, compared with the rest of the library and with the general laws."""
     rivals, law_test = against

@@ -138,13 +138,7 @@ def _require_range(effects: str) -> None:
 
 
 def make_apart(
-    out: Path,
-    seed: int,
-    cases: int,
-    workers: int,
-    lengths: tuple[float, float],
-    effects: str = "",
-    maker: str = MAKER,
+    out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float], effects: str = "", maker: str = MAKER
 ) -> Iterator[int]:
     """Make the cases in a separate process and yield their number from time to time. Raises Refused if it fails."""
     command = [sys.executable, "-m", maker, "--seed", str(seed), "--cases", str(cases)]

@@ -22,12 +22,7 @@ from sim_gap.checks.rigid_fit import ChannelMotion, beside_slow_torques, fit_rig
 from sim_gap.checks.sampling import even_times, find_dropped, find_time_unit, without_held, without_repeats
 from sim_gap.checks.small_zero import find_small_zero
 from sim_gap.checks.torque_delay import find_delay, find_short_delay
-from sim_gap.checks.torque_source import (
-    find_gain_command,
-    find_same,
-    find_source,
-    find_unsigned,
-)
+from sim_gap.checks.torque_source import find_gain_command, find_same, find_source, find_unsigned
 from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm

@@ -60,8 +60,7 @@ def diagnose(
         Path | None, typer.Option(help="Where the draws go: .csv, .json or .parquet. Default: samples.csv.")
     ] = None,
     out_actuators: Annotated[
-        Path | None,
-        typer.Option(help="Write actuator entries for Isaac Lab and mjlab here (.py)."),
+        Path | None, typer.Option(help="Write actuator entries for Isaac Lab and mjlab here (.py).")
     ] = None,
     physics_step: Annotated[
         float, typer.Option(help="Step of the training simulation in which --out-actuators counts delays [s].")

@@ -96,7 +96,7 @@ def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], c
     for one in outliers:
         console.print(
             f"{one['arm']}: {one['effect']} of {one['joint']}: {one['parameter']} {one['value']:.3g} {one['unit']}, "
-            f"{one['others']:.3g} on the other arms",
+            f"{one['others']:.3g} on the other arms"
         )
 
 

@@ -42,8 +42,7 @@ def plan(
     run = shlex.join(["armlink", "gap", "collect", arm, "--motion", str(out), "--out", str(out.with_suffix(".mcap"))])
     console.print(f"{out}: {motion.seconds:.0f} s; next: {run}")
     write_json(
-        json_file,
-        {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences},
+        json_file, {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences}
     )
     return 0
 

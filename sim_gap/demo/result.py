@@ -81,12 +81,7 @@ def summary(result: DemoResult) -> dict[str, Any]:
         },
         "verify": {"poses": len(result.verify.position), "rms": numbers(result.verify.rms)},
         "gap": result.gap.to_json(),
-        "bus": {
-            "frames": bus.frames,
-            "rate_hz": number(bus.rate_hz),
-            "load": number(bus.load),
-            "missed": bus.missed,
-        },
+        "bus": {"frames": bus.frames, "rate_hz": number(bus.rate_hz), "load": number(bus.load), "missed": bus.missed},
         "wall_s": number(result.wall_s),
         "sim_s": number(result.sim_s),
     }

@@ -172,10 +172,7 @@ def _at_rest(search: LoopSearch, fit: LoopFit) -> LoopFit:
         for name in point:
             point[name][j] = search.nominal[name][j]
     return replace(
-        fit,
-        point=point,
-        active=tuple(() if j in search.resting else own for j, own in enumerate(fit.active)),
-        rms=None,
+        fit, point=point, active=tuple(() if j in search.resting else own for j, own in enumerate(fit.active)), rms=None
     )
 
 

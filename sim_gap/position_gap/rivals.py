@@ -109,9 +109,7 @@ def _like(torque: Array, columns: Sequence[Array]) -> Array:
     return np.asarray(np.linalg.pinv(gram, rcond=1e-9, hermitian=True) @ (flat @ (torque * size).ravel()))
 
 
-_ALWAYS = {
-    "controller.dead_zone": ("transmission.backlash",),
-}
+_ALWAYS = {"controller.dead_zone": ("transmission.backlash",)}
 """Effects that positions alone never separate."""
 
 

@@ -2,12 +2,7 @@
 
 from sim_gap.attribution.diagnosis import HINT, Diagnosis
 
-WORDS = {
-    "explained": "explained",
-    "ambiguous": "ambiguous",
-    "unexplained": "not explained",
-    "no_gap": "no gap",
-}
+WORDS = {"explained": "explained", "ambiguous": "ambiguous", "unexplained": "not explained", "no_gap": "no gap"}
 """Verdicts as a heading."""
 CHANNEL_WORDS = {"tau": "torque sensor", "tau_motor": "motor torque", "tau_cmd": "commanded torque"}
 """Torque channels of a recording, for people."""

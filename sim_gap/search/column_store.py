@@ -46,12 +46,7 @@ class ColumnStore:
         self._columns: dict[Term, Columns] = {}
         self._offsets: dict[Term, Columns] = {}
 
-    def at(
-        self,
-        values: Values,
-        pins: Values | None = None,
-        slopes: "ColumnStore | None" = None,
-    ) -> "ColumnStore":
+    def at(self, values: Values, pins: Values | None = None, slopes: "ColumnStore | None" = None) -> "ColumnStore":
         return ColumnStore(self.data, values, self.nominal or self, pins, slopes=slopes)
 
     def beside(self, near: "ColumnStore | None") -> "ColumnStore":
