@@ -192,7 +192,7 @@ def test_nonlinear_effects_are_offered_at_the_size_that_they_have_in_place_of_a_
         )
 
     monkeypatch.setattr(model_selection, "NormalEquations", lambda store, terms: None)
-    monkeypatch.setattr(model_selection, "Search", search)
+    monkeypatch.setattr(model_selection, "StepwiseSearch", search)
     assert [term.times for term in relinearised_in_place(None, [chosen], [bent])] == [2]
     assert relinearised_in_place(None, [], [bent]) == [bent]
 
