@@ -14,10 +14,10 @@ from sim_gap.attribution.residual_laws import ResidualLaw, as_effects, residual_
 from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
 from sim_gap.model.load import SimModel
-from sim_gap.residuals.besides import fast, left_out, slides, slow
+from sim_gap.residuals.disregarded_rows import fast, left_out, slides, slow
+from sim_gap.residuals.location import Location, by_joint, combined, locate
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.where import Location, by_joint, combined, locate
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +27,11 @@ class Internals:
     model: SimModel
     train: ResidualSet
     heldout: ResidualSet
-    estimate: Estimate | None
+    estimate: EffectEstimate | None
     """None if there is no gap."""
     recordings: tuple[Recording, ...] = ()
     """Held-out recordings."""
-    nominal: Estimate | None = None
+    nominal: EffectEstimate | None = None
     """The fit even if there is no gap."""
 
 
@@ -74,7 +74,7 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
     )
 
 
-def _dry_friction(nominal: Array, estimate: Estimate | None) -> Array:
+def _dry_friction(nominal: Array, estimate: EffectEstimate | None) -> Array:
     """Dry friction of the joints as far as it is known: the model's, and what was found beside it [N·m], (n,)."""
     friction = nominal.copy()
     for term in estimate.terms if estimate is not None else ():
@@ -83,7 +83,7 @@ def _dry_friction(nominal: Array, estimate: Estimate | None) -> Array:
     return np.maximum(friction, 0.0)
 
 
-def _aside(made: Internals, estimate: Estimate | None, friction: Array) -> list[Location]:
+def _aside(made: Internals, estimate: EffectEstimate | None, friction: Array) -> list[Location]:
     """Gaps at rest, in creep and above the band on held-out data."""
     judge = made.heldout
     zero = {row: np.zeros(len(values)) for row, values in judge.values.items()}

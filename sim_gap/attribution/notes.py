@@ -10,25 +10,23 @@ from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.laws import LAWS
+from sim_gap.residuals.channel_quality import Stuck
 from sim_gap.residuals.disturbances import AROUND_S
 from sim_gap.residuals.layout import Row
+from sim_gap.residuals.location import Location, locate
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.stuck_channels import Stuck
-from sim_gap.residuals.where import Location, locate
-from sim_gap.search.estimate import NOMINAL, Estimate
+from sim_gap.search.estimate import NOMINAL, EffectEstimate
 from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants, shares_a_factor
 
 ALIKE = 0.05
 """A general law that scores worse than a cause by less than this is noted."""
-MOST_ROWS = 3
-"""Number of rows with a remaining gap that are noted."""
 
 
 def notes(
     found: Sequence[Cause],
     stuck: Sequence[Stuck],
-    estimate: Estimate | None,
+    estimate: EffectEstimate | None,
     fit: ResidualSet,
     judge: ResidualSet,
     left: dict[Row, Array],
@@ -40,7 +38,6 @@ def notes(
 
 
 def _noisy(data: ResidualSet) -> tuple[str, ...]:
-    """A note for each joint whose command passes over noisy channels."""
     layout, names = data.layout, data.signals[0].arm.names
     return tuple(
         f"{names[j]}: too noisy: {' and '.join(layout.chain[: layout.beyond(j)])}; the command is compared with "
@@ -84,7 +81,6 @@ def _impacts(data: ResidualSet) -> tuple[str, ...]:
 
 
 def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
-    """A note for each disturbance."""
     lines = (
         f"{s.label}: at {one.start:.1f} s several joints are far off at once, {s.arm.names[one.joint]} by "
         f"{one.torque:.2g} N·m, as at no other time: something touched the arm or torques were misread; "
@@ -96,7 +92,7 @@ def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(lines))
 
 
-def _common_factor(estimate: Estimate | None, fit: ResidualSet) -> tuple[str, ...]:
+def _common_factor(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[str, ...]:
     """A note for torque constants, or masses, that motor torque alone tells: only their products are known."""
     if estimate is not None and masses_may_be_constants(fit.layout, estimate.terms):
         return (
@@ -114,7 +110,7 @@ def _common_factor(estimate: Estimate | None, fit: ResidualSet) -> tuple[str, ..
     )
 
 
-def _bound(estimate: Estimate | None, fit: ResidualSet, judge: ResidualSet) -> tuple[str, ...]:
+def _bound(estimate: EffectEstimate | None, fit: ResidualSet, judge: ResidualSet) -> tuple[str, ...]:
     """A note for effects in some recordings alone, and for a payload that includes model errors of the links."""
     lines = []
     for term in () if estimate is None else estimate.terms:
@@ -133,7 +129,6 @@ def _bound(estimate: Estimate | None, fit: ResidualSet, judge: ResidualSet) -> t
 
 
 def _turned(sets: Sequence[ResidualSet]) -> list[str]:
-    """A note for each recording in which a body is mounted in another way."""
     return [
         f"link.payload: in {s.label} it is turned by {np.degrees(s.mount):.0f}° about the axis of {s.arm.names[-1]} "
         "against the other recordings; that angle was found from this recording"
@@ -143,7 +138,6 @@ def _turned(sets: Sequence[ResidualSet]) -> list[str]:
 
 
 def _alike(found: Sequence[Cause]) -> tuple[str, ...]:
-    """A note for each cause that a general law could replace."""
     return tuple(
         f"{cause.effect}: {LAWS[cause.law].description} would look the same in this motion; the true cause may not be "
         "in the library"
@@ -158,7 +152,7 @@ def _remaining(data: ResidualSet, left: dict[Row, Array]) -> tuple[str, ...]:
     return tuple(
         f"{at.joint}: {at.rms:.2g} N·m of {at.channel} remain (noise {at.noise:.2g}), "
         + ("without a known regime" if at.regime == "other" else f"correlated with {at.regime} ({at.share:.0%})")
-        for at in (locate(data, left, above)[:MOST_ROWS] if above else [])
+        for at in (locate(data, left, above)[:3] if above else [])
     )
 
 
@@ -183,7 +177,6 @@ def besides_notes(aside: Sequence[Location]) -> tuple[str, ...]:
 
 
 def law_notes(laws: Sequence[ResidualLaw], names: Sequence[str]) -> tuple[str, ...]:
-    """A note for each law that takes what the library leaves."""
     return tuple(
         f"{names[law.joint]}: what is left of {law.channel} follows a law of {law.quantity} of {names[law.joint]}"
         + (" that opposes the motion" if law.directed else "")

@@ -13,9 +13,9 @@ from armlink.errors import ArmlinkError, BadInput
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording, slice_rows
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.blind.cases.seal import seal, verify, write_answer
-from sim_gap.blind.judging.judge import CONFIDENT
-from sim_gap.blind.judging.score import WITHHELD, answer_name
+from sim_gap.blind.bench import seal, verify, write_answer
+from sim_gap.blind.judge import CONFIDENT
+from sim_gap.blind.score import WITHHELD, answer_name
 
 SCHEMA = "armlink.real-bench/1"
 KNOWN = Path(__file__).with_name("real_arms.yaml")

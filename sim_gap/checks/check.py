@@ -7,36 +7,61 @@ option that settles it.
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.changed_order import find_changed_order
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.column_order import find_changed_order
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
+from sim_gap.checks.jumps import find_jumps, find_seam, unwrapped
 from sim_gap.checks.mapping import SURE, find_mapping
 from sim_gap.checks.mounting import as_mounted
-from sim_gap.checks.one_way import goes_one_way
-from sim_gap.checks.rigid_fit import Motion, beside_slow_torques, fit_rigid, motion_of
-from sim_gap.checks.rows.clock import even_times, find_dropped, find_time_unit, without_repeats
-from sim_gap.checks.rows.held_positions import without_held
-from sim_gap.checks.rows.jumps import find_jumps, find_seam, unwrapped
+from sim_gap.checks.rigid_fit import ChannelMotion, beside_slow_torques, fit_rigid, motion_of
+from sim_gap.checks.sampling import even_times, find_dropped, find_time_unit, without_held, without_repeats
 from sim_gap.checks.small_zero import find_small_zero
-from sim_gap.checks.torque.delay import find_delay, find_short_delay
-from sim_gap.checks.torque.source import (
-    find_gain_command,
-    find_same,
-    find_source,
-    find_unsigned,
-)
-from sim_gap.checks.torque.unit import find_absent, find_joint_scale, find_outgrown, find_scale
+from sim_gap.checks.torque_delay import find_delay, find_short_delay
+from sim_gap.checks.torque_source import find_gain_command, find_same, find_source, find_unsigned
+from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import TRIM_S, Signals, prepare
+from sim_gap.residuals.preprocess import TRIM_S, PreparedSignals, prepare
+
+LEAST_WAY = 1.5
+"""Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
+LEAST_RANGE = 0.1
+"""Range from which a joint moves [rad]."""
+
+
+def goes_one_way(recording: Recording) -> bool:
+    """Whether the joints that move go to and fro less than once, or none moves.
+
+    Then every angle and every torque is one smooth curve over time, and a wrong column, sign or zero may fit such a
+    curve as well as the right one does.
+    """
+    t = np.arange(recording.t[0], recording.t[-1], 0.1)  # noise of closer positions would make up the way
+    q = np.column_stack([np.interp(t, recording.t[there := np.isfinite(x)], x[there]) for x in recording.position.T])
+    span = np.ptp(q, axis=0)
+    moving = span > LEAST_RANGE
+    if not moving.any():
+        return True
+    return bool(np.median(np.abs(np.diff(q[:, moving], axis=0)).sum(0) / span[moving]) < LEAST_WAY)
+
+
+def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """A sentence if no recording turns back."""
+    if not all(goes_one_way(recording) for recording in recordings):
+        return ()
+    return (
+        "order, signs, zeros and clocks of the columns could not be checked: the joints go one way only, or hardly "
+        "move; record motion to and fro",
+    )
 
 
 def check_recordings(
     arm: RigidArm, recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
-) -> tuple[list[Recording], list[Finding]]:
+) -> tuple[list[Recording], list[RecordingFinding]]:
     """Correct recordings whose mapping, units or clocks are certainly wrong.
 
     Args:
@@ -57,7 +82,7 @@ def check_recordings(
 
 def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections
-) -> tuple[Recording, list[Finding]]:
+) -> tuple[Recording, list[RecordingFinding]]:
     """Check and correct one recording. Raises BadInput for a finding that is not certain."""
     for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
         raise BadInput(f"{label}: {finding.sentence()}")
@@ -99,14 +124,19 @@ def check_recording(
     return recording, [*found, *velocity]
 
 
-def _prepared(recording: Recording, arm: RigidArm, label: str, stated: Corrections) -> Signals:
+def _prepared(recording: Recording, arm: RigidArm, label: str, stated: Corrections) -> PreparedSignals:
     """The recording with velocities of its own only if they are those of the positions."""
     return prepare(sound_velocity(recording, stated)[0], arm, label)
 
 
 def _unsigned(
-    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
-) -> list[Finding]:
+    arm: RigidArm,
+    mounted: RigidArm,
+    s: PreparedSignals,
+    motion: ChannelMotion,
+    recording: Recording,
+    stated: Corrections,
+) -> list[RecordingFinding]:
     """Joints that read amounts, unless they do not with the channel's delay taken off."""
     found = find_unsigned(mounted, motion, stated)
     if not found or goes_one_way(recording):
@@ -119,8 +149,13 @@ def _unsigned(
 
 
 def _mapping(
-    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
-) -> list[Finding]:
+    arm: RigidArm,
+    mounted: RigidArm,
+    s: PreparedSignals,
+    motion: ChannelMotion,
+    recording: Recording,
+    stated: Corrections,
+) -> list[RecordingFinding]:
     """Findings on clock, order, sign, zero and angle unit, in the order in which they are corrected."""
     if goes_one_way(recording):
         return []
@@ -139,8 +174,13 @@ def _mapping(
 
 
 def _source(
-    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
-) -> list[Finding]:
+    arm: RigidArm,
+    mounted: RigidArm,
+    s: PreparedSignals,
+    motion: ChannelMotion,
+    recording: Recording,
+    stated: Corrections,
+) -> list[RecordingFinding]:
     """Findings on the channel's scale and on what it is a reading of."""
     fit = beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
     scale = (
@@ -152,12 +192,11 @@ def _source(
     return [*scale, *find_source(fit, s, motion, stated)]
 
 
-def _rate(s: Signals, motion: Motion) -> float:
-    """Rate of a motion's rows [Hz]."""
+def _rate(s: PreparedSignals, motion: ChannelMotion) -> float:
     return float((len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9))
 
 
-def _corrected(recording: Recording, finding: Finding, label: str) -> Recording:
+def _corrected(recording: Recording, finding: RecordingFinding, label: str) -> Recording:
     """The recording after the correction that a finding's option makes."""
     name, _, value = finding.option.partition(" ")
     keys = {"--sign": "sign", "--units": "units", "--zero": "zero", "--clock": "clock", "--map": "columns"}

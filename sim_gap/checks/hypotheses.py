@@ -10,7 +10,7 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Kind
-from sim_gap.checks.rigid_fit import Motion, changed
+from sim_gap.checks.rigid_fit import ChannelMotion, changed
 from sim_gap.model.rigid_body import RigidArm
 
 TURN = math.pi / 180.0
@@ -26,10 +26,12 @@ class Hypothesis:
     joints: tuple[int, ...]
     what: str
     option: str
-    change: Callable[[Motion], Motion]
+    change: Callable[[ChannelMotion], ChannelMotion]
 
 
-def hypotheses(arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
+def hypotheses(
+    arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]
+) -> Iterator[Hypothesis]:
     """Every way in which one column, or all of a channel, may be wrong, less those that the user has settled."""
     channel = motion.channel
 
@@ -83,10 +85,10 @@ def ordered(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str], torq
     return Hypothesis("order", tuple(channels), touched, what, option, permuted(order, values))
 
 
-def _turned(joints: tuple[int, ...], torque: bool) -> Callable[[Motion], Motion]:
+def _turned(joints: tuple[int, ...], torque: bool) -> Callable[[ChannelMotion], ChannelMotion]:
     """Change of sign of the torques, or of the positions, of some joints."""
 
-    def change(motion: Motion) -> Motion:
+    def change(motion: ChannelMotion) -> ChannelMotion:
         sign = np.ones(motion.q.shape[1])
         sign[list(joints)] = -1.0
         if torque:
@@ -96,8 +98,8 @@ def _turned(joints: tuple[int, ...], torque: bool) -> Callable[[Motion], Motion]
     return change
 
 
-def _moved(joint: int, angle: float) -> Callable[[Motion], Motion]:
-    def change(motion: Motion) -> Motion:
+def _moved(joint: int, angle: float) -> Callable[[ChannelMotion], ChannelMotion]:
+    def change(motion: ChannelMotion) -> ChannelMotion:
         q = motion.q.copy()
         q[:, joint] += angle
         return changed(motion, q=q)
@@ -105,14 +107,14 @@ def _moved(joint: int, angle: float) -> Callable[[Motion], Motion]:
     return change
 
 
-def _degrees(motion: Motion) -> Motion:
+def _degrees(motion: ChannelMotion) -> ChannelMotion:
     return changed(motion, q=motion.q * TURN, v=motion.v * TURN, a=motion.a * TURN)
 
 
-def permuted(order: Sequence[int], names: Sequence[str]) -> Callable[[Motion], Motion]:
+def permuted(order: Sequence[int], names: Sequence[str]) -> Callable[[ChannelMotion], ChannelMotion]:
     """Columns of some fields of a motion in another order."""
 
-    def change(motion: Motion) -> Motion:
+    def change(motion: ChannelMotion) -> ChannelMotion:
         values: dict[str, Array] = {name: getattr(motion, name)[:, list(order)] for name in names}
         return changed(motion, **values)
 

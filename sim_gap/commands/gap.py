@@ -3,11 +3,9 @@
 import typer
 
 from sim_gap.commands.gap_bench import bench
-from sim_gap.commands.gap_collect import collect
 from sim_gap.commands.gap_diagnose import diagnose
-from sim_gap.commands.gap_fleet import diagnose_fleet
-from sim_gap.commands.gap_plan import plan
-from sim_gap.commands.gap_trend import trend
+from sim_gap.commands.gap_fleet import diagnose_fleet, trend
+from sim_gap.commands.gap_motion import collect, plan
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
 

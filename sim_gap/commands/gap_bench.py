@@ -44,8 +44,8 @@ def bench(
     from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
     from sim_gap.blind.bench import diagnose_files, run_bench
-    from sim_gap.blind.judging.tables import show, show_positions, show_real
     from sim_gap.blind.real import KNOWN, run_real
+    from sim_gap.blind.tables import show, show_positions, show_real
 
     if json is not None and str(json) != "-" and not json.resolve().parent.is_dir():
         raise BadInput(f"--json {json}: its folder does not exist: create it first")

@@ -60,8 +60,7 @@ def diagnose(
         Path | None, typer.Option(help="Where the draws go: .csv, .json or .parquet. Default: samples.csv.")
     ] = None,
     out_actuators: Annotated[
-        Path | None,
-        typer.Option(help="Write actuator entries for Isaac Lab and mjlab here (.py)."),
+        Path | None, typer.Option(help="Write actuator entries for Isaac Lab and mjlab here (.py).")
     ] = None,
     physics_step: Annotated[
         float, typer.Option(help="Step of the training simulation in which --out-actuators counts delays [s].")
@@ -147,8 +146,8 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
 
 
 def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
-    from sim_gap.better_model.motor_entries import write_motor_entries
-    from sim_gap.closed_loop.training.actuators import write_actuators
+    from sim_gap.better_model.actuator_entries import write_motor_entries
+    from sim_gap.position_gap.training.training_files import write_actuators
 
     if answer.unit == "rad":
         write_actuators(answer.internals, path, step)
@@ -158,7 +157,7 @@ def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
 
 def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
     from sim_gap.better_model.samples import drawn_parameters, write_rows
-    from sim_gap.closed_loop.training.posterior import write_samples
+    from sim_gap.position_gap.training.training_files import write_samples
 
     target = path or Path("samples.csv")
     if answer.unit == "rad":
@@ -175,7 +174,7 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     kind = "URDF" if path.suffix == ".urdf" else "MJCF"
     if answer.unit == "rad":
         from sim_gap.better_model.effects_module import module_path
-        from sim_gap.closed_loop.training.posterior import batch_path, module_model, write_exported
+        from sim_gap.position_gap.training.training_files import batch_path, module_model, write_exported
 
         with_actuators = " with its position actuators" if kind == "MJCF" else ""
         for line in write_exported(answer.internals, path):

@@ -5,12 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Effect, Plausibility, SearchHints, Shape, Signature
-from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.effects.effect import InverseEffect, Plausibility, SearchHints, Shape, Signature
+from sim_gap.residuals.layout import ChannelLayout, Columns
+from sim_gap.residuals.preprocess import PreparedSignals
 
-WIDE = 1.0
-"""Prior standard deviation of an angle [rad]: a base may stand on a wall."""
 STEP = 1e-6
 """Step of the differences in a rotation [rad]."""
 LARGE = 0.3
@@ -43,20 +41,20 @@ def _slopes(gravity: Array, angles: Array) -> Array:
     return np.stack([tilted(gravity, angles + d) - tilted(gravity, angles - d) for d in steps], axis=-1) / (2 * STEP)
 
 
-def _tilt(signals: Signals, layout: Layout, _place: int, shape: Shape) -> Columns:
+def _tilt(signals: PreparedSignals, layout: ChannelLayout, _place: int, shape: Shape) -> Columns:
     """The base rotated about two axes across gravity (its x and y if gravity is along z), linearised at `shape`."""
     columns = np.asarray(signals.gravity_columns @ _slopes(signals.read.arm.gravity, np.array(shape or (0.0, 0.0))))
     return {(layout.against_model, joint): columns[:, joint] for joint in range(signals.n)}
 
 
-def _beside(signals: Signals, layout: Layout, shape: Shape) -> Columns:
-    """What a large tilt is beside its columns."""
+def _beside(signals: PreparedSignals, layout: ChannelLayout, shape: Shape) -> Columns:
+    """Part of a large tilt that its columns lack."""
     nominal, angles = signals.read.arm.gravity, np.array(shape or (0.0, 0.0))
     rest = tilted(nominal, angles) - nominal - _slopes(nominal, angles) @ angles
     return {(layout.against_model, joint): signals.gravity_columns[:, joint] @ rest for joint in range(signals.n)}
 
 
-def _starts(signals: Sequence[Signals], _place: int) -> tuple[Shape, ...]:
+def _starts(signals: Sequence[PreparedSignals], _place: int) -> tuple[Shape, ...]:
     """No tilt, and the direction that a free fit of gravity finds, if that is far from the model's."""
     nominal = signals[0].arm.gravity
     gram, side = 1e-9 * np.eye(3), np.zeros(3)
@@ -85,10 +83,10 @@ def angles_of(nominal: Array, found: Array) -> Array:
 
 
 EFFECTS = (
-    Effect(
+    InverseEffect(
         "base.tilt",
         Signature(_tilt, whole_arm=True, offset=_beside),
-        Plausibility(prior_std=lambda _signals, _place: np.full(2, WIDE)),
+        Plausibility(prior_std=lambda _signals, _place: np.full(2, 1.0)),  # a base may stand on a wall
         SearchHints(shapes_for=_starts, linearised_at=0, relinearise=lambda c, _shape: (float(c[0]), float(c[1]))),
     ),
 )

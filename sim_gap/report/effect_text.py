@@ -2,19 +2,14 @@
 
 from sim_gap.attribution.diagnosis import HINT, Diagnosis
 
-WORDS = {
-    "explained": "explained",
-    "ambiguous": "ambiguous",
-    "unexplained": "not explained",
-    "no_gap": "no gap",
-}
+WORDS = {"explained": "explained", "ambiguous": "ambiguous", "unexplained": "not explained", "no_gap": "no gap"}
 """Verdicts as a heading."""
 CHANNEL_WORDS = {"tau": "torque sensor", "tau_motor": "motor torque", "tau_cmd": "commanded torque"}
 """Torque channels of a recording, for people."""
 
 
 def advice(answer: Diagnosis) -> str:
-    """What a person does about it, in a sentence."""
+    """Advice to a person, in a sentence."""
     if answer.verdict == "no_gap":
         return "Nothing needs to be changed: the simulator agrees with the arm within the noise of the recordings."
     if answer.verdict == "unexplained":

@@ -6,12 +6,11 @@ from typing import Any
 from armlink.effect_catalogue import CATALOGUE
 from calib.report.page import ReportTable, Section, html_of, paragraph, paragraphs, render, verdict_line
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
-from sim_gap.report.cause_figures import cause_figure
+from sim_gap.report.cause_figures import cause_figure, law_figure
 from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
-from sim_gap.report.law_figure import law_figure
-from sim_gap.report.over_time import torque_over_time
 from sim_gap.report.position_page import position_sections
+from sim_gap.report.time_figures import torque_over_time
 
 
 def sections(answer: Diagnosis) -> list[Section]:
@@ -25,7 +24,6 @@ def sections(answer: Diagnosis) -> list[Section]:
 
 
 def write_report(answer: Diagnosis, path: Path, title: str = "Sim-to-real gap", subtitle: str = "") -> None:
-    """Write one self-contained HTML file."""
     render(path, title, sections(answer), subtitle)
 
 
@@ -115,7 +113,6 @@ def _over_time(answer: Diagnosis) -> list[Section]:
 
 
 def _causes(answer: Diagnosis) -> list[Section]:
-    """A figure for every cause."""
     figures = [cause_figure(answer, cause) for cause in answer.causes]
     shown = [figure for figure in figures if figure is not None]
     if not shown:
@@ -128,7 +125,6 @@ def _causes(answer: Diagnosis) -> list[Section]:
 
 
 def _laws(answer: Diagnosis) -> list[Section]:
-    """A figure for every law outside the library."""
     if not answer.laws:
         return []
     text = (

@@ -6,12 +6,12 @@ from typing import Any
 from calib.report.page import ReportTable, Section, html_of, paragraph, paragraphs, verdict_line
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
-from sim_gap.closed_loop.identify import Identified
-from sim_gap.closed_loop.training.export import WRITTEN
-from sim_gap.closed_loop.training.replay import Simulated, commanded, less, replay, simulated
+from sim_gap.position_gap.identify import Identified
+from sim_gap.position_gap.training.export import WRITTEN
+from sim_gap.position_gap.training.replay import Simulated, commanded, less, replay, simulated
 from sim_gap.report.effect_text import WORDS, advice, sentence
 from sim_gap.report.figures import BLUE, GREY, ORANGE
-from sim_gap.report.over_time import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, without
+from sim_gap.report.time_figures import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, without
 
 
 def position_sections(answer: Diagnosis) -> list[Section]:

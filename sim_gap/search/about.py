@@ -11,9 +11,9 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.base import tilted
-from sim_gap.effects.inertials import mounted, moved, point
-from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import Found, Signals
+from sim_gap.effects.link import mounted, moved, point
+from sim_gap.residuals.layout import ChannelLayout, Columns
+from sim_gap.residuals.preprocess import Found, PreparedSignals
 from sim_gap.search.term import Term
 
 Values = Mapping[Term, Array]
@@ -21,14 +21,12 @@ Values = Mapping[Term, Array]
 
 
 STAGES = (("timing.delay", "torque.crosstalk"), ("torque.hysteresis",), ("torque.deadband",), ("torque.saturation",))
-"""What happens in a torque sensor before its gain, in this order: each stage gets what the one before passes on."""
+"""Stages of a torque sensor before its gain, in this order: each gets the torque that the one before passes on."""
 
 
 @dataclass(frozen=True, eq=False)
 class About:
-    """One recording about an estimate."""
-
-    signals: Signals
+    signals: PreparedSignals
     shares: dict[Term, Columns]
     """Torque that each term adds to the rows [N·m], (K,) each, exact; together they are the estimate's prediction."""
     sensor_gain: Array
@@ -37,10 +35,10 @@ class About:
     """Reported motor torque per torque at the motor, (n,)."""
     motor_slope: Array
     """Change of the reported motor torque with the torque of its joint, (K, n)."""
-    stages: tuple[Signals, ...]
+    stages: tuple[PreparedSignals, ...]
     """The signals with the torque as it enters each stage of the sensors (`STAGES`)."""
 
-    def entering(self, term: Term) -> Signals:
+    def entering(self, term: Term) -> PreparedSignals:
         """The signals as a term meets them: in a sensor, with the torque that earlier stages pass on."""
         return self.stages[_stage(term)] if term.form.signature.side == "distortion" else self.signals
 
@@ -49,14 +47,14 @@ class About:
 class _Parts:
     """The chain from link to motor as it is built up."""
 
-    signals: Signals
+    signals: PreparedSignals
     shares: dict[Term, Columns] = field(default_factory=dict)
 
     def add(self, term: Term, rows: Columns) -> None:
         self.shares[term] = rows
 
 
-def about(read: Signals, layout: Layout, values: Values) -> About:
+def about(read: PreparedSignals, layout: ChannelLayout, values: Values) -> About:
     """A recording about an estimate; about nothing, the recording itself."""
     parts = _Parts(read)
     bodies = _bodies(parts, layout, values) if values else read.bodies
@@ -68,7 +66,7 @@ def about(read: Signals, layout: Layout, values: Values) -> About:
     for term, c in values.items():
         if term.form.signature.side == "motor":
             _add_to(lost, layout.motor_side, _share(parts, s, layout, term, c))
-    stages: list[Signals] = []
+    stages: list[PreparedSignals] = []
     for stage in range(len(STAGES)):
         entering = replace(s, found=replace(still, bent=bent.copy())) if bent.any() else s
         stages.append(entering)
@@ -84,12 +82,10 @@ def about(read: Signals, layout: Layout, values: Values) -> About:
 
 
 def _stage(term: Term) -> int:
-    """The stage of the sensor in which a term acts."""
     return next(k for k, effects in enumerate(STAGES) if term.effect in effects)
 
 
-def _share(parts: _Parts, s: Signals, layout: Layout, term: Term, c: Array) -> Columns:
-    """The torque that a term adds to its rows."""
+def _share(parts: _Parts, s: PreparedSignals, layout: ChannelLayout, term: Term, c: Array) -> Columns:
     rows = {row: x @ c for row, x in _columns(s, layout, term).items()}
     parts.add(term, rows)
     return rows
@@ -102,11 +98,11 @@ def _add_to(total: Array, channel: str | None, rows: Columns) -> None:
             total[:, joint] += share
 
 
-def _columns(s: Signals, layout: Layout, term: Term) -> Columns:
+def _columns(s: PreparedSignals, layout: ChannelLayout, term: Term) -> Columns:
     return term.form.signature.columns(s, layout, term.place, term.shape)
 
 
-def _bodies(parts: _Parts, layout: Layout, values: Values) -> Array:
+def _bodies(parts: _Parts, layout: ChannelLayout, values: Values) -> Array:
     """Torque of the links about the estimate (K, n); shares of the terms that change it: masses, gravity, positions."""
     read, channel = parts.signals, layout.against_model
     arm, torque = read.arm, read.bodies
@@ -142,7 +138,7 @@ def _bodies(parts: _Parts, layout: Layout, values: Values) -> Array:
     return torque
 
 
-def _springs(parts: _Parts, layout: Layout, values: Values) -> Array:
+def _springs(parts: _Parts, layout: ChannelLayout, values: Values) -> Array:
     """Torque of the springs across the joints about the estimate (K, n): the rest of the links' side; its shares.
 
     The nominal model's own pull as they do at the positions that were read: shares are what the estimate adds.
@@ -169,7 +165,7 @@ def inertial_change(term: Term, c: Array, inertial: Array, number: int) -> Array
     return None
 
 
-def _gains(s: Signals, values: Values) -> tuple[Array, Array, Array]:
+def _gains(s: PreparedSignals, values: Values) -> tuple[Array, Array, Array]:
     """How readings of sensor and motor change with the torque: `About.sensor_gain`, `motor_gain`, `motor_slope`."""
     sensor, motor, slope = np.eye(s.n), np.ones(s.n), np.ones_like(s.q)
     gain = np.ones(s.n)

@@ -46,13 +46,7 @@ class ColumnStore:
         self._columns: dict[Term, Columns] = {}
         self._offsets: dict[Term, Columns] = {}
 
-    def at(
-        self,
-        values: Values,
-        pins: Values | None = None,
-        slopes: "ColumnStore | None" = None,
-    ) -> "ColumnStore":
-        """The columns about other values."""
+    def at(self, values: Values, pins: Values | None = None, slopes: "ColumnStore | None" = None) -> "ColumnStore":
         return ColumnStore(self.data, values, self.nominal or self, pins, slopes=slopes)
 
     def beside(self, near: "ColumnStore | None") -> "ColumnStore":
@@ -97,7 +91,6 @@ class ColumnStore:
 
     @cached_property
     def about(self) -> list[About]:
-        """Each recording about the estimate."""
         return [about(s, self.data.layout, self.values) for s in self.data.signals]
 
     def release(self) -> None:
@@ -118,7 +111,7 @@ class ColumnStore:
         return self._columns[term]
 
     def offset(self, term: Term) -> Columns:
-        """What a nonlinear term is beside its columns times its coefficients, (K, 1) per row; empty if it is linear."""
+        """Part of a nonlinear term beside its columns times its coefficients, (K, 1) per row; empty if it is linear."""
         if term not in self._columns:
             self._compute(term)
         return self._offsets[term]
@@ -169,7 +162,7 @@ class ColumnStore:
         return self.slopes._columns.get(term)
 
     def _beside(self, term: Term) -> Columns:
-        """What a term is beside derivatives that are not about its estimate, (K, 1) per row."""
+        """Part of a term beside derivatives that are not about its estimate, (K, 1) per row."""
         own, layout = self._columns[term], self.data.layout
         parts = []
         for one in self.about:

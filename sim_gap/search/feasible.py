@@ -11,24 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from sim_gap.effects.inertials import pseudo_inertia
+from sim_gap.effects.link import pseudo_inertia
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.search.about import inertial_change
-from sim_gap.search.stepwise import Search
+from sim_gap.search.stepwise import StepwiseSearch
 from sim_gap.search.term import Term
-
-BARRIERS = (1e-1, 1e-2, 1e-3, 1e-4)
-"""Weights of −log det in turn, in units of the squares that the constraint costs at the start."""
-NEWTON_STEPS = 25
-SLOPE_STEP = 1e-6
-MARGIN = 1e-6
-"""Least eigenvalue of the pseudo-inertia relative to that of the nominal link."""
 
 Matrix = Callable[[Array], Array]
 Places = NDArray[np.intp]
 
 
-def pins(search: Search, arm: RigidArm) -> dict[Term, Array]:
+def pins(search: StepwiseSearch, arm: RigidArm) -> dict[Term, Array]:
     """Coefficients of the terms that a fit would give to links that cannot exist, at the closest that can."""
     index, coefficients = search.weighted.fit(search.active)
     values = {term: coefficients[np.isin(index, search.normal.at[term])] for term in search.active}
@@ -79,10 +72,10 @@ def _change(term: Term, c: Array, inertial: Array) -> Array:
 
 
 def _positive(matrix: Array) -> bool:
-    return bool(np.linalg.eigvalsh(matrix).min() > MARGIN * max(float(np.trace(matrix)), 0.0))
+    return bool(np.linalg.eigvalsh(matrix).min() > 1e-6 * max(float(np.trace(matrix)), 0.0))
 
 
-def _alone(search: Search, index: Places, at: Places) -> Array:
+def _alone(search: StepwiseSearch, index: Places, at: Places) -> Array:
     """Curvature of the weighted squares in the coefficients `at`, all others of the fit adapting, (p, p)."""
     weighted = search.weighted
     rest = np.setdiff1d(index, at).astype(int)
@@ -106,11 +99,11 @@ def _closest(wanted: Array, curvature: Array, matrix: Matrix) -> Array:
         barrier = weight * float(np.linalg.slogdet(matrix(at))[1])
         return 0.5 * float((at - wanted) @ curvature @ (at - wanted)) - barrier
 
-    for barrier in BARRIERS:
+    for barrier in (1e-1, 1e-2, 1e-3, 1e-4):  # in units of the squares that the constraint costs
         weight = barrier * max(cost, 1e-12)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(25):
             inverse = np.linalg.inv(matrix(x))
-            steps = SLOPE_STEP * np.maximum(np.abs(x), 1e-3)
+            steps = 1e-6 * np.maximum(np.abs(x), 1e-3)
             parts = [
                 inverse @ (matrix(x + d) - matrix(x - d)) / (2 * s) for s, d in zip(steps, np.diag(steps), strict=True)
             ]

@@ -12,13 +12,32 @@ from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converged
 from sim_gap.search.normal_equations import NormalEquations, Weighted
-from sim_gap.search.stepwise import TRIES, Search, impossible, shortlist
+from sim_gap.search.stepwise import TRIES, StepwiseSearch, impossible, shortlist
 from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
-from sim_gap.search.whole_body import one_body
+
+MOMENTS, BODY = "link.mass_moment", "link.payload"
 
 
-def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
+def one_body(store: ColumnStore, search: StepwiseSearch, offered: Sequence[Term]) -> list[Term] | None:
+    """The active terms with a payload in place of the mass moments, if that fits as well about itself; else None.
+
+    Linear in its mass and first moment, a payload lacks the inertia that its mass has where it hangs; mass moments of
+    all links together then fit a little better, and no single exchange leads back. `store` has the columns about the
+    nominal model.
+    """
+    active = search.active
+    bodies = [term for term in offered if term.effect == BODY and not term.shape]
+    moments = [term for term in active if term.effect == MOMENTS]
+    if len(moments) < 2 or not bodies or any(term.effect == BODY for term in active):
+        return None
+    about, kept = converged(store, [*(term for term in active if term not in moments), bodies[0]])
+    found = StepwiseSearch(NormalEquations(about, kept), kept)
+    there = any(term.effect == BODY for term in found.active)
+    return found.active if there and found.score < search.score else None
+
+
+def select_model(store: ColumnStore, library: Sequence[str]) -> StepwiseSearch:
     """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place."""
     offered, active = first_search(store, library)
     store.keep(offered)
@@ -37,7 +56,7 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
 
 def searched_again(
     store: ColumnStore, active: Sequence[Term], offered: Sequence[Term], usual: frozenset[str] = frozenset()
-) -> Search:
+) -> StepwiseSearch:
     """The terms offered, searched about the fit of those that are active, until both agree."""
     chosen = refine(store, one_each([canonical(term) for term in active]))
     values: Values = {}
@@ -65,7 +84,7 @@ def searched_again(
 def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term], list[Term]]:
     """The terms that are offered to the search about the estimate, and those that a search about the nominal model
     selects."""
-    search = Search(NormalEquations(store, candidates(store.data, library)))
+    search = StepwiseSearch(NormalEquations(store, candidates(store.data, library)))
     search.run()
     search = without_doubtful(search)
     return likely_shapes(search), search.active
@@ -78,7 +97,7 @@ def about_itself(
     start: Values,
     near: ColumnStore | None = None,
     usual: frozenset[str] = frozenset(),
-) -> Search:
+) -> StepwiseSearch:
     """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
     `start` on. `near` is the store of an earlier fit, whose columns of rivals serve if it is close."""
     store, chosen = with_lost(nominal, chosen, *converged(nominal, chosen, start))
@@ -91,7 +110,7 @@ def about_itself(
     keys = {term.key for term in chosen}
     others = [term for term in with_levels(store, offered) if term.key not in keys]
     rivals = relinearised_in_place(store, chosen, others)
-    return Search(NormalEquations(store, [*chosen, *rivals]), chosen, usual=usual)
+    return StepwiseSearch(NormalEquations(store, [*chosen, *rivals]), chosen, usual=usual)
 
 
 def with_lost(
@@ -106,7 +125,7 @@ def with_lost(
     shapes = [Term(*key, shape) for key, grid in grids.items() for shape in grid]
     needed = {key for term in shapes for key in term.beneath} - {term.key for term in chosen} - lost
     beneath = [term for term in wanted if term.key in needed]
-    search = Search(NormalEquations(store, [*chosen, *shapes, *beneath]), chosen)
+    search = StepwiseSearch(NormalEquations(store, [*chosen, *shapes, *beneath]), chosen)
     search.take_back(lost)
     return converged(nominal, search.active, store.values) if len(search.active) > len(chosen) else (store, chosen)
 
@@ -144,7 +163,7 @@ def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
     ]
 
 
-def likely_shapes(search: Search) -> list[Term]:
+def likely_shapes(search: StepwiseSearch) -> list[Term]:
     """The terms of a search, of each effect and place only the SHAPES that would help most beside the active ones."""
     rest = [term for term in search.normal.terms if term not in search.active]
     count = Counter[Key]()
@@ -166,7 +185,7 @@ def one_each(terms: Sequence[Term]) -> list[Term]:
     return list({term.key: term for term in reversed(terms)}.values())[::-1]
 
 
-def without_doubtful(search: Search) -> Search:
+def without_doubtful(search: StepwiseSearch) -> StepwiseSearch:
     """Search again with terms that leave a large residual on their rows replaced by their simpler alternatives.
 
     Single steps do not get there if several alternatives are needed at once.
@@ -179,7 +198,7 @@ def without_doubtful(search: Search) -> Search:
     for term in doubtful:
         rest = search.without(term, rest)
     wanted = {key for term in doubtful for key in parts[term]} - {other.key for other in rest}
-    again = Search(search.normal, [*rest, *(other for other in search.normal.terms if other.key in wanted)])
+    again = StepwiseSearch(search.normal, [*rest, *(other for other in search.normal.terms if other.key in wanted)])
     again.added.update({term.key: TRIES - 1 for term in doubtful})
     again.run()
     return again if again.score < search.score - 1e-3 else search
@@ -237,7 +256,7 @@ def relinearised(store: ColumnStore, active: list[Term]) -> list[Term]:
     if all(term.form.hints.linearised_at is None for term in active):
         return active
     normal = NormalEquations(store, active)
-    search = Search(normal, list(normal.terms))
+    search = StepwiseSearch(normal, list(normal.terms))
     _, values = search.weighted.fit(normal.terms)
     return [term.relinearised(values[normal.at[term]]) for term in normal.terms]
 
@@ -248,7 +267,7 @@ def relinearised_in_place(store: ColumnStore, chosen: list[Term], offered: list[
         nonlinear = [term for term in offered if term.form.hints.linearised_at is not None]
         if not nonlinear or not chosen:
             return offered
-        search = Search(NormalEquations(store, [*chosen, *nonlinear]), list(chosen))
+        search = StepwiseSearch(NormalEquations(store, [*chosen, *nonlinear]), list(chosen))
         best: dict[Term, tuple[float, Term]] = {}
         for term in search.active:
             rest = search.without(term, search.active)

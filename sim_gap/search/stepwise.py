@@ -14,8 +14,6 @@ from sim_gap.search.term import Term
 Scored = tuple[float, list[Term]]
 """Score of a set of terms, lower is better, and the terms."""
 
-SHORTLIST = 10
-MOST_TERMS = 60
 TRIES = 3
 """How often one effect at one place may be added during a search."""
 OWED = 0.06
@@ -27,7 +25,7 @@ MUCH = 3.0
 
 
 @dataclass
-class Search:
+class StepwiseSearch:
     """Stepwise search over one set of normal equations."""
 
     normal: NormalEquations
@@ -69,7 +67,6 @@ class Search:
         return terms
 
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
-        """The first of the terms with implausible coefficients."""
         return next(impossible(self.normal, terms, self.weighted.fit(terms)[1]), None) if terms else None
 
     def accept(self, chosen: list[Term], simpler: bool = False) -> bool:
@@ -96,7 +93,9 @@ class Search:
         """
         for key in lost:
             shapes = [term for term in self.normal.terms if term.key == key]
-            trials = [Search(self.normal, self.with_beneath(term, self.active), usual=self.usual) for term in shapes]
+            trials = [
+                StepwiseSearch(self.normal, self.with_beneath(term, self.active), usual=self.usual) for term in shapes
+            ]
             best = min(trials, key=lambda trial: trial.score, default=self)
             if best.score < self.score:
                 self.active, self.weighted, self.score = best.active, best.weighted, best.score
@@ -142,7 +141,7 @@ class Search:
             tried = {term.key for term in first}
             lists = [[pair for pair in each if pair[1].key not in tried] for each in lists]
         chosen = self._best(judged, self.score - self.least)
-        return chosen is not None and len(chosen) <= MOST_TERMS and self.accept(chosen)
+        return chosen is not None and len(chosen) <= 60 and self.accept(chosen)
 
     def backward(self) -> bool:
         """Drop the term that is missed least, if the rest scores better without it."""
@@ -255,6 +254,6 @@ def shortlist(screened: list[tuple[float, Term]]) -> list[tuple[float, Term]]:
         seen[term.key] = seen.get(term.key, 0) + 1
         if seen[term.key] <= 2:
             out.append((fall, term))
-        if len(out) == SHORTLIST:
+        if len(out) == 10:
             break
     return out

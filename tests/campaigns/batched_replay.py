@@ -21,10 +21,10 @@ from armlink.recording.files import load_recording
 from armlink.recording.recording import slice_rows
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.better_model.native_drives import hold
-from sim_gap.closed_loop.identify import Identified
-from sim_gap.closed_loop.training.draws import draw
-from sim_gap.closed_loop.training.posterior import batched
-from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, actuator_of, commanded, replay
+from sim_gap.position_gap.identify import Identified
+from sim_gap.position_gap.training.draws import draw
+from sim_gap.position_gap.training.replay import OPENING_S, Simulated, actuator_of, commanded, replay
+from sim_gap.position_gap.training.training_files import batched
 
 AGREE = 0.05
 """Largest difference of the RMS gap to the measured position between both simulators, over all joints."""

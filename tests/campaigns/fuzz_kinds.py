@@ -51,8 +51,8 @@ from calib.sweep.dataset import load_data
 from gcomp.arm.load import load_model
 from gcomp.errors import BadModel
 from sim_bus.truth import Truth
-from sim_gap.experiment.motion_file import load_motion
-from sim_gap.fleet.fleet import Answers
+from sim_gap.experiment import load_motion
+from sim_gap.fleet import Answers
 from sim_gap.model.load import load_compiled
 
 ROOT = Path(__file__).parents[2]
@@ -330,8 +330,8 @@ def answers(_: Path) -> list[Seed]:
 
 
 def read_answers(path: Path) -> None:
-    from sim_gap.fleet.fleet import table
-    from sim_gap.fleet.trends import fleet_trends, rows
+    from sim_gap.fleet import table
+    from sim_gap.trends import fleet_trends, rows
 
     found = Answers(path).found
     table(found)

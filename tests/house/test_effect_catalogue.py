@@ -10,8 +10,8 @@ from calib.fit import unmodelled_effects
 from calib.observer.effect_dictionary import CAUSES
 from sim_bus.effects.registry import NOT_SIMULATED
 from sim_bus.effects.registry import effects as forward_effects
+from sim_gap.blind.effects import DRAWS, NOT_DRAWN
 from sim_gap.blind.effects.drawn import Drawn
-from sim_gap.blind.effects.library import DRAWS, NOT_DRAWN
 from sim_gap.effects.registry import NOT_DIAGNOSED, effects, library_without
 
 DOCS = Path(__file__).parents[2] / "docs"

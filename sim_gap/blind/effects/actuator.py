@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.effects.drawn import Draw, Drawn, added, motor_level, pick, replaced, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 LATE_S = (0.008, 0.016)
 """Delays and lags [s]: two to four sample intervals."""
@@ -12,7 +12,6 @@ SLOW = "needs steps, a chirp or faster logging"
 
 
 def gain(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """Torque produced per torque reported."""
     wanted = np.maximum(1.3 * motor_level(scene, random) / rms(scene.torque + scene.rotor_torque), 0.07)
     j = pick(wanted, 0.3, random)
     if j is None:
@@ -50,12 +49,10 @@ def _late(scene: Scene, random: np.random.Generator, effect: str, other: str) ->
 
 
 def lag(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A first-order lag from command to torque."""
     return _late(scene, random, "actuator.lag", "actuator.delay")
 
 
 def delay(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A dead time from command to torque."""
     return _late(scene, random, "actuator.delay", "actuator.lag")
 
 

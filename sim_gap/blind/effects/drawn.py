@@ -7,9 +7,9 @@ import numpy as np
 
 from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array, Mask
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
+from sim_gap.blind.arms import BenchArm
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 SENSOR_LEAST = 0.12
 MOTOR_LEAST = 0.3
@@ -25,14 +25,12 @@ Apply = Callable[[TrueArm], None]
 
 @dataclass(frozen=True)
 class Drawn:
-    """An effect on one arm."""
-
     effect: str
     parameters: dict[str, Values]
     """By joint name (`arm` for the whole arm); named as a diagnosis reports them."""
     apply: Apply
     """Puts the effect into the true arm."""
-    nominal: Callable[[Arm], Arm] | None = None
+    nominal: Callable[[BenchArm], BenchArm] | None = None
     """Changes the nominal model, if need be."""
     implied: tuple[str, ...] = ()
     """Simpler effects that are part of it and may correctly be named as well."""
@@ -55,12 +53,11 @@ class Drawn:
         effect: str,
         values: Values,
         apply: Apply,
-        nominal: Callable[[Arm], Arm] | None = None,
+        nominal: Callable[[BenchArm], BenchArm] | None = None,
         implied: tuple[str, ...] = (),
         undecided: str = "",
         confused_with: tuple[str, ...] = (),
     ) -> "Drawn":
-        """An effect at one joint (or link)."""
         name = scene.arm.names[joint]
         return cls(effect, {name: values}, apply, nominal, implied, undecided, confused_with)
 
@@ -111,7 +108,6 @@ def pick(wanted: Array, cap: float | Array, random: np.random.Generator, allowed
 
 
 def sign(random: np.random.Generator) -> float:
-    """Plus or minus one."""
     return float(random.choice([-1.0, 1.0]))
 
 

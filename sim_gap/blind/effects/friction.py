@@ -5,19 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
+from sim_gap.blind.arms import BenchArm
 from sim_gap.blind.effects.drawn import Draw, Drawn, added, motor_level, pick, replaced, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
-MOVING = 0.02
-"""Speed [rad/s] below which friction does not show in the readings."""
 
-
-def _known_coulomb(joint: int, torque: float, known: bool) -> tuple[Callable[[Arm], Arm] | None, tuple[str, ...]]:
+def _known_coulomb(
+    joint: int, torque: float, known: bool
+) -> tuple[Callable[[BenchArm], BenchArm] | None, tuple[str, ...]]:
     """Coulomb friction under another effect: either the nominal model has it, or it is implied."""
 
-    def nominal(arm: Arm) -> Arm:
+    def nominal(arm: BenchArm) -> BenchArm:
         frictionloss = arm.frictionloss.copy()
         frictionloss[joint] = torque
         return replace(arm, frictionloss=frictionloss)
@@ -26,14 +25,12 @@ def _known_coulomb(joint: int, torque: float, known: bool) -> tuple[Callable[[Ar
 
 
 def coulomb(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A constant torque against the motion."""
     j = int(random.integers(scene.arm.n))
     torque = float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0))
     return Drawn.at(scene, j, "friction.coulomb", {"torque": torque}, added(lambda true: true.coulomb, j, torque))
 
 
 def viscous(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A torque proportional to the velocity."""
     j = int(random.integers(scene.arm.n))
     damping = float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0) / rms(scene.motion[1])[j])
     return Drawn.at(scene, j, "friction.viscous", {"damping": damping}, added(lambda true: true.viscous, j, damping))
@@ -43,7 +40,7 @@ def stribeck(scene: Scene, random: np.random.Generator) -> Drawn | None:
     """More friction at low speed, in addition to Coulomb friction."""
     j = int(random.integers(scene.arm.n))
     level, speed = float(motor_level(scene, random)[j]), np.abs(scene.motion[1][:, j])
-    moving = speed[speed > MOVING]
+    moving = speed[speed > 0.02]  # below, friction does not show
     velocity = float(np.clip(np.quantile(moving, random.uniform(0.25, 0.5)), 0.05, 0.35))
     breakaway = float(1.2 * level / rms(np.exp(-((moving / velocity) ** 2))))
     base = breakaway * random.uniform(0.8, 1.6)
@@ -58,7 +55,6 @@ def stribeck(scene: Scene, random: np.random.Generator) -> Drawn | None:
 
 
 def asymmetric(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """Friction that differs between directions."""
     j = int(random.integers(scene.arm.n))
     ratio = sign(random) * random.uniform(0.25, 0.6)
     base = float(1.5 * motor_level(scene, random)[j] / abs(ratio))

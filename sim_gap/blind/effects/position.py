@@ -3,9 +3,9 @@
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.effects.drawn import Draw, Drawn, added, pick, replaced, sensor_level, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 PERIOD_S = 0.004
 """Sample interval of the recordings [s]: shorter delays do not show."""

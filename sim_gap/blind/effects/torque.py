@@ -2,20 +2,18 @@
 
 import numpy as np
 
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
 from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, added, pick, replaced, reversals, sensor_level, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 
 def offset(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A constant added to the reading."""
     j = int(random.integers(scene.arm.n))
     value = sign(random) * float(sensor_level(scene, random)[j] * random.uniform(1.0, 2.0))
     return Drawn.at(scene, j, "torque.offset", {"offset": value}, added(lambda true: true.torque_offset, j, value))
 
 
 def gain(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """The reading scaled."""
     wanted = np.maximum(sensor_level(scene, random) / rms(scene.torque), 0.06)
     j = pick(wanted, 0.25, random)
     if j is None:

@@ -5,15 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import SharedMotor, TrueArm
+from sim_gap.blind.arms import BenchArm
 from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, replaced, reversals, sensor_level, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import SharedMotor, TrueArm
 
 STEP_S = 5e-4
 """Time step of the plant [s]: springs must be slower."""
-ELASTIC_LEAST = 0.25
-"""Least RMS torque caused by the deflection of an elastic joint [N·m]."""
 
 
 def ripple(scene: Scene, random: np.random.Generator) -> Drawn | None:
@@ -57,7 +55,7 @@ def elasticity(scene: Scene, random: np.random.Generator) -> Drawn | None:
     stiffness_of = rms(scene.torque) / random.uniform(0.015, 0.04)  # from the RMS deflection [rad]
     resonance, stiffest = (2 * np.pi * 4.0) ** 2 * scene.inertia, _stiffest(scene)
     shown = _turn_felt(scene, scene.torque / stiffness_of)
-    fit = (shown > ELASTIC_LEAST) & (stiffness_of > resonance) & (stiffness_of < stiffest)
+    fit = (shown > 0.25) & (stiffness_of > resonance) & (stiffness_of < stiffest)  # N·m of deflection
     if not fit.any():
         return None
     j = int(random.choice(np.flatnonzero(fit)))
@@ -100,7 +98,7 @@ def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
     coulomb, viscous = 1.5 * level, 0.8 * level / float(rms(speed))
     rotor = 0.5 * level / float(rms(push))
 
-    def nominal(arm: Arm) -> Arm:
+    def nominal(arm: BenchArm) -> BenchArm:
         out = replace(
             arm, armature=arm.armature.copy(), damping=arm.damping.copy(), frictionloss=arm.frictionloss.copy()
         )

@@ -12,7 +12,7 @@ from armlink.model_file import compile_model
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.effects.base import angles_of, tilted
-from sim_gap.effects.inertials import moved, point, point_slopes, pseudo_inertia
+from sim_gap.effects.link import moved, point, point_slopes, pseudo_inertia
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 

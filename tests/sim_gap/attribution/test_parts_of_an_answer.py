@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from sim_gap.attribution import notes, rollout
-from sim_gap.attribution.causes import ordered
+from sim_gap.attribution.causes import ordered, steadiness
 from sim_gap.attribution.diagnosis import Rollout
-from sim_gap.attribution.positions.answer import _where
-from sim_gap.attribution.positions.notes import running_free
-from sim_gap.attribution.residual_laws import ResidualLaw, _Candidate
+from sim_gap.attribution.position_answer import _where
+from sim_gap.attribution.position_notes import running_free
+from sim_gap.attribution.residual_laws import ResidualLaw, _LawCandidate
 from sim_gap.attribution.rollout import RollOuts
-from sim_gap.attribution.steadiness import steadiness
 from sim_gap.better_model.export import _line
-from sim_gap.residuals.layout import Layout
-from sim_gap.residuals.where import Location, _features
+from sim_gap.residuals.layout import ChannelLayout
+from sim_gap.residuals.location import Location, _features
 from sim_gap.search.estimate import Value
 from sim_gap.search.term import Term
 
@@ -73,7 +72,7 @@ def test_a_remaining_gap_is_noted_with_its_regime_where_one_is_clear(monkeypatch
 def test_a_joint_that_rests_tells_nothing_of_its_friction() -> None:
     moving = np.zeros((100, 2))
     moving[:10, 0] = 1.0
-    layout = Layout(2, "tau", "tau_motor")
+    layout = ChannelLayout(2, "tau", "tau_motor")
     signals = SimpleNamespace(moving=moving, arm=SimpleNamespace(names=("shoulder", "wrist")))
     (said,) = notes._at_rest(SimpleNamespace(signals=(signals,), layout=layout, rows=layout.rows))
     assert said.startswith("wrist hardly moves: its tau_motor")
@@ -104,7 +103,7 @@ def test_a_directed_law_turns_with_the_motion_and_is_nothing_at_rest() -> None:
     direction = np.array([[1.0], [0.5], [0.0], [-1.0]])
     half = np.full((4, 1), 0.5)
     signals = SimpleNamespace(q=half, v=half, model=half, direction=direction, filtered=lambda x: x)
-    columns = _Candidate("position", True, np.array([0.0, 1.0])).columns(signals, 0)
+    columns = _LawCandidate("position", True, np.array([0.0, 1.0])).columns(signals, 0)
     np.testing.assert_allclose(columns, 0.5 * direction * np.ones(2))
 
 

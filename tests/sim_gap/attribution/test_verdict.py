@@ -8,15 +8,14 @@ from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution import diagnose
 from sim_gap.attribution.causes import _Scorer, founded_ones
-from sim_gap.attribution.confidence import founded
 from sim_gap.attribution.diagnosis import Cause, Signs
-from sim_gap.attribution.verdict import carries
+from sim_gap.attribution.verdict import carries, founded
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 SIGNS = Signs(1.0, 0.0, 1.0, 0.0)
@@ -40,7 +39,7 @@ def test_what_is_missed_without_a_term_is_what_no_other_takes():
     data = ResidualSet((signals,), layout_of([signals]))
     terms = [Term("friction.coulomb", j) for j in range(3)] + [Term("friction.viscous", j) for j in range(3)]
     slow = Term("friction.stribeck", 1, (0.25,))
-    scorer = _Scorer(Estimate(ColumnStore(data), [*terms, slow]), data)
+    scorer = _Scorer(EffectEstimate(ColumnStore(data), [*terms, slow]), data)
     alone = np.max(scorer.rms(terms[:3]) - scorer.rms([*terms[:3], slow]))
     assert scorer.missed([slow]) < 0.1 * alone
     assert scorer.missed([slow, terms[4]]) > 0.5 * alone
@@ -67,6 +66,6 @@ def test_within_the_margins_what_may_be_nothing_is_minor(monkeypatch, within, na
     wrong = Wrong(coulomb=0.6)
     recordings = [record(model(), wrong, seed=seed, seconds=12.0, rate=50.0) for seed in (1, 2)]
     monkeypatch.setattr(diagnose, "is_within", lambda data: within)
-    monkeypatch.setattr(Estimate, "may_be_nothing", lambda self, term: True)
+    monkeypatch.setattr(EffectEstimate, "may_be_nothing", lambda self, term: True)
     answer = diagnose.diagnose(model(), recordings[:1], recordings[1:])
     assert [bool(each) for each in (answer.causes, answer.minor)] == [named, not named]

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 
 from sim_gap.blind import bench
-from sim_gap.blind.cases.arms import draw_arm
-from sim_gap.blind.cases.motion import RATE
-from sim_gap.blind.cases.true_arm import TrueArm, sound
-from sim_gap.blind.plant.drive import Drives
-from sim_gap.blind.plant.friction import STIFFEST, Bristles
-from sim_gap.blind.plant.runs import Log
+from sim_gap.blind.arms import draw_arm
+from sim_gap.blind.motion import RATE
+from sim_gap.blind.plant.controller import FINE, ServoLaw, ServoRun, Servos
+from sim_gap.blind.plant.drive import STIFFEST, Bristles, PlantDrives
 from sim_gap.blind.plant.sensors import SENSOR_BITS, record
-from sim_gap.blind.servo.law import FINE, ServoLaw, ServoRun, Servos
-from sim_gap.blind.servo.make import Recipe, draw, recorded
+from sim_gap.blind.servo_cases import ServoRecipe, draw, recorded
+from sim_gap.blind.true_arm import Log, TrueArm, sound
 
 STEP = 5e-4
 """Of the plant [s]."""
@@ -28,7 +26,7 @@ def truth(rated: float = 10.0) -> TrueArm:
 def test_a_drive_with_a_lag_follows_a_step_by_all_but_one_eth_in_that_time() -> None:
     arm = truth()
     arm.motor_lag[:] = 21 * STEP
-    drives = Drives([arm], np.full((1, 3), 0.1), np.zeros((1, 3)), [np.zeros(3)], STEP)
+    drives = PlantDrives([arm], np.full((1, 3), 0.1), np.zeros((1, 3)), [np.zeros(3)], STEP)
     for _ in range(21):
         drives._follow(np.ones((1, 3)))
     np.testing.assert_allclose(drives.current, 1.0 - np.exp(-1.0), rtol=1e-9)
@@ -82,7 +80,7 @@ def test_positions_are_recorded_at_their_times_beside_the_command_of_their_turn(
 
 
 def test_servos_of_a_case_have_the_bandwidth_and_damping_of_hobby_servos() -> None:
-    found = draw(Recipe("case_0000", "", True, (4, 1)), (3.0, 3.0), 0)
+    found = draw(ServoRecipe("case_0000", "", True, (4, 1)), (3.0, 3.0), 0)
     assert found is not None
     inertia = found.runs[0].inertia
     hz = np.sqrt(found.law.stiffness / inertia) / (2 * np.pi)

@@ -14,7 +14,7 @@ from armlink.recording.recording import Recording, take_joints
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.checks.check import check_recording
 from sim_gap.checks.mapping import find_mapping
-from sim_gap.checks.rigid_fit import Motion
+from sim_gap.checks.rigid_fit import ChannelMotion
 from sim_gap.model.load import load_model
 
 REAL = Wrong(
@@ -243,9 +243,9 @@ def test_a_tool_that_outweighs_the_last_link_is_no_zero_of_its_joint():
     loaded = arm.inertial.copy()
     loaded[-1, :4] += body
     reading = arm.with_inertial(loaded).torque(q, v, a) + 0.2 * np.tanh(v / 0.01)
-    assert find_mapping(arm, Motion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
+    assert find_mapping(arm, ChannelMotion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
     turned_zero = q + np.array([0.0, 0.0, np.pi / 2])
-    (finding,) = find_mapping(arm, Motion(turned_zero, v, a, arm.torque(q, v, a), "tau_motor"), AS_IT_IS)
+    (finding,) = find_mapping(arm, ChannelMotion(turned_zero, v, a, arm.torque(q, v, a), "tau_motor"), AS_IT_IS)
     assert finding.option == "--zero q_3=-1.57080"
 
 
@@ -267,7 +267,7 @@ def test_a_joint_whose_friction_outweighs_the_models_torque_tells_no_zero():
     _, q, v, a = motion(3, 30.0, 100.0, seed=4)
     reading = arm.torque(q, v, a) + np.tanh(v / 0.01)
     reading[:, 2] += 300.0 * arm.torque(q + np.array([0.0, 0.0, np.pi / 2]), v, a)[:, 2]
-    assert find_mapping(arm, Motion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
+    assert find_mapping(arm, ChannelMotion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
 
 
 def test_friction_tells_the_sign_where_the_model_says_nothing(arm, motor):

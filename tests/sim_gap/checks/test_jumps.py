@@ -8,7 +8,7 @@ from wrong_arms import Wrong, model, record
 
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.rows.jumps import find_jumps, find_seam, unwrapped
+from sim_gap.checks.jumps import find_jumps, find_seam, unwrapped
 
 
 def of_position(position: np.ndarray, rate: float) -> Recording:

@@ -5,7 +5,7 @@ import pytest
 
 from sim_gap.effects.drive import _lag
 from sim_gap.effects.effect import added_or_taken_off
-from sim_gap.effects.inertials import point, pseudo_inertia
+from sim_gap.effects.link import point, pseudo_inertia
 from sim_gap.effects.registry import effects
 
 

@@ -8,8 +8,8 @@ from sim_gap.attribution.diagnose import diagnose
 from sim_gap.report import page
 from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.figures import residual_panels
-from sim_gap.report.over_time import torque_over_time
 from sim_gap.report.page import sections
+from sim_gap.report.time_figures import torque_over_time
 
 WRONG = Wrong(coulomb=np.array([0.0, 0.8, 0.0]), spring=np.array([0.0, 0.0, 2.0]))
 

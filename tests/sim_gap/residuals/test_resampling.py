@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim_gap.residuals.gear_impacts import SHARP, near_impacts
 from sim_gap.residuals.resampling import coverage, thinner
+from sim_gap.residuals.residual_set import SHARP, near_impacts
 
 
 @pytest.mark.parametrize(("hz", "lost"), [(1000.0, 0.03), (10.0, 0.3)])

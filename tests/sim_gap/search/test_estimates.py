@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
-from sim_gap.effects.inertials import point
+from sim_gap.effects.link import point
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
@@ -15,7 +15,7 @@ from sim_gap.residuals.residual_set import FLOOR, FLOOR_INNER, ResidualSet
 from sim_gap.search import gauss_newton, model_selection
 from sim_gap.search.about import about
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.feasible import _closest, _shapes
 from sim_gap.search.model_selection import golden, relinearised_in_place, select_model
 from sim_gap.search.normal_equations import NormalEquations
@@ -101,7 +101,7 @@ def test_between_motor_and_sensor_less_of_a_gap_is_worth_a_parameter(data: Resid
 def test_what_an_effect_needs_is_at_hand_for_its_parameters(data: ResidualSet) -> None:
     """The asymmetry is told as a share of the Coulomb friction fitted beneath it."""
     terms = [COULOMB, Term("friction.asymmetric", 1)]
-    estimate = Estimate(ColumnStore(data), terms)
+    estimate = EffectEstimate(ColumnStore(data), terms)
     asymmetric = next(term for term in estimate.terms if term.effect == "friction.asymmetric")
     (ratio,) = estimate.parameters(asymmetric).values()
     size = float(estimate.of(asymmetric)[0])
@@ -111,7 +111,9 @@ def test_what_an_effect_needs_is_at_hand_for_its_parameters(data: ResidualSet) -
 
 def test_friction_that_is_clearly_there_has_a_narrow_interval(data: ResidualSet) -> None:
     """Sound arms differ by some hundredths of a newton metre, not by all that a joint has."""
-    estimate = Estimate(ColumnStore(data), [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,))])
+    estimate = EffectEstimate(
+        ColumnStore(data), [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,))]
+    )
     (torque,) = estimate.parameters(estimate.terms[0]).values()
     assert torque.low < 0.5 < torque.high
     assert torque.high - torque.low < 1.5
@@ -119,7 +121,7 @@ def test_friction_that_is_clearly_there_has_a_narrow_interval(data: ResidualSet)
 
 def test_what_is_not_there_may_be_nothing_by_its_interval(data: ResidualSet) -> None:
     terms = [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,)), GAIN]
-    estimate = Estimate(ColumnStore(data), terms)
+    estimate = EffectEstimate(ColumnStore(data), terms)
     found = {term.effect: term for term in estimate.terms}
     (gain,) = estimate.parameters(found["actuator.gain"]).values()
     assert gain.low < 1.0 < gain.high
@@ -190,7 +192,7 @@ def test_nonlinear_effects_are_offered_at_the_size_that_they_have_in_place_of_a_
         )
 
     monkeypatch.setattr(model_selection, "NormalEquations", lambda store, terms: None)
-    monkeypatch.setattr(model_selection, "Search", search)
+    monkeypatch.setattr(model_selection, "StepwiseSearch", search)
     assert [term.times for term in relinearised_in_place(None, [chosen], [bent])] == [2]
     assert relinearised_in_place(None, [], [bent]) == [bent]
 
