@@ -35,12 +35,6 @@ class ModelArm:
     arm: Arm
     beta: Array
     """Mass moments (2n,) of the model's inertials [kg·m]."""
-    mass: Array
-    """Link masses (n,), bodies welded to a link included [kg]."""
-    first_moment: Array
-    """Link first moments (n, 3) in bar frames, from the joint's anchor [kg·m]."""
-    bodies: tuple[tuple[str, ...], ...]
-    """Names of the bodies that each link consists of, the one with the joint first."""
 
 
 def load_model(
@@ -58,7 +52,7 @@ def load_model(
 
 @dataclass(frozen=True, eq=False)
 class PlacedChain:
-    """The chain in MuJoCo's reference configuration, with all that is needed to write inertials back into the file."""
+    """The chain in MuJoCo's reference configuration."""
 
     model: "mujoco.MjModel"
     data: "mujoco.MjData"
@@ -69,7 +63,7 @@ class PlacedChain:
     reference: Array
     """Joint positions (n,) of this configuration [rad]."""
     bodies: tuple[tuple[int, ...], ...]
-    """Ids of the bodies that each link consists of."""
+    """Ids of the bodies that each link consists of, the one with the joint first."""
 
 
 def place_chain(
@@ -217,8 +211,7 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None,
         limits=limits,
     )
     moments = np.einsum("ndk,nd->nk", geometry.bar, first_moment)
-    names = tuple(tuple(model.body(body).name for body in of_link) for of_link in bodies)
-    arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments), mass, moments, names)
+    arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments))
     return PlacedChain(model, data, arm, geometry, data.xanchor[chain], reference, tuple(map(tuple, bodies)))
 
 

@@ -1,11 +1,10 @@
-"""Choice of sweeps: against exhaustive and random choice, what it promises is what a fit then finds; cures."""
+"""Choice of sweeps: against exhaustive and random choice, and what it promises is what a fit then finds."""
 
 import numpy as np
 import pytest
-from gravity_rig import DOWN, SARCOS_BETA, make_readings, make_sarcos, sweep_rows
+from gravity_rig import SARCOS_BETA, make_readings, sweep_rows
 
 from gcomp.arm.arm import Arm
-from gcomp.design.remedies import remedies
 from gcomp.design.selection import sweep_jacobian
 from gcomp.design.sweep_design import Design, Sweep, choose_sweeps, readings_of, stop_combinations
 from gcomp.errors import BadArray
@@ -103,45 +102,6 @@ def test_a_joint_without_limits_has_no_stops() -> None:
               np.array([-np.inf]), np.array([np.inf]))  # fmt: skip
     with pytest.raises(BadArray, match="joint a has no limits"):
         stop_combinations(arm, 0)
-
-
-def test_cure_of_a_missing_sweep_names_it_and_works(sarcos) -> None:
-    """Joint 4 was never swept: the sentence names a sweep of it, and with that sweep the fit is complete."""
-    rng = np.random.default_rng(1)
-    positions, marks = sweep_rows(sarcos, 1, 9, rng)
-    kept = np.isnan(marks[:, 3])
-    rows = make_readings(sarcos, GUESS, positions[kept], marks[kept], sigma=SIGMA)
-    found = identify_global(sarcos, rows, unknown=MOMENTS)
-    advice = remedies(sarcos, rows, found.complete, unknown=MOMENTS)
-    assert set(advice) == set(found.not_identifiable)
-    assert "mass_moment_x[joint_4]" in advice
-    assert advice["mass_moment_x[joint_4]"].startswith("sweep joint_4 with joint_1 at its ")
-    pose = [
-        (sarcos.lower if f"joint_{i + 1} at its lower" in advice["mass_moment_x[joint_4]"] else sarcos.upper)[i]
-        for i in range(7)
-    ]
-    sweep = Sweep(3, np.array(pose), np.linspace(sarcos.lower[3], sarcos.upper[3], 9))
-    more = rows.joined(readings_of(sarcos, [sweep], SIGMA))
-    assert not set(advice) & set(identify_global(sarcos, more, unknown=MOMENTS).not_identifiable)
-
-
-def test_cure_of_the_missing_scale_is_a_reference_mass(sarcos) -> None:
-    rng = np.random.default_rng(1)
-    rows = make_readings(sarcos, GUESS, *sweep_rows(sarcos, 2, 9, rng), sigma=SIGMA)
-    found = identify_global(sarcos, rows, unknown=CALIBRATION)
-    advice = remedies(sarcos, rows, found.complete, unknown=CALIBRATION)
-    assert "with a reference mass" in advice["gain[joint_1]"]
-
-
-def test_vertical_joint_is_beyond_cure_but_for_tilting_the_base() -> None:
-    arm, rng = make_sarcos(DOWN), np.random.default_rng(1)
-    rows = make_readings(arm, GUESS, *sweep_rows(arm, 2, 9, rng), sigma=SIGMA)
-    found = identify_global(arm, rows, unknown=MOMENTS)
-    advice = remedies(arm, rows, found.complete, unknown=MOMENTS)
-    assert advice == dict.fromkeys(
-        ("mass_moment_x[joint_1]", "mass_moment_y[joint_1]"),
-        "no sweep: gravity does not act on it in any pose; tilt the base",
-    )
 
 
 def test_the_jacobian_of_candidate_sweeps_is_the_sensor_model_s(rng, random_arm) -> None:
