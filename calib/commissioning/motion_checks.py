@@ -20,8 +20,7 @@ from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
 from calib.plan.sweep_plan import plan_sweep
-from gcomp.arm.inertia import joint_inertias
-from gcomp.arm.load import place_chain
+from gcomp.arm.load import joint_inertias, place_chain
 from gcomp.gravity.torque import gravity_torque
 
 POSES = 500

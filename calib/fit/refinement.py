@@ -19,8 +19,7 @@ from calib.fit.sweep_readings import SweepReadings
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.identifiability import analyse, describe_null_space
-from gcomp.identify.natural_units import natural_units
-from gcomp.identify.parameters import Parameters, Prior, parameter_names, prior_vectors
+from gcomp.identify.parameters import Parameters, Prior, natural_units, parameter_names, prior_vectors
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict_and_jacobian
 

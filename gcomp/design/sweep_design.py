@@ -9,15 +9,18 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask, as_array
-from gcomp.design.choices import MINIMUM_LEVER, SKETCH_STEPS
 from gcomp.design.selection import Criterion, select, sweep_information, sweep_jacobian
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.global_fit import Prediction, predict_covariance
-from gcomp.identify.natural_units import natural_units
-from gcomp.identify.parameters import Parameters, free_mask
+from gcomp.identify.parameters import Parameters, free_mask, natural_units
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import expected_readings
+
+MINIMUM_LEVER = 0.3
+"""Γ/g of the swept joint below which a combination is used only if none is better (docs/theory.md, section 2.5)."""
+SKETCH_STEPS = 7
+"""Steps by which a candidate sweep is judged: more than a sinusoid's three unknowns (docs/theory.md, section 5.3)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from armlink.errors import BadInput
-from gcomp.arm.model_xml import parse_xml
+from gcomp.arm.model_file import parse_xml
 from gcomp.arrays import Array
 from sim_gap.better_model.with_effects import body_parameters, split
 from sim_gap.better_model.xml_comment import xml_comment

@@ -3,7 +3,7 @@
 from typing import Any
 
 from armlink.errors import BadInput
-from gcomp.arm.model_tree import HAND, coupled_joints, upwards
+from gcomp.arm.model_file import HAND, coupled_joints, upwards
 
 
 def hinges_of(model: Any) -> dict[str, int]:
