@@ -8,8 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.content.model_sizes import model_budget
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm, model_arm
+from calib.arm.kinematics import Limits, gcomp_arm, model_arm
 from calib.arm.sweep_section import sweep_section
 from calib.commissioning.finding import SetupFinding
 from calib.creep.choice import sweep_motion

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.torque_calibration import GAIN_RANGE
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import Limits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.creep.model import CreepModel
 from calib.creep.parameters import HARMONICS, Doubt, family_slices, prior

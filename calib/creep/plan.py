@@ -7,14 +7,12 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm, model_arm
+from calib.arm.kinematics import Limits, gcomp_arm, model_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.arm.unseen import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
+from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
 from calib.creep.design import Candidate, choose
 from calib.creep.parameters import Doubt
-from calib.plan.choices import POINTS
-from calib.plan.collisions import Geometry
+from calib.plan.collisions import POINTS, Geometry
 from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
 from calib.plan.poses import require_range
 from calib.plan.types import Side, Sweep, SweepPlan

@@ -8,7 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.unseen import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
+from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
 from calib.creep.fit import QUANTILE, CreepFit
 from calib.creep.parameters import LAST_ZERO
 from calib.fit.gravity_fit import GravityFit

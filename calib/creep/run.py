@@ -9,7 +9,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused, Stall
 from armlink.link.guard import Guard
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.arm.sweep_section import sweep_section
 from calib.creep.bins import bin_readings
 from calib.creep.plan import RAMP, CreepGround, check_creep_limits, creep_ends, creep_speed, plan_creep

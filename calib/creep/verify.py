@@ -10,11 +10,10 @@ from armlink.errors import Refused
 from armlink.link.guard import Guard
 from armlink.link.types import Sample
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.creep.plan import CreepGround
-from calib.motion.mover import Mover, Stalled
+from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
-from calib.motion.thresholds import STALL
 from calib.plan.poses import nearest_first
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.stalls import OnStall, give_up, repeated

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from armlink.arm_file import ArmFile
 from armlink.loop.messages import Answer
-from calib.daemon.environment import Environment
+from calib.daemon.environment import BusJobs, Environment
 from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
 from calib.daemon.observing.active_records import ActiveRecords
 from calib.daemon.observing.daily_diagnosis import DailyDiagnosis
@@ -31,7 +31,6 @@ from calib.daemon.observing.pose_tours import PoseTours
 from calib.daemon.observing.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration, DaemonSection
 from calib.daemon.state.arm_state import ArmState
-from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.busiest_minute import BusiestMinute
 from calib.daemon.state.event_log import EventLog
 from calib.daemon.state.journal import Journal

@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
+from calib.arm.skeleton import skeleton
 from calib.daemon.observing.observation import Observation
 from calib.daemon.service import Service
 from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.view import api_models
-from calib.daemon.view.drawn_arm import drawn_arm
+from calib.daemon.view.api_models import DrawnArm, DrawnJoint
 from calib.daemon.view.fan_out import Client
-from calib.daemon.view.view import Decisions, NoSuch
-from calib.daemon.view.window import Window
+from calib.daemon.view.view import Decisions, NoSuch, Window
 from gcomp.arrays import Array
 
 
@@ -228,3 +229,19 @@ def _point(
         return api_models.HistoryPoint(time=time, t=t, joint=joint, record=record, **values)
     except (LookupError, TypeError, ValueError):
         return None
+
+
+def drawn_arm(arm: ArmFile) -> DrawnArm:
+    """The arm of an arm file; reads its model file, if it has one, and raises BadInput or OSError if it cannot."""
+    drawn = skeleton(arm)
+    columns = zip(
+        arm.joint_names,
+        drawn.axes.tolist(),
+        drawn.points.tolist(),
+        drawn.reference.tolist(),
+        (link.tolist() for link in drawn.links),
+        strict=True,
+    )
+    keys = ("joint", "axis", "point", "reference", "link")
+    joints = tuple(DrawnJoint.model_validate(dict(zip(keys, column, strict=True))) for column in columns)
+    return DrawnArm.model_validate({"up": drawn.up.tolist(), "joints": joints})

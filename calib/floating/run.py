@@ -12,8 +12,7 @@ from armlink.drives.orders import Mode
 from armlink.errors import ArmlinkError, Refused
 from armlink.link.types import Command, Sample
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import Limits, gcomp_arm
 from calib.floating.controller import FloatConfig, FloatControl
 from calib.records.records import CalibrationRecord
 from gcomp.arrays import Array

@@ -9,8 +9,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from armlink.loop.driver import ArmDriver
 from armlink.loop.open import open_arm
-from calib.field.field_fit import FieldFit
-from calib.field.heldout import heldout_errors
+from calib.field.field_fit import FieldFit, heldout_errors
 from calib.fit.findings import Finding
 from calib.fit.heldout import heldout_scores, worse_joint
 from calib.fit.sensor_fit import SensorFit

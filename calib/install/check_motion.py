@@ -11,8 +11,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.types import Calibration
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import Limits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading, stack

@@ -297,3 +297,32 @@ class CauseTest:
         dof, level = len(self._white) - parameters, self.belief.level
         known = np.inf if not level.total.any() else level.rows + LEVEL_ROWS
         return round(float((chi2 - dof) / np.sqrt(2 * dof * (1 + len(self.window.position) / known))), 2)
+
+
+UNSEEN = 1.0
+"""A gain whose limit is above this is not observed: gravity hardly loads the joint."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Smallest changes that are noticed, in one case of two; 1.5 times as large ones almost always."""
+
+    gain: Array
+    """Relative (n,); NaN if gravity does not load the joint."""
+    offset: Array
+    """(n,) [N·m]."""
+    rests: int
+    """Rests at other poses after which they are noticed."""
+
+
+def limits(test: CauseTest, config: ObserverConfig, wait: int) -> Limits:
+    """Limits in work at poses like those of a test.
+
+    A change is noticed if it stands out of a window of the longest kind, by the rule of the cause test, and rows after
+    it confirm it. `wait` is the number of rests until the first test.
+    """
+    count, n = test.window.position.shape
+    longer = np.sqrt(config.longest_window / count)
+    gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) / longer for cause in ("gain", "offset"))
+    gain[~(gain <= UNSEEN)] = np.nan
+    return Limits(gain, offset, wait + config.longest_window + 2 * config.window)

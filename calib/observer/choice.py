@@ -2,12 +2,12 @@
 
 from typing import Any, Protocol
 
+from calib.observer.cause_test import Limits
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Finding
 from calib.observer.events import Event
 from calib.observer.moving.observer import MovingObserver
 from calib.observer.observer import Observer
-from calib.observer.tracking.limits import Limits
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.audit import DOUBTED, audit, confirmed, may_adapt
-from calib.observer.cause_test import CauseTest, Verdict
+from calib.observer.cause_test import CauseTest, Limits, Verdict
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Agreeing, Finding, agreed, decide
 from calib.observer.discrepancy.level import Level
@@ -20,7 +20,6 @@ from calib.observer.events import Event, verdict_evidence
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
 from calib.observer.rest_detector import RestDetector
-from calib.observer.tracking.limits import Limits
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.observer.tracking.tracking import Tracking
 from calib.records.records import CalibrationRecord, GravityRecord

@@ -14,9 +14,8 @@ from calib.install.journaled_write import Controllers, install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
 from calib.observer.check_at_rests import AfterWrite, Checked
 from calib.observer.decision import Finding
-from calib.records.missing import no_record
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
-from calib.records.store import RecordStore
+from calib.records.store import RecordStore, no_record
 from gcomp.arrays import Array
 
 Policy = Literal["observe", "propose", "apply"]

@@ -3,12 +3,16 @@
 import numpy as np
 import numpy.typing as npt
 
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.arm.sweep_section import SweepSection
-from calib.plan.choices import FASTEST, SLOWEST
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates
 from gcomp.arrays import Array, Mask
+
+SLOWEST = 0.3
+"""Acceleration that every planned sweep must allow [rad/s²]: a step of 0.5 rad then takes 2.6 s; a choice."""
+FASTEST = 2.0
+"""Largest acceleration between sweeps [rad/s²]; a choice, swept in tests/campaigns/random_arms.py."""
 
 
 def hold_torque(guess: GravityGuess, section: SweepSection, limits: Limits, poses: Array) -> tuple[Array, Array, Array]:

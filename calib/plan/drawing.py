@@ -9,8 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.content.atomic_file import write_whole
 from armlink.content.printable_text import printable_text
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import Limits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.trajectory import trajectory
 from calib.plan.collisions import sweep_ends

@@ -10,13 +10,15 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.plan.choices import FASTEST, SERVO_GAP, SLOWEST
+from calib.plan.bias_torque import FASTEST, SLOWEST
 from calib.plan.poses import sweep_range
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array
 
+SERVO_GAP = 0.05
+"""Distance from the stop at which a servo-held joint rests [rad]; a choice."""
 ROUNDING = 1e-6
 """Share of a value, or [rad], by which arithmetic in another order may differ: far above that of 64-bit numbers."""
 

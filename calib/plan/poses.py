@@ -3,15 +3,16 @@
 import numpy as np
 
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.arm.sweep_section import SweepSection
-from calib.plan.choices import SCOUT_CANDIDATES
 from calib.plan.collisions import Geometry
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.design.selection import select
 from gcomp.gravity.torque import gravity_regressor
 
+SCOUT_CANDIDATES = 300
+"""Random poses among which the scout's are chosen; a choice: n + 3 of them are needed."""
 UNKNOWN = 1e-6
 """Prior information on each parameter: negligible, but it keeps the first poses' matrices regular."""
 Poses = tuple[tuple[float, ...], ...]

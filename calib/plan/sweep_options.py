@@ -7,12 +7,10 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import Limits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.plan.bias_torque import hold_torque, pressable
-from calib.plan.choices import POINTS
-from calib.plan.collisions import Collided, Geometry
+from calib.plan.collisions import POINTS, Collided, Geometry
 from calib.plan.poses import require_range, sweep_range
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates, stop_combinations, with_lever

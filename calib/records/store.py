@@ -251,3 +251,18 @@ def _activate(connection: sa.Connection, record: AnyRecord, arm: ArmFile, by: st
 def _write_row(line: ControllerWrite, arm: ArmFile, record: str, stage: str, body: dict[str, Any]) -> dict[str, Any]:
     row = {"record": record, "arm": arm.name, "serial": arm.serial, "at": _now(), "by": line.by, "stage": stage}
     return row | {"body": json.dumps(body)}
+
+
+MAKERS = {"calibration": "calibrate", "gravity": "identify"}
+"""Kind of record → the command that makes it from sweeps."""
+
+
+def no_record(arm: ArmFile, kind: str) -> Refused:
+    """The refusal of work that needs a record of the `kind`, with the commands that lead to one."""
+    return Refused(f"{arm.name} {arm.serial}: no {kind} record yet: {way_to(arm, kind)}")
+
+
+def way_to(arm: ArmFile, *kinds: str) -> str:
+    """The commands that make records of these kinds, from the first."""
+    made = " and ".join(MAKERS[kind] for kind in kinds)
+    return f"sweep the arm, then {made}: armlink sweep {arm.argument} --out unloaded"

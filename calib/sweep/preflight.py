@@ -12,11 +12,23 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.types import Stats
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
-from calib.sweep.thresholds import HOT, LATE, LISTEN, LOUD, MISSING, NEAR_LIMIT, STOP_APPROACH
 from gcomp.arrays import Array
+
+LISTEN = 0.5
+"""Seconds for which the sensors are listened to at rest, after as long again in which switching on dies down."""
+MISSING, LATE = 0.1, 0.5
+"""Shares of readings from which on they are said to be missing, and to be late."""
+LOUD = 0.05
+"""Noise of a torque sensor, as a share of rated torque, from which it is not fit for a calibration."""
+NEAR_LIMIT = 1.9
+"""Reading, in rated torques, at which a torque sensor is about to saturate."""
+STOP_APPROACH = 0.08
+"""Distance from the arm file's stop from which a joint creeps [rad]."""
+HOT = 70.0
+"""Temperature of a drive from which no sweep is begun: it would fall or rise while the sensors are read [°C]."""
 
 
 @dataclass(frozen=True, eq=False)

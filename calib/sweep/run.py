@@ -9,7 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused, Stall
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Slipped, Stalled
 from calib.motion.static_reading import StaticReading
@@ -18,10 +18,17 @@ from calib.plan.plan_limits import check_bias, check_limits
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, SweepData, load_data
-from calib.sweep.scout import SCOUT, rough_model, run_scout
+from calib.sweep.scout import SCOUT, SLOWER, rough_model, run_scout
 from calib.sweep.stalls import OnStall, bridged, give_up, restart, stall_line
-from calib.sweep.thresholds import APPROACH, GAP, RETRIES, SLOWER
 from gcomp.arrays import Array
+
+APPROACH = 0.03
+"""Each step is approached over at least this way [rad]."""
+GAP = 0.02
+"""Distance from a stop at which creeping begins [rad]."""
+RETRIES = 3
+"""How often a joint that slipped or stalled is tried again before the sweep gives up."""
+
 
 Progress = Callable[[int, int, float, str], None]
 """Called after each reading with (readings done, readings in all, seconds left, what is being done)."""

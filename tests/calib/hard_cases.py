@@ -17,7 +17,7 @@ from rank_test import undetermined
 from sweep_arms import random_arm, with_section
 
 from armlink.arm_file import ArmFile
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.plan.types import SweepPlan
 from calib.sweep import run as runner

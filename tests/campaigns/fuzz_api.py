@@ -33,7 +33,7 @@ from test_web_schema import SETTINGS, check_all
 
 from calib.daemon.service_view import ServiceView
 from calib.daemon.web import peer
-from calib.daemon.web.rate import RateLimit
+from calib.daemon.web.guard import RateLimit
 from calib.observer.decision import Finding
 
 A_GO, EXAMPLES, GROWTH = 100, 5, 200.0

@@ -4,18 +4,16 @@ import logging
 from collections.abc import Callable
 
 from armlink.errors import ArmlinkError
-from calib.daemon.environment import Environment
+from calib.daemon.environment import BusJobs, Environment
 from calib.daemon.observing.observation import Observation
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
-from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
 from calib.install.journaled_write import recover
 from calib.install.plausibility import GateRefused
 from calib.records.database import StoreFault, first_line
-from calib.records.missing import way_to
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.records.store import ControllerWrite, RecordStore
+from calib.records.store import ControllerWrite, RecordStore, way_to
 
 _LOG = logging.getLogger("armlink.daemon")
 RECORDS_SECONDS = 5.0

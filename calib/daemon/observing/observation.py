@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from datetime import datetime
 
+from calib.daemon.environment import BusJobs
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.observing.observer_feed import ObserverFeed
 from calib.daemon.observing.observer_storage import ObserverStorage
 from calib.daemon.observing.recalibration_workflow import RecalibrationWorkflow
-from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.event_text import describe, one_alarm_a_joint

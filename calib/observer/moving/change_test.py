@@ -13,11 +13,20 @@ import numpy as np
 from calib.creep.parameters import family_slices
 from calib.observer.cause_test import Verdict, smallest_noticed, solved, span
 from calib.observer.config import ObserverConfig
-from calib.observer.moving.belief import MotorBelief
+from calib.observer.moving.belief import USUAL_ROWS, MotorBelief
 from calib.observer.moving.passages import Passage
-from calib.observer.moving.thresholds import FEWEST, INEXACT, MISFIT, PAYLOAD_ROUNDS, USUAL_ROWS
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
+
+FEWEST = 6
+"""Rows of a joint from which a change of its drive can be told."""
+MISFIT = 8.0
+"""χ² above its degrees of freedom, in standard deviations, from which nothing explains the rows: 120 rows then scatter
+by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is far beyond."""
+INEXACT = 0.03
+"""Most that a change's own shape may be off, as a share."""
+PAYLOAD_ROUNDS = 2
+"""Further linearisations of a payload."""
 
 
 @dataclass(frozen=True, eq=False)

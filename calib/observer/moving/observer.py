@@ -9,20 +9,29 @@ from typing import Any
 
 import numpy as np
 
+from calib.observer.cause_test import Limits
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Finding
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.moving.belief import MotorBelief
 from calib.observer.moving.change_test import ChangeTest
 from calib.observer.moving.passages import Passage, PassageDetector
-from calib.observer.moving.thresholds import AGREEING, BLOCK, LONGEST, REFERENCE, UNEXPLAINED
 from calib.observer.saved_values import UNREADABLE
-from calib.observer.tracking.limits import Limits
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, as_array
 
+BLOCK = 60
+"""Rows of one test: of seven joints that creep in turn, 40 s."""
+REFERENCE = 360
+"""Rows without a change that the belief is learned from: four minutes of creeping."""
+LONGEST = 120
+"""Rows of a test at most: the latest."""
+AGREEING = 2
+"""Tests in a row that must say the same until it is an event."""
+UNEXPLAINED = 3
+"""The same of tests that nothing explains: the first ones after a change have rows of before it."""
 SCHEMA = "moving/1"
 
 

@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading, batch, stack
-from calib.observer.cause_test import CauseTest
+from calib.observer.cause_test import CauseTest, Limits, limits
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Finding
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.saved_values import UNREADABLE, read_rows, save_rows
 from calib.observer.tracking.cusum import Cusum
-from calib.observer.tracking.limits import Limits, limits
 from calib.observer.tracking.pose_memory import PoseMemory
 from calib.observer.tracking.sensor_filter import SensorFilter
 from gcomp.arrays import Array, as_array

@@ -13,7 +13,7 @@ from sweep_arms import random_arm
 from armlink.arm_file import load_arm
 from armlink.cli import run
 from armlink.link.link import Link
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.install import apply
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore

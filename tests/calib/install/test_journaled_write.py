@@ -12,7 +12,7 @@ from armlink.arm_file import load_arm
 from armlink.errors import BusFault, Refused
 from armlink.link.link import Link
 from armlink.link.types import Calibration
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.install.check_motion import CheckMotion, check_poses
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, admit, check_bounds, check_change, history_std, past_changes

@@ -7,7 +7,7 @@ from sweep_arms import random_arm, synthetic_pass, with_section
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import SweepPlan
 from calib.sweep.scout import rough_model

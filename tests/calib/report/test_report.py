@@ -9,9 +9,8 @@ from sweep_arms import random_arm
 from synthetic_sweeps import passes
 
 from armlink.errors import Refused
-from calib.field.field_fit import fit_field
+from calib.field.field_fit import fit_field, heldout_errors
 from calib.field.field_record import field_record
-from calib.field.heldout import heldout_errors
 from calib.field.rows import rows_of_sweeps
 from calib.fit.findings import Finding
 from calib.fit.gravity_fit import identify_gravity

@@ -13,11 +13,10 @@ from sweep_arms import random_arm
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.link import Link
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.motion.encoder_check import EncoderFault
 from calib.plan.drawing import stops_seconds
-from calib.sweep.preflight import find_stops, listen
-from calib.sweep.thresholds import HOT
+from calib.sweep.preflight import HOT, find_stops, listen
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.sim_section import EffectEntry
 from sim_bus.simulated_arm import SimulatedArm

@@ -11,7 +11,7 @@ from sweep_arms import at_rate, random_arm, with_section
 from armlink.arm_file import ArmFile
 from armlink.errors import HostLate, Refused, Stall
 from armlink.link.link import Link
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import Limits
 from calib.arm.sweep_section import sweep_section
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors

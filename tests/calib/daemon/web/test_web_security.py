@@ -13,9 +13,8 @@ from served_page import TOKEN, Served, served
 from armlink.errors import BadInput
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web import peer as peer_module
-from calib.daemon.web.guard import BODY_LIMIT, REQUESTS, WRONG_TOKENS, Access, Guard
+from calib.daemon.web.guard import BODY_LIMIT, REQUESTS, WRONG_TOKENS, Access, Guard, Rate, RateLimit
 from calib.daemon.web.peer import PEER, Peer
-from calib.daemon.web.rate import Rate, RateLimit
 from calib.daemon.web.server import serve, unix_socket
 
 
