@@ -71,7 +71,7 @@ def _with_stops(arm_file: ArmFile, arm: Arm) -> Arm:
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class DriveLimits:
     """Stops, and what the drives are capable of; all (n,)."""
 
     lower: Array
@@ -86,7 +86,7 @@ class Limits:
     """[rad/s]"""
 
     @classmethod
-    def of(cls, arm_file: ArmFile) -> "Limits":
+    def of(cls, arm_file: ArmFile) -> "DriveLimits":
         """From the arm file's link section and joint range."""
         kinematics, link = gcomp_arm(arm_file), arm_file.require_link()
         return cls(

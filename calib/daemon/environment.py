@@ -43,7 +43,7 @@ class Immediate:
         return True
 
 
-class Port(Protocol):
+class BusAccess(Protocol):
     """Access to the bus loop."""
 
     @property
@@ -66,7 +66,7 @@ class Environment:
     """With time zone."""
     run: RunAside
     """For bus and record store."""
-    port: Port
+    port: BusAccess
     disk: Disk = field(default_factory=Immediate)
 
 

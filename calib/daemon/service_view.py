@@ -12,7 +12,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
 from calib.arm.skeleton import skeleton
-from calib.daemon.observing.observation import Observation
+from calib.daemon.observing.observation import ActiveObservation
 from calib.daemon.service import Service
 from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.view import api_models
@@ -32,11 +32,10 @@ class ServiceView:
         self.decisions: Decisions = service.recalibrations
 
     @property
-    def _observation(self) -> Observation | None:
+    def _observation(self) -> ActiveObservation | None:
         return self._service.records.observation
 
     def status(self) -> api_models.Status:
-        """State, bus and records."""
         service, observation = self._service, self._observation
         arm_state, configuration, now = service.arm_state, service.configuration, service.environment.monotonic()
         return api_models.Status(
@@ -66,7 +65,6 @@ class ServiceView:
         )
 
     def joints(self) -> tuple[api_models.JointNow, ...]:
-        """Every joint as of the newest samples, base to tip."""
         names, arm_state = self._service.configuration.names, self._service.arm_state
         batch = arm_state.batch
         if batch is None:
@@ -115,7 +113,6 @@ class ServiceView:
         return torque, model
 
     def estimates(self) -> tuple[api_models.JointEstimate, ...]:
-        """Every joint's gain and offset, base to tip; empty while there is no gravity record."""
         if self._observation is None:
             return ()
         feed, last_accepted = self._observation.feed, self._observation.last_accepted
@@ -140,19 +137,16 @@ class ServiceView:
         )
 
     def events(self, after: int = 0, limit: int = 500) -> tuple[api_models.EventRecord, ...]:
-        """Events with a larger id, oldest first; raises sqlite3.Error."""
         return tuple(self._service.journal.events(after, limit))
 
     def history(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
     ) -> tuple[api_models.HistoryPoint, ...]:
-        """Estimates over time, oldest first; raises NoSuch."""
         return tuple(point for page in self.history_pages(joint, since, until, most) for point in page)
 
     def history_pages(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
     ) -> Iterator[tuple[api_models.HistoryPoint, ...]]:
-        """Likewise in pieces; raises NoSuch at the first."""
         names, reader = self._service.configuration.names, self._history
         if joint is not None and joint not in names:
             raise NoSuch(f"no joint {joint!r}; there are {', '.join(names)}")
@@ -163,11 +157,9 @@ class ServiceView:
                 yield tuple(point for point in points if point is not None)
 
     def proposals(self, limit: int = 200) -> tuple[api_models.Proposal, ...]:
-        """Newest first."""
         return tuple(row.answer() for row in self._service.journal.proposals(limit))
 
     def subscribe(self) -> Client:
-        """A new client of the stream; it begins with the present joints."""
         client = self._service.hub.subscribe()
         client.put(self.snapshot())
         return client

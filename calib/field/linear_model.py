@@ -38,7 +38,7 @@ class Belief:
     spread: tuple[Array, Array] | None
     """Its standard deviations of gain and offset (n,), NaN if unknown; None without a record."""
     discrepancy: tuple[Discrepancy | None, ...]
-    """What that record's calibrated torque and the gravity model disagree by, joint by joint."""
+    """Disagreement of that record's calibrated torque with the gravity model, joint by joint."""
     local: Array
     """Columns of the discrepancy, each of unit standard deviation, at the rows (K, n, F) [N·m]; see `over`."""
 

@@ -12,7 +12,7 @@ from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.fit.examination import Goodness, examine
-from calib.fit.findings import Finding
+from calib.fit.findings import FitFinding
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
 from calib.sweep.data_sets import digests
@@ -80,7 +80,7 @@ class SensorFit:
         return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[FitFinding, ...]:
         """Effects in the readings that the sensor model does not have."""
         return self.goodness.findings
 
@@ -134,7 +134,6 @@ class SensorFit:
         return rms
 
     def record(self, arm_file: ArmFile) -> CalibrationRecord:
-        """The calibration record of this fit."""
         residual = self.residual_rms
         joints = tuple(
             JointCalibration(
@@ -261,7 +260,7 @@ def _number(value: float) -> float | None:
 WORDY = 6
 """Largest number of parameters that a reason names."""
 WHERE_IT_HANGS = ": measure where the reference mass hangs (sweep.reference_point in the arm file)"
-"""What fixes a gain that the readings with a mass leave open, as those of a single joint do."""
+"""Remedy for a gain that the readings with a mass leave open, as those of a single joint do."""
 
 
 def missing_values(fit: GlobalFit, rows: SweepReadings) -> dict[tuple[str, Parameter], str]:

@@ -11,7 +11,7 @@ from armlink.link.guard import Crossed, Guard
 from armlink.link.integral import slowest_time
 from armlink.link.types import Command, Sample, Samples, Setpoints
 from armlink.loop.driver import ArmDriver
-from calib.arm.kinematics import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import SweepSection
 from calib.motion.encoder_check import EncoderCheck
 from calib.motion.settle_rule import SettleRule
@@ -63,7 +63,6 @@ class Slipped(Refused):
     """A pressed joint left its stop."""
 
     def __init__(self, name: str, joint: int) -> None:
-        """Joint's name and index."""
         super().__init__(f"{name}: slipped off its stop")
         self.joint = joint
 
@@ -71,7 +70,7 @@ class Slipped(Refused):
 class Mover:
     """Holds the arm's command and changes it in small, safe ways. The link must be enabled."""
 
-    def __init__(self, link: ArmDriver, section: SweepSection, limits: Limits) -> None:
+    def __init__(self, link: ArmDriver, section: SweepSection, limits: DriveLimits) -> None:
         """Take over an enabled link: every joint is held at its last target."""
         self.link, self.section, self.limits = link, section, limits
         self.average_to(section.standard_error)

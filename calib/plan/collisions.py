@@ -17,7 +17,7 @@ POINTS = 15
 DEPTH = 0.0005
 """Overlap from which bodies count as touching [m]; a choice, below the accuracy of collision meshes."""
 PARKED = "parked "
-"""What the names of bodies of an arm that is parked beside this one begin with, where it has a model of its own."""
+"""Prefix of the body names of an arm that is parked beside this one, where it has a model of its own."""
 Pair = tuple[str, str]
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from calib.arm.kinematics import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.plan.bias_torque import (
     bias_and_acceleration,
     hold_torque,
@@ -172,7 +172,7 @@ def _hold(planned: PlannedArm, one: Candidates) -> tuple[Mask, Array | None, flo
 
 
 def reference_masses(
-    kinematics: Arm, limits: Limits, options: list[Candidates], guess: GravityGuess | None
+    kinematics: Arm, limits: DriveLimits, options: list[Candidates], guess: GravityGuess | None
 ) -> list[float]:
     """Masses [kg] that take `MASS_SHARES` of the torque left at the joint that they load most, to two digits."""
     poses = np.concatenate([each.poses.reshape(-1, kinematics.n) for each in options])

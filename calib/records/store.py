@@ -54,7 +54,6 @@ class RecordStore:
         self.url = self._engine.url.render_as_string(hide_password=True)
 
     def close(self) -> None:
-        """Close the database."""
         self._engine.dispose()
 
     def add(self, record: AnyRecord) -> str:
@@ -221,7 +220,7 @@ class RecordStore:
             return [ControllerWrite(*row[:5], self._parsed(row[5])) for row in connection.execute(wanted)]
 
     def import_yaml(self, path: Path, arm: ArmFile) -> str:
-        """Append the record of a YAML file (as `Record.to_yaml` wrote it), not making it current; returns its id.
+        """Append the record of a YAML file (as `ArmRecord.to_yaml` wrote it), not making it current; returns its id.
 
         Raises BadInput if the file is no record or was changed, Refused if it is of another arm or not sound.
         """
@@ -229,7 +228,7 @@ class RecordStore:
 
 
 def load_yaml(path: Path) -> AnyRecord:
-    """The record of a YAML file (as `Record.to_yaml` wrote it); raises BadInput if it is none or was changed."""
+    """The record of a YAML file (as `ArmRecord.to_yaml` wrote it); raises BadInput if it is none or was changed."""
     try:
         content = read_yaml(path)
     except OSError as error:

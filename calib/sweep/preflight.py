@@ -12,7 +12,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.types import Stats
 from armlink.loop.driver import ArmDriver
-from calib.arm.kinematics import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
 from gcomp.arrays import Array
@@ -54,7 +54,7 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     Raises Refused naming the joint whose sensor is silent, loud or at the end of its range, or whose drive is hot.
     """
     temperature = read_temperatures(link)
-    limits, mover = Limits.of(arm), Mover(link, sweep_section(arm), Limits.of(arm))
+    limits, mover = DriveLimits.of(arm), Mover(link, sweep_section(arm), DriveLimits.of(arm))
     cycles = max(int(LISTEN / link.period), 20)
     for _ in range(cycles):
         mover.cycle()
@@ -122,7 +122,7 @@ def find_stops(
     Raises Refused naming the joint and the place where a stop is not where the arm file has it. A stop that a joint
     does not get to is left out.
     """
-    limits, section = Limits.of(arm), sweep_section(arm)
+    limits, section = DriveLimits.of(arm), sweep_section(arm)
     mover = Mover(link, section, limits)
     mover.hold_all()
     middle = (limits.lower + limits.upper) / 2

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from calib.arm.kinematics import Limits, gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading, stack
@@ -51,7 +51,7 @@ def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callab
 def rough_model(arm: ArmFile, readings: Sequence[StaticReading]) -> GravityGuess:
     """The rough gravity model from the scout's readings among `readings`."""
     scouted = [reading for reading in readings if reading.sweep == SCOUT]
-    limits, section = Limits.of(arm), sweep_section(arm)
+    limits, section = DriveLimits.of(arm), sweep_section(arm)
     return guess_gravity(
         gcomp_arm(arm),
         stack(scouted, "position"),

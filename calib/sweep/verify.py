@@ -10,7 +10,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.loop.driver import ArmDriver
 from armlink.torque_calibration import TorqueCalibration, per_joint
-from calib.arm.kinematics import Limits, gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
@@ -85,9 +85,9 @@ def run_verify(
     reading a Stall interrupts is repeated where `on_stall` accepts it. Raises Refused on records of another arm, or if
     no pose can be reached; BusFault.
     """
-    n, section, limits = link.n, sweep_section(arm_file), Limits.of(arm_file)
+    n, section, limits = link.n, sweep_section(arm_file), DriveLimits.of(arm_file)
     kinematics = gcomp_arm(arm_file)
-    sensors = _Sensors.of(link, None if calibration is None else calibration.require(arm_file))
+    sensors = _SensorConversion.of(link, None if calibration is None else calibration.require(arm_file))
     beta = np.array(gravity.require(arm_file).beta)
     mover = Mover(link, section, limits)
     mover.hold_all()
@@ -136,7 +136,7 @@ def _tolerance(calibration: CalibrationRecord | None, model: Array, variance: Ar
     return passes
 
 
-def verify_poses(limits: Limits, section: SweepSection, count: int, seed: int, begin: Array) -> Array:
+def verify_poses(limits: DriveLimits, section: SweepSection, count: int, seed: int, begin: Array) -> Array:
     """Random poses (count, n) [rad] within the joint range, in an order with little travel from `begin` (n,)."""
     ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))])
     generator = np.random.default_rng([seed, 6])
@@ -144,7 +144,7 @@ def verify_poses(limits: Limits, section: SweepSection, count: int, seed: int, b
 
 
 @dataclass(frozen=True, eq=False)
-class _Sensors:
+class _SensorConversion:
     """Conversion of what the controllers send to angles and torques."""
 
     installed: TorqueCalibration[Array]
@@ -152,7 +152,7 @@ class _Sensors:
     record: CalibrationRecord | None
 
     @classmethod
-    def of(cls, link: ArmDriver, record: CalibrationRecord | None) -> "_Sensors":
+    def of(cls, link: ArmDriver, record: CalibrationRecord | None) -> "_SensorConversion":
         installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
         return cls(installed, installed if record is None else record.torque_calibration(installed), record)
 

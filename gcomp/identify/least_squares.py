@@ -60,7 +60,6 @@ class LeastSquaresProblem:
         return cls(arm, readings, free_mask(arm.n, unknown), mean, std, loss, noise, unit)
 
     def on(self, readings: StaticReadings) -> "LeastSquaresProblem":
-        """The same problem with other readings."""
         return replace(self, readings=readings)
 
     @property
@@ -120,8 +119,6 @@ class LeastSquaresProblem:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """End of the iteration."""
-
     vector: Array
     information: Information
     cost: float

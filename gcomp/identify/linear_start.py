@@ -77,7 +77,6 @@ def _solve(
 
 
 def _with_gain(parameters: Parameters, gain: Array) -> Parameters:
-    """The parameters with other gains (n,)."""
     vector = parameters.vector
     vector[family_slices(len(gain))["gain"]] = gain
     return Parameters.from_vector(vector, len(gain))

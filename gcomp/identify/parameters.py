@@ -70,7 +70,6 @@ class Parameters:
 
     @property
     def vector(self) -> Array:
-        """The parameter vector (6n + 3,)."""
         return np.concatenate([getattr(self, family) for family in FAMILIES])
 
     def __post_init__(self) -> None:

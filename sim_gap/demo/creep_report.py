@@ -9,7 +9,8 @@ from rich.table import Table
 
 from calib.creep.record import HEADINGS, missing, told, values_told
 from calib.report.figures import COLOURS, GREY, PANEL, verify_figure
-from calib.report.page import ReportTable, Section, bullets, paragraph, paragraphs, render
+from calib.report.page import ReportSection as Section
+from calib.report.page import ReportTable, bullets, paragraph, paragraphs, render
 from sim_gap.demo.creep_run import CreepDemo, worst_gain_error
 from sim_gap.demo.show import gap_line
 from sim_gap.demo.summary import numbers

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from calib.report.figures import verify_figure
-from calib.report.page import ReportTable, Section, bullets, paragraph, paragraphs, render
+from calib.report.page import ReportSection as Section
+from calib.report.page import ReportTable, bullets, paragraph, paragraphs, render
 from sim_gap.demo.figures import drift_figure, error_bars, sweep_figure
 from sim_gap.demo.show import drift_line, gap_line
 from sim_gap.demo.summary import SHOWN, DemoResult

@@ -14,7 +14,7 @@ from calib.daemon.view.event_text import describe, one_alarm_a_joint
 from calib.observer.events import Event
 
 
-class Observation:
+class ActiveObservation:
     """`handle` a batch of samples: to the observer, and what it finds to the event log and to recalibration."""
 
     def __init__(
@@ -36,7 +36,6 @@ class Observation:
         self._accepted = feed.observer.accepted
 
     def handle(self, batch: Batch) -> None:
-        """Observe the samples of a batch."""
         samples = self.feed.decimate(batch)
         if self._jobs.busy:
             return  # the calibration changes under these readings

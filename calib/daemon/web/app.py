@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException
 
 from calib.daemon.view.api_models import StreamItem
 from calib.daemon.view.view import DaemonView
-from calib.daemon.web.guard import Access, Guard
+from calib.daemon.web.guard import Access, RequestGuard
 from calib.daemon.web.metrics import metrics_text
 from calib.daemon.web.page import PageFile, page_files
 from calib.daemon.web.peer import App
@@ -28,7 +28,6 @@ class Described(FastAPI):
     """An application that completes its description on the first request for it, which takes 0.2 s."""
 
     def openapi(self) -> dict[str, Any]:
-        """The complete description."""
         if self.openapi_schema is None:
             _complete(super().openapi())
         return super().openapi()
@@ -61,7 +60,7 @@ def make_app(view: DaemonView, access: Access | None = None) -> tuple[App, Strea
     files = page_files()
     app = open_app(view, streams, files)
     access = replace(access or Access(), open_paths=frozenset(files))
-    return Guard(app, access), streams
+    return RequestGuard(app, access), streams
 
 
 def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> FastAPI:

@@ -69,8 +69,6 @@ _LABEL = re.compile(r"[a-z0-9_-]+")
 
 @dataclass(frozen=True)
 class Access:
-    """Access over TCP."""
-
     token: str | None = None
     """None: no access."""
     hosts: frozenset[str] = frozenset()
@@ -88,7 +86,7 @@ class Denied(Exception):
         self.status, self.headers = status, headers or {}
 
 
-class Guard:
+class RequestGuard:
     """ASGI middleware. The Unix socket's file mode controls access to it; TCP needs the token, and has rate limits.
 
     On both, Host must be one of the daemon's names: otherwise a page of another origin could get in through DNS

@@ -1,4 +1,4 @@
-"""What is believed of drives whose torque is a motor current: friction, gravity and their doubts.
+"""Belief about drives whose torque is a motor current: friction, gravity and their doubts.
 
 The unknowns are those of the creep fit (`calib.creep.parameters`), against readings that are corrected by the record in
 force: gains are 1 and offsets 0 while nothing has changed. Records say how sure each value is, though not how gains and

@@ -6,7 +6,7 @@ from gravity_rig import SARCOS_BETA, make_readings, sweep_rows
 
 from gcomp.arm.arm import Arm
 from gcomp.design.selection import sweep_jacobian
-from gcomp.design.sweep_design import Design, Sweep, choose_sweeps, readings_of, stop_combinations
+from gcomp.design.sweep_design import Design, JointSweep, choose_sweeps, readings_of, stop_combinations
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.global_fit import Prediction, identify_global, predict_covariance
@@ -47,7 +47,7 @@ def test_greedy_choice_is_the_best_of_all_on_a_small_arm(rng) -> None:
     )  # fmt: skip
     guess = Parameters.nominal(3, beta=[2.0, 0.5, 1.0, -0.3, 0.4, 0.2])
     design = choose_sweeps(arm, guess, sigma=0.05, unknown=MOMENTS, poses=1, steps=9)
-    choices = [[Sweep(j, pose, np.linspace(arm.lower[j], arm.upper[j], 9)) for pose in stop_combinations(arm, j)]
+    choices = [[JointSweep(j, pose, np.linspace(arm.lower[j], arm.upper[j], 9)) for pose in stop_combinations(arm, j)]
                for j in range(3)]  # fmt: skip
     every = [
         log_volume(predict_covariance(arm, readings_of(arm, [x, y, z], 0.05), guess, unknown=MOMENTS))
@@ -109,7 +109,7 @@ def test_the_jacobian_of_candidate_sweeps_is_the_sensor_model_s(rng, random_arm)
     arm, n = built.arm, 5
     guess = Parameters(*(rng.uniform(0.5, 1.5, size) for size in (n, n, n, n, 2 * n, 3)))
     free, sigma, loads = rng.random(6 * n + 3) < 0.7, rng.uniform(0.1, 0.3, n), (0.0, 1.5)
-    sweeps = [Sweep(2, pose, np.linspace(-1.0, 1.0, 4)) for pose in rng.uniform(-1, 1, (3, n))]
+    sweeps = [JointSweep(2, pose, np.linspace(-1.0, 1.0, 4)) for pose in rng.uniform(-1, 1, (3, n))]
     ours = sweep_jacobian(arm, guess, 2, np.stack([sweep.positions() for sweep in sweeps]), sigma, free, loads)
     for sweep, jacobian in zip(sweeps, ours, strict=True):
         rows = readings_of(arm, [sweep], sigma, loads)
