@@ -39,12 +39,12 @@ ArmLike: TypeAlias = ArmFile | str | Path
 SweepLike: TypeAlias = SweepData | str | Path
 """The data set of a pass of sweeps: loaded, or its folder."""
 Calibrated: TypeAlias = SensorFit | CreepCalibration
-"""What `calibrate` finds: in steps at rest, or in creep sweeps of drives whose torque is a motor current."""
+"""Result of `calibrate`: from steps at rest, or from creep sweeps of drives whose torque is a motor current."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What the observer found in a recording."""
+    """Findings of the observer in a recording."""
 
     names: tuple[str, ...]
     """Joints, base to tip."""

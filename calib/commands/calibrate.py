@@ -37,8 +37,8 @@ def calibrate(
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm
     from calib.commands.creep.fits import calibrate_creep
+    from calib.commands.options import load_sweeps
     from calib.commands.screen import print_lines
-    from calib.commands.sweep_data import load_sweeps
     from calib.creep.choice import all_creep
     from calib.fit.felt_mass import felt_mass
     from calib.fit.sensor_fit import fit_sensors

@@ -8,7 +8,7 @@ import typer
 from calib.commands.options import JsonFile, Store
 
 if TYPE_CHECKING:
-    from calib.records.compare import Change
+    from calib.records.compare import ParameterChange
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore
 
@@ -50,7 +50,7 @@ def _record(records: "RecordStore", given: str) -> "CalibrationRecord | GravityR
 
 
 def _show(
-    old: "CalibrationRecord | GravityRecord", new: "CalibrationRecord | GravityRecord", changes: "list[Change]"
+    old: "CalibrationRecord | GravityRecord", new: "CalibrationRecord | GravityRecord", changes: "list[ParameterChange]"
 ) -> None:
     from rich.table import Table
 

@@ -76,9 +76,8 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
 
     from armlink.errors import BadInput
     from calib.arm.kinematics import model_arm
-    from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
-    from calib.records.store import RecordStore
+    from calib.records.store import RecordStore, no_record
 
     records = RecordStore(store)
     calibration = records.current(CalibrationRecord, arm_file)

@@ -26,7 +26,7 @@ def identify(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput
     from calib.commands.creep.fits import identify_creep
-    from calib.commands.sweep_data import load_sweeps
+    from calib.commands.options import load_sweeps
     from calib.creep.choice import all_creep
     from calib.fit.gravity_fit import identify_gravity
     from calib.fit.sensor_fit import SensorFit, fit_sensors

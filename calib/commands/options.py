@@ -1,9 +1,13 @@
 """Arguments and options that several commands share."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from armlink.arm_file import ArmFile
+    from calib.sweep.dataset import SweepData
 
 Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweep, without and with load.")]
 SweepsArm = Annotated[str | None, typer.Option("--arm", help="Arm file, if it is no longer where sweep found it.")]
@@ -18,3 +22,14 @@ Replaced = Annotated[
 ]
 Store = Annotated[str | None, typer.Option(help="Record store: file or database URL; default: state folder.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")]
+
+
+def load_sweeps(command: str, directories: list[Path], arm: str | None) -> "tuple[list[SweepData], ArmFile]":
+    """Data sets and the arm file that they were made with, or `arm`; raises BadInput."""
+    from armlink.errors import BadInput
+    from calib.sweep.data_sets import data_sets
+
+    if not directories:
+        raise BadInput(f"{command}: give the directories that sweep wrote")
+    data = data_sets(directories)
+    return data, data[0].load_arm(arm)

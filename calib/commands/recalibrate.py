@@ -44,9 +44,8 @@ def recalibrate(
     from armlink.commands.plain_console import PlainConsole
     from calib.field.field_fit import fit_field
     from calib.field.field_record import field_record
-    from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
-    from calib.records.store import RecordStore
+    from calib.records.store import RecordStore, no_record
 
     arm_file, records = load_arm(arm), RecordStore(store)
     gravity, before = records.current(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)

@@ -72,12 +72,10 @@ class SweepScreen:
         _CONSOLE.print(text)
 
     def __enter__(self) -> Self:
-        """Show the bar."""
         self._progress.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Leave it as it stands."""
         self._progress.stop()
 
 

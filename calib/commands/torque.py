@@ -60,9 +60,8 @@ def _model(
     from armlink.content.model_sizes import model_budget
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm, model_arm
-    from calib.records.missing import way_to
     from calib.records.records import GravityRecord
-    from calib.records.store import RecordStore
+    from calib.records.store import RecordStore, way_to
     from gcomp.arm.load import load_model
 
     if Path(arm).suffix.lower() in MODEL_SUFFIXES:

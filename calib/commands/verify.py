@@ -40,8 +40,7 @@ def verify(
     from calib.commands.screen import SweepScreen
     from calib.creep.choice import sweep_motion
     from calib.creep.verify import verify_creeping
-    from calib.records.missing import no_record
-    from calib.records.store import RecordStore
+    from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify
 
     arm_file = load_arm(arm)
@@ -73,8 +72,8 @@ def verify(
 
 def _records(store: Any, arm_file: Any, ids: list[str]) -> "tuple[GravityRecord, CalibrationRecord | None]":
     """The records named, else the current ones; raises Refused where there is no gravity record."""
-    from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
+    from calib.records.store import no_record
 
     named = [store.usable(record, arm_file) for record in ids]
     gravity = next((each for each in named if isinstance(each, GravityRecord)), None)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from armlink.errors import BadInput
 from calib.commissioning.model_joints import ModelJoint
-from gcomp.arm.model_tree import HAND
+from gcomp.arm.model_file import HAND
 
 
 @dataclass(frozen=True)

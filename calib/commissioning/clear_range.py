@@ -59,7 +59,7 @@ def narrowed(arm_file: ArmFile) -> ClearRange | None:
 
 
 def _problem(arm_file: ArmFile) -> Exception | None:
-    """What stands against the sweeps that would be planned."""
+    """The error that planning the sweeps ends with, None if it succeeds."""
     from armlink.errors import ArmlinkError
 
     model = model_arm(arm_file)

@@ -52,7 +52,7 @@ class JointDraft:
 
 @dataclass
 class Draft:
-    """What will stand in the arm file."""
+    """Content of the arm file to be."""
 
     name: str
     model: Path

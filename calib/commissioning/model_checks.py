@@ -8,7 +8,7 @@ from armlink.arm_file import ArmFile
 from armlink.model_file import read_model
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.finding import SetupFinding
-from calib.plan.choices import DEAD_LEVER
+from calib.plan.sweep_plan import DEAD_LEVER
 from gcomp.gravity.torque import gravity_levers
 
 POSES = 500

@@ -8,8 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.content.model_sizes import model_budget
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm, model_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import sweep_section
 from calib.commissioning.finding import SetupFinding
 from calib.creep.choice import sweep_motion
@@ -20,8 +19,7 @@ from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
 from calib.plan.sweep_plan import plan_sweep
-from gcomp.arm.inertia import joint_inertias
-from gcomp.arm.load import place_chain
+from gcomp.arm.load import joint_inertias, place_chain
 from gcomp.gravity.torque import gravity_torque
 
 POSES = 500
@@ -72,7 +70,7 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
 
 def _strength(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
     """Joints whose drives cannot hold the arm everywhere in its range."""
-    arm, limits = gcomp_arm(arm_file), Limits.of(arm_file)
+    arm, limits = gcomp_arm(arm_file), DriveLimits.of(arm_file)
     low, high = np.nan_to_num(arm.lower, neginf=-np.pi), np.nan_to_num(arm.upper, posinf=np.pi)
     poses = np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
     need = np.abs(gravity_torque(arm, guess.beta, poses)).max(axis=0)
@@ -116,7 +114,7 @@ def _damping(arm_file: ArmFile, model: Path) -> Iterator[SetupFinding]:
 
 def _stops(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
     """Joints that cannot be pressed on any stop within max_torque while another is swept."""
-    arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), Limits.of(arm_file)
+    arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), DriveLimits.of(arm_file)
     ever = np.zeros(arm.n, dtype=bool)
     for joint in range(arm.n):
         candidates = stop_combinations(arm, joint, sweep_range(section, limits, joint))

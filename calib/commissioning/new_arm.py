@@ -24,7 +24,7 @@ RATING_FACTOR = 2.5
 
 
 class Questions(Protocol):
-    """What a person at a terminal is asked."""
+    """Questions to a person at a terminal."""
 
     def which(self, chains: Sequence[Chain]) -> Chain:
         """Which of several arms in a model is meant."""
@@ -45,7 +45,6 @@ class NewArm:
 
     @property
     def text(self) -> str:
-        """The file's text."""
         return arm_text(self.draft, self.out)
 
     def parsed(self) -> ArmFile:

@@ -18,7 +18,7 @@ SCATTER_SHARE = 0.003
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class CreepCandidate:
     """One creep: the other joints' poses, and both ends of the joint's way."""
 
     joint: int
@@ -37,9 +37,9 @@ class Candidate:
 
 
 def choose(
-    arm: Arm, beta: Array, rated: Array, candidates: list[list[Candidate]], count: int, speeds: tuple[float, ...],
+    arm: Arm, beta: Array, rated: Array, candidates: list[list[CreepCandidate]], count: int, speeds: tuple[float, ...],
     mass: float, doubt: Doubt,
-) -> tuple[list[list[Candidate]], Array]:  # fmt: skip
+) -> tuple[list[list[CreepCandidate]], Array]:  # fmt: skip
     """(`count` candidates of each list, tip to base; standard deviations of the gains that they promise (n,)).
 
     Greedy: each choice makes the sum of the gains' variances least, with one pass without and one with the mass [kg].
@@ -50,7 +50,7 @@ def choose(
     x[at["beta"]], x[at["coulomb"]], x[at["load"]] = beta, 0.02 * rated, 0.05
     information = np.diag(1 / std**2)
     rows = [[_information(arm, x, one, speeds[0], mass, rated) for one in each] for each in candidates]
-    chosen: list[list[Candidate]] = [[] for _ in candidates]
+    chosen: list[list[CreepCandidate]] = [[] for _ in candidates]
     gains = at["gain"]
     for _ in range(count):
         for place, each in enumerate(candidates):
@@ -61,7 +61,7 @@ def choose(
     return chosen, np.sqrt(np.diag(invert(information))[gains])
 
 
-def _information(arm: Arm, x: Array, one: Candidate, speed: float, mass: float, rated: Array) -> Array:
+def _information(arm: Arm, x: Array, one: CreepCandidate, speed: float, mass: float, rated: Array) -> Array:
     """Information of a creep both ways, without and with the mass (P, P)."""
     poses = np.tile(one.poses(BINS), (4, 1))
     side, loads = np.repeat([1.0, -1.0, 1.0, -1.0], BINS), np.repeat([0.0, 0.0, mass, mass], BINS)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.torque_calibration import GAIN_RANGE
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.creep.model import CreepModel
 from calib.creep.parameters import HARMONICS, Doubt, family_slices, prior
@@ -19,7 +18,7 @@ from calib.creep.pushes import WIDE_SHARE, Disturbed, Spring, disturbed_sweeps, 
 from calib.creep.ripple import ripple_cycles
 from calib.creep.rows import CreepRows
 from calib.creep.scatter import Scatter, scatter
-from calib.creep.solve import Solution, solve
+from calib.creep.solve import CreepSolution, solve
 from calib.sweep.data_sets import digests
 from calib.sweep.dataset import SweepData
 from gcomp.arm.arm import Arm
@@ -44,7 +43,7 @@ class CreepFit:
 
     arm: Arm
     rows: CreepRows
-    solution: Solution
+    solution: CreepSolution
     prior_std: Array
     scatter: Scatter
     """Of the readings."""
@@ -59,7 +58,6 @@ class CreepFit:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Joint names."""
         return self.arm.names
 
     @cached_property
@@ -77,7 +75,6 @@ class CreepFit:
         return self.solution.x[self.slices[family]]
 
     def std(self, family: str) -> Array:
-        """Standard deviations of one family."""
         variance: Array = np.diag(self.covariance)[self.slices[family]]
         return np.sqrt(variance)
 
@@ -101,7 +98,7 @@ class CreepFit:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What disturbed the sweeps, one sentence each."""
+        """Disturbances of the sweeps, one sentence each."""
         return tuple(str(each) for each in (*self.disturbed, *self.springs))
 
     @property
@@ -128,7 +125,7 @@ def fit_creep(arm_file: ArmFile, passes: Sequence[SweepData]) -> CreepFit:
     if not len(rows):
         raise BadInput(f"{passes[0].path}: no creep sweeps: sweep with sweep.motion: creep")
     doubt, sources = Doubt.of(sweep_section(arm_file)), digests(passes)
-    return fit_rows(gcomp_arm(arm_file), rows, Limits.of(arm_file).rated, doubt, sources)
+    return fit_rows(gcomp_arm(arm_file), rows, DriveLimits.of(arm_file).rated, doubt, sources)
 
 
 def fit_rows(
@@ -178,7 +175,7 @@ def _fitted(
     return CreepFit(arm, rows, found, std, scattered, model.ripple)
 
 
-def _unevenness(found: Solution, std: Array, coulomb: Array, doubt: Doubt) -> Array:
+def _unevenness(found: CreepSolution, std: Array, coulomb: Array, doubt: Doubt) -> Array:
     """Usual size of each harmonic of the friction over position (HARMONICS,), as a share of the Coulomb friction.
 
     That of all joints' harmonics of one order, which count by what the data tell of them, and of `ASSUMED` more of the
@@ -197,6 +194,6 @@ def _temperature_std(rows: CreepRows) -> float:
     return float(steps.min(initial=1.0)) / np.sqrt(12) if steps.size else 0.0
 
 
-def _used(found: Solution, std: Array) -> float:
+def _used(found: CreepSolution, std: Array) -> float:
     """Parameters that the data, and not the prior, determine."""
     return float(np.sum(1 - np.diag(found.covariance) / std**2))

@@ -8,7 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.unseen import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
+from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
 from calib.creep.fit import QUANTILE, CreepFit
 from calib.creep.parameters import LAST_ZERO
 from calib.fit.gravity_fit import GravityFit
@@ -34,7 +34,7 @@ VALUES: dict[Value, str] = {
     "load": "load",
     "viscous": "viscous",
 }
-"""What a program asks for → family of the fit."""
+"""Value by the name that programs use → family of the fit."""
 HEADINGS = {
     "gain": "reading per N·m (1/k)",
     "offset": "offset [N·m]",
@@ -159,13 +159,12 @@ def gravity_record(fit: CreepFit, arm_file: ArmFile, calibration: CalibrationRec
 
 @dataclass(frozen=True, eq=False)
 class CreepCalibration:
-    """What creep sweeps tell of the drives, as programs ask for it: NaN where they do not tell a value."""
+    """The drives' values by creep sweeps, as programs ask for them: NaN where the sweeps do not determine one."""
 
     fit: CreepFit
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Joint names."""
         return self.fit.names
 
     @cached_property
@@ -175,7 +174,7 @@ class CreepCalibration:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What disturbed the sweeps, one sentence each."""
+        """Disturbances of the sweeps, one sentence each."""
         return self.fit.findings
 
     @property

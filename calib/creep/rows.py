@@ -45,7 +45,6 @@ class CreepRows:
     """Temperature of each joint's drive at which warmth is 0 (n,) [°C]; NaN where it is not in kelvin."""
 
     def __len__(self) -> int:
-        """Rows."""
         return len(self.joint)
 
     @property
@@ -54,7 +53,6 @@ class CreepRows:
         return np.sign(self.velocity)
 
     def kept(self, mask: Mask) -> Self:
-        """Some of the rows."""
         names = ("joint", "position", "reading", "velocity", "mass", "warmth", "sweep")
         return replace(self, **{name: getattr(self, name)[mask] for name in names})
 

@@ -15,7 +15,7 @@ SMALL = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class CreepSolution:
     """Maximum of the posterior."""
 
     x: Array
@@ -30,7 +30,7 @@ class Solution:
         return invert(self.information)
 
 
-def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: Array) -> Solution:
+def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: Array) -> CreepSolution:
     """The parameters for rows that scatter so, with the prior's mean and std (P,), from `start`."""
     x, damping = start.copy(), 1e-6
     reading = model.rows.reading
@@ -57,7 +57,7 @@ def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: A
             break
     predicted, jacobian = model.linearised(x)
     weighted = scatter.whitened(jacobian)
-    return Solution(x, reading - predicted, weighted.T @ weighted + np.diag(1 / std**2))
+    return CreepSolution(x, reading - predicted, weighted.T @ weighted + np.diag(1 / std**2))
 
 
 def invert(information: Array) -> Array:

@@ -12,13 +12,26 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
-from calib.field.linear_model import Belief, Solution, belief_of, field_columns, solve
-from calib.field.thresholds import DRIFT, GAIN_STD, OFFSET_STD, PAYLOAD_EVIDENCE, ROUNDS, UNKNOWN_MOMENT
+from calib.field.linear_model import UNKNOWN_MOMENT, Belief, Solution, belief_of, field_columns, solve
+from calib.fit.heldout import FEWEST
 from calib.records.records import CalibrationRecord, GravityRecord, Parameter
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.readings import StaticReadings
+
+GAIN_STD = 0.02
+"""Relative standard deviation above which a gain counts as not separable from the offset."""
+OFFSET_STD = 0.005
+"""Likewise of an offset, as a share of rated torque."""
+DRIFT = 0.05
+"""Standard deviation allowed for the drift of a gain that these rows do not show, as a ratio."""
+ROUNDS = 4
+"""Gauss-Newton steps, each with the noise scaled to the residuals' scatter."""
+PAYLOAD_EVIDENCE = 10.0
+"""BIC difference up to which a payload that explains the rows worse than new gains and offsets is not excluded."""
+BLOCK = 24
+"""Rows that are held out together, since neighbours are correlated: six seconds of a recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,3 +199,23 @@ def _no_gain(torque: Array) -> str:
         f"it cannot be separated from the offset: gravity torque varies by only {spread:.2g} N·m (standard deviation)"
         " in these poses: move it, or the joints beyond it, further"
     )
+
+
+def heldout_errors(rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:
+    """Errors (K, n) [N·m] of held-out rows with a new calibration and with the one before; NaN if they do not count.
+
+    For every joint a line of readings over model torque is fitted to every second block of rows and predicts the
+    others.
+    """
+    block = np.arange(len(rows.torque)) // min(BLOCK, max(len(rows.torque) // 6, 1)) % 2
+    old = rows.torque - before.torque_calibration().apply(fit.torque)
+    new = np.full_like(old, np.nan)
+    counted = np.isfinite(old) & np.isfinite(fit.gain)
+    for j in range(old.shape[1]):
+        for held in (0, 1):
+            train, test = counted[:, j] & (block != held), counted[:, j] & (block == held)
+            if train.sum() < FEWEST:
+                continue
+            line = np.polyfit(fit.torque[train, j], rows.torque[train, j], 1)
+            new[test, j] = rows.torque[test, j] - np.polyval(line, fit.torque[test, j])
+    return new, old

@@ -12,8 +12,7 @@ from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.fit.examination import Goodness, examine
-from calib.fit.findings import Finding
-from calib.fit.missing_values import missing_values
+from calib.fit.findings import FitFinding
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
 from calib.sweep.data_sets import digests
@@ -81,7 +80,7 @@ class SensorFit:
         return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[FitFinding, ...]:
         """Effects in the readings that the sensor model does not have."""
         return self.goodness.findings
 
@@ -135,7 +134,6 @@ class SensorFit:
         return rms
 
     def record(self, arm_file: ArmFile) -> CalibrationRecord:
-        """The calibration record of this fit."""
         residual = self.residual_rms
         joints = tuple(
             JointCalibration(
@@ -257,3 +255,36 @@ def _said(value: float, interval: str = "") -> str:
 
 def _number(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
+
+
+WORDY = 6
+"""Largest number of parameters that a reason names."""
+WHERE_IT_HANGS = ": measure where the reference mass hangs (sweep.reference_point in the arm file)"
+"""Remedy for a gain that the readings with a mass leave open, as those of a single joint do."""
+
+
+def missing_values(fit: GlobalFit, rows: SweepReadings) -> dict[tuple[str, Parameter], str]:
+    """(joint, parameter) → reason, for each parameter without a value."""
+    reasons: dict[tuple[str, Parameter], str] = {}
+    lost = {name: found for name, found in zip(fit.names, fit.identifiable, strict=True) if not found}
+    for name in (*lost, *fit.hopeless):
+        family, _, joint = name.rstrip("]").partition("[")
+        for parameter in PARAMETERS:
+            if parameter == family:
+                reasons[joint, parameter] = _reason(name, fit, rows)
+    return reasons
+
+
+def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
+    if name in fit.hopeless:
+        spread = float(np.sqrt(fit.covariance_of(name)[0, 0]))
+        return f"these sweeps determine it to ± {2 * spread:.2g} only: gravity hardly acts on it in these poses"
+    for sentence in fit.null_space:
+        if name in sentence:
+            if "common factor" in sentence and not any(rows.masses):
+                return "no readings with a reference mass: only ratios of gains are determined"
+            remedy = WHERE_IT_HANGS if "load_point" in sentence and name.startswith("gain") else ""
+            if sentence.count(",") > WORDY:
+                return f"not identifiable: the data fit equally well with other values{remedy}"
+            return f"{sentence}{remedy}"
+    return "the readings do not determine it"

@@ -73,7 +73,7 @@ class Troubles:
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What the columns need beside the readings."""
+    """Inputs of the columns beside the readings."""
 
     arm: Arm
     rated: Array

@@ -32,7 +32,7 @@ PATH = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Effect:
+class UnmodelledEffect:
     """An effect found: its columns, in the effect's own units."""
 
     joint: int
@@ -52,7 +52,9 @@ def size_of(coefficients: Array) -> float:
     return float(np.sqrt(np.mean(coefficients**2)))
 
 
-def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array) -> Effect | None:
+def strongest_effect(
+    kinematics: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array
+) -> UnmodelledEffect | None:
     """The effect that explains most of the residuals of `refined` beyond chance; None if none is material.
 
     rated (n,) [N·m]; kept (K, n) are the readings that `refined` used, without outliers.
@@ -85,7 +87,7 @@ def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: 
     return best
 
 
-def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Iterator[Effect]:
+def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Iterator[UnmodelledEffect]:
     """Every effect that is tried, a joint at a time."""
     complete, readings = refined.fit.complete, rows.readings
     counted = readings.counted
@@ -103,7 +105,7 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
         sides = [here * side for side in _sides(rows, joint)]
         if sides:
             columns = tuple(_one(kinematics.n, joint, "torque.hysteresis", side).extras[0] for side in sides)
-            yield Effect(joint, "torque.hysteresis", columns, doubt=doubt, each_sweep=True)
+            yield UnmodelledEffect(joint, "torque.hysteresis", columns, doubt=doubt, each_sweep=True)
         yield replace(
             _one(kinematics.n, joint, "torque.hysteresis", here * lag(kinematics, rows, refined, joint)), doubt=doubt
         )
@@ -123,14 +125,14 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
         if float(np.ptp(angle[here])) > TURN:
             turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
             extras = tuple(Extra(joint, "position.eccentricity", each) for each in turn)
-            yield Effect(joint, "position.eccentricity", extras)
+            yield UnmodelledEffect(joint, "position.eccentricity", extras)
 
 
-def _one(n: int, joint: int, effect_id: str, values: Array, knee: float = np.nan) -> Effect:
+def _one(n: int, joint: int, effect_id: str, values: Array, knee: float = np.nan) -> UnmodelledEffect:
     """An effect that shows in one joint's sensor alone, `values` (K,)."""
     column = np.zeros((len(values), n))
     column[:, joint] = values
-    return Effect(joint, effect_id, (Extra(joint, effect_id, column),), knee)
+    return UnmodelledEffect(joint, effect_id, (Extra(joint, effect_id, column),), knee)
 
 
 def _sides(rows: SweepReadings, joint: int) -> Iterator[Array]:

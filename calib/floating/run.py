@@ -12,8 +12,7 @@ from armlink.drives.orders import Mode
 from armlink.errors import ArmlinkError, Refused
 from armlink.link.types import Command, Sample
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.floating.controller import FloatConfig, FloatControl
 from calib.records.records import CalibrationRecord
 from gcomp.arrays import Array
@@ -27,8 +26,6 @@ as it is now. A calibration leaves well below a hundredth (`ObserverConfig.initi
 
 @dataclass(frozen=True)
 class Floated:
-    """Summary of one float."""
-
     seconds: float
     """Of the link's clock [s]."""
     cycles: int
@@ -57,14 +54,14 @@ def run_float(
     arm; `on_sample` sees every sample and the torque commanded (n,) [N·m]. Raises BusFault, and Refused if sensors and
     model disagree.
     """
-    described, limits = gcomp_arm(arm), Limits.of(arm)
+    described, limits = gcomp_arm(arm), DriveLimits.of(arm)
     given = (
         ()
         if calibration is None
         else (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
     )
     control = FloatControl(described, beta, limits.rated, limits.speed, link.period, config, *given)
-    run = _Run(link, control, on_sample)
+    run = _Float(link, control, on_sample)
     run.compare(limits.rated)
     try:
         run.follow(Floating(control, run.position, reflect), seconds)
@@ -97,9 +94,7 @@ class Floating:
         return Command(np.full(len(torque), Mode.TORQUE, np.int8), torque, self._position.copy())
 
 
-class _Run:
-    """One float under way."""
-
+class _Float:
     def __init__(
         self, link: ArmDriver, control: FloatControl, on_sample: Callable[[Sample, Array], None] | None
     ) -> None:
@@ -153,5 +148,4 @@ class _Run:
             self._link.cycle(here)
 
     def result(self) -> Floated:
-        """Summary."""
         return Floated(self._seconds, self._cycles, self._largest, self._fastest, self._high - self._low)

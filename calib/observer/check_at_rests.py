@@ -26,8 +26,6 @@ FLOOR = 0.0005
 
 @dataclass(frozen=True)
 class Checked:
-    """Outcome of the check."""
-
     verdict: Literal["kept", "worse"]
     joint: int
     """Joint with the largest increase of RMS, or the smallest decrease."""

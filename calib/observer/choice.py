@@ -2,12 +2,12 @@
 
 from typing import Any, Protocol
 
+from calib.observer.cause_test import DetectionLimits
 from calib.observer.config import ObserverConfig
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.observer.events import Event
 from calib.observer.moving.observer import MovingObserver
 from calib.observer.observer import Observer
-from calib.observer.tracking.limits import Limits
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
@@ -15,7 +15,7 @@ from gcomp.arrays import Array
 
 
 class Observes(Protocol):
-    """What both do; see `calib.observer.observer.Observer`."""
+    """Interface that both have; see `calib.observer.observer.Observer`."""
 
     @property
     def rows(self) -> int:
@@ -40,7 +40,7 @@ class Observes(Protocol):
         """Gain and offset of every joint."""
         ...
 
-    def limits(self) -> Limits:
+    def limits(self) -> DetectionLimits:
         """Changes that would be noticed now."""
         ...
 
@@ -48,7 +48,7 @@ class Observes(Protocol):
         """Gravity torque as believed (…, n) [N·m]."""
         ...
 
-    def install(self, finding: Finding) -> None:
+    def install(self, finding: DriftFinding) -> None:
         """A finding was written."""
         ...
 

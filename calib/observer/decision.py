@@ -17,7 +17,7 @@ discrepancy are estimates. Without it the errors of 30 findings on arms of `sim.
 
 
 @dataclass(frozen=True)
-class Finding:
+class DriftFinding:
     """Change of one joint's sensor against the installed calibration, and the reasons against writing it, if any."""
 
     joint: int
@@ -83,7 +83,7 @@ def agreed(first: CauseTest, second: CauseTest, joint: int, beside: int | None, 
     return float((a - b) @ np.linalg.solve(cov_a + cov_b, a - b)) < limit
 
 
-def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig) -> Finding:
+def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig) -> DriftFinding:
     """The finding for one joint of a drift verdict on all rows that agree, with every rule that forbids a write."""
     cause, refused = verdict.cause, []
     beside = verdict.other(joint)
@@ -113,7 +113,7 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     if cause != "gain" and moved >= config.common_joints - 1:
         refused.append(f"the zeros of {moved} other joints moved as well: temperature")
     rows = len(test.window.position)
-    return Finding(
+    return DriftFinding(
         joint,
         cause,
         1.0 + float(change[0]),

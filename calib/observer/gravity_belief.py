@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.observer.discrepancy.kernel import Kernel
-from calib.observer.discrepancy.level import Level
+from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.discrepancy.posterior import Data, Posterior
 from calib.observer.discrepancy.reference import Reference, Rows
 from calib.observer.saved_values import UNREADABLE
@@ -80,7 +80,7 @@ class GravityBelief:
         beta: Array,
         covariance: Array,
         position_std: float = 0.0,
-        level: Level | None = None,
+        level: DiscrepancyLevel | None = None,
         first_rows: int = FIRST_ROWS,
         wander: Array | float = np.inf,
     ) -> None:
@@ -98,7 +98,7 @@ class GravityBelief:
         self._position_std, self._wander = position_std, wander
         self.mass = 0.0
         """Mass of the loads that the model has taken over as tools [kg]."""
-        self.level = Level.none(arm.n) if level is None else level
+        self.level = DiscrepancyLevel.none(arm.n) if level is None else level
         self._noise: Array = np.zeros(arm.n)
         self._reference = Reference(arm.n, first_rows)
         self._posterior: Posterior | None = None
@@ -113,7 +113,6 @@ class GravityBelief:
 
     @property
     def learnt(self) -> int:
-        """Reference rows."""
         return len(self._reference.rows)
 
     @property
@@ -127,7 +126,7 @@ class GravityBelief:
         return torque
 
     def expected(self, q: Array, side: Array, temperature: Array | None = None) -> Expected:
-        """What residuals to expect at poses q [rad], sides of approach and temperatures [°C], (K, n) each."""
+        """Residuals to expect at poses q [rad], sides of approach and temperatures [°C], (K, n) each."""
         if self._posterior is None:
             self._posterior = self._learn(self._reference.rows)
         warmer = np.full(q.shape, np.nan) if temperature is None else temperature - self._reference.temperature
@@ -244,7 +243,7 @@ class GravityBelief:
             mass, level, saved = float(values["mass"]), self.level, values.get("level")
             if saved is not None:
                 stds = {name: as_array(name, saved[name], np.shape(getattr(level, name))) for name in LEVEL_ARRAYS}
-                level = Level(**stds, rows=int(saved["rows"]))
+                level = DiscrepancyLevel(**stds, rows=int(saved["rows"]))
         except UNREADABLE:
             return False
         if not reference.restore(values):

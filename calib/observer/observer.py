@@ -12,15 +12,14 @@ import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.audit import DOUBTED, audit, confirmed, may_adapt
-from calib.observer.cause_test import CauseTest, Verdict
+from calib.observer.cause_test import CauseTest, DetectionLimits, Verdict
 from calib.observer.config import ObserverConfig
-from calib.observer.decision import Agreeing, Finding, agreed, decide
-from calib.observer.discrepancy.level import Level
+from calib.observer.decision import Agreeing, DriftFinding, agreed, decide
+from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
 from calib.observer.rest_detector import RestDetector
-from calib.observer.tracking.limits import Limits
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.observer.tracking.tracking import Tracking
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -43,7 +42,7 @@ class Observer:
         config: ObserverConfig | None = None,
         position_gain: Array | None = None,
         position_offset: Array | None = None,
-        level: Level | None = None,
+        level: DiscrepancyLevel | None = None,
     ) -> None:
         """Watch an arm.
 
@@ -56,7 +55,7 @@ class Observer:
         self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
         self._rest = RestDetector(arm.n, self.config)
         rated, settings = np.asarray(sigma, dtype=float) / self.config.noise_share, self.config
-        expected = level or Level.expected(settings.discrepancy_share * rated)
+        expected = level or DiscrepancyLevel.expected(settings.discrepancy_share * rated)
         wander = settings.zero_wander * rated
         belief = GravityBelief(
             arm, beta, beta_covariance, settings.position_std, expected, settings.baseline_rows, wander
@@ -64,7 +63,7 @@ class Observer:
         self._tracking = Tracking(belief, sigma, self.config)
         self._investigation = Investigation(arm.n, self.config)
         self._proposed = np.full(arm.n, -np.inf)
-        self._limits: tuple[tuple[int, ...], Limits] | None = None
+        self._limits: tuple[tuple[int, ...], DetectionLimits] | None = None
 
     @property
     def rows(self) -> int:
@@ -94,7 +93,9 @@ class Observer:
         config = config or ObserverConfig()
         sigma = config.noise_share * np.asarray(rated_torque, dtype=float)
         position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
-        level = Level.of_record(calibration, config.discrepancy_share * np.asarray(rated_torque, dtype=float))
+        level = DiscrepancyLevel.of_record(
+            calibration, config.discrepancy_share * np.asarray(rated_torque, dtype=float)
+        )
         return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position, level)
 
     def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Event]:
@@ -130,7 +131,7 @@ class Observer:
         """Current gain and offset of every joint against the installed calibration."""
         return self._tracking.filter.estimate()
 
-    def limits(self) -> Limits:
+    def limits(self) -> DetectionLimits:
         """The changes of each joint that would be noticed now, at poses like the latest ones."""
         key = (
             self._tracking.rows // self.config.audit_rows,
@@ -146,7 +147,7 @@ class Observer:
         torque: Array = self._tracking.belief.torque(np.atleast_2d(self._angle(position)))
         return torque.reshape(position.shape)
 
-    def install(self, finding: Finding) -> None:
+    def install(self, finding: DriftFinding) -> None:
         """The finding was written to the controller: readings are correct again within the finding's uncertainty."""
         self._tracking.install(finding)
         self._resume()

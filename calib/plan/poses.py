@@ -3,22 +3,23 @@
 import numpy as np
 
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import SweepSection
-from calib.plan.choices import SCOUT_CANDIDATES
 from calib.plan.collisions import Geometry
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.design.selection import select
 from gcomp.gravity.torque import gravity_regressor
 
+SCOUT_CANDIDATES = 300
+"""Random poses among which the scout's are chosen; a choice: n + 3 of them are needed."""
 UNKNOWN = 1e-6
 """Prior information on each parameter: negligible, but it keeps the first poses' matrices regular."""
 Poses = tuple[tuple[float, ...], ...]
 """(P, n) [rad]"""
 
 
-def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[float, float]:
+def sweep_range(section: SweepSection, limits: DriveLimits, joint: int) -> tuple[float, float]:
     """First and last step [rad] of a joint; the margin grows with the angle, since the position gain is unknown."""
     low, high = float(limits.lower[joint]), float(limits.upper[joint])
     margin = section.range_margin
@@ -28,7 +29,7 @@ def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[floa
 def scout_poses(
     kinematics: Arm,
     section: SweepSection,
-    limits: Limits,
+    limits: DriveLimits,
     seed: int,
     geometry: Geometry | None = None,
 ) -> Poses:
@@ -64,7 +65,7 @@ def nearest_first(poses: Array, begin: Array) -> Array:
     return poses[way]
 
 
-def require_range(section: SweepSection, limits: Limits, kinematics: Arm) -> None:
+def require_range(section: SweepSection, limits: DriveLimits, kinematics: Arm) -> None:
     """Raise BadInput, naming the joint, if a range leaves nothing to sweep."""
     for joint, name in enumerate(kinematics.names):
         first, last = sweep_range(section, limits, joint)

@@ -4,13 +4,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.plan.choices import HOPELESS, SCATTER, SIDE
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.types import Sweep
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import predict_covariance
 from gcomp.identify.parameters import Parameters, Prior
 from gcomp.identify.readings import StaticReadings
+
+SIDE = 0.05
+"""Lateral offset at which the reference mass is assumed to hang [m]; a choice."""
+SCATTER = 1.3
+"""Scatter of readings over the noise of their samples, since joints never rest completely: as the fits of
+tests/campaigns/random_arms.py find it."""
+HOPELESS = 0.15
+"""Standard deviation beyond which more averaging cannot help a gain: that known beforehand (`PRIOR_GAIN`)."""
 
 
 def predicted_gain_std(

@@ -4,10 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.plan.choices import GAIN_STD, MODEL_ERROR, SIGMAS
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor
+
+GAIN_STD = 0.3
+"""Standard deviation of an uncalibrated torque gain; tests/calib/drawn_arms.py draws 0.7 to 1.3."""
+MODEL_ERROR = 0.1
+"""Standard deviation of a model file's mass moments, as a share of each; a choice."""
+SIGMAS = 3.0
+"""Standard deviations of the rough model that its bounds include: 99.7 %."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calib.plan.choices import PRIOR_GAIN, PRIOR_POINT, PRIOR_POSITION_GAIN, SKETCH_STEPS, TRAVEL_COST
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.design.selection import select, sweep_information, sweep_jacobian
@@ -14,6 +13,13 @@ from gcomp.design.sweep_design import well_felt
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.parameters import Parameters, free_mask
 
+SKETCH_STEPS = 5
+"""Steps by which a candidate sweep is judged: more than a sinusoid's three unknowns (docs/theory.md, section 5.3)."""
+TRAVEL_COST = 0.6
+"""Price of a second of travel between two sweeps, as log determinant (docs/theory.md, section 7.4)."""
+PRIOR_GAIN, PRIOR_POSITION_GAIN, PRIOR_POINT = 0.15, 0.02, 0.2
+"""Standard deviations before any reading of torque gain, position gain and place of the mass [m]
+(docs/theory.md, section 7.4)."""
 UNKNOWN = ("gain", "offset", "position_gain", "beta", "rho")
 """Parameter families for which the stops are chosen."""
 

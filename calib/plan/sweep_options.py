@@ -7,12 +7,10 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.plan.bias_torque import hold_torque, pressable
-from calib.plan.choices import POINTS
-from calib.plan.collisions import Collided, Geometry
+from calib.plan.collisions import POINTS, Collided, Geometry
 from calib.plan.poses import require_range, sweep_range
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates, stop_combinations, with_lever
@@ -26,7 +24,7 @@ class PlannedArm:
 
     kinematics: Arm
     section: SweepSection
-    limits: Limits
+    limits: DriveLimits
     guess: GravityGuess | None
     """Rough gravity model; None if nothing is known of the masses."""
     geometry: Geometry | None
@@ -35,7 +33,7 @@ class PlannedArm:
     @classmethod
     def of(cls, arm_file: ArmFile, guess: GravityGuess | None) -> Self:
         """Raises BadInput if a joint's range is too short to sweep or the model cannot be used."""
-        kinematics, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), Limits.of(arm_file)
+        kinematics, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), DriveLimits.of(arm_file)
         require_range(section, limits, kinematics)
         return cls(kinematics, section, limits, guess, None if arm_file.model_path is None else Geometry(arm_file))
 

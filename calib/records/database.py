@@ -245,5 +245,4 @@ def _to_one_file(connection: sqlite3.Connection) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """First line of an error's message."""
     return str(error).strip().partition("\n")[0]

@@ -22,7 +22,7 @@ GRID = {"gridcolor": "#e8ecf0", "zerolinecolor": "#c6ced6", "automargin": True}
 
 
 @dataclass(frozen=True)
-class Section:
+class ReportSection:
     """One part of a report. Text is escaped by the template, all but what is Markup."""
 
     title: str
@@ -71,7 +71,7 @@ def _shown(value: Any) -> Any:
     return printable_text(value, keep="\n") if type(value) is str else value
 
 
-def render(path: Path, title: str, sections: Sequence[Section], subtitle: str = "") -> None:
+def render(path: Path, title: str, sections: Sequence[ReportSection], subtitle: str = "") -> None:
     """Write the page with plotly's script inside, so that it opens without a network. Raises OSError."""
     from jinja2 import Environment, PackageLoader
     from plotly.offline import get_plotlyjs

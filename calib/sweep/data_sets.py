@@ -30,7 +30,7 @@ def data_sets(given: Sequence[Path | SweepData]) -> list[SweepData]:
 
 
 def labels(paths: Sequence[Path]) -> list[str]:
-    """What records and findings call data of these paths: their last names, or the paths where two have the same."""
+    """Names of the data of these paths in records and findings: last names, or the paths where two have the same."""
     names = [path.resolve().name for path in paths]
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
@@ -41,7 +41,7 @@ def digests(data: Sequence[SweepData]) -> dict[str, str]:
 
 
 def _missing(data: SweepData) -> str:
-    """What the sweep of a data set did not get to, in words; empty if nothing."""
+    """The first part that the sweep of a data set did not reach, in words; empty if it is whole."""
     if data.plan is None:
         return "its first sweep"
     made = Counter(reading.sweep for reading in data.readings)

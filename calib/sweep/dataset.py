@@ -256,11 +256,9 @@ class DataWriter:
             ) from None
 
     def __enter__(self) -> Self:
-        """The writer itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file."""
         self._file.close()
 
     def _drop_torn_line(self) -> None:

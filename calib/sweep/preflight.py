@@ -12,11 +12,23 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.types import Stats
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
-from calib.sweep.thresholds import HOT, LATE, LISTEN, LOUD, MISSING, NEAR_LIMIT, STOP_APPROACH
 from gcomp.arrays import Array
+
+LISTEN = 0.5
+"""Seconds for which the sensors are listened to at rest, after as long again in which switching on dies down."""
+MISSING, LATE = 0.1, 0.5
+"""Shares of readings from which on they are said to be missing, and to be late."""
+LOUD = 0.05
+"""Noise of a torque sensor, as a share of rated torque, from which it is not fit for a calibration."""
+NEAR_LIMIT = 1.9
+"""Reading, in rated torques, at which a torque sensor is about to saturate."""
+STOP_APPROACH = 0.08
+"""Distance from the arm file's stop from which a joint creeps [rad]."""
+HOT = 70.0
+"""Temperature of a drive from which no sweep is begun: it would fall or rise while the sensors are read [°C]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +54,7 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     Raises Refused naming the joint whose sensor is silent, loud or at the end of its range, or whose drive is hot.
     """
     temperature = read_temperatures(link)
-    limits, mover = Limits.of(arm), Mover(link, sweep_section(arm), Limits.of(arm))
+    limits, mover = DriveLimits.of(arm), Mover(link, sweep_section(arm), DriveLimits.of(arm))
     cycles = max(int(LISTEN / link.period), 20)
     for _ in range(cycles):
         mover.cycle()
@@ -110,7 +122,7 @@ def find_stops(
     Raises Refused naming the joint and the place where a stop is not where the arm file has it. A stop that a joint
     does not get to is left out.
     """
-    limits, section = Limits.of(arm), sweep_section(arm)
+    limits, section = DriveLimits.of(arm), sweep_section(arm)
     mover = Mover(link, section, limits)
     mover.hold_all()
     middle = (limits.lower + limits.upper) / 2

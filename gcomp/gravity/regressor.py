@@ -10,7 +10,7 @@ import numpy as np
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
-from gcomp.gravity.half_angle import half_angles
+from gcomp.gravity.batch import half_angles
 from gcomp.gravity.single_pose import without_rounding
 
 BLOCK = 10_000
@@ -35,17 +35,17 @@ def regressor(arm: Arm, q: Array) -> Array:
     columns[:, 0] = 0.0
     for j in range(n - 1):
         columns[2 * j : 2 * j + 2, j + 1 :] = 0.0
-    space = _Space(n, min(size, BLOCK))
+    space = _RegressorBuffers(n, min(size, BLOCK))
     for begin in range(0, size, BLOCK):
         poses = q[begin : begin + BLOCK]
         if len(poses) < space.size:
-            space = _Space(n, len(poses))
+            space = _RegressorBuffers(n, len(poses))
         space.turn_by(arm, poses)
         _levers_outwards(arm, columns[..., begin : begin + BLOCK], space)
     return columns.transpose(2, 1, 0)
 
 
-def _levers_outwards(arm: Arm, columns: Array, space: "_Space") -> None:
+def _levers_outwards(arm: Arm, columns: Array, space: "_RegressorBuffers") -> None:
     """Levers w_i in bar frame j into columns[2j : 2j + 2, i], i ≤ j; gravity is turned along and gives w_j.
 
     Rows from j + 1 on are zero, so that a new lever has no component along its axis.
@@ -88,7 +88,7 @@ def _about_x(
     return Signed(to_y, 1.0), Signed(to_z, 1.0)
 
 
-class _Space:
+class _RegressorBuffers:
     """Work space for `size` poses of n joints, and the turns about each joint's axis."""
 
     def __init__(self, n: int, size: int) -> None:

@@ -9,7 +9,9 @@ from gcomp.arrays import Array, Mask
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.readings import StaticReadings
-from gcomp.identify.thresholds import DEAD_COLUMN
+
+DEAD_COLUMN = 1e-6
+"""Share of g·√K below which a column's norm counts as zero: the axis was along gravity in every row (section 2.3)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 
 from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
-from gcomp.arm.model_xml import parse_xml
+from gcomp.arm.model_file import parse_xml
 from gcomp.arrays import Array
 from sim_gap.better_model.corrected_model import body_parameters, split
 from sim_gap.model.load import linear_part

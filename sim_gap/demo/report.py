@@ -14,7 +14,8 @@ from calib.creep.record import HEADINGS, told
 from calib.fit.sensor_fit import SensorFit
 from calib.records.records import Parameter
 from calib.report.figures import COLOURS, GREY, PANEL, add_sweeps, verify_figure
-from calib.report.page import ReportTable, Section, bullets, paragraph, paragraphs, render
+from calib.report.page import ReportSection as Section
+from calib.report.page import ReportTable, bullets, paragraph, paragraphs, render
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from sim_gap.demo.bench import Bench, GravityCheck

@@ -11,7 +11,7 @@ from armlink.arm_file import ArmFile, parse_arm
 from armlink.arrays import Array
 from armlink.link.link import Link
 from calib.arm.kinematics import gcomp_arm
-from calib.arm.unseen import vertical
+from calib.creep.choice import vertical
 from calib.creep.fit import QUANTILE, CreepFit, fit_creep
 from calib.creep.plan import plan_creep
 from calib.creep.record import missing

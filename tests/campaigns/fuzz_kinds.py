@@ -45,7 +45,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.commands.poses_csv import load_poses
 from calib.daemon.settings import daemon_section
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.records.store import RecordStore
 from calib.sweep.dataset import load_data
 from gcomp.arm.load import load_model
@@ -273,7 +273,7 @@ def journals(folder: Path) -> list[Seed]:
     bench = DaemonBench(folder, small_arm())
     bench.run(3.0)
     journal, when = bench.service.journal, bench.wall()
-    finding = Finding(2, "drift", 1.02, 0.1, np.diag([1e-6, 1e-4]), 40, 0.99)
+    finding = DriftFinding(2, "drift", 1.02, 0.1, np.diag([1e-6, 1e-4]), 40, 0.99)
     for joint in ("elbow", "elbow", "base"):
         journal.add_proposal(when, joint, "ab" * 4, "cd" * 4, finding)
     journal.decide(3, when, "rejected", "ann")

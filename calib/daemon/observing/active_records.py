@@ -4,18 +4,16 @@ import logging
 from collections.abc import Callable
 
 from armlink.errors import ArmlinkError
-from calib.daemon.environment import Environment
-from calib.daemon.observing.observation import Observation
+from calib.daemon.environment import BusJobs, Environment
+from calib.daemon.observing.observation import ActiveObservation
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
-from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
 from calib.install.journaled_write import recover
 from calib.install.plausibility import GateRefused
 from calib.records.database import StoreFault, first_line
-from calib.records.missing import way_to
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.records.store import ControllerWrite, RecordStore
+from calib.records.store import ControllerWrite, RecordStore, way_to
 
 _LOG = logging.getLogger("armlink.daemon")
 RECORDS_SECONDS = 5.0
@@ -43,12 +41,12 @@ class ActiveRecords:
         arm_state: ArmState,
         events: EventLog,
         jobs: BusJobs,
-        observe: Callable[[CalibrationRecord, GravityRecord], Observation],
+        observe: Callable[[CalibrationRecord, GravityRecord], ActiveObservation],
     ) -> None:
         """`observe` makes the observation against a pair of records; raises Refused if they are of another arm."""
         self._configuration, self._environment, self._store = configuration, environment, store
         self._arm_state, self._events, self._jobs, self._observe = arm_state, events, jobs, observe
-        self.observation: Observation | None = None
+        self.observation: ActiveObservation | None = None
         """None until there are both records."""
         self.detail = ""
         """Why there is no observation, or none against the newest records; empty otherwise."""
@@ -96,7 +94,7 @@ class ActiveRecords:
         self._jobs.aside(look, self._found)
 
     def _found(self, found: Found | ArmlinkError) -> None:
-        """What the store has now; while it fails, the records in force stay in force."""
+        """Take over what the store has now; while it fails, the records in force stay in force."""
         self._looking = False
         if isinstance(found, StoreFault):
             self._store_failed(found)

@@ -3,18 +3,18 @@
 from collections.abc import Callable
 from datetime import datetime
 
+from calib.daemon.environment import BusJobs
 from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.observing.observer_feed import ObserverFeed
 from calib.daemon.observing.observer_storage import ObserverStorage
 from calib.daemon.observing.recalibration_workflow import RecalibrationWorkflow
-from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.event_text import describe, one_alarm_a_joint
 from calib.observer.events import Event
 
 
-class Observation:
+class ActiveObservation:
     """`handle` a batch of samples: to the observer, and what it finds to the event log and to recalibration."""
 
     def __init__(
@@ -36,7 +36,6 @@ class Observation:
         self._accepted = feed.observer.accepted
 
     def handle(self, batch: Batch) -> None:
-        """Observe the samples of a batch."""
         samples = self.feed.decimate(batch)
         if self._jobs.busy:
             return  # the calibration changes under these readings

@@ -8,7 +8,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.loop_messages import Batch
 from calib.observer.choice import observer_of
 from calib.observer.config import ObserverConfig
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.observer.events import Event
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arrays import Array
@@ -41,7 +41,7 @@ class ObserverFeed:
         """Whether these are its records."""
         return (calibration.id, gravity.id) == (self.calibration.id, self.gravity.id)
 
-    def install(self, record: CalibrationRecord, finding: Finding) -> None:
+    def install(self, record: CalibrationRecord, finding: DriftFinding) -> None:
         """A finding was written: `record`, which follows from the one before, is in force and in the controllers."""
         self.calibration = record
         self.controllers_hold(None)

@@ -5,7 +5,7 @@ from datetime import timedelta
 from calib.daemon.environment import Environment
 from calib.daemon.observing.observer_feed import ObserverFeed
 from calib.daemon.state.journal import Journal
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 
 SAVE_SECONDS = 5.0
 """The observer's state is saved this often while there is something new [s]: what a kill may lose, about two stops."""
@@ -28,7 +28,6 @@ class ObserverStorage:
         self._saved_at = self._history_at = self._thinned_at = -float("inf")
 
     def tick(self, feed: ObserverFeed | None) -> None:
-        """Save what is due."""
         now = self._environment.monotonic()
         if now - self._thinned_at >= THIN_SECONDS:
             self._journal.thin_history(self._environment.wall() - HISTORY_WHOLE, THINNED)
@@ -49,7 +48,7 @@ class ObserverStorage:
                 self._history_at = t
         self._saved_at, self._rows = t, feed.observer.rows
 
-    def restore(self, feed: ObserverFeed, installed: Finding | None) -> None:
+    def restore(self, feed: ObserverFeed, installed: DriftFinding | None) -> None:
         """Continue a new feed's observer from the saved state if that belongs to the same records.
 
         It may also belong to the record before, if `installed`, a finding that the state lacks, led from there to here.

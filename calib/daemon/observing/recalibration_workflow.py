@@ -6,23 +6,23 @@ from collections.abc import Callable
 from concurrent.futures import Future
 
 from armlink.errors import ArmlinkError, BusFault, Refused
+from calib.daemon.environment import BusJobs
 from calib.daemon.observing.observer_feed import Samples
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
-from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.event_log import EventLog
 from calib.daemon.state.journal import Journal
 from calib.daemon.state.proposal_row import ProposalRow
 from calib.daemon.view.api_models import Proposal
 from calib.daemon.view.view import NoSuch, NotPossible
 from calib.observer.check_at_rests import Checked
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.observer.recalibrator import APPLIED_BY, Recalibration, Recalibrator
 from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 
-Installed = Callable[[CalibrationRecord, Finding], None]
+Installed = Callable[[CalibrationRecord, DriftFinding], None]
 
 DAY = 86400.0
 WAITING = 1000
@@ -48,7 +48,7 @@ class RecalibrationWorkflow:
         self._journal, self._events, self._jobs = journal, events, jobs
         self._recalibrator: Recalibrator | None = None
         self._installed: Installed = lambda record, finding: None
-        self._waiting: list[Finding] = []
+        self._waiting: list[DriftFinding] = []
         self._monotonic = monotonic
         self._written = _earlier_writes(journal, monotonic())
         """Joint and time of every write, by the monotonic clock [s]."""
@@ -59,7 +59,7 @@ class RecalibrationWorkflow:
         """A write that made the readings worse and could not be taken back yet."""
         self._unexplained: deque[Samples] = deque(maxlen=WAITING)
 
-    def begin(self, recalibrator: Recalibrator, installed: Installed) -> Finding | None:
+    def begin(self, recalibrator: Recalibrator, installed: Installed) -> DriftFinding | None:
         """Follow other records from now on; approvals that a kill interrupted are closed.
 
         `installed` is called with each record that becomes current, once its finding is written. Returns the finding
@@ -85,7 +85,7 @@ class RecalibrationWorkflow:
 
     # ---- what the observer found
 
-    def found(self, finding: Finding) -> None:
+    def found(self, finding: DriftFinding) -> None:
         """Do with a finding what the policy says."""
         policy = self._configuration.settings.policy
         if policy == "observe":
@@ -108,7 +108,7 @@ class RecalibrationWorkflow:
 
         self._jobs.start(lambda: recalibrator.propose(finding, by, ask), done)
 
-    def _proposed(self, finding: Finding, outcome: Recalibration, automatic: bool) -> None:
+    def _proposed(self, finding: DriftFinding, outcome: Recalibration, automatic: bool) -> None:
         joint, record = outcome.joint, outcome.record
         now = self._events.now()
         with self._journal.transaction():
@@ -359,7 +359,7 @@ class RecalibrationWorkflow:
         elif self._waiting and self._may_propose:
             self.found(self._waiting.pop(0))
 
-    def _refused(self, finding: Finding, error: ArmlinkError, number: int | None = None) -> None:
+    def _refused(self, finding: DriftFinding, error: ArmlinkError, number: int | None = None) -> None:
         joint = self._names[finding.joint]
         kind = "refused" if isinstance(error, Refused) else "fault"
         evidence = {} if number is None else {"proposal": number}

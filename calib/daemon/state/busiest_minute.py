@@ -61,7 +61,6 @@ class BusiestMinute:
         self._best: Minute | None = None
 
     def append(self, batch: Batch) -> None:
-        """Take the samples of a batch."""
         t = batch.t[:: self._stride].copy()
         if self._parts and not 0.0 <= t[0] - self._parts[-1][0][-1] <= PAUSE:
             self._end()

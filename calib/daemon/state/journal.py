@@ -25,7 +25,7 @@ from calib.daemon.environment import Immediate, RunAside
 from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.state.proposal_row import PROPOSALS, ProposalRow, proposal_of
 from calib.daemon.view.api_models import EventRecord
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 
 R = TypeVar("R")
 
@@ -74,7 +74,7 @@ log = logging.getLogger("armlink.daemon")
 
 
 @dataclass(frozen=True)
-class Belief:
+class SavedBelief:
     """The observer's saved state, and the records that it is relative to."""
 
     calibration: str | None
@@ -431,7 +431,7 @@ class Journal:
 
     # ---- proposals
 
-    def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: Finding) -> int:
+    def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: DriftFinding) -> int:
         """Append a pending proposal and return its id; earlier pending ones of the joint are superseded."""
         number, self._next_proposal = self._next_proposal, self._next_proposal + 1
         statement = "INSERT INTO proposals(id, time, joint, record, base, finding) VALUES (?, ?, ?, ?, ?, ?)"
@@ -456,7 +456,6 @@ class Journal:
         return list(self._rows.values())[:limit]
 
     def pending(self) -> int:
-        """Number of pending proposals."""
         return sum(row.state == "pending" for row in self.proposals())
 
     def proposal(self, number: int) -> ProposalRow | None:
@@ -476,11 +475,11 @@ class Journal:
             waits.statements = [each for each in waits.statements if each[0] is not _BELIEF]
         self._write(_BELIEF, _iso(time), *self._belief)
 
-    def belief(self) -> Belief | None:
+    def belief(self) -> SavedBelief | None:
         """The observer's saved state; None if there is none or it cannot be read."""
         row = self._belief
         try:
-            return None if row is None else Belief(row[0], row[1], json.loads(row[2]))
+            return None if row is None else SavedBelief(row[0], row[1], json.loads(row[2]))
         except (ValueError, TypeError):
             return None
 

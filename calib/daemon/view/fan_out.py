@@ -32,23 +32,18 @@ class Client:
         return self._items.popleft()
 
     def close(self) -> None:
-        """Unsubscribe."""
         self._hub.clients.discard(self)
 
 
 class Hub:
-    """All clients of the stream."""
-
     def __init__(self) -> None:
         self.clients: set[Client] = set()
 
     def subscribe(self) -> Client:
-        """A new client."""
         client = Client(self)
         self.clients.add(client)
         return client
 
     def publish(self, item: Item) -> None:
-        """Give an item to every client."""
         for client in self.clients:
             client.put(item)

@@ -45,7 +45,6 @@ class DaemonCollector(Collector):
         self._view, self._streams = view, streams
 
     def collect(self) -> Iterable[Metric]:
-        """All families."""
         status = self._view.status()
         yield from _of_status(status)
         yield from _of_joints(JOINT, self._view.joints())

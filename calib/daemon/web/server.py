@@ -120,7 +120,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-class _Server(uvicorn.Server):
+class _ApiServer(uvicorn.Server):
     """uvicorn's server without its signal handlers (the service has its own), and with a queue longer than one go."""
 
     async def startup(self, sockets: list[sockets.socket] | None = None) -> None:
@@ -150,7 +150,7 @@ async def _run(view: DaemonView, listening: list[sockets.socket], access: Access
         limit_concurrency=MOST_CONNECTIONS,
         timeout_graceful_shutdown=CLOSING_SECONDS,
     )
-    server = _Server(config)
+    server = _ApiServer(config)
     running = asyncio.create_task(server.serve(sockets=listening))
     try:
         await asyncio.shield(running)

@@ -24,7 +24,7 @@ with one, since work is not done at the calibration's poses."""
 
 
 @dataclass(frozen=True)
-class Level:
+class DiscrepancyLevel:
     """Standard deviations of each joint's discrepancy [N·m]."""
 
     smooth: Array
@@ -39,19 +39,19 @@ class Level:
     """Rows that it was learned from."""
 
     @classmethod
-    def none(cls, n: int) -> "Level":
+    def none(cls, n: int) -> "DiscrepancyLevel":
         """A model without error."""
         zero = np.zeros(n)
         return cls(np.zeros((len(PARTS), n)), zero, zero, zero + SPREAD_UNKNOWN)
 
     @classmethod
-    def expected(cls, before: Array, spread: Array | None = None) -> "Level":
+    def expected(cls, before: Array, spread: Array | None = None) -> "DiscrepancyLevel":
         """Before the first row; spread (n,) if a calibration has measured it."""
         parts = np.sqrt(SHARES)[:, None] * before
         return cls(parts[:-1], parts[-1], before, np.full_like(before, SPREAD_UNKNOWN) if spread is None else spread)
 
     @classmethod
-    def of_record(cls, calibration: CalibrationRecord, otherwise: Array) -> "Level":
+    def of_record(cls, calibration: CalibrationRecord, otherwise: Array) -> "DiscrepancyLevel":
         """As the record has it, `otherwise` (n,) [N·m] for joints of which it says nothing."""
         level, std = calibration.discrepancy("level"), calibration.discrepancy("level_std")
         said = level > 0
@@ -69,7 +69,7 @@ class Level:
         """Whether rows or a calibration have told it."""
         return self.rows > 0 or bool((self.spread < SPREAD_UNKNOWN).all())
 
-    def fitted(self, unit: Array, residual: Array, noise: Array, known: Array, free: Array) -> "Level":
+    def fitted(self, unit: Array, residual: Array, noise: Array, known: Array, free: Array) -> "DiscrepancyLevel":
         """The level of greatest restricted likelihood, given what was expected; by Fisher scoring.
 
         unit (parts, n, N, N): covariance of the discrepancy's parts at level 1. residual (n, N) [N·m]: readings less

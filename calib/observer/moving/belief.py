@@ -1,4 +1,4 @@
-"""What is believed of drives whose torque is a motor current: friction, gravity and their doubts.
+"""Belief about drives whose torque is a motor current: friction, gravity and their doubts.
 
 The unknowns are those of the creep fit (`calib.creep.parameters`), against readings that are corrected by the record in
 force: gains are 1 and offsets 0 while nothing has changed. Records say how sure each value is, though not how gains and
@@ -15,22 +15,30 @@ from calib.creep.model import CreepModel
 from calib.creep.parameters import LAST_ZERO, Doubt, family_slices
 from calib.creep.rows import CreepRows
 from calib.observer.moving.passages import Passage
-from calib.observer.moving.thresholds import (
-    ALIKE,
-    FITTED,
-    LEARNING_ROUNDS,
-    NEXT,
-    SIGMA_SHARE,
-    TOLD_WARMTH,
-    UNTOLD_WARMTH,
-    USUAL_ROWS,
-    ZERO_STD,
-)
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor
 
+ZERO_STD = 2e-3
+"""Least standard deviation of a position zero [rad]: links give way."""
+SIGMA_SHARE = 2e-3
+"""Standard deviation of a row about the model where the record has none, as a share of rated torque."""
+USUAL_ROWS = 5
+"""Rows that the standard deviation assumed at first counts for; then it is measured."""
+ALIKE = 2.0
+"""The variance of rows is multiplied by this to begin with: what the model lacks is alike in neighbouring rows. Then it
+is measured."""
+FITTED = 5
+"""Rows of a joint that its own parameters take up."""
+NEXT = 0.2
+"""Rows of a joint are neighbours if it moved less between them [rad]."""
+LEARNING_ROUNDS = 3
+"""Linearisations of learning, each with the scatter found by the one before."""
+UNTOLD_WARMTH = 0.01
+"""Doubt of a gain where no temperature is known: a drive that warms by 10 K loses a hundredth."""
+TOLD_WARMTH = 5e-4
+"""Doubt of a gain where it is: drives tell whole kelvins."""
 USUAL = Doubt()
 
 

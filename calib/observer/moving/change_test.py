@@ -13,15 +13,24 @@ import numpy as np
 from calib.creep.parameters import family_slices
 from calib.observer.cause_test import Verdict, smallest_noticed, solved, span
 from calib.observer.config import ObserverConfig
-from calib.observer.moving.belief import MotorBelief
+from calib.observer.moving.belief import USUAL_ROWS, MotorBelief
 from calib.observer.moving.passages import Passage
-from calib.observer.moving.thresholds import FEWEST, INEXACT, MISFIT, PAYLOAD_ROUNDS, USUAL_ROWS
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
 
+FEWEST = 6
+"""Rows of a joint from which a change of its drive can be told."""
+MISFIT = 8.0
+"""χ² above its degrees of freedom, in standard deviations, from which nothing explains the rows: 120 rows then scatter
+by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is far beyond."""
+INEXACT = 0.03
+"""Most that a change's own shape may be off, as a share."""
+PAYLOAD_ROUNDS = 2
+"""Further linearisations of a payload."""
+
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class ChangeHypothesis:
     """A change: its columns (K, p) in the readings, per unit of each parameter."""
 
     cause: str
@@ -31,13 +40,13 @@ class Candidate:
 
     @property
     def name(self) -> tuple[str, int | None]:
-        """What it is."""
+        """Kind of change."""
         return self.cause, self.joint
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
-    candidate: Candidate
+class _ChangeFit:
+    candidate: ChangeHypothesis
     bic: float
     chi2: float
     values: Array
@@ -127,12 +136,12 @@ class ChangeTest:
         white: Array = np.linalg.solve(self._root, columns)
         return white
 
-    def _fit(self, candidate: Candidate) -> _Fit:
+    def _fit(self, candidate: ChangeHypothesis) -> _ChangeFit:
         if candidate.cause == "payload":
             return self._fit_payload(candidate)
         return self._least_squares(candidate, self._white, 0.0)
 
-    def _fit_payload(self, candidate: Candidate) -> _Fit:
+    def _fit_payload(self, candidate: ChangeHypothesis) -> _ChangeFit:
         """Linearised again at the load found: friction goes with torque, whose sign a load may turn."""
         arm, values = self._belief.arm, np.zeros(4)
         per_unit = np.column_stack(payload_columns(arm))
@@ -145,11 +154,11 @@ class ChangeTest:
             fit = self._least_squares(replace(candidate, columns=white[:, 1:]), white[:, 0], values)
         return fit
 
-    def _least_squares(self, candidate: Candidate, target: Array, around: Array | float) -> _Fit:
+    def _least_squares(self, candidate: ChangeHypothesis, target: Array, around: Array | float) -> _ChangeFit:
         """The candidate's parameters from whitened residuals that it has at values `around`."""
         found = solved(candidate.columns, target)
         bic = found.chi2 + found.shown * float(np.log(len(target)))
-        return _Fit(candidate, bic, found.chi2, around + found.values, found.covariance)
+        return _ChangeFit(candidate, bic, found.chi2, around + found.values, found.covariance)
 
     def _misfit(self, chi2: float, parameters: int) -> float:
         """χ² above its degrees of freedom, in standard deviations, those of the rows' own scatter included."""
@@ -157,7 +166,7 @@ class ChangeTest:
         return round(float((chi2 - free) / np.sqrt(2 * free * (1 + free / known))), 2)
 
 
-def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[Candidate]:
+def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[ChangeHypothesis]:
     n, at = belief.arm.n, family_slices(belief.arm.n)
     found = []
     coulomb, load = belief.mean[at["coulomb"]], belief.mean[at["load"]]
@@ -170,10 +179,10 @@ def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[Cand
         friction = friction + jacobian[:, uneven[j]] @ belief.mean[uneven[j]]
         for cause, each in (("gain", column["gain"]), ("offset", column["offset"]), ("friction", friction)):
             if np.abs(each).max() > 1e-9:
-                found.append(Candidate(cause, j, each[:, None]))
+                found.append(ChangeHypothesis(cause, j, each[:, None]))
     payload = jacobian[:, at["beta"]] @ np.column_stack(payload_columns(belief.arm))
     if np.abs(payload).max() > 1e-9:
-        found.append(Candidate("payload", None, payload))
+        found.append(ChangeHypothesis("payload", None, payload))
     return found
 
 

@@ -9,20 +9,29 @@ from typing import Any
 
 import numpy as np
 
+from calib.observer.cause_test import DetectionLimits
 from calib.observer.config import ObserverConfig
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.moving.belief import MotorBelief
 from calib.observer.moving.change_test import ChangeTest
 from calib.observer.moving.passages import Passage, PassageDetector
-from calib.observer.moving.thresholds import AGREEING, BLOCK, LONGEST, REFERENCE, UNEXPLAINED
 from calib.observer.saved_values import UNREADABLE
-from calib.observer.tracking.limits import Limits
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, as_array
 
+BLOCK = 60
+"""Rows of one test: of seven joints that creep in turn, 40 s."""
+REFERENCE = 360
+"""Rows without a change that the belief is learned from: four minutes of creeping."""
+LONGEST = 120
+"""Rows of a test at most: the latest."""
+AGREEING = 2
+"""Tests in a row that must say the same until it is an event."""
+UNEXPLAINED = 3
+"""The same of tests that nothing explains: the first ones after a change have rows of before it."""
 SCHEMA = "moving/1"
 
 
@@ -68,12 +77,10 @@ class MovingObserver:
 
     @property
     def rows(self) -> int:
-        """Rows used."""
         return int(self._count.sum())
 
     @property
     def accepted(self) -> Array:
-        """Rows of each joint (n,)."""
         return self._count.copy()
 
     @property
@@ -82,7 +89,6 @@ class MovingObserver:
         return False
 
     def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Event]:
-        """Take one sample: readings (n,) in SI units, NaN if missing; returns events, usually none."""
         events: list[Event] = []
         for passage in self._detector.handle(t, self._angle(position), torque, temperature):
             events += self.handle_row(passage)
@@ -131,20 +137,19 @@ class MovingObserver:
             std[:, j] = np.sqrt(np.diag(covariance))
         return Estimate(gain, std[0], offset, std[1], self._count.copy())
 
-    def limits(self) -> Limits:
+    def limits(self) -> DetectionLimits:
         """The changes of each joint that would be noticed now, by motion like the latest; NaN where it tells none."""
         test, n = self._test(), self.arm.n
         if test is None:
-            return Limits(np.full(n, np.nan), np.full(n, np.nan), LONGEST + BLOCK)
+            return DetectionLimits(np.full(n, np.nan), np.full(n, np.nan), LONGEST + BLOCK)
         gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) for cause in ("gain", "offset"))
-        return Limits(gain, offset, LONGEST + BLOCK)
+        return DetectionLimits(gain, offset, LONGEST + BLOCK)
 
     def model_torque(self, position: Array) -> Array:
-        """Gravity torque [N·m] that the observer believes at position readings [rad]; (n,), or (K, n) of K poses."""
         torque = self._belief.gravity_torque(np.atleast_2d(self._angle(position)))
         return torque.reshape(position.shape)
 
-    def install(self, finding: Finding) -> None:
+    def install(self, finding: DriftFinding) -> None:
         """Another calibration is in force: rows before it no longer count."""
         self._block, self._recent, self._blocks = [], [], 0
 
@@ -155,7 +160,6 @@ class MovingObserver:
         return {"schema": SCHEMA, "count": self._count.tolist(), "reported": self._reported_json(), **saved}
 
     def restore(self, values: dict[str, Any]) -> bool:
-        """Continue from saved values of the same arm and records; False, and nothing changed, if they do not fit."""
         n = self.arm.n
         try:
             if values["schema"] != SCHEMA:

@@ -9,18 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.moving.thresholds import (
-    GAP,
-    LEAST_SAMPLES,
-    LEAST_SECONDS,
-    MOST_SECONDS,
-    SLOWEST,
-    STEADY,
-    TURNED,
-    WIDTH,
-)
 from calib.observer.saved_values import known
 from gcomp.arrays import Array, as_array
+
+WIDTH = 0.1
+"""A stretch is complete when some joint has moved this far [rad]: two or three periods of a motor's cogging."""
+LEAST_SECONDS, MOST_SECONDS = 0.2, 3.0
+"""Shortest and longest stretch [s]: a slower joint creeps below the speeds at which its friction is known."""
+LEAST_SAMPLES = 8
+SLOWEST = 0.03
+"""Below this speed friction depends on the time at rest [rad/s]: such a joint gives no row."""
+STEADY = 0.15
+"""Largest acceleration in a stretch [rad/s²]: 1 kg·m² then takes 0.15 N·m."""
+TURNED = 0.03
+"""After a reversal friction has turned round once the joint has moved so far [rad]."""
+GAP = 0.05
+"""A stretch with samples missing for longer starts again [s]."""
 
 
 @dataclass(frozen=True, eq=False)

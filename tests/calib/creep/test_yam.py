@@ -8,9 +8,8 @@ import yaml
 
 from armlink.arm_file import ArmFile, load_arm
 from calib.arm.kinematics import gcomp_arm
-from calib.arm.unseen import VERTICAL, vertical
 from calib.commissioning.model_checks import model_findings
-from calib.creep.choice import sweep_motion
+from calib.creep.choice import VERTICAL, sweep_motion, vertical
 from calib.creep.plan import plan_creep
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "yam.yaml"

@@ -14,15 +14,15 @@ from armlink.errors import BusFault, Refused
 from armlink.torque_calibration import TorqueCalibration
 from calib.install.journaled_write import recover
 from calib.observer.check_at_rests import Checked
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.observer.recalibrator import Recalibrator, recalibrated
 from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.records.store import RecordStore
 
 
-def finding(gain: float = 1.03, offset: float = 0.3, at: int = 1, cause: str = "drift") -> Finding:
-    return Finding(at, cause, gain, offset, np.array([[4e-8, -1e-8], [-1e-8, 1e-5]]), 40, 0.999)
+def finding(gain: float = 1.03, offset: float = 0.3, at: int = 1, cause: str = "drift") -> DriftFinding:
+    return DriftFinding(at, cause, gain, offset, np.array([[4e-8, -1e-8], [-1e-8, 1e-5]]), 40, 0.999)
 
 
 def still_gravity() -> GravityRecord:
@@ -199,7 +199,7 @@ def test_a_second_drift_is_relative_to_the_first_recalibration(store: RecordStor
     ("change", "what"),
     [(finding(1.2, 0.0), r"elbow: gain 1\.3200 is \+20\.0%"), (finding(1.0, 6.0), r"elbow: offset 6\.200 N·m")],
 )
-def test_an_implausible_change_is_refused(store: RecordStore, change: Finding, what: str) -> None:
+def test_an_implausible_change_is_refused(store: RecordStore, change: DriftFinding, what: str) -> None:
     controllers = Controllers()
     with pytest.raises(Refused, match=what):
         Recalibrator(ARM, controllers, store, "apply").handle(change)

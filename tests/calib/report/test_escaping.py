@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import calib.report.page as report_page
-from calib.report.page import ReportTable, Section, bullets, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.page import ReportSection, ReportTable, bullets, html_of, paragraph, paragraphs, render, verdict_line
 
 HOSTILE = (
     "<x-evil>",
@@ -58,7 +58,7 @@ def page_with(name: str, folder: Path) -> Tags:
     html += html_of("<b>{}</b>", name)
     table = ReportTable((name, "value"), [[name, "1"], [html_of("<i>{}</i>", name), name]], name)
     path = folder / "page.html"
-    render(path, name, [Section(name, html, [figure], [table]), Section("other", name)], name)
+    render(path, name, [ReportSection(name, html, [figure], [table]), ReportSection("other", name)], name)
     found = Tags()
     found.feed(path.read_text(encoding="utf-8"))
     return found

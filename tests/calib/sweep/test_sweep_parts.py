@@ -18,10 +18,9 @@ from armlink.link.integral import slowest_time
 from armlink.link.types import Sample
 from calib.arm.sweep_section import SweepSection
 from calib.commands.screen import unsettled_said
-from calib.motion.mover import Mover
+from calib.motion.mover import STOP_TOLERANCE, Mover
 from calib.motion.settle_rule import SettleRule
 from calib.motion.static_reading import StaticReading
-from calib.motion.thresholds import STOP_TOLERANCE
 from calib.motion.trajectory import trajectory
 from calib.plan.sweep_plan import plan_sweep
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, encoded, load_data

@@ -7,11 +7,10 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from armlink.arm_file import load_arm
+from calib.daemon.service_view import drawn_arm
 from calib.daemon.view import api_models
-from calib.daemon.view.drawn_arm import drawn_arm
 from calib.daemon.view.fan_out import Client, Hub
-from calib.daemon.view.view import NoSuch, NotPossible
-from calib.daemon.view.window import Window
+from calib.daemon.view.view import NoSuch, NotPossible, Window
 
 NOW = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
 NAMES = tuple(f"joint_{i}" for i in range(1, 8))

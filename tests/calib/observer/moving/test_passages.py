@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from calib.observer.moving.passages import Passage, PassageDetector
-from calib.observer.moving.thresholds import WIDTH
+from calib.observer.moving.passages import WIDTH, Passage, PassageDetector
 
 PERIOD = 0.02
 

@@ -1,13 +1,36 @@
-"""The tree of a compiled MuJoCo model: what carries a body, which joints are coupled, which belong to a hand."""
+"""XML of model files, read as leniently as ROS and MuJoCo do, and the tree of bodies and joints of a compiled one."""
 
 import re
+import xml.etree.ElementTree as ET
 from typing import TYPE_CHECKING
+from xml.parsers import expat
 
 if TYPE_CHECKING:
     import mujoco
 
 HAND = re.compile(r"grip|finger|hand|jaw|thumb|claw", re.IGNORECASE)
 """Names of joints that grasp rather than move the arm."""
+
+
+class NotXml(ValueError):
+    """Not well-formed XML."""
+
+
+def parse_xml(source: bytes) -> ET.Element:
+    """The root element of a model file; raises NotXml, in one line.
+
+    Names with a colon stay as they are: published URDF files have tags such as `drake:acceleration` whose prefix they
+    do not declare. Readers without namespaces, as those of ROS and MuJoCo, take them; xml.etree by itself refuses.
+    """
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    try:
+        parser.Parse(source, True)
+    except expat.ExpatError as error:
+        raise NotXml(str(error)) from None
+    return builder.close()
 
 
 def upwards(model: "mujoco.MjModel", body: int) -> list[int]:
