@@ -34,8 +34,9 @@ def hold_afloat(
     from contextlib import suppress
 
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, command_line, results
     from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
     from calib.commands.screen import warn_late
@@ -44,8 +45,10 @@ def hold_afloat(
     arm_file = load_arm(arm)
     beta, calibration, source = _model(arm_file, record, store)
     screen = PlainConsole()
-    with open_arm(arm_file, bus) as link:
+    resume = command_line("float", arm, bus=bus, record=record, store=store)
+    with early_end(arm_file, resume) as work, open_arm(arm_file, bus) as link:
         link.start()
+        work.enabled = True
         link.enable()
         screen.print(f"{arm_file.name}: floating by {source}; Ctrl-C ends it")
         try:
@@ -54,7 +57,7 @@ def hold_afloat(
             with suppress(ArmlinkError):
                 lateness = link.stats.lateness
                 warn_late(arm_file, lateness)
-    screen.print(f"floated {result.seconds:.1f} s")
+    results(json_file).print(f"floated {result.seconds:.1f} s")
     write_json(
         json_file,
         {

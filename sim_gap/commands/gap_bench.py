@@ -41,7 +41,7 @@ def bench(
     from rich.progress import Progress, TaskID
 
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from sim_gap.blind.bench import diagnose_files, run_bench
     from sim_gap.blind.judging.tables import show, show_positions, show_real
@@ -75,5 +75,5 @@ def bench(
                 positions=positions,
             )
     shown = show_real if real is not None else show_positions if positions else show
-    shown(result, console)
+    shown(result, results(json))
     write_json(json, result)

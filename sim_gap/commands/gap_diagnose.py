@@ -79,12 +79,13 @@ def diagnose(
     Example: armlink gap diagnose --sim arm.xml --train slow.csv --train fast.csv --heldout other.csv --json -
     """
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
     from sim_gap.commands.gap_tables import show
+    from sim_gap.report.effect_text import sentence
 
     console = PlainConsole()
     paths = [*train, *(heldout or [])]
@@ -121,22 +122,38 @@ def diagnose(
     for name, recording in {**fitted, **judged}.items():
         if recording.warning:
             console.print(f"{name}: {recording.warning}", style="yellow")
+    out = results(json)
     for finding in answer.checks:
-        console.print(finding.sentence(), style="yellow")
-    show(answer, console)
+        out.print(finding.sentence(), style="yellow")
+    show(answer, out)
     if report is not None:
         from sim_gap.report.page import write_report
 
         write_report(answer, report, subtitle=f"{sim} against {', '.join(str(path) for path in paths)}")
-        console.print(f"report: {report}")
+        out.print(f"report: {report}")
     if out_model is not None:
-        _write_model(answer, out_model, console)
+        _write_model(answer, out_model, out)
     if samples:
-        _write_samples(answer, samples, out_samples, console)
+        _write_samples(answer, samples, out_samples, out)
     if out_actuators is not None:
         _write_actuators(answer, out_actuators, physics_step)
-        console.print(f"actuator entries for Isaac Lab and mjlab: {out_actuators}")
+        out.print(f"actuator entries for Isaac Lab and mjlab: {out_actuators}")
     write_json(json, answer.to_json())
+    out.print(sentence(answer), style="bold")
+    _suggest(answer, sim, json, out_model)
+
+
+def _suggest(answer: "Diagnosis", sim: str, json: Path | None, out_model: Path | None) -> None:
+    """The next command after an ambiguous or explained gap."""
+    from armlink.arm_file import bundled_arms
+    from armlink.commands.plain_console import PlainConsole, command_line, suggest
+
+    if answer.verdict == "ambiguous":
+        arm = sim if sim in bundled_arms() or sim.endswith((".yaml", ".yml")) else "ARM.yaml"
+        written = "gap.json" if json is None or str(json) == "-" else json
+        suggest(command_line("gap", "plan", arm, answer=written, out="motion.csv"))
+    elif answer.verdict == "explained" and out_model is None:
+        PlainConsole().print("next: the same command with --out-model corrected.xml writes the corrected model")
 
 
 def _progress(console: "Console", status: "Status", stage: str) -> None:

@@ -28,7 +28,7 @@ def diagnose_fleet(
     from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results
     from sim_gap.fleet.cluster import cluster, open_to_all
     from sim_gap.fleet.fleet import Answers, diagnose_fleet, find_cases
     from sim_gap.fleet.fleet import table as table_of
@@ -52,9 +52,12 @@ def diagnose_fleet(
                 bars.advance(task)
     found = {case.name: answers.found[case.name] for case in cases}
     rows = table_of(found)
-    _show(rows, console)
+    out_console = results(json_file)
+    _show(rows, out_console)
     trends, outliers = rows_of(fleet_trends(found)), rows_of(fleet_outliers(found))
-    show_changes(trends, outliers, console)
+    show_changes(trends, outliers, out_console)
+    failed = sum("error" in answer for answer in found.values())
+    out_console.print(f"{len(found) - failed} of {len(found)} cases are diagnosed: {answers.path}")
     if table is not None:
         _write_table(rows, table)
     write_json(json_file, {"schema": "armlink.gap-fleet/1", "answers": found, "trends": trends, "outliers": outliers})

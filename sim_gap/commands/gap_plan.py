@@ -1,6 +1,5 @@
 """Plans the motion that would separate the candidate causes of a diagnosis."""
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -28,20 +27,20 @@ def plan(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import command_line, results, suggest
     from sim_gap.experiment.excitation import joints_in_doubt, plan_motion
     from sim_gap.experiment.motion_file import save_motion
 
     joints, sentences = joints_in_doubt(answer) if answer else ([], [])
     motion = plan_motion(load_arm(arm), [*joints, *(joint or [])], poses, seed)
     save_motion(motion, out)
-    console = PlainConsole()
+    console = results(json_file)
     for sentence in sentences:
         console.print(f"requested by the diagnosis: {sentence}")
     for piece in motion.pieces:
         console.print(piece)
-    run = shlex.join(["armlink", "gap", "collect", arm, "--motion", str(out), "--out", str(out.with_suffix(".mcap"))])
-    console.print(f"{out}: {motion.seconds:.0f} s; next: {run}")
+    console.print(f"{out}: {motion.seconds:.0f} s of motion")
+    suggest(command_line("gap", "collect", arm, motion=out, out=out.with_suffix(".mcap")))
     write_json(
         json_file,
         {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences},

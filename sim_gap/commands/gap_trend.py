@@ -26,14 +26,14 @@ def trend(
     Example: armlink gap trend recordings/ --sim arm.yaml
     """
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import results
     from sim_gap.commands.gap_fleet import show_changes
     from sim_gap.fleet.fleet import Answers, diagnose_case, find_cases
     from sim_gap.fleet.trends import date_of, fleet_trends, rows
     from sim_gap.model.load import load_compiled
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
-    console = PlainConsole()
+    console = results(json_file)
     answers = Answers(out or folder / "answers.jsonl")
     newest = ""
     for case in sorted(find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
@@ -44,6 +44,8 @@ def trend(
         console.print(f"{case.name}: {answer.get('verdict') or answer['error']}")
     trends = rows(fleet_trends(answers.found))
     show_changes(trends, [], console)
+    changes = f"{len(trends)} parameters change" if trends else "no parameter changes"
+    console.print(f"{len(answers.found)} recordings: {changes}")
     newest_answer = answers.found[newest]
     shown = {"case": newest.partition("/")[2], "answer": newest_answer}
     write_json(json_file, {"schema": "armlink.gap-trend/1", "newest": shown, "trends": trends})

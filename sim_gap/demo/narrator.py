@@ -21,9 +21,9 @@ Report = Callable[[float, float, float | None, str], None]
 class Narrator:
     """Headlines and progress on a console."""
 
-    def __init__(self, console: Console) -> None:
-        """Speak on `console`."""
-        self._console = console
+    def __init__(self, console: Console, results: Console) -> None:
+        """Progress on `console`, tables and findings on `results`."""
+        self._console, self._results = console, results
         self._began = time.monotonic()
 
     @property
@@ -33,12 +33,18 @@ class Narrator:
 
     def say(self, text: str, style: str = "") -> None:
         """One line, with the time since the start."""
-        line = Text.assemble((f"{self.elapsed:5.0f} s", "dim"), "  ", (printable_text(text), style))
-        self._console.print(line, soft_wrap=True)
+        self._console.print(self._stamped(text, style), soft_wrap=True)
+
+    def find(self, text: str) -> None:
+        """The same among the results."""
+        self._results.print(self._stamped(text, ""), soft_wrap=True)
+
+    def _stamped(self, text: str, style: str) -> Text:
+        return Text.assemble((f"{self.elapsed:5.0f} s", "dim"), "  ", (printable_text(text), style))
 
     def show(self, table: object) -> None:
         """A rich table."""
-        self._console.print(table)
+        self._results.print(table)
 
     @contextmanager
     def stage(self, headline: str) -> Iterator[Report]:

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
 from armlink.commands.output import write_json
+from armlink.commands.plain_console import results
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.new_arm import new_arm
@@ -43,7 +44,7 @@ def run_demo(
     arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console, realism: float | None = None
 ) -> DemoResult | CreepDemo:
     """Run it, write `report.html`, `summary.json` and the data into `out`; raises BadInput, Refused, BusFault."""
-    teller = Narrator(console)
+    teller = Narrator(console, results(json_path))
     if Path(arm_name).suffix.lower() in MODEL_SUFFIXES:
         arm_name = str(_from_model(Path(arm_name), out, teller))
     arm = load_arm(arm_name)
@@ -67,7 +68,7 @@ def run_demo(
     content = _told(result, out / "report.html", teller)
     write_json(out / "summary.json", content)
     write_json(json_path, content)
-    teller.say(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}")
+    teller.find(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}")
     return result
 
 
@@ -117,14 +118,14 @@ def _work(
     diagnosis = other_core.submit(diagnose_recordings, arm.path, recordings)
     with teller.stage("ordinary work: a torque sensor will drift") as report:
         drift = run_drift(bench, store, gravity_record, check, seed, report)
-    teller.say(drift_line(link.names, drift))
+    teller.find(drift_line(link.names, drift))
     with teller.stage("diagnosing the gap between the recording and the nominal simulation"):
         try:
             answer = diagnosis.result()
         except BrokenProcessPool:
             teller.say("the process that did it was killed: doing it again in this one")
             answer = diagnose_recordings(arm.path, recordings)
-    teller.say(gap_line(answer))
+    teller.find(gap_line(answer))
     stats = link.stats
     link.disable()
     run = DemoRun(bench, seed, gravity_check, check, answer, stats, teller.elapsed, bench.simulated.time)

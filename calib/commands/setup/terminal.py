@@ -57,7 +57,8 @@ class Terminal:
     def stops(self, joint: str) -> tuple[float, float] | None:
         """Stops [rad] of a joint without limits; None where it has none."""
         text = ask(
-            f"{joint} has no limits in the model. Its lower and upper stop [rad], as -2.9 2.9; Enter: it has none",
+            f"{joint} has no limits in the model. Give its lower and upper stop [rad], such as -2.9 2.9,"
+            " or Enter for none",
             default="",
             show_default=False,
         )
