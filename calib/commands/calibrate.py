@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store, Sweeps, SweepsArm
+from calib.commands.options import APPLY, Bus, Check, Flash, JsonFile, Replaced, Store, Sweeps, SweepsArm
 
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
@@ -24,7 +24,10 @@ def calibrate(
     replaced: Replaced = None,
     accept: Annotated[
         list[str] | None,
-        typer.Option(help="With --apply: a joint to write although the sensor model does not hold there."),
+        typer.Option(
+            help="Joint to write although the sensor model does not hold there; may be repeated.",
+            rich_help_panel=APPLY,
+        ),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Also write a report: one self-contained HTML file.")] = None,
     store: Store = None,

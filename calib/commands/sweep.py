@@ -27,19 +27,36 @@ def sweep(
     plan: Annotated[
         bool, typer.Option("--plan", help="Print the plan from the arm file alone; nothing moves.")
     ] = False,
-    picture: Annotated[Path | None, typer.Option(help="With --plan: draw the poses into this HTML file.")] = None,
-    hold: Annotated[str | None, typer.Option(help="stops or servo: how resting joints are held.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="With --plan: draw the poses into this HTML file.", rich_help_panel="Plan")
+    ] = None,
+    hold: Annotated[
+        str | None, typer.Option(help="stops or servo: how resting joints are held.", rich_help_panel="Plan")
+    ] = None,
     check_stops: Annotated[
-        bool, typer.Option(help="Before the pass without load, push every joint slowly onto both its stops.")
+        bool,
+        typer.Option(
+            help="Before the pass without load, push every joint slowly onto both its stops.", rich_help_panel="Run"
+        ),
     ] = True,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Run the whole plan on the simulated arm of the arm file's sim section.")
+        bool,
+        typer.Option(
+            "--dry-run",
+            help="Run the whole plan on the simulated arm of the arm file's sim section.",
+            rich_help_panel="Run",
+        ),
     ] = False,
     keep_going: Annotated[
-        int, typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle.")
+        int,
+        typer.Option(
+            min=0,
+            help="Enable the joints again by itself up to N times after a stall of the cycle.",
+            rich_help_panel="Run",
+        ),
     ] = 0,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.")] = 0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.", rich_help_panel="Run")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.", rich_help_panel="Plan")] = 0,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write plan or outcome here; - is standard output.")
     ] = None,

@@ -24,10 +24,18 @@ def diagnose(
     columns: Columns = None,
     joints: Joints = "",
     base: Annotated[
-        str | None, typer.Option(help="Body of the model that carries the recorded arm; default: the world.")
+        str | None,
+        typer.Option(
+            help="Body of the model that carries the recorded arm; default: the world.",
+            rich_help_panel="About the arm and the recordings",
+        ),
     ] = None,
     tip: Annotated[
-        str | None, typer.Option(help="Body of the model that the recorded arm ends in, where it has several arms.")
+        str | None,
+        typer.Option(
+            help="Body of the model that the recorded arm ends in, where it has several arms.",
+            rich_help_panel="About the arm and the recordings",
+        ),
     ] = None,
     units: Units = None,
     sign: Sign = None,
@@ -41,6 +49,7 @@ def diagnose(
             metavar="NAME=REC[,REC…]",
             help="Recordings (held-out ones too) with a common body such as a payload; may be repeated. "
             "Default: found by itself.",
+            rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the result here; - is standard output.")] = None,
@@ -51,20 +60,37 @@ def diagnose(
             metavar="REC=VALUE",
             help="Gain of the position controller in a recording (patterns allowed), in any unit; only if there is no "
             "torque channel and recordings differ in it.",
+            rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
     samples: Annotated[
-        int, typer.Option(min=0, help="Number of draws of all parameters to write, for domain randomisation.")
+        int,
+        typer.Option(
+            min=0,
+            help="Number of draws of all parameters to write, for domain randomisation.",
+            rich_help_panel="For training in simulation",
+        ),
     ] = 0,
     out_samples: Annotated[
-        Path | None, typer.Option(help="Where the draws go: .csv, .json or .parquet. Default: samples.csv.")
+        Path | None,
+        typer.Option(
+            help="Where the draws go: .csv, .json or .parquet. Default: samples.csv.",
+            rich_help_panel="For training in simulation",
+        ),
     ] = None,
     out_actuators: Annotated[
         Path | None,
-        typer.Option(help="Write actuator entries for Isaac Lab and mjlab here (.py)."),
+        typer.Option(
+            help="Write actuator entries for Isaac Lab and mjlab here (.py).",
+            rich_help_panel="For training in simulation",
+        ),
     ] = None,
     physics_step: Annotated[
-        float, typer.Option(help="Step of the training simulation in which --out-actuators counts delays [s].")
+        float,
+        typer.Option(
+            help="Step of the training simulation, in which the entries count delays [s].",
+            rich_help_panel="For training in simulation",
+        ),
     ] = 0.005,
     out_model: Annotated[
         Path | None,

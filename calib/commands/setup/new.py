@@ -25,17 +25,26 @@ def new(
         typer.Option(help="Arm file to write; default: the model's name with .yaml, here; arm.yaml without one."),
     ] = None,
     base: Annotated[
-        str | None, typer.Option(help="Body that carries the arm, such as a torso; default: the world.")
+        str | None,
+        typer.Option(help="Body that carries the arm, such as a torso; default: the world.", rich_help_panel="Model"),
     ] = None,
     tip: Annotated[
-        str | None, typer.Option(help="Body that the arm ends in; default: the end of the longest chain.")
+        str | None,
+        typer.Option(help="Body that the arm ends in; default: the end of the longest chain.", rich_help_panel="Model"),
     ] = None,
     stops: Annotated[
-        list[str] | None, typer.Option(help="JOINT:LOWER:UPPER [rad], instead of the model's limits; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            help="JOINT:LOWER:UPPER [rad], instead of the model's limits; may be repeated.", rich_help_panel="Model"
+        ),
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the arm; default: the model's.")] = None,
     bus: Annotated[
-        str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]: find the drives there, and write them down.")
+        str | None,
+        typer.Option(
+            help="INTERFACE:CHANNEL[@BITRATE]: find the drives there, and write them down.",
+            rich_help_panel="Drives on a bus",
+        ),
     ] = None,
     by_hand: Annotated[
         bool | None,
@@ -43,6 +52,7 @@ def new(
             help="With --bus: find each joint's drive, direction and gear by turning the joint by hand, without power;"
             " else the drives are taken in the order of their node ids. Default: ask.",
             show_default=False,
+            rich_help_panel="Drives on a bus",
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
