@@ -30,7 +30,9 @@ def check(
     arm: Arm,
     bus: OtherBus = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the joints are enabled.")] = False,
-    passive: Annotated[bool, typer.Option("--passive", help="Only what needs no power: read, configure.")] = False,
+    passive: Annotated[
+        bool, typer.Option("--passive", help="Only the checks that need no power: they read and configure.")
+    ] = False,
     host: Annotated[
         bool, typer.Option("--host", help="Measure how well this machine keeps the cycle instead; needs no bus.")
     ] = False,

@@ -169,7 +169,7 @@ def _cycle(cycle: dict[str, Any] | None) -> list[str]:
         f"{cycle['period_ms']:.3f} ms, jitter {cycle['jitter_ms']:.3f} ms, longest {cycle['longest_period_ms']:.3f} ms",
         f"SYNC to the last reading: p50 {cycle['latency_p50_ms']:.3f}, p99 {cycle['latency_p99_ms']:.3f}, "
         f"p99.9 {cycle['latency_p999_ms']:.3f}, longest {cycle['latency_max_ms']:.3f} ms",
-        f"bus {cycle['load']:.1%} busy with stuff bits: {cycle['bus_ms_per_cycle']:.3f} ms of each cycle is the wire's",
+        f"bus {cycle['load']:.1%} busy, stuff bits included: {cycle['bus_ms_per_cycle']:.3f} ms of each cycle",
     ]
     most = max((count for _, count in cycle["histogram"]), default=1)
     return lines + [

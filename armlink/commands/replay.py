@@ -19,13 +19,15 @@ def replay(
     bus: Annotated[
         str | None, typer.Option(help="Play onto this bus instead: virtual:…, udp_multicast:… or socketcan:vcan….")
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.0, help="Times as fast as it was; 0: as fast as it goes.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="Speed relative to the recording; 0: as fast as possible.")
+    ] = 1.0,
     json: Annotated[Path | None, typer.Option(help="Write what was replayed here; - is standard output.")] = None,
 ) -> int:
     """Decode a raw log or a recording again; with neither TARGET nor --bus, show it as a live table at --speed.
 
     A raw log goes through the same decoding as live frames: its samples are those that armlink record --frames wrote,
-    bit for bit. A log or recording that was cut is read up to the cut, which is said. On a bus go only the joints' own
+    bit for bit. One that was cut off is read up to there, with a warning. On a bus go only the joints' own
     frames and SYNC, never a command, an SDO or NMT, and only on a virtual bus: for a listener such as
     armlink daemon --listen-only or armlink monitor. Nothing is ever replayed as torque or motion.
 

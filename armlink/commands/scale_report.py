@@ -39,7 +39,7 @@ def check_scales(
         raise Refused(f"check --scales: {wrong[0][0]}: {wrong[0][1]}")
     if not any(each.evidence for each in found):
         raise Refused("check --scales: no joint moved enough to judge a scale: move every joint by a third of a radian")
-    out.print("no scale is wrong where one was judged")
+    out.print("every scale that could be judged is right")
     return 0
 
 

@@ -151,7 +151,7 @@ def _show(fit: "SensorFit", console: "PlainConsole") -> None:
     print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns, console)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
     doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
-    lines.append(f"sensors and gravity model still disagree at new poses by [N·m]: {', '.join(doubts)}")
+    lines.append(f"at new poses, sensors and gravity model still disagree by [N·m]: {', '.join(doubts)}")
     lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
     if fit.gain_ratio is not None:
         ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))

@@ -44,7 +44,9 @@ def daemon(
         Path | None,
         typer.Option(help="File with the token that TCP clients must send.", rich_help_panel="Page and API"),
     ] = None,
-    policy: Annotated[Policies | None, typer.Option(help="Instead of the arm file's daemon.policy.")] = None,
+    policy: Annotated[
+        Policies | None, typer.Option(help="What to do about a drift, instead of the arm file's daemon.policy.")
+    ] = None,
     state: Annotated[
         Path | None, typer.Option(help="Directory of journal and recordings; default the user's state directory.")
     ] = None,

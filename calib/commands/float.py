@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 def hold_afloat(
     arm: Arm,
     bus: OtherBus = None,
-    seconds: Annotated[float, typer.Option(min=0.0, help="End after so long; 0 is until Ctrl-C [s].")] = 0.0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Duration [s]; 0: until Ctrl-C.")] = 0.0,
     record: Annotated[
         str | None, typer.Option(help="Id of a gravity record; default: the current one, else the model's inertials.")
     ] = None,
     store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write how it went here; - is standard output.")
+        Path | None, typer.Option("--json", help="Write a summary here; - is standard output.")
     ] = None,
 ) -> None:
     """Feed the gravity torque forward until Ctrl-C; then every joint holds where it is.

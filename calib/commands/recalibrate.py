@@ -146,6 +146,6 @@ def _show(fit: "FieldFit", console: "PlainConsole") -> None:
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
     lines.append(
         f"a factor common to all gains is known to ± {1.96 * fit.common_scale_std:.2%} only (within the intervals): in"
-        " these readings it looks the same as the scale of the gravity record"
+        " these readings it cannot be separated from the scale of the gravity record"
     )
     print_lines(lines, console=console)

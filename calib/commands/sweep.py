@@ -51,7 +51,7 @@ def sweep(
         int,
         typer.Option(
             min=0,
-            help="Enable the joints again by itself up to N times after a stall of the cycle.",
+            help="Number of stalls of the cycle after which the joints are enabled again without asking.",
             rich_help_panel="Run",
         ),
     ] = 0,

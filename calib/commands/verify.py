@@ -21,10 +21,12 @@ def verify(
     ] = None,
     store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
     poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
-    seed: Annotated[int, typer.Option(min=0, help="Draws other poses.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the poses.")] = 0,
     keep_going: Annotated[
         int,
-        typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle."),
+        typer.Option(
+            min=0, help="Number of stalls of the cycle after which the joints are enabled again without asking."
+        ),
     ] = 0,
     report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
     json_file: Annotated[

@@ -20,7 +20,7 @@ def bench(
     channels: Annotated[
         str,
         typer.Option(
-            help="q,q_cmd: arms with position servos, seen as these alone; default: with torques.",
+            help="q,q_cmd: cases with position servos and no torques; default: with torques.",
             rich_help_panel="Other cases",
         ),
     ] = "",
@@ -35,7 +35,7 @@ def bench(
     known: Annotated[
         Path | None,
         typer.Option(
-            help="What is known of these arms (YAML). Default: of the arms that are published.",
+            help="Known effects of these arms (YAML); default: those of the published arms.",
             rich_help_panel="Other cases",
         ),
     ] = None,

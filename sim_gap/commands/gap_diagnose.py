@@ -207,7 +207,7 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
     if answer.unit == "rad":
         write_samples(answer.internals, count, target)
     elif answer.internals.estimate is None:
-        console.print("no draws of parameters: there is no gap that any would explain", style="yellow")
+        console.print("no draws written: there is no gap for parameters to explain", style="yellow")
         return
     else:
         write_rows(drawn_parameters(answer.internals.estimate, answer.names, count), target)

@@ -104,7 +104,9 @@ def new(
         found = bundled or model
         if drives_by_ids(found):
             if by_hand:
-                raise BadInput("--by-hand: these drives are found by the ids in the arm file, and tell no position yet")
+                raise BadInput(
+                    "--by-hand: these drives are found by their ids in the arm file and give no position yet"
+                )
             return copy(found, out, str(bus), bundled is not None, json_file)
         return rewire(found, out, str(bus), hand(by_hand, interactive), json_file)
     with console.status(f"reading {model} and looking for collisions"):

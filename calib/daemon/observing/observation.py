@@ -67,4 +67,4 @@ class Observation:
             if event.finding is not None:
                 self.recalibrations.found(event.finding)
             elif event.kind == "undecided":
-                self._more_poses("watching alone cannot decide")
+                self._more_poses("observation alone cannot decide")

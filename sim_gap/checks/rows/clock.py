@@ -60,8 +60,9 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
         return recording, []
     scatter = float(np.std(recording.t - sampled))
     evidence = (
-        f"steps scatter by {scatter * 1e3:.1f} ms about even samples of {1e3 * float(np.median(np.diff(sampled))):.2f} "
-        f"ms, on which the positions are {before / max(after, 1e-12):.1f} times as smooth: times of receipt"
+        f"time steps scatter by {scatter * 1e3:.1f} ms; at even steps of "
+        f"{1e3 * float(np.median(np.diff(sampled))):.2f} ms the positions are "
+        f"{before / max(after, 1e-12):.1f} times smoother: these are times of receipt"
     )
     values = {**vars(recording), "t": sampled}
     return Recording(**values), [Finding("jitter", "t", "all", evidence, "--clock t=0 (keep the times)", True)]
@@ -144,7 +145,7 @@ def find_dropped(recording: Recording) -> list[Finding]:
     missing = float((whole - 1.0).sum() / whole.sum())
     if missing < DROPPED or np.mean(np.abs(periods - whole) < NEAR) < EVEN:
         return []
-    evidence = f"{missing:.0%} of the samples are missing, up to {whole.max() - 1.0:.0f} one after the other"
+    evidence = f"{missing:.0%} of the samples are missing, up to {whole.max() - 1.0:.0f} in a row"
     return [Finding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)]
 
 

@@ -23,7 +23,7 @@ def without_held(recording: Recording) -> tuple[Recording, list[Finding]]:
     if velocity is not None and np.mean(_repeats(velocity)[same]) > 0.5:
         velocity = filled(recording.t, velocity, known)
     position = filled(recording.t, recording.position, known)
-    evidence = f"repeats in {share:.0%} of the rows in motion while torques change: read less often; filled in between"
+    evidence = f"repeats in {share:.0%} of the rows in motion while torques change: it is read less often; interpolated"
     found = Finding("duplicate", "q", "all", evidence, "record at the rate at which positions are read", True)
     return replace(recording, position=position, velocity=velocity), [found]
 
