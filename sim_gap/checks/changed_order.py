@@ -43,7 +43,7 @@ def find_changed_order(arm: RigidArm, motion: Motion, stated: Corrections) -> li
     if fall < CLEAR:
         return _absent_from_a_half(arm, motion, model, whole, stated)
     part = f"{'after' if late else 'before'} {share:.0%} of the recording"
-    evidence = f"{part}, and only there, {own.what}: with that the model explains much more"
+    evidence = f"{own.what} only {part}: with that the model explains much more"
     option = f"give both parts as recordings of their own, the {'later' if late else 'earlier'} with {own.option}"
     return [Finding("order", motion.channel, arm.names[own.joints[0]], evidence, option, False, fall)]
 
