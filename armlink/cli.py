@@ -126,7 +126,7 @@ def _invoke(point: EntryPoint, arguments: list[str]) -> int:
 
     import typer
 
-    from armlink.commands.grouped_help import GroupedCommand
+    from armlink.commands.options import GroupedCommand
 
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(PrintableFormatter())

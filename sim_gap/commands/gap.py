@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import typer
 
-from armlink.commands.grouped_help import GroupedCommand
+from armlink.commands.options import GroupedCommand
 from sim_gap.commands.gap_bench import bench
 from sim_gap.commands.gap_collect import collect
 from sim_gap.commands.gap_diagnose import diagnose

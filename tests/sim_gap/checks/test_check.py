@@ -344,9 +344,7 @@ def test_a_link_torque_that_another_column_holds_midway_is_refused():
     made = replace(record(model(), REAL, seconds=30.0, rate=100.0), motor_torque=None)
     torque = made.torque.copy()
     torque[made.t.size // 2 :, 0] = 0.05 * made.position[made.t.size // 2 :, 0]
-    with pytest.raises(
-        BadInput, match=r"tau of joint_1: only in the second half of the recording: .* not show in it"
-    ):
+    with pytest.raises(BadInput, match=r"tau of joint_1: only in the second half of the recording: .* not show in it"):
         check(load_model(model()).arm, replace(made, torque=torque))
 
 
