@@ -53,7 +53,7 @@ def test_the_command_says_it_in_one_line_and_exits_with_one(tmp_path: Path, caps
     bench(tmp_path, post(0.3, -0.02))
     assert run(["sweep", str(tmp_path / "bench.yaml"), "--plan"]) == 1
     error = capsys.readouterr().err
-    assert "post does upper" in error
+    assert "for example post and upper" in error
     assert error.strip().count("\n") == 0
 
 
