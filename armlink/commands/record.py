@@ -14,7 +14,7 @@ def record(
     arm: Arm,
     out: Annotated[
         Path | None,
-        typer.Argument(help="File to write (.mcap); the command convert makes other formats of it.", show_default=False),
+        typer.Argument(help="File to write (.mcap); convert makes other formats of it.", show_default=False),
     ] = None,
     frames: Annotated[
         Path | None, typer.Option(help="Write every frame here as it is: .asc, .blf or .log, by suffix.")
