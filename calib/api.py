@@ -151,7 +151,9 @@ def identify(*sweeps: SweepLike, arm: ArmLike | None = None, sensors: Calibrated
     arm_file = _arm_of(data, arm)
     found = sensors or _calibrated(arm_file, data)
     if isinstance(found, CreepCalibration) != all_creep(data):
-        raise BadInput("identify: sensors: found in sweeps of the other kind (creep, steps at rest): leave them out")
+        raise BadInput(
+            "identify: sensors: these were found in sweeps of the other kind (creep or steps): leave the argument out"
+        )
     return gravity_fit(found.fit) if isinstance(found, CreepCalibration) else identify_gravity(arm_file, data, found)
 
 

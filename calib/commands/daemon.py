@@ -32,11 +32,21 @@ def daemon(
         ),
     ] = False,
     socket: Annotated[
-        Path | None, typer.Option(help="Unix socket of API and page; default api.sock in the state directory.")
+        Path | None,
+        typer.Option(
+            help="Unix socket of API and page; default api.sock in the state directory.", rich_help_panel="Page and API"
+        ),
     ] = None,
-    tcp: Annotated[str | None, typer.Option(help="Serve on HOST:PORT too; needs --token-file.")] = None,
-    token_file: Annotated[Path | None, typer.Option(help="File with the token that TCP clients must send.")] = None,
-    policy: Annotated[Policies | None, typer.Option(help="Instead of the arm file's daemon.policy.")] = None,
+    tcp: Annotated[
+        str | None, typer.Option(help="Serve on HOST:PORT too; needs --token-file.", rich_help_panel="Page and API")
+    ] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(help="File with the token that TCP clients must send.", rich_help_panel="Page and API"),
+    ] = None,
+    policy: Annotated[
+        Policies | None, typer.Option(help="What to do about a drift, instead of the arm file's daemon.policy.")
+    ] = None,
     state: Annotated[
         Path | None, typer.Option(help="Directory of journal and recordings; default the user's state directory.")
     ] = None,

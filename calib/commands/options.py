@@ -11,14 +11,26 @@ if TYPE_CHECKING:
 
 Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweep, without and with load.")]
 SweepsArm = Annotated[str | None, typer.Option("--arm", help="Arm file, if it is no longer where sweep found it.")]
-Bus = Annotated[str | None, typer.Option(help="With --apply: INTERFACE:CHANNEL[@BITRATE].")]
+APPLY = "With --apply"
+"""Group of the options that only count when a record is written to the controllers, in a command's help."""
+Bus = Annotated[
+    str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.", rich_help_panel=APPLY)
+]
 Check = Annotated[
     bool,
-    typer.Option(help="With --apply: a small motion of every joint before and after; a worse result is rolled back."),
+    typer.Option(
+        help="Move every joint a little before and after the write; roll back if the arm then holds worse.",
+        rich_help_panel=APPLY,
+    ),
 ]
-Flash = Annotated[bool, typer.Option("--flash", help="With --apply: also store to the controllers' flash.")]
+Flash = Annotated[
+    bool, typer.Option("--flash", help="Also store the values in the controllers' flash.", rich_help_panel=APPLY)
+]
 Replaced = Annotated[
-    list[str] | None, typer.Option(help="With --apply: a joint whose sensor was exchanged since the last record.")
+    list[str] | None,
+    typer.Option(
+        help="Joint whose sensor was exchanged since the last record; may be repeated.", rich_help_panel=APPLY
+    ),
 ]
 Store = Annotated[str | None, typer.Option(help="Record store: file or database URL; default: state folder.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")]

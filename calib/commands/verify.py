@@ -8,6 +8,7 @@ import typer
 from armlink.commands.options import Arm, OtherBus
 
 if TYPE_CHECKING:
+    from armlink.commands.plain_console import PlainConsole
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.sweep.verify import Verification
 
@@ -20,10 +21,12 @@ def verify(
     ] = None,
     store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
     poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
-    seed: Annotated[int, typer.Option(min=0, help="Draws other poses.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the poses.")] = 0,
     keep_going: Annotated[
         int,
-        typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle."),
+        typer.Option(
+            min=0, help="Number of stalls of the cycle after which the joints are enabled again without asking."
+        ),
     ] = 0,
     report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
     json_file: Annotated[
@@ -35,7 +38,9 @@ def verify(
     Example: armlink verify sarcos --bus socketcan:vcan0 --poses 40 --json -
     """
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import command_line, results, suggest
     from armlink.loop.open import open_arm
     from calib.commands.screen import SweepScreen
     from calib.creep.choice import sweep_motion
@@ -44,12 +49,16 @@ def verify(
     from calib.sweep.verify import run_verify
 
     arm_file = load_arm(arm)
-    with open_arm(arm_file, bus) as link:
+    with (
+        early_end(arm_file, command_line("verify", arm, bus=bus, store=store)) as work,
+        open_arm(arm_file, bus) as link,
+    ):
         gravity, calibration = _records(RecordStore(store), arm_file, record or [])
         creeping = sweep_motion(arm_file) == "creep"
         if creeping and calibration is None:
             raise no_record(arm_file, "calibration")
         link.start()
+        work.enabled = True
         with SweepScreen(f"{arm_file.name}: verify") as screen:
             link.enable()
             watch, bridge = screen.count, screen.on_stall(keep_going)
@@ -61,7 +70,9 @@ def verify(
                 result = run_verify(
                     link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
                 )
-    _show(result)
+    _show(result, results(json_file))
+    if result.passed:
+        suggest(command_line("daemon", arm, bus=bus, store=store))
     if report is not None:
         from calib.report.verification import write_report
 
@@ -104,10 +115,8 @@ def _answer(
     }
 
 
-def _show(result: "Verification") -> None:
+def _show(result: "Verification", console: "PlainConsole") -> None:
     from rich.table import Table
-
-    from armlink.commands.plain_console import PlainConsole
 
     title = f"Model against sensor at {len(result.sensor)} poses [N·m]"
     table = Table("joint", "RMS", "largest", "allowed RMS", title=title)
@@ -115,4 +124,7 @@ def _show(result: "Verification") -> None:
         table.add_row(
             name, f"{result.rms[joint]:.3f}", f"{result.max_error[joint]:.3f}", f"{result.tolerance[joint]:.3f}"
         )
-    PlainConsole().print(table)
+    console.print(table)
+    beyond = [name for name, off in zip(result.names, result.rms > result.tolerance, strict=True) if off]
+    agree = "passed: model and sensor agree at every joint within its allowed RMS"
+    console.print(f"failed: RMS above the allowed one at {', '.join(beyond)}" if beyond else agree)

@@ -89,8 +89,8 @@ def moved_node(joint: str, turned: dict[int, float], bus: str) -> int:
     order = sorted(turned, key=lambda node: -abs(turned[node]))
     if abs(turned[order[0]]) < LEAST_TURN:
         raise BusFault(
-            f"{bus}: no drive read the motion of {joint}: release its brake, turn it further, or its drive is not on"
-            " this bus"
+            f"{bus}: no drive read the motion of {joint}: release its brake and turn it further, or look for its"
+            " drive on another bus"
         )
     if len(order) > 1 and abs(turned[order[0]]) < CLEAR * abs(turned[order[1]]):
         raise BusFault(

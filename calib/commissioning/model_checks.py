@@ -44,9 +44,9 @@ def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     if model.unphysical:
         yield SetupFinding(
             "warning",
-            f"inertia with a negative principal moment, taken as none: {', '.join(model.unphysical)}",
+            f"inertia with a negative principal moment, ignored: {', '.join(model.unphysical)}",
             where,
-            "correct the inertia of these links, or know that their torque at acceleration is not modelled",
+            "correct the inertia of these links: until then their torque under acceleration is not modelled",
         )
     if model.left_out:
         remedy = "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)"
@@ -79,14 +79,14 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             axis = "its axis is vertical" if joint == 0 else "its axis is vertical in every pose"
             yield SetupFinding(
                 "warning",
-                f"gravity has no lever on it (Γ/g {lever[joint]:.2f}): {axis}, and its torque gain cannot be found",
+                f"gravity does not load it (Γ/g {lever[joint]:.2f}): {axis}, and its torque gain cannot be found",
                 name,
-                "incline the base for the sweeps, or live with its offset alone",
+                "incline the base for the sweeps, or do without its gain",
             )
         elif lever[joint] < SMALL_LEVER:
             yield SetupFinding(
                 "hint",
-                f"gravity has a short lever on it (Γ/g at most {lever[joint]:.2f}): its torque gain will be imprecise",
+                f"gravity loads it little (Γ/g at most {lever[joint]:.2f}): its torque gain will be imprecise",
                 name,
                 "incline the base for the sweeps, or widen the ranges of the joints before it",
             )

@@ -77,11 +77,11 @@ def _strength(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
     for joint, name in enumerate(arm.names):
         most = limits.max_torque[joint]
         if need[joint] > most:
-            what = f"gravity needs up to {need[joint]:.3g} N·m by the model, max_torque is {most:g}"
+            what = f"by the model, gravity needs up to {need[joint]:.3g} N·m, but max_torque is {most:g}"
             remedy = "check the model's masses and max_torque: the arm would fall"
             yield SetupFinding("error", what, name, remedy)
         elif RESERVE * need[joint] > most:
-            what = f"gravity needs up to {need[joint]:.3g} N·m by the model, max_torque is {most:g}: little is left"
+            what = f"by the model, gravity needs up to {need[joint]:.3g} N·m of max_torque {most:g}: little is left"
             yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
 
 
@@ -105,9 +105,9 @@ def _damping(arm_file: ArmFile, model: Path) -> Iterator[SetupFinding]:
         if ratio < LEAST_DAMPING:
             enough = 2 * LEAST_DAMPING * math.sqrt(drive.kp * inertia / square)
             softer = square * (drive.kd / (2 * LEAST_DAMPING)) ** 2 / inertia
-            what = f"kd {drive.kd:g} damps its swing by a ratio of {ratio:.2f} where it turns {inertia:.2g} kg·m²"
+            what = f"kd {drive.kd:g} gives a damping ratio of only {ratio:.2f} at an inertia of {inertia:.2g} kg·m²"
             remedy = (
-                f"kd {enough:.2g} or more, or kp {softer:.2g} or less, gives {LEAST_DAMPING:g}, at which it settles"
+                f"set kd to {enough:.2g} or more, or kp to {softer:.2g} or less: the ratio is then {LEAST_DAMPING:g}"
             )
             yield SetupFinding("warning", what, joint.name, remedy)
 

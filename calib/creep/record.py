@@ -62,11 +62,11 @@ def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
         elif not found["gain"][joint]:
             reasons[name, "gain"] = VERTICAL if upright else _no_gain(fit, joint, loaded)
         if not found["offset"][joint]:
-            reasons[name, "offset"] = "no sweep of this joint tells it"
+            reasons[name, "offset"] = "no sweep of this joint shows it"
         if joint == fit.arm.n - 1 and fit.prior_std[fit.slices["zero"]][joint] <= LAST_ZERO:
             reasons[name, "position_offset"] = "turning the last link's frame is the same as turning its centre of mass"
         elif not zero[joint]:
-            reasons[name, "position_offset"] = "the sweeps tell no more than was known before"
+            reasons[name, "position_offset"] = "the sweeps add nothing to what was known before"
     return reasons
 
 
@@ -86,7 +86,7 @@ def _no_gain(fit: CreepFit, joint: int, loaded: bool) -> str:
     if not (fit.rows.joint == joint).any():
         return "no sweep of this joint was free of disturbance"
     if not loaded:
-        return "without a reference mass only products of torque constant and mass are seen: sweep again with one"
+        return "without a reference mass only the product of torque constant and mass shows: sweep again with one"
     if not fit.found("gain").any() and known_lever(fit.arm) < SHORTEST:
         return NO_LEVER
     return "gravity loads this joint too little in these sweeps: attach the mass further out, or add poses"

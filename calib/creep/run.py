@@ -174,7 +174,9 @@ class _CreepPass(SweepPass):
         self.writer.append(line)
         self.progress(len(self.made), len(self._plan.sweeps), 0.0, text)
         if self._contacts > MOST_CONTACTS * len(self._plan.sweeps):
-            raise Refused(f"{text}; {self._contacts} sweeps ended so: clear the workspace, or narrow lower and upper")
+            raise Refused(
+                f"{text}; {self._contacts} sweeps ended like this: clear the workspace, or narrow lower and upper"
+            )
         goal = mover.command.position.copy()
         goal[sweep.joint] = sweep.rest[sweep.joint]
         mover.travel(goal, self._plan.travel_acceleration)

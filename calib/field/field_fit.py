@@ -78,7 +78,7 @@ def fit_field(
     belief = belief_of(arm, gravity, calibration)
     n, q = belief.arm.n, rows.position * belief.position_gain + belief.position_offset
     if not np.isfinite(rows.torque).any():
-        raise BadInput("no torque reading counts")
+        raise BadInput("no torque reading can be used")
     belief = belief.over(rows, q)
     gain, sigma = belief.installed.gain, rows.sigma
     noise, prior = sigma, belief.prior(np.ones(n))
@@ -156,13 +156,13 @@ def _report(belief: Belief, rows: StaticReadings, columns: Array, solved: Soluti
         here = model[counted[:, j], j]
         sides = set(np.sign(rows.direction[counted[:, j], j])) - {0.0}
         if len(here) == 0:
-            reasons[name, "gain"] = reasons[name, "offset"] = "its sensor counts in none of these rows"
+            reasons[name, "gain"] = reasons[name, "offset"] = "none of these rows has a usable reading of its sensor"
         elif unseen[j]:
             reasons[name, "gain"] = _no_gain(here)
         if len(here) and len(sides) < 2:
             hysteresis[j] = np.nan
             reasons[name, "offset"] = (
-                "it was approached from one side only, where friction or hysteresis looks the same: move it both ways"
+                "it was approached from one side only, so friction and hysteresis look the same: move it both ways"
             )
         elif len(here) and np.sqrt(pairs[j, 1, 1]) > OFFSET_STD * belief.rated[j]:
             reasons[name, "offset"] = (

@@ -89,7 +89,7 @@ def encoder_findings(names: tuple[str, ...], rows: SweepReadings) -> list[FitFin
     for joint, bit, step in stuck_bits(rows.readings.position, rows.resolution, rows.target):
         text = (
             f"{names[joint]}: bit {bit} of the position reading ({step:.3g} rad) never changes: the encoder or its"
-            " transmission is faulty; nothing found with this joint's positions holds"
+            " transmission is faulty; no result that uses this joint's position is valid"
         )
         found.append(FitFinding(names[joint], "encoder", step, "rad", text))
     return found

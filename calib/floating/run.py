@@ -120,9 +120,9 @@ class _Float:
         worst = int(np.nanargmax(away / rated))
         if not away[worst] <= AGREEMENT * rated[worst]:
             raise Refused(
-                f"{self._link.names[worst]}: its sensor reads {sensor[worst]:.2f} N·m, the gravity model says"
-                f" {model[worst]:.2f}; at most {AGREEMENT * rated[worst]:.2f} apart is safe to float with: is a load"
-                " on the arm, a joint on its stop, or the calibration not written to the controllers?"
+                f"{self._link.names[worst]}: its sensor reads {sensor[worst]:.2f} N·m, but the gravity model says"
+                f" {model[worst]:.2f}; floating is safe only within {AGREEMENT * rated[worst]:.2f} of it: is a load on"
+                " the arm, a joint on its stop, or the calibration not written to the controllers?"
             )
 
     def follow(self, floating: Floating, seconds: float) -> None:

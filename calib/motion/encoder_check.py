@@ -19,7 +19,7 @@ class EncoderFault(Refused):
     def __init__(self, name: str, seen: str, bit: int | None) -> None:
         """Joint's name, what its readings did, and the bit that would do it."""
         cause = "its encoder or cable" if bit is None else f"bit {bit} of its encoder, which is stuck or lost"
-        super().__init__(f"{name}: {seen}: repair {cause}: no calibration with it would hold")
+        super().__init__(f"{name}: {seen}: repair {cause}: no calibration with it is valid")
 
 
 class EncoderCheck:

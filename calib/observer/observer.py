@@ -234,7 +234,7 @@ class Observer:
         self._investigation.first = Agreeing(rows, together, first.joints)
         verdict = together.verdict()
         if not verdict.is_drift or frozenset(verdict.joints) != first.joints:
-            return self._undecided(t, None, "all windows together say something else")
+            return self._undecided(t, None, "all windows together point to another cause")
         return [event for joint in verdict.joints for event in self._decide(t, together, verdict, joint)]
 
     def _decide(self, t: float, test: CauseTest, verdict: Verdict, joint: int) -> list[Event]:

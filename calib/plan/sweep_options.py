@@ -83,8 +83,8 @@ def _without_collision(candidates: Candidates, geometry: Geometry, name: str) ->
         return candidates.kept(free)
     first, second = next(found for pose in flat for found in geometry.contacts(pose)).bodies
     raise Collided(
-        f"joint {name}: in every combination of stops something touches, as {first} does {second}: narrow lower and"
-        " upper in the arm file"
+        f"joint {name}: in every combination of stops something touches, for example {first} and {second}:"
+        " narrow lower and upper in the arm file"
     )
 
 

@@ -122,9 +122,7 @@ def drives_of(data: Sequence["SweepData"]) -> tuple[str, ...]:
     told = [each for each in data if each.manifest.drives]
     for each in told[1:]:
         if not {*each.manifest.drives} & {*told[0].manifest.drives} - {""}:
-            raise Refused(
-                f"{told[0].path} and {each.path}: no drive of one is a drive of the other: they are of two arms"
-            )
+            raise Refused(f"{told[0].path} and {each.path}: they have no drive in common: they come from two arms")
     return told[-1].manifest.drives if told else ()
 
 

@@ -40,7 +40,7 @@ OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
 OWN_HELDOUT_S = 3.0
 """Least length of it [s], up to half of a short recording."""
-LENT = "the first is fitted: by a body it differs from all training recordings"
+LENT = "since no training recording shows the body that it carries, or lacks: the first half is fitted"
 """Why half of a held-out recording is fitted."""
 MOUNTED = 2
 """How often the ways in which a body is mounted are looked at."""
@@ -119,7 +119,7 @@ def diagnose(
         other, again = _fitted(more, library)
         if body_of(again) is not None:
             search, estimate, judge, heldout = other, again, _placed(again, rest), recordings
-            heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} the second half, for {LENT}"
+            heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} only the second half, {LENT}"
     fit = estimate.store.data
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     within = is_within(judge) and is_within(fit)

@@ -58,13 +58,14 @@ class Compensation:
         if self.held:
             law = f"{self.torque:.2g} N·m" + (f" and {self.viscous:.2g} N·m·s/rad" if abs(self.viscous) > 0.01 else "")
             return (
-                f"{self.recording}: the controller compensates friction of {self.joint}: {self.channel} follows the "
-                f"measured velocity as friction of {law} would, and holds that torque"
+                f"{self.recording}: the controller compensates the friction of {self.joint}: {self.channel} contains "
+                f"a torque of {law} in the direction of the measured velocity"
             )
         beside = "" if self.usual is None else f" ({self.usual:.2g} in the other recordings)"
         return (
-            f"{self.recording}: {self.joint} shows {self.torque:.2g} N·m of friction{beside}: friction compensation "
-            f"that {self.channel} does not hold; leave this recording out, or give the whole command"
+            f"{self.recording}: {self.joint} shows {self.torque:.2g} N·m of friction{beside}: the controller "
+            f"compensates friction with a torque that {self.channel} lacks; "
+            "leave this recording out, or record the whole command"
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def notes(
 def _noisy(data: ResidualSet) -> tuple[str, ...]:
     layout, names = data.layout, data.signals[0].arm.names
     return tuple(
-        f"{names[j]}: too noisy: {' and '.join(layout.chain[: layout.beyond(j)])}; the command is compared with "
+        f"{names[j]}: {' and '.join(layout.chain[: layout.beyond(j)])} too noisy; the command is compared with "
         f"{layout.reference((str(layout.command), j)) or 'the model'} instead"
         for j in range(layout.n)
         if layout.beyond(j)
@@ -50,8 +50,8 @@ def _noisy(data: ResidualSet) -> tuple[str, ...]:
 def _stuck(stuck: Sequence[Stuck], data: ResidualSet) -> tuple[str, ...]:
     names = data.signals[0].arm.names
     lines = (
-        f"{names[one.joint]}: {one.channel} repeats one value for {one.seconds:.3g} s while the arm moves: stuck "
-        "sensor or channel; these samples are left out"
+        f"{names[one.joint]}: {one.channel} repeats one value for {one.seconds:.3g} s while the arm moves: the "
+        "sensor or the channel is stuck; these samples are left out"
         for one in stuck
     )
     return tuple(dict.fromkeys(lines))
@@ -66,8 +66,8 @@ def _spiked(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
         count, readings = (sum(getattr(one, part) for _, one in ours) for part in ("count", "readings"))
         joints = {name: sum(one.count for other, one in ours if other == name) for name, _ in ours}
         lines.append(
-            f"{channel}: {count} samples of {readings} ({count / readings:.2%}) are left out as spikes, each far from "
-            f"those before and after it ({', '.join(f'{name} {number}' for name, number in joints.items())})"
+            f"{channel}: {count} of {readings} samples ({count / readings:.2%}) are left out as spikes, far from the "
+            f"samples before and after ({', '.join(f'{name} {number}' for name, number in joints.items())})"
         )
     return tuple(lines)
 
@@ -82,8 +82,8 @@ def _impacts(data: ResidualSet) -> tuple[str, ...]:
 
 def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
     lines = (
-        f"{s.label}: at {one.start:.1f} s several joints are far off at once, {s.arm.names[one.joint]} by "
-        f"{one.torque:.2g} N·m, as at no other time: something touched the arm or torques were misread; "
+        f"{s.label}: at {one.start:.1f} s, and at no other time, several joints leave the fit at once, "
+        f"{s.arm.names[one.joint]} by {one.torque:.2g} N·m: something touched the arm, or torques were misread; "
         f"{one.end - one.start + 2.0 * AROUND_S:.1f} s are left out"
         for data in sets
         for s in data.signals
@@ -96,17 +96,17 @@ def _common_factor(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[s
     """A note for torque constants, or masses, that motor torque alone tells: only their products are known."""
     if estimate is not None and masses_may_be_constants(fit.layout, estimate.terms):
         return (
-            f"{MASSES}: {fit.layout.motor} alone tells only products of masses and torque constants: constants of all "
-            "drives that are off by the same factor would look like this, too; creep sweeps with a weighed mass tell "
-            "them apart",
+            f"{MASSES}: {fit.layout.motor} alone shows only the products of masses and torque constants: if all "
+            "constants were off by one factor, the recordings would look the same; creep sweeps with a weighed mass "
+            "tell which it is",
         )
     if estimate is None or not shares_a_factor(fit.layout, estimate.terms):
         return ()
     return (
-        f"{CONSTANT}: a factor common to all torque constants and all masses is not determined by {fit.layout.motor} "
-        "alone: with all links 1 % heavier than in the model, all constants, friction and rotor inertias are 1 % "
+        f"{CONSTANT}: {fit.layout.motor} alone does not determine the scale of all masses and torque constants "
+        "together: if all links are 1 % heavier than in the model, all constants, friction and rotor inertias are 1 % "
         f"larger; the intervals allow for masses that are {2 * NOMINAL:.0%} off; creep sweeps with a weighed mass "
-        "determine it",
+        "determine the scale",
     )
 
 
@@ -115,7 +115,7 @@ def _bound(estimate: EffectEstimate | None, fit: ResidualSet, judge: ResidualSet
     lines = []
     for term in () if estimate is None else estimate.terms:
         if alone := recordings_with(term, (fit, judge)):
-            lines.append(f"{term.effect} is present in {' and '.join(alone)} alone")
+            lines.append(f"{term.effect} is present only in {' and '.join(alone)}")
         elif term.effect == "link.payload":
             lines.append(
                 "link.payload: includes mass errors of the links themselves; to separate them, add recordings of the "
@@ -130,8 +130,8 @@ def _bound(estimate: EffectEstimate | None, fit: ResidualSet, judge: ResidualSet
 
 def _turned(sets: Sequence[ResidualSet]) -> list[str]:
     return [
-        f"link.payload: in {s.label} it is turned by {np.degrees(s.mount):.0f}° about the axis of {s.arm.names[-1]} "
-        "against the other recordings; that angle was found from this recording"
+        f"link.payload: in {s.label} the payload is turned by {np.degrees(s.mount):.0f}° about the axis of "
+        f"{s.arm.names[-1]}, compared with the other recordings; the angle was found from this recording"
         for s in dict.fromkeys(s for data in sets for s in data.signals)
         if s.mount and s.number != ABSENT
     ]
@@ -178,8 +178,8 @@ def besides_notes(aside: Sequence[Location]) -> tuple[str, ...]:
 
 def law_notes(laws: Sequence[ResidualLaw], names: Sequence[str]) -> tuple[str, ...]:
     return tuple(
-        f"{names[law.joint]}: what is left of {law.channel} follows a law of {law.quantity} of {names[law.joint]}"
-        + (" that opposes the motion" if law.directed else "")
+        f"{names[law.joint]}: the remaining {law.channel} is a function of the joint's {law.quantity}"
+        + (", against the motion" if law.directed else "")
         + f" ({law.before:.2g} to {law.after:.2g} N·m on held-out data); its cause is not in the library"
         for law in laws
     )

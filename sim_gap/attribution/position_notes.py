@@ -27,18 +27,18 @@ def notes(found: Identified) -> list[str]:
     if loose := undecided_scale(found.search, found.fit, found.spread):
         listed = ", ".join(names[j] for j in loose)
         out.append(
-            f"{listed}: position alone shows ratios of gain, friction and inertia here, their common scale rests on "
-            "the model's inertia: hold a known load or record the current"
+            f"{listed}: positions show only the ratios of gain, friction and inertia here; their scale is that of the "
+            "model's inertia: hold a known load or record the current to measure it"
         )
     if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
         out.append(
-            "viscous friction, back-EMF and damping of the measured velocity act alike on a position: the sum is given"
+            "viscous friction, back-EMF and velocity feedback act alike on positions: only their sum is given"
             + (", as part of the controller" if found.search.open_controller else "")
         )
     if found.search.resting:
         listed = ", ".join(names[j] for j in sorted(found.search.resting))
         assumed = "a controller that holds it is assumed" if found.search.open_controller else "the model's values stay"
-        out.append(f"{listed}: the command rests in all that is fitted, from which nothing follows: {assumed}")
+        out.append(f"{listed}: no training recording commands a motion here, so nothing can be fitted: {assumed}")
     if limits := described(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
     out += [*_early(found), *_touching(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
@@ -61,15 +61,16 @@ def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> li
     if rollout.worse:
         before, after = (float(np.sqrt(np.mean(x**2))) for x in (rollout.before, rollout.after))
         out.append(
-            f"running free, the corrected model leaves more ({after:.3g} rad) than the nominal one ({before:.3g} rad): "
-            + ("it is nothing to train with; give recordings of other motion" if gap else "use the model as it is")
+            f"running free, the corrected model leaves a larger gap ({after:.3g} rad) than the nominal one "
+            f"({before:.3g} rad): "
+            + ("do not train with it, and record other motion" if gap else "use the nominal model")
         )
     left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
     far = [
-        f"{found.sim.arm.names[j]} {left[j]:.3g} rad (the fit {found.heldout_after[j]:.3g})"
+        f"{found.sim.arm.names[j]} {left[j]:.3g} rad (fit {found.heldout_after[j]:.3g})"
         for j in np.flatnonzero(left > FAR * least)
     ]
-    told = "the corrected model in MuJoCo, running free along the held-out commands, is further off"
+    told = "the corrected model, running free in MuJoCo along the held-out commands, leaves more than the fit"
     return [*out, f"{told}: {', '.join(far)}"] if far else out
 
 
@@ -89,8 +90,8 @@ def _early(found: Identified) -> list[str]:
     time = rows * period if rows and abs(time / period - rows) < NEAR_A_ROW else time
     listed = ", ".join(f"{name} {value:.3g} s" for name, value in early.items())
     return [
-        f"commands act before their rows' time ({listed}), as no controller does: rows that hold the position of a "
-        f"later time, or clocks that differ; state it with --clock q_cmd={time:.3g}"
+        f"commands take effect before the time of their rows ({listed}), which no controller can do: the rows hold "
+        f"the position of a later time, or two clocks differ; state it with --clock q_cmd={time:.3g}"
     ]
 
 
@@ -103,10 +104,10 @@ def _touching(found: Identified) -> list[str]:
     some = [100.0 * float(rows.mean()) for rows in found.touched if rows.any()]
     part = " to ".join(dict.fromkeys(f"{each:.0f}" for each in (min(some), max(some))))
     return [
-        f"the arm presses on something below it, such as a table, in {len(some)} of {len(found.touched)} recordings: "
-        f"{joints} stop short of the command the lower {names[found.surface.link]} goes, from a height of "
-        f"{found.surface.height:.2f} m on; these moments ({part} % of such a recording) "
-        "are neither fitted nor judged: if simulated motion goes there, put a surface there into the model"
+        f"in {len(some)} of {len(found.touched)} recordings the arm presses on something below it, such as a table: "
+        f"where {names[found.surface.link]} goes below a height of {found.surface.height:.2f} m, {joints} stop short "
+        f"of the command; these moments ({part} % of such a recording) are neither fitted nor judged; if simulated "
+        "motion goes there, add the surface to the model"
     ]
 
 
@@ -118,7 +119,7 @@ def _ranges(found: Identified) -> list[str]:
         for j in widened(found.sim)
         for low, high in [found.sim.arm.range[j]]
     ]
-    return [f"goes further than the model's range, where a simulation would stop: {', '.join(out)}"] if out else []
+    return [f"moves beyond the model's joint range, where a simulation would stop: {', '.join(out)}"] if out else []
 
 
 def _beyond(found: Identified) -> list[str]:
@@ -131,7 +132,7 @@ def _beyond(found: Identified) -> list[str]:
         outside = float(np.mean((other < fitted.min()) | (other > fitted.max())))
         if outside > 1.0 - SHARE:
             out.append(f"{name}: {outside:.0%} of the held-out motion")
-    told = "outside the range of the training recordings, where bands may be too narrow"
+    told = "moves outside the range of the training recordings, where the band may be too narrow"
     return [f"{told}: {', '.join(out)}"] if out else []
 
 
@@ -143,9 +144,9 @@ def _faster(found: Identified) -> list[str]:
         if not (fitted.size and other.size):
             continue
         if np.mean(other > fitted.max()) > AT_TIMES:
-            out.append(f"{name} up to {other.max():.2g} rad/s (fitted {fitted.max():.2g})")
-    told = "held-out motion is faster than any that is fitted, from which nothing follows for it"
-    return [f"{told}: {', '.join(out)}: give faster motion to fit"] if out else []
+            out.append(f"{name} up to {other.max():.2g} rad/s (in training {fitted.max():.2g})")
+    told = "the held-out motion is faster than all training motion, so the fit may not hold for it"
+    return [f"{told}: {', '.join(out)}: add faster motion to --train"] if out else []
 
 
 def _released(found: Identified) -> list[str]:
@@ -156,8 +157,8 @@ def _released(found: Identified) -> list[str]:
         for j, name in enumerate(found.sim.arm.names)
         if off[0][j] == 0.0 < off[1][j]
     ]
-    told = "in the held-out motion the servo is off, in what is fitted never, from which nothing follows for it"
-    return [f"{told}: {', '.join(out)}: give such a swing to fit"] if out else []
+    told = "the servo is off in part of the held-out motion, but never in training, so the fit may not hold there"
+    return [f"{told}: {', '.join(out)}: add such a swing to --train"] if out else []
 
 
 def _speeds(data: Windows, joint: int) -> Array:

@@ -37,8 +37,8 @@ def show(result: Mapping[str, Any], console: Console) -> None:
 
 def show_positions(result: Mapping[str, Any], console: Console) -> None:
     console.print(
-        f"{result['answers']} answers, {result['tellable']} of them on one effect that can be told: right first or "
-        f"confounded {_percent(result['named_where_tellable'])}, a false cause above 0.8 "
+        f"{result['answers']} answers, {result['tellable']} of them on one effect that can be identified: right first "
+        f"or confounded {_percent(result['named_where_tellable'])}, a false cause above 0.8 "
         f"{_percent(result['false_confident'])}, false alarms without an effect "
         f"{_percent(result['label_withheld']['no_effect']['false_alarms'])}"
     )
@@ -69,7 +69,7 @@ def show_real(result: Mapping[str, Any], console: Console) -> None:
         table.add_row(*cells, ", ".join(row["false"]), ", ".join(row["lacking"]))
     console.print(table)
     right, false, named = (_percent(result[key]) for key in ("right_first", "false_confident", "named"))
-    console.print(f"right first {right}, a false cause above 0.8 {false}, all that is known named {named}")
+    console.print(f"right first {right}, a false cause above 0.8 {false}, all known effects named {named}")
     if result["missing"]:
         console.print(f"recordings missing: {', '.join(result['missing'])}")
 

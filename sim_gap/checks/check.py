@@ -54,8 +54,8 @@ def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
     if not all(goes_one_way(recording) for recording in recordings):
         return ()
     return (
-        "order, signs, zeros and clocks of the columns could not be checked: the joints go one way only, or hardly "
-        "move; record motion to and fro",
+        "order, signs, zeros and clocks of the columns could not be checked: the joints move one way only, or "
+        "hardly at all; record motion to and fro",
     )
 
 

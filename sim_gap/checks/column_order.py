@@ -84,7 +84,7 @@ def find_changed_order(arm: RigidArm, motion: ChannelMotion, stated: Corrections
     if fall < CLEAR:
         return _absent_from_a_half(arm, motion, model, whole, stated)
     part = f"{'after' if late else 'before'} {share:.0%} of the recording"
-    evidence = f"{part} alone {own.what}: then the logarithm of what the model leaves falls by {fall:.1f}"
+    evidence = f"{own.what} only {part}: with that the model explains much more"
     option = f"give both parts as recordings of their own, the {'later' if late else 'earlier'} with {own.option}"
     return [RecordingFinding("order", motion.channel, arm.names[own.joints[0]], evidence, option, False, fall)]
 
@@ -105,7 +105,7 @@ def _absent_from_a_half(
         for found in find_absent(arm, fits[half], rows_of(motion, rows), stated):
             option = f"give both halves as recordings of their own, this one with {found.option}"
             return [
-                replace(found, evidence=f"in the {half} half of the recording alone {found.evidence}", option=option)
+                replace(found, evidence=f"only in the {half} half of the recording: {found.evidence}", option=option)
             ]
     return []
 

@@ -29,7 +29,7 @@ BEYOND, KICK, NEAR = 1.2, 2.5, 5
 else, by the first factor, as their velocities jump by the second; anywhere else is so many rows away."""
 LEAST_BEYOND, LEAST_KICK = 0.005, 0.05
 """Least distance [rad] and velocity [rad/s] of that: a sound recording misses single rows, too (0.002 and 0.002)."""
-TOGETHER = "pieces put together, or rows missing whose time the clock does not show?"
+TOGETHER = "were separate pieces joined here, or are rows missing?"
 SETTLED = "give each piece as a recording of its own, or --clock t=0 if it is right"
 
 
@@ -43,7 +43,7 @@ def unwrapped(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
             if not turns.any() or np.any(np.abs(jumps / turn - turns)[jumps != 0.0] > WRAPPED):
                 continue
             position[:, j] = q - turn * np.concatenate([[0.0], np.cumsum(turns)])
-            evidence = f"wraps around a whole turn, {np.count_nonzero(turns)} times: turned on from there"
+            evidence = f"wraps around a whole turn, {np.count_nonzero(turns)} times: unwrapped"
             found.append(
                 RecordingFinding("zero", "q", recording.names[j], evidence, "record it without wrapping", True)
             )
@@ -103,7 +103,7 @@ def find_seam(recording: Recording, stated: Corrections) -> list[RecordingFindin
     if len(joints) < 2:
         return []
     evidence = (
-        f"and {', '.join(joints[1:])} go farther than their velocities before and after allow, which jump, at "
+        f"and {', '.join(joints[1:])} move farther than their velocities allow, and these jump as well, at "
         f"t = {t[row + 3]:.2f} s: {TOGETHER}"
     )
     return [RecordingFinding("dropped", "q", joints[0], evidence, SETTLED, False)]

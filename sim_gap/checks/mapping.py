@@ -254,11 +254,11 @@ def _finding(arm: RigidArm, change: HypothesisTest, fit: RigidFit, sure: bool) -
     own = change.hypothesis
     joint = "all" if len(own.joints) == arm.n > 1 else arm.names[own.joints[0]]
     share = float(np.min(fit.explained[list(own.joints)]))
-    evidence = f"{own.what}: then the model explains {share:.0%} (logarithm of what is left falls by {change.fall:.1f})"
+    evidence = f"{own.what}: with that the model explains {share:.0%} of the torque"
     if change.others:
         same = all(other.joints == own.joints for other in change.others)
         names = " or ".join(other.channels[0] for other in change.others) if same else "other changes"
-        evidence += f"; or {names}, with which it explains as much"
+        evidence += f"; {names} would explain as much"
     options = [each.option for each in (own, *change.others)]
     option = ", or ".join([*options[:MOST_OPTIONS], *(["another order"] if len(options) > MOST_OPTIONS else [])])
     return RecordingFinding(own.kind, own.channels[0], joint, evidence, option, sure, change.fall)

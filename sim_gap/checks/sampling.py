@@ -64,8 +64,9 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
         return recording, []
     scatter = float(np.std(recording.t - sampled))
     evidence = (
-        f"steps scatter by {scatter * 1e3:.1f} ms about even samples of {1e3 * float(np.median(np.diff(sampled))):.2f} "
-        f"ms, on which the positions are {before / max(after, 1e-12):.1f} times as smooth: times of receipt"
+        f"time steps scatter by {scatter * 1e3:.1f} ms; at even steps of "
+        f"{1e3 * float(np.median(np.diff(sampled))):.2f} ms the positions are "
+        f"{before / max(after, 1e-12):.1f} times smoother: these are times of receipt"
     )
     values = {**vars(recording), "t": sampled}
     return Recording(**values), [RecordingFinding("jitter", "t", "all", evidence, "--clock t=0 (keep the times)", True)]
@@ -148,7 +149,7 @@ def find_dropped(recording: Recording) -> list[RecordingFinding]:
     missing = float((whole - 1.0).sum() / whole.sum())
     if missing < DROPPED or np.mean(np.abs(periods - whole) < NEAR) < EVEN:
         return []
-    evidence = f"{missing:.0%} of the samples are missing, up to {whole.max() - 1.0:.0f} one after the other"
+    evidence = f"{missing:.0%} of the samples are missing, up to {whole.max() - 1.0:.0f} in a row"
     return [
         RecordingFinding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)
     ]
@@ -181,7 +182,7 @@ def without_held(recording: Recording) -> tuple[Recording, list[RecordingFinding
     if velocity is not None and np.mean(_repeats(velocity)[same]) > 0.5:
         velocity = filled(recording.t, velocity, known)
     position = filled(recording.t, recording.position, known)
-    evidence = f"repeats in {share:.0%} of the rows in motion while torques change: read less often; filled in between"
+    evidence = f"repeats in {share:.0%} of the rows in motion while torques change: it is read less often; interpolated"
     found = RecordingFinding("duplicate", "q", "all", evidence, "record at the rate at which positions are read", True)
     return replace(recording, position=position, velocity=velocity), [found]
 

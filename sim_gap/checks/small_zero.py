@@ -50,9 +50,7 @@ def find_small_zero(
         return []
     names = [name for name in ("q", *follows) if name != "dq"]
     option = "--zero " + ",".join(f"{name}_{j + 1}={angle:.2f}" for name in names) + f", or q_{j + 1}=0 if it is right"
-    evidence = (
-        f"may have its zero off by about {angle:+.2f} rad: then the logarithm of what is left falls by {fall:.1f}"
-    )
+    evidence = f"may have its zero off by about {angle:+.2f} rad: with that the model explains much more of the torque"
     return [RecordingFinding("zero", "q", arm.names[j], evidence, option, False, fall)]
 
 

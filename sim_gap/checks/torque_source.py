@@ -47,7 +47,7 @@ def find_unsigned(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> 
         touches = np.quantile(np.abs(y), 0.02) < TOUCHES * y.std()
         follows = folded > max(plain + 0.2, 0.6)
         if follows or touches or unrelated or (explained < LITTLE and falls[j] > BETTER):
-            how = f"it follows its amount ({folded:.2f})" if follows or not touches else "it turns round at zero"
+            how = f"it follows its magnitude ({folded:.2f})" if follows or not touches else "it turns back at zero"
             evidence = f"never changes its sign, though the model's torque does; {how}"
             option = f"record signed torque, or --sign {motion.channel}_{j + 1}=1 if it is right"
             found.append(RecordingFinding("unsigned", motion.channel, arm.names[j], evidence, option, False))
@@ -82,7 +82,7 @@ def find_gain_command(recording: Recording, stated: Corrections) -> list[Recordi
         lawful += bool(np.var(law @ steps[1:]) > LAWFUL * np.var(steps[0]) and law[0] > 0.0)
     if 2 * lawful <= recording.position.shape[1]:
         return []
-    evidence = "is kp (q_cmd − q) of its own row, of which the drive's time within the cycle is not known; left out"
+    evidence = "is kp (q_cmd − q) of its own row, but the drive acts at another time within the cycle; left out"
     return [RecordingFinding("clock", "tau_cmd", "all", evidence, "--clock tau_cmd=0 (keep it)", True)]
 
 
@@ -104,7 +104,7 @@ def find_source(
     if without < GEAR_FRICTION:
         return _odd_joint(int(np.flatnonzero(moving)[friction.argmax()]), fit, s, stated)
     evidence = (
-        f"holds friction of {share:.0%} of its torque, which a link-side sensor does not feel: it is a motor's effort"
+        f"contains friction ({share:.0%} of its torque), which a link-side sensor does not feel: it is a motor's effort"
     )
     return [
         RecordingFinding("effort_source", "tau", "all", evidence, "--effort-is motor", "tau_motor" not in s.reading)
@@ -117,8 +117,8 @@ def _odd_joint(j: int, fit: RigidFit, s: PreparedSignals, stated: Corrections) -
     if stated.states("units", column):
         return []
     evidence = (
-        f"holds friction of {fit.friction[j] / fit.spread[j]:.0%} of its torque, which a link-side sensor does not "
-        "feel, and no other joint does: amperes, or a motor's effort?"
+        f"contains friction ({fit.friction[j] / fit.spread[j]:.0%} of its torque), which a link-side sensor does not "
+        "feel, and no other joint does: is it in amperes, or a motor's effort?"
     )
     option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
     return [RecordingFinding("scale", "tau", s.arm.names[j], evidence, option, False)]

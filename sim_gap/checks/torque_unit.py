@@ -53,7 +53,7 @@ def find_scale(arm: RigidArm, fit: RigidFit, motion: ChannelMotion, stated: Corr
     if SCALE[0] < scale < SCALE[1]:
         return []
     joints = ", ".join(f"{arm.names[j]} {fit.scale[j]:.3g}" for j in np.flatnonzero(strong))
-    evidence = f"reads the model's torque times {joints}: amperes, or another unit?"
+    evidence = f"is the model's torque times a factor ({joints}): is it in amperes, or another unit?"
     option = f"--units {motion.channel}=A:K (N·m/A at the joint, or one each: K1;K2;…), or {motion.channel}=N·m"
     return [RecordingFinding("scale", motion.channel, "all", evidence, option, False)]
 
@@ -81,7 +81,8 @@ def find_joint_scale(arm: RigidArm, motion: ChannelMotion, stated: Corrections) 
         if stated.states("units", column) or not apart or not tells:
             continue
         evidence = (
-            f"reads the model's torque times {alone.scale[j]:.3g}, unlike the other joints: amperes, or another unit?"
+            f"is {alone.scale[j]:.3g} times the model's torque, unlike the other joints: is it in amperes, or another "
+            "unit?"
         )
         option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
         found.append(RecordingFinding("scale", motion.channel, arm.names[j], evidence, option, False))
@@ -105,7 +106,7 @@ def find_outgrown(
         if model[j] < ALONE * spread[j] and spread[j] > OUTGROWN * largest and not stated.states("units", column):
             evidence = (
                 f"varies by {spread[j]:.3g} N·m, of which the model's torque is {model[j] / spread[j]:.0%}; no joint "
-                f"nearer the base has more than {largest:.3g} N·m: milliamperes, or another unit?"
+                f"nearer the base varies by more than {largest:.3g} N·m: is it in milliamperes, or another unit?"
             )
             option = f"--units {column}=A:K (N·m/A at the joint), or {column}=N·m if it is right"
             found.append(RecordingFinding("scale", motion.channel, arm.names[j], evidence, option, False))
@@ -124,8 +125,8 @@ def find_absent(arm: RigidArm, fit: RigidFit, motion: ChannelMotion, stated: Cor
     read = (fit.own_share > ABSENT) & (fit.own_share < STUCK)
     for j in np.flatnonzero(read & (fit.scale < HELD)).tolist():
         evidence = (
-            f"varies by {fit.spread[j]:.2g} N·m, while the model's torque varies by {fit.own_share[j]:.0f} times as "
-            "much and is not in it: another joint's column?"
+            f"varies by {fit.spread[j]:.2g} N·m; the model's torque for this joint varies {fit.own_share[j]:.0f} times "
+            "more and does not show in it: is it another joint's column?"
         )
         option = f"--map {motion.channel}_{j + 1}=COLUMN, or --units {motion.channel}=N·m if it is right"
         found.append(RecordingFinding("order", motion.channel, arm.names[j], evidence, option, False))

@@ -69,7 +69,10 @@ def _findings(recording: Recording, velocity: Array, stated: Corrections) -> lis
     wrong = {
         "order": (clear & (best != np.arange(moves.size)) & (np.abs(np.diag(match)) < 0.5), "belongs to another joint"),
         "sign": (own & (scale < 0.0), "has the opposite sign of the position's derivative"),
-        "scale": (own & (scale > 0.0) & ~((low < scale) & (scale < high)), "is not the position's derivative in size"),
+        "scale": (
+            own & (scale > 0.0) & ~((low < scale) & (scale < high)),
+            "differs in size from the position's derivative",
+        ),
     }
     found = []
     for kind, (joints, what) in wrong.items():
@@ -83,7 +86,7 @@ def _findings(recording: Recording, velocity: Array, stated: Corrections) -> lis
     if not found and own.any() and not stated.states("units", "dq_1"):
         late = _delay(recording, rate[:, moves], velocity[:, moves])
         if late:
-            evidence = f"is {late * 1e3:.0f} ms behind the position's derivative, as a filter makes it: left out"
+            evidence = f"lags {late * 1e3:.0f} ms behind the position's derivative, as after a filter: left out"
             found.append(RecordingFinding("filter", "dq", "all", evidence, "--units dq=rad (keep it)", True))
     return found
 

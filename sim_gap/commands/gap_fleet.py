@@ -29,7 +29,7 @@ def diagnose_fleet(
     from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results
     from sim_gap.fleet import Answers, cluster, diagnose_fleet, find_cases, open_to_all
     from sim_gap.fleet import table as table_of
     from sim_gap.trends import fleet_outliers, fleet_trends
@@ -52,9 +52,12 @@ def diagnose_fleet(
                 bars.advance(task)
     found = {case.name: answers.found[case.name] for case in cases}
     rows = table_of(found)
-    _show(rows, console)
+    out_console = results(json_file)
+    _show(rows, out_console)
     trends, outliers = rows_of(fleet_trends(found)), rows_of(fleet_outliers(found))
-    show_changes(trends, outliers, console)
+    show_changes(trends, outliers, out_console)
+    failed = sum("error" in answer for answer in found.values())
+    out_console.print(f"{len(found) - failed} of {len(found)} cases are diagnosed: {answers.path}")
     if table is not None:
         _write_table(rows, table)
     write_json(json_file, {"schema": "armlink.gap-fleet/1", "answers": found, "trends": trends, "outliers": outliers})
@@ -134,13 +137,13 @@ def trend(
     Example: armlink gap trend recordings/ --sim arm.yaml
     """
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import results
     from sim_gap.fleet import Answers, diagnose_case, find_cases
     from sim_gap.model.load import load_compiled
     from sim_gap.trends import date_of, fleet_trends, rows
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
-    console = PlainConsole()
+    console = results(json_file)
     answers = Answers(out or folder / "answers.jsonl")
     newest = ""
     for case in sorted(find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
@@ -151,6 +154,8 @@ def trend(
         console.print(f"{case.name}: {answer.get('verdict') or answer['error']}")
     trends = rows(fleet_trends(answers.found))
     show_changes(trends, [], console)
+    changes = f"{len(trends)} parameters change" if trends else "no parameter changes"
+    console.print(f"{len(answers.found)} recordings: {changes}")
     newest_answer = answers.found[newest]
     shown = {"case": newest.partition("/")[2], "answer": newest_answer}
     write_json(json_file, {"schema": "armlink.gap-trend/1", "newest": shown, "trends": trends})

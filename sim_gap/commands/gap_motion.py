@@ -1,6 +1,5 @@
 """Plans the motion that would separate the candidate causes of a diagnosis, and runs it on the arm."""
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -28,19 +27,19 @@ def plan(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import command_line, results, suggest
     from sim_gap.experiment import joints_in_doubt, plan_motion, save_motion
 
     joints, sentences = joints_in_doubt(answer) if answer else ([], [])
     motion = plan_motion(load_arm(arm), [*joints, *(joint or [])], poses, seed)
     save_motion(motion, out)
-    console = PlainConsole()
+    console = results(json_file)
     for sentence in sentences:
         console.print(f"requested by the diagnosis: {sentence}")
     for piece in motion.pieces:
         console.print(piece)
-    run = shlex.join(["armlink", "gap", "collect", arm, "--motion", str(out), "--out", str(out.with_suffix(".mcap"))])
-    console.print(f"{out}: {motion.seconds:.0f} s; next: {run}")
+    console.print(f"{out}: {motion.seconds:.0f} s of motion")
+    suggest(command_line("gap", "collect", arm, motion=out, out=out.with_suffix(".mcap")))
     write_json(
         json_file, {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences}
     )
@@ -63,8 +62,9 @@ def collect(
     from rich.progress import Progress
 
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainColumn, PlainConsole
+    from armlink.commands.plain_console import PlainColumn, PlainConsole, command_line, results, suggest
     from armlink.errors import BadInput
     from armlink.loop.open import open_arm
     from sim_gap.experiment import collect as run
@@ -75,16 +75,20 @@ def collect(
     arm_file = load_arm(arm)
     target = load_motion(motion, arm_file)
     console = PlainConsole()
+    again = command_line("gap", "collect", arm, motion=motion, out=out, bus=bus)
     with (
+        early_end(arm_file, again) as work,
         open_arm(arm_file, bus) as link,
         Progress(PlainColumn("{task.description}"), *Progress.get_default_columns()[1:], console=console) as bars,
     ):
         task = bars.add_task(f"{arm_file.name}: {motion.name}", total=len(target))
         link.start()
+        work.enabled = True
         link.enable()
         rows = run(link, target, out, lambda k, _: bars.update(task, completed=k) if k % 50 == 0 else None)
         bars.update(task, completed=rows)
         link.disable()
-    console.print(f"{out}: {rows} rows, {rows / link.rate:.1f} s")
+    results(json_file).print(f"{out}: {rows} rows, {rows / link.rate:.1f} s")
+    suggest(command_line("gap", "diagnose", sim=arm, train=out))
     write_json(json_file, {"file": str(out), "rows": rows, "seconds": rows / link.rate})
     return 0

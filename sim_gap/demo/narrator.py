@@ -18,8 +18,9 @@ Report = Callable[[float, float, float | None, str], None]
 class Narrator:
     """Lines with the time since the start, and progress, on a console."""
 
-    def __init__(self, console: Console) -> None:
-        self.console = console
+    def __init__(self, console: Console, results: Console) -> None:
+        """Progress on `console`, tables and findings on `results`."""
+        self.console, self.results = console, results
         self._began = time.monotonic()
 
     @property
@@ -27,8 +28,14 @@ class Narrator:
         return time.monotonic() - self._began
 
     def say(self, text: str, style: str = "") -> None:
-        line = Text.assemble((f"{self.elapsed:5.0f} s", "dim"), "  ", (printable_text(text), style))
-        self.console.print(line, soft_wrap=True)
+        self.console.print(self._stamped(text, style), soft_wrap=True)
+
+    def find(self, text: str) -> None:
+        """The same among the results."""
+        self.results.print(self._stamped(text, ""), soft_wrap=True)
+
+    def _stamped(self, text: str, style: str) -> Text:
+        return Text.assemble((f"{self.elapsed:5.0f} s", "dim"), "  ", (printable_text(text), style))
 
     @contextmanager
     def stage(self, headline: str) -> Iterator[Report]:

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
 from armlink.commands.output import write_json
+from armlink.commands.plain_console import results
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm, model_arm
@@ -56,7 +57,7 @@ def run_demo(
     arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console, realism: float | None = None
 ) -> DemoResult:
     """Run it, write `report.html`, `summary.json` and the data into `out`; raises BadInput, Refused, BusFault."""
-    teller = Narrator(console)
+    teller = Narrator(console, results(json_path))
     if Path(arm_name).suffix.lower() in MODEL_SUFFIXES:
         arm_name = str(_from_model(Path(arm_name), out, teller))
     arm = load_arm(arm_name)
@@ -75,12 +76,12 @@ def run_demo(
             result = demo.creep_demo() if creeping else demo.sensor_demo()
         store.close()
     if result.creep is not None:
-        console.print(creep_table(result, result.creep))
+        teller.results.print(creep_table(result, result.creep))
     write_report(result, out / "report.html")
     content = summary(result)
     write_json(out / "summary.json", content)
     write_json(json_path, content)
-    teller.say(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}")
+    teller.find(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}")
     return result
 
 
@@ -118,25 +119,25 @@ class _Demo:
         apply = Apply(BY, accepted=arm.joint_names)
         admitted = admit_sweeps(record, arm, store, data, sensors.goodness.findings, apply)
         written = install(admitted, store, link, by=BY, reason="sweeps without and with reference mass", check=None)
-        teller.console.print(calibration_table(self.bench, sensors))
+        teller.results.print(calibration_table(self.bench, sensors))
         teller.say(f"record {record.id} written to {len(written)} controllers and read back")
         check = self._verified(
             "verifying at poses that the fit has not seen",
             lambda progress: run_verify(link, arm, gravity_record, record, seed=seed, progress=progress),
         )
         gravity_check = check_gravity(self.bench, gravity.beta, record, seed)
-        teller.console.print(verify_table(link.names, check, gravity_check))
+        teller.results.print(verify_table(link.names, check, gravity_check))
         recordings, diagnosis = self._recorded(record, (40.0, 25.0), motor_only=False)
         with teller.stage("ordinary work: a torque sensor will drift") as report:
             drift = run_drift(self.bench, store, gravity_record, check, seed, report)
-        teller.say(drift.sentence(link.names))
+        teller.find(drift.sentence(link.names))
         with teller.stage("diagnosing the gap between the recording and the nominal simulation"):
             try:
                 gap = diagnosis.result()
             except BrokenProcessPool:
                 teller.say("the process that did it was killed: doing it again in this one")
                 gap = diagnose_recordings(arm.path, recordings)
-        teller.say(sentence(gap))
+        teller.find(sentence(gap))
         result = DemoResult(self.bench, seed, sensors, gravity_check, check, gap, link.stats, 0.0, 0.0, drift=drift)
         return self._ended(result)
 

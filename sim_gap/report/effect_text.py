@@ -15,8 +15,8 @@ def advice(answer: Diagnosis) -> str:
     if answer.verdict == "unexplained":
         return "Change nothing yet: look at where the gap is, check cabling, payload and model there, and record again."
     if answer.verdict == "ambiguous":
-        return "Record one more motion, which tells the candidates apart; gap plan makes it of the answer in JSON."
-    return "Add these effects to the simulator; the diagnosis writes the corrected model if it is given --out-model."
+        return "Record one more motion that separates the candidates; gap plan makes it of the answer in JSON."
+    return "Add these effects to the simulation: with --out-model the diagnosis writes the corrected model."
 
 
 def sentence(answer: Diagnosis) -> str:
@@ -26,7 +26,7 @@ def sentence(answer: Diagnosis) -> str:
     if answer.verdict == "unexplained" and answer.unexplained < 0.01 and answer.notes:
         return f"Gap not explained: {answer.notes[0]}"
     if answer.verdict == "unexplained":
-        return f"Gap not explained: {answer.unexplained:.0%} of it remains that no effect of the library explains"
+        return f"Gap not explained: no effect of the library accounts for {answer.unexplained:.0%} of it"
     first = answer.causes[0]
     if answer.verdict == "ambiguous" and not first.confounded_with:
         hints = ", ".join(cause.effect for cause in answer.causes if cause.confidence < HINT)

@@ -15,9 +15,9 @@ from armlink.drives.orders import Mode
 from armlink.errors import BusFault
 
 LOST: Mapping[Entry, str] = {
-    objects.RPDO_DEADLINE: "no deadline for commands: the heartbeat alone tells that the host is gone",
+    objects.RPDO_DEADLINE: "no deadline for commands: only its heartbeat shows that the host is gone",
     objects.HEARTBEAT_CONSUMER: "the device does not watch its host",
-    objects.HEARTBEAT_PRODUCER: "a device that leaves the bus is noticed by its readings alone",
+    objects.HEARTBEAT_PRODUCER: "only missing readings show that the device has left the bus",
     objects.ABORT_OPTION: "what it does when its host falls silent cannot be set",
     objects.QUICK_STOP_OPTION: "whether it holds after a quick stop cannot be set",
     objects.MAX_TORQUE: "the device does not bound torque: the host alone does",

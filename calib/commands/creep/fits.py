@@ -7,6 +7,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.commands.output import write_json
+from armlink.commands.plain_console import PlainConsole, results
 from calib.commands.screen import print_intervals, print_lines
 from calib.creep.fit import QUANTILE, CreepFit, fit_creep
 from calib.creep.record import HEADINGS, calibration_record, gravity_record, missing, values_told
@@ -23,8 +24,9 @@ def calibrate_creep(data: list[SweepData], arm_file: ArmFile, store: str | None,
     current = records.current(CalibrationRecord, arm_file)
     record = calibration_record(fit, arm_file).model_copy(update={"parent": None if current is None else current.id})
     records.put(record, arm_file, by="armlink calibrate", reason="creep sweeps")
-    _show(fit, data)
-    print_lines([f"record {record.id} is current: it corrects readings and commands when the arm is opened next"])
+    out = results(json_file)
+    _show(fit, data, out)
+    out.print(f"record {record.id} is current: it corrects readings and commands when the arm is opened next")
     write_json(json_file, {"schema": "armlink.creep/1", "record": record.id, **_answer(fit, data)})
 
 
@@ -36,13 +38,15 @@ def identify_creep(data: list[SweepData], arm_file: ArmFile, store: str | None, 
     used = current if current is not None and current.sources == fit.sources else None
     record = gravity_record(fit, arm_file, used)
     records.put(record, arm_file, by="armlink identify", reason="creep sweeps")
-    found = fit.found("beta")
+    out, found = results(json_file), fit.found("beta")
     beta, half = np.where(found, fit.value("beta"), np.nan), QUANTILE * fit.std("beta")
     print_intervals(
         "Mass moments [kg·m], ± half of the 95 % interval",
         fit.names,
         {"x": (beta[0::2], half[0::2]), "y": (beta[1::2], half[1::2])},
+        out,
     )
+    out.print(f"record {record.id} is current: {found.sum()} of {len(found)} mass moments are determined")
     answer = {
         "schema": "armlink.gravity/1",
         "record": record.id,
@@ -60,14 +64,14 @@ def _fit(data: list[SweepData], arm_file: ArmFile) -> CreepFit:
     return fit_creep(arm_file, [each.require(arm_file) for each in data])
 
 
-def _show(fit: CreepFit, data: list[SweepData]) -> None:
+def _show(fit: CreepFit, data: list[SweepData], console: PlainConsole) -> None:
     reasons = missing(fit)
     columns = {}
     for family, heading in HEADINGS.items():
         columns[heading] = (values_told(fit, family), QUANTILE * fit.std(family))
-    print_intervals("Drives, ± half of the 95 % interval", fit.names, columns)
-    print_lines([f"{joint} {parameter}: {reason}" for (joint, parameter), reason in reasons.items()])
-    print_lines([*(each.reason for one in data for each in contacts(one)), *fit.findings], "yellow")
+    print_intervals("Drives, ± half of the 95 % interval", fit.names, columns, console)
+    print_lines([f"{joint} {parameter}: {reason}" for (joint, parameter), reason in reasons.items()], console=console)
+    print_lines([*(each.reason for one in data for each in contacts(one)), *fit.findings], "yellow", console)
 
 
 def _answer(fit: CreepFit, data: list[SweepData]) -> dict[str, Any]:

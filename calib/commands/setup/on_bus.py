@@ -1,6 +1,5 @@
 """The parts of `armlink new` that begin with the drives on a bus: of an arm file, and of nothing else."""
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +16,7 @@ if TYPE_CHECKING:
 SCHEMA = "armlink.new/1"
 
 
-def begin_with_drives(
-    console: Any, out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None
-) -> int:
+def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None) -> int:
     """An arm file of nothing but a bus: its drives, and no geometry."""
     from armlink.arm_file import parse_arm
     from armlink.drives.registry import found_drives
@@ -34,10 +31,10 @@ def begin_with_drives(
     write_whole(out, made.text)
     nodes = ", ".join(str(match.drive.node) for match in made.matches)
     told = f"{len(made.matches)} joints, nodes {nodes}; the geometry is not known, and says so in the file"
-    return _tell(console, out, told, "check", name or out.stem, _matched(made.matches), [], json_file)
+    return _tell(out, told, "check", name or out.stem, _matched(made.matches), [], json_file)
 
 
-def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
+def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
     """An arm file with the drives of a bus."""
     from armlink.arm_file import load_arm, parse_arm, read_yaml
     from armlink.content.yaml_text import yaml_comment, yaml_document
@@ -69,7 +66,7 @@ def rewire(console: Any, model: Path, out: Path, bus: str, ask: "Ask | None", js
     title = yaml_comment(f"{arm.name} with the drives on {channel}, from {model.name}, by the command new.")
     write_whole(out, title + "\n" + yaml_document(content))
     told = f"nodes {', '.join(str(match.drive.node) for match in matches)}"
-    return _tell(console, out, told, "check", arm.name, _matched(matches), findings, json_file)
+    return _tell(out, told, "check", arm.name, _matched(matches), findings, json_file)
 
 
 def drives_by_ids(model: Path) -> bool:
@@ -80,7 +77,7 @@ def drives_by_ids(model: Path) -> bool:
     return by_ids(load_arm(model))
 
 
-def copy(console: Any, model: Path, out: Path, bus: str, new_serial: bool, json_file: Path | None) -> int:
+def copy(model: Path, out: Path, bus: str, new_serial: bool, json_file: Path | None) -> int:
     """An arm file with drives that are known by their ids, on a bus of one's own."""
     from armlink.arm_file import load_arm
     from calib.commissioning.own_copy import own_copy
@@ -93,7 +90,7 @@ def copy(console: Any, model: Path, out: Path, bus: str, new_serial: bool, json_
     write_whole(out, copied.text)
     told = f"{', '.join(address for _, address, _ in copied.drives)} answer; limits are those of {model}"
     joints = [{"name": name, "address": address, "serial": serial} for name, address, serial in copied.drives]
-    return _tell(console, out, told, "doctor", arm.name, joints, copied.findings, json_file)
+    return _tell(out, told, "doctor", arm.name, joints, copied.findings, json_file)
 
 
 def _matched(matches: "Sequence[Match]") -> list[dict[str, Any]]:
@@ -101,7 +98,6 @@ def _matched(matches: "Sequence[Match]") -> list[dict[str, Any]]:
 
 
 def _tell(
-    console: Any,
     out: Path,
     told: str,
     command: str,
@@ -112,12 +108,14 @@ def _tell(
 ) -> int:
     """Findings, what was written and the next command, to the screen and as JSON; the exit status."""
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import command_line, results, suggest
 
+    console = results(json_file)
     for found in findings:
         console.print(str(found), style="red")
-    step = shlex.join(["armlink", command, str(out)])
+    step = command_line(command, str(out))
     console.print(f"{out}: {told}")
-    console.print(f"next: {step}", style="bold")
+    suggest(step)
     answer = {"out": str(out), "name": name, "joints": joints, "next": step}
     write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in findings]})
     return 1 if findings else 0

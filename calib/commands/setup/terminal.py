@@ -53,7 +53,8 @@ class Terminal:
 
     def stops(self, joint: str) -> tuple[float, float] | None:
         text = ask(
-            f"{joint} has no limits in the model. Its lower and upper stop [rad], as -2.9 2.9; Enter: it has none",
+            f"{joint} has no limits in the model. Give its lower and upper stop [rad], such as -2.9 2.9,"
+            " or Enter for none",
             default="",
             show_default=False,
         )

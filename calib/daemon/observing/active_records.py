@@ -114,7 +114,7 @@ class ActiveRecords:
     def _store_failed(self, fault: StoreFault) -> None:
         self._looked = self._environment.monotonic() - RECORDS_SECONDS + STORE_SECONDS
         if not self._store_fault:
-            kept = "" if self.observation is None else "; the records in force stay in force"
+            kept = "" if self.observation is None else "; the records in force are kept"
             self._events.say("fault", None, f"{fault}{kept}", {})
         self._store_fault = str(fault)
 
@@ -138,7 +138,9 @@ class ActiveRecords:
         self.detail = ""
         if before is not None:
             evidence = {"calibration": calibration.id, "gravity": gravity.id}
-            self._events.say("configuration", None, "other records are in force and observed against now", evidence)
+            self._events.say(
+                "configuration", None, "other records are in force now, and the observer uses them", evidence
+            )
         self._check_controllers()
 
     def renew(self) -> None:

@@ -66,4 +66,4 @@ class ActiveObservation:
             if event.finding is not None:
                 self.recalibrations.found(event.finding)
             elif event.kind == "undecided":
-                self._more_poses("watching alone cannot decide")
+                self._more_poses("observation alone cannot decide")

@@ -241,7 +241,7 @@ class RecalibrationWorkflow:
         if row.state != "pending":
             raise NotPossible(f"proposal {row.number} is {row.state} already")
         if row.id in self._journal.deciding:
-            raise NotPossible(f"proposal {row.number} is decided already, which waits for the disk")
+            raise NotPossible(f"proposal {row.number} is decided already; the decision waits for the disk")
 
     # ---- after a write
 
@@ -310,7 +310,7 @@ class RecalibrationWorkflow:
             return
         joint = self._names[checked.joint]
         why = checked.why.removeprefix(f"{joint}: ")
-        self._events.say("check", joint, f"{joint}: recalibration holds: {why}", {"kept": True})
+        self._events.say("check", joint, f"{joint}: recalibration confirmed: {why}", {"kept": True})
 
     def _take_back(self, checked: Checked) -> None:
         """Roll the last write back; where store or bus fail, again later."""
@@ -374,9 +374,9 @@ class RecalibrationWorkflow:
         """The proposal of that number; raises NoSuch, and NotPossible where it is not the one of that digest."""
         row = self._journal.proposal_numbered(number)
         if row is None:
-            raise NoSuch(f"no proposal {number}: the list of proposals has the numbers of now")
+            raise NoSuch(f"no proposal {number}: /api/proposals lists the present ones")
         if digest is not None and digest != row.digest:
-            raise NotPossible(f"proposal {number} is not the one of hash {digest[:12]}…: look at it again, then decide")
+            raise NotPossible(f"proposal {number} is not that of hash {digest[:12]}…: look at it again, then decide")
         return row
 
 

@@ -107,7 +107,7 @@ def test_a_dry_run_makes_the_whole_sweep_on_the_simulated_arm(
     mass = answer["recommended_reference_mass"]
     assert mass > 0
     again = f"armlink sweep {arm_path} --dry-run --reference-mass {mass:g} --out {out}-loaded"
-    assert said.err.splitlines()[-1] == again
+    assert said.err.splitlines()[-1] == f"next: {again}"
 
 
 def test_where_the_model_does_not_hold_nothing_is_written_unless_accepted(

@@ -257,7 +257,7 @@ def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_b
     assert json.loads(capsys.readouterr().out)["next"] == "armlink check arm.yaml"
     assert cli.run(["check", "arm.yaml", "--passive"]) == 0
     assert cli.run(["doctor", "arm.yaml"]) == 1
-    assert "geometry is not known" in capsys.readouterr().err
+    assert "geometry is not known" in capsys.readouterr().out
     assert cli.run(["new"]) == 2
     assert "--bus" in capsys.readouterr().err
 

@@ -211,7 +211,7 @@ def test_bounds_are_against_the_last_sweep_not_the_last_step(store: RecordStore)
     recalibrator = Recalibrator(ARM, Controllers(), store, "apply")
     recalibrator.handle(finding(1.06, 0.0))
     again = Recalibrator(ARM, recalibrator._controllers, store, "apply")  # after a restart too
-    with pytest.raises(Refused, match="at most 10% is drift"):
+    with pytest.raises(Refused, match="a drift is at most 10%"):
         again.handle(finding(1.06, 0.0))
 
 

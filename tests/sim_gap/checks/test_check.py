@@ -325,7 +325,7 @@ def test_rows_stamped_together_are_put_on_even_times_or_refused(arm, motor):
 def test_torques_exchanged_midway_are_refused(arm, motor):
     exchanged = motor.motor_torque.copy()
     exchanged[motor.t.size // 2 :] = exchanged[motor.t.size // 2 :][:, [0, 2, 1]]
-    with pytest.raises(BadInput, match=r"after 50% of the recording alone .* --map tau_motor_2=tau_motor_3"):
+    with pytest.raises(BadInput, match=r"after 50% of the recording: .* --map tau_motor_2=tau_motor_3"):
         check(arm, replace(motor, motor_torque=exchanged, velocity=None))
 
 
@@ -334,7 +334,7 @@ def test_torques_exchanged_in_a_part_of_the_rows_are_refused_with_its_place(arm,
     rows = (motor.t > motor.t[0] + share * np.ptp(motor.t)) == late
     exchanged = motor.motor_torque.copy()
     exchanged[rows] = exchanged[rows][:, [2, 1, 0]]
-    place = rf"{'after' if late else 'before'} {share:.0%} of the recording alone .* --map tau_motor_1=tau_motor_3"
+    place = rf"{'after' if late else 'before'} {share:.0%} of the recording: .* --map tau_motor_1=tau_motor_3"
     with pytest.raises(BadInput, match=place):
         check(arm, replace(motor, motor_torque=exchanged, velocity=None))
 
@@ -344,7 +344,7 @@ def test_a_link_torque_that_another_column_holds_midway_is_refused():
     made = replace(record(model(), REAL, seconds=30.0, rate=100.0), motor_torque=None)
     torque = made.torque.copy()
     torque[made.t.size // 2 :, 0] = 0.05 * made.position[made.t.size // 2 :, 0]
-    with pytest.raises(BadInput, match=r"tau of joint_1: in the second half of the recording alone .* is not in it"):
+    with pytest.raises(BadInput, match=r"tau of joint_1: only in the second half of the recording: .* not show in it"):
         check(load_model(model()).arm, replace(made, torque=torque))
 
 

@@ -64,7 +64,7 @@ def test_rows_with_the_position_of_the_next_are_told_with_their_remedy(tmp_path)
     assert {cause.effect for cause in answer.causes} == {"controller.delay"}
     for found in answer.causes[0].parameters.values():
         assert found["time"].value == pytest.approx(-PERIOD, abs=2e-3)
-    (note,) = [each for each in answer.notes if each.startswith("commands act before their rows' time")]
+    (note,) = [each for each in answer.notes if each.startswith("commands take effect before the time of their rows")]
     assert note.endswith("--clock q_cmd=-0.034")
 
 
