@@ -12,9 +12,6 @@ if TYPE_CHECKING:
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore
 
-STRIKING = 3.0
-"""Changes of at least this many standard deviations are set in bold: by chance once in 370."""
-
 
 def diff(
     before: Annotated[str, typer.Argument(metavar="A", help="Id of a record, or a record's YAML file.")],
@@ -62,7 +59,7 @@ def _show(
     for each in changes:
         if each.before is None and each.after is None:
             continue
-        striking = each.deviations is not None and abs(each.deviations) >= STRIKING
+        striking = each.deviations is not None and abs(each.deviations) >= 3.0  # by chance once in 370
         cells = (_text(each.before, ".5f"), _text(each.after, ".5f"), _text(each.change, "+.5f"))
         deviations = _text(each.deviations, "+.1f")
         row = (each.joint, each.parameter.replace("_", " "), each.unit, *cells, deviations)
