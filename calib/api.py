@@ -23,9 +23,9 @@ from calib.creep.run import run_creep
 from calib.creep.verify import verify_creeping
 from calib.fit.gravity_fit import GravityFit, identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
-from calib.observer.choice import observer_of
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
+from calib.observer.observer import observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.data_sets import data_sets
 from calib.sweep.dataset import SweepData

@@ -11,12 +11,6 @@ from calib.commissioning.finding import SetupFinding
 from calib.plan.sweep_plan import DEAD_LEVER
 from gcomp.gravity.torque import gravity_levers
 
-POSES = 500
-SMALL_LEVER = 0.2
-"""Γ/g below which the torque gain becomes imprecise; a choice."""
-USUAL_GRAVITY = (9.7, 9.9)
-"""On Earth [m/s²]."""
-
 
 def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     """Findings about kinematics and model; raises BadInput where the model cannot be used at all."""
@@ -65,14 +59,14 @@ def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
 def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     arm, where = gcomp_arm(arm_file), str(arm_file.path)
     size = float(np.linalg.norm(arm.gravity))
-    if not USUAL_GRAVITY[0] < size < USUAL_GRAVITY[1]:
+    if not 9.7 < size < 9.9:  # on Earth
         remedy = "give kinematics.gravity in m/s² in the base frame, such as [0, 0, -9.81]"
         yield SetupFinding("warning", f"gravity is {size:.3g} m/s², not 9.81", f"{where}: kinematics.gravity", remedy)
         if size < 1e-6:
             return
     low = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
     high = np.where(np.isfinite(arm.upper), arm.upper, np.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
+    poses = np.random.default_rng(0).uniform(low, high, (500, arm.n))
     lever = gravity_levers(arm, poses).max(axis=0) / size
     for joint, name in enumerate(arm.names):
         if lever[joint] < DEAD_LEVER:
@@ -83,7 +77,7 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
                 name,
                 "incline the base for the sweeps, or do without its gain",
             )
-        elif lever[joint] < SMALL_LEVER:
+        elif lever[joint] < 0.2:  # a choice
             yield SetupFinding(
                 "hint",
                 f"gravity loads it little (Γ/g at most {lever[joint]:.2f}): its torque gain will be imprecise",

@@ -22,11 +22,6 @@ from calib.plan.sweep_plan import plan_sweep
 from gcomp.arm.load import joint_inertias, place_chain
 from gcomp.gravity.torque import gravity_torque
 
-POSES = 500
-DAMPED_POSES = 100
-"""An inertia changes little from pose to pose."""
-RESERVE = 1.2
-"""Torque that a drive should have over gravity, as a factor; a choice: friction and acceleration need the rest."""
 LEAST_DAMPING = 0.3
 """Damping ratio of a joint that its drive holds with stiffness and damping alone; below it swings after each move."""
 FASTEST_RATE = 20.0
@@ -72,7 +67,7 @@ def _strength(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
     """Joints whose drives cannot hold the arm everywhere in its range."""
     arm, limits = gcomp_arm(arm_file), DriveLimits.of(arm_file)
     low, high = np.nan_to_num(arm.lower, neginf=-np.pi), np.nan_to_num(arm.upper, posinf=np.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
+    poses = np.random.default_rng(0).uniform(low, high, (500, arm.n))
     need = np.abs(gravity_torque(arm, guess.beta, poses)).max(axis=0)
     for joint, name in enumerate(arm.names):
         most = limits.max_torque[joint]
@@ -80,7 +75,7 @@ def _strength(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
             what = f"by the model, gravity needs up to {need[joint]:.3g} N·m, but max_torque is {most:g}"
             remedy = "check the model's masses and max_torque: the arm would fall"
             yield SetupFinding("error", what, name, remedy)
-        elif RESERVE * need[joint] > most:
+        elif 1.2 * need[joint] > most:  # friction and acceleration need the rest; a choice
             what = f"by the model, gravity needs up to {need[joint]:.3g} N·m of max_torque {most:g}: little is left"
             yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
 
@@ -95,7 +90,8 @@ def _damping(arm_file: ArmFile, model: Path) -> Iterator[SetupFinding]:
         placed = place_chain(model, base=arm_file.kinematics.base, tip=arm_file.kinematics.tip)
     arm = placed.arm.arm
     low, high = np.nan_to_num([arm.lower, arm.upper], posinf=np.pi, neginf=-np.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (DAMPED_POSES, arm.n))
+    # few: an inertia changes little from pose to pose
+    poses = np.random.default_rng(0).uniform(low, high, (100, arm.n))
     mass = sweep_section(arm_file).reference_mass or 0.0
     largest = dict(zip(arm.names, joint_inertias(placed, poses, mass).max(axis=0).tolist(), strict=True))
     for joint in joints:

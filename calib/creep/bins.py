@@ -12,9 +12,6 @@ from armlink.link.types import Sample
 from calib.motion.static_reading import StaticReading, stack
 from gcomp.arrays import Array
 
-LEAST_SAMPLES = 5
-"""Samples that a bin has at least."""
-
 
 def bin_readings(
     samples: Sequence[Sample], joint: int, side: int, middles: Array, temperature: Array | None = None
@@ -38,7 +35,7 @@ def _reading(
     position: Array, torque: Array, t: Array, inside: Array, middle: float, width: float, joint: int, side: int,
     temperature: Array | None,
 ) -> StaticReading | None:  # fmt: skip
-    if inside.sum() < LEAST_SAMPLES:
+    if inside.sum() < 5:  # too few for a mean
         return None
     q, v, when = position[inside], torque[inside], t[inside]
     weight = 1 + np.cos(2 * np.pi * (q[:, joint] - middle) / width)

@@ -13,8 +13,6 @@ from gcomp.arrays import Array
 
 BINS = 10
 """Rows per direction with which a candidate is judged."""
-SCATTER_SHARE = 0.003
-"""Scatter of a row, as a share of rated torque, that the choice assumes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +76,6 @@ def _information(arm: Arm, x: Array, one: CreepCandidate, speed: float, mass: fl
         warmest=np.zeros(arm.n),
     )
     _, jacobian = CreepModel(arm, rows).linearised(x)
-    jacobian /= SCATTER_SHARE * rated[one.joint]
+    jacobian /= 0.003 * rated[one.joint]  # the scatter that the choice assumes
     information: Array = jacobian.T @ jacobian
     return information

@@ -44,15 +44,13 @@ HEADINGS = {
     "viscous": "viscous [N·m·s/rad]",
 }
 """Families of the fit, as people read them."""
-ZERO_SEEN = 0.9
-"""A zero counts as found if the data leave at most so much of its doubt."""
 
 
 def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
     """(Joint, parameter) → why the data cannot determine it."""
     reasons: dict[tuple[str, Parameter], str] = {}
     found = {"gain": fit.found("gain"), "offset": fit.found("offset")}
-    zero = fit.std("zero") < ZERO_SEEN * fit.prior_std[fit.slices["zero"]]
+    zero = fit.std("zero") < 0.9 * fit.prior_std[fit.slices["zero"]]  # the data leave less than all of its doubt
     loaded = bool((fit.rows.mass > 0).any())
     for joint, name in enumerate(fit.names):
         upright = vertical(fit.arm, joint)

@@ -14,12 +14,8 @@ from gcomp.arrays import Array
 
 LEAST_PERIODS = 2.0
 """Periods over the way of a sweep that a ripple has at least: slower ones could be gravity's."""
-FINENESS = 16
-"""Tried frequencies per reciprocal of the joint's way."""
 CLEAR = 12.0
 """Least power of a line, in twice the variance that is left without it: chance gives it once in 160,000 frequencies."""
-LEAST_BINS = 8
-"""Bins of a joint, over all its sweeps, in which a ripple is searched for."""
 
 
 def ripple_cycles(rows: CreepRows, residual: Array, n: int) -> Array:
@@ -27,7 +23,7 @@ def ripple_cycles(rows: CreepRows, residual: Array, n: int) -> Array:
     cycles = np.zeros(n)
     for joint in range(n):
         own = np.flatnonzero(rows.joint == joint)
-        if own.size >= 2 * LEAST_BINS:
+        if own.size >= 16:  # eight bins both ways
             cycles[joint] = _clearest(rows, residual, joint, own)
     return cycles
 
@@ -42,7 +38,8 @@ def _clearest(rows: CreepRows, residual: Array, joint: int, own: NDArray[np.intp
     if not way:
         return 0.0
     lowest, highest = 2 * np.pi * LEAST_PERIODS / max(way), np.pi / float(np.median(spacing))
-    tried = np.arange(lowest, highest, 2 * np.pi / float(np.ptp(position)) / FINENESS)
+    # frequencies per reciprocal of the joint's way
+    tried = np.arange(lowest, highest, 2 * np.pi / float(np.ptp(position)) / 16)
     left = residual[own] - residual[own].mean()
     powers = np.array([_explained(left, position, each) for each in tried])
     best = int(np.argmax(powers)) if powers.size else 0

@@ -15,8 +15,6 @@ STEADY = 0.02
 """Largest difference of a bin's speed from the middle one of its creep, as a share: beyond, inertia takes torque."""
 ROUGH = 6.0
 """Where the speeds of a creep scatter more: so many times the middle size of these differences."""
-COMMON_MODE = 1.0
-"""Spread of the logged temperatures from which they, and not time, say how warm a drive is [K]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +107,7 @@ def _warmth(
     n = len(passes[0].manifest.names) if passes else 0
     temperature = np.array([each.temperature[j] for each, j in zip(readings, joint, strict=True)])
     known = bool(np.isfinite(temperature).all())
-    if known and np.ptp(temperature) >= COMMON_MODE:
+    if known and np.ptp(temperature) >= 1.0:  # [K]
         warm = np.array([temperature[joint == j].max(initial=-np.inf) for j in range(n)])
         return temperature - warm[joint], np.where(np.isfinite(warm), warm, np.nan)
     span = max(float(np.ptp(t)), 1.0) if len(t) else 1.0

@@ -9,10 +9,6 @@ from calib.creep.model import CreepModel
 from calib.creep.scatter import Scatter
 from gcomp.arrays import Array
 
-STEPS = 60
-SMALL = 1e-9
-"""A step that improves the cost by a smaller share of it ends the search."""
-
 
 @dataclass(frozen=True, eq=False)
 class CreepSolution:
@@ -39,7 +35,7 @@ def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: A
         return float((scatter.whitened(reading - model.predict(at)) ** 2).sum() + (((at - mean) / std) ** 2).sum())
 
     now = cost(x)
-    for _ in range(STEPS):
+    for _ in range(60):
         predicted, jacobian = model.linearised(x)
         weighted = scatter.whitened(jacobian)
         information = weighted.T @ weighted + np.diag(1 / std**2)
@@ -53,7 +49,7 @@ def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: A
                 x, now, damping = tried, value, max(damping / 5, 1e-9)
                 break
             damping *= 8
-        if before - now <= SMALL * now:
+        if before - now <= 1e-9 * now:  # too little to go on
             break
     predicted, jacobian = model.linearised(x)
     weighted = scatter.whitened(jacobian)

@@ -257,8 +257,6 @@ def _number(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
-WORDY = 6
-"""Largest number of parameters that a reason names."""
 WHERE_IT_HANGS = ": measure where the reference mass hangs (sweep.reference_point in the arm file)"
 """Remedy for a gain that the readings with a mass leave open, as those of a single joint do."""
 
@@ -284,7 +282,7 @@ def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
             if "common factor" in sentence and not any(rows.masses):
                 return "no readings with a reference mass: only ratios of gains are determined"
             remedy = WHERE_IT_HANGS if "load_point" in sentence and name.startswith("gain") else ""
-            if sentence.count(",") > WORDY:
+            if sentence.count(",") > 6:  # too many parameters to name
                 return f"not identifiable: the data fit equally well with other values{remedy}"
             return f"{sentence}{remedy}"
     return "the readings do not determine it"

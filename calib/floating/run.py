@@ -13,7 +13,7 @@ from armlink.errors import ArmlinkError, Refused
 from armlink.link.types import Command, Sample
 from armlink.loop.driver import ArmDriver
 from calib.arm.kinematics import DriveLimits, gcomp_arm
-from calib.floating.controller import FloatConfig, FloatControl
+from calib.floating.controller import FloatControl
 from calib.records.records import CalibrationRecord
 from gcomp.arrays import Array
 
@@ -44,7 +44,6 @@ def run_float(
     calibration: CalibrationRecord | None = None,
     *,
     seconds: float = float("inf"),
-    config: FloatConfig | None = None,
     reflect: Callable[[Sample], Array] | None = None,
     on_sample: Callable[[Sample, Array], None] | None = None,
 ) -> Floated:
@@ -60,7 +59,7 @@ def run_float(
         if calibration is None
         else (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
     )
-    control = FloatControl(described, beta, limits.rated, limits.speed, link.period, config, *given)
+    control = FloatControl(described, beta, limits.rated, limits.speed, link.period, None, *given)
     run = _Float(link, control, on_sample)
     run.compare(limits.rated)
     try:

@@ -7,8 +7,6 @@ from armlink.link.types import Sample
 from calib.motion.encoder_bits import bit_of, missing_bit
 from gcomp.arrays import Array, Mask
 
-MISSING = 0.02
-"""Share of a motion's cycles without timely readings above which nothing is said of its encoders."""
 JUMP, JUMP_STEPS = 3.0, 4.0
 """A change of a position reading beyond this many times the speed limit, plus this many increments, is no motion."""
 
@@ -62,7 +60,7 @@ class EncoderCheck:
         seen (K, n) is what was read and path (K, n) where the `movable` joints were sent [rad]; `resolution` (n,) is
         the smallest change that was ever read, inf where none was: bits below it are never used.
         """
-        if np.isnan(seen).any(axis=1).mean() > MISSING:
+        if np.isnan(seen).any(axis=1).mean() > 0.02:  # too many cycles without timely readings
             return
         step = np.where(np.isfinite(resolution), resolution, self._step)
         for joint in np.flatnonzero(movable):

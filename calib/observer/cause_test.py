@@ -299,10 +299,6 @@ class CauseTest:
         return round(float((chi2 - dof) / np.sqrt(2 * dof * (1 + len(self.window.position) / known))), 2)
 
 
-UNSEEN = 1.0
-"""A gain whose limit is above this is not observed: gravity hardly loads the joint."""
-
-
 @dataclass(frozen=True)
 class DetectionLimits:
     """Smallest changes that are noticed, in one case of two; 1.5 times as large ones almost always."""
@@ -324,5 +320,5 @@ def limits(test: CauseTest, config: ObserverConfig, wait: int) -> DetectionLimit
     count, n = test.window.position.shape
     longer = np.sqrt(config.longest_window / count)
     gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) / longer for cause in ("gain", "offset"))
-    gain[~(gain <= UNSEEN)] = np.nan
+    gain[~(gain <= 1.0)] = np.nan  # gravity hardly loads the joint
     return DetectionLimits(gain, offset, wait + config.longest_window + 2 * config.window)

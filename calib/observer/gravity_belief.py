@@ -17,8 +17,6 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, as_array
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 
-LEVEL_ROWS = 120
-"""Most rows that the level is fitted to, evenly chosen: known to 7 % then, in 50 ms."""
 WANDER = 0.5
 """How far a zero may have moved with temperature since the reference, as a share of the discrepancy's level: a sensor
 of class 0.05 moves by 0.1 % of rated torque in 20 K, and an arm of such sensors has a discrepancy of 0.2 to 0.4 %."""
@@ -26,8 +24,6 @@ THERMAL, TOLD = 1.0, 0.3
 """Where drives tell their temperature: how far a zero follows a rise of 20 K, as a share of the level, and the share of
 WANDER that is left, since the sensor's own temperature is another."""
 LEVEL_ARRAYS = ("smooth", "rough", "before", "spread")
-FIRST_ROWS = 120
-"""Rows of the first epoch unless told otherwise."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +77,7 @@ class GravityBelief:
         covariance: Array,
         position_std: float = 0.0,
         level: DiscrepancyLevel | None = None,
-        first_rows: int = FIRST_ROWS,
+        first_rows: int = 120,
         wander: Array | float = np.inf,
     ) -> None:
         """beta (2n,) [kg·m], covariance (2n, 2n) [kg²·m²], with zero rows for what gravity does not determine.
@@ -187,7 +183,8 @@ class GravityBelief:
     def _fit_level(self, rows: Rows) -> None:
         if not self.level.before.any():
             return
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(LEVEL_ROWS, len(rows))).astype(int))]
+        # rows at most, evenly chosen: the level is known to 7 % then, in 50 ms
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(120, len(rows))).astype(int))]
         points, n = self.kernel.points(rows.position, rows.side), self.arm.n
         at_origin, by_point = payload_columns(self.arm)
         regressor = gravity_regressor(self.arm, rows.position)

@@ -19,6 +19,7 @@ from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
+from calib.observer.moving.observer import MovingObserver
 from calib.observer.rest_detector import RestDetector
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.observer.tracking.tracking import Tracking
@@ -279,3 +280,19 @@ class Observer:
 
     def _event(self, t: float, kind: str, joint: int | None, **evidence: Any) -> Event:
         return Event(t, kind, None if joint is None else self.arm.names[joint], evidence)
+
+
+def observer_of(
+    arm: Arm,
+    calibration: CalibrationRecord,
+    gravity: GravityRecord,
+    rated_torque: Array,
+    config: ObserverConfig | None = None,
+) -> Observer | MovingObserver:
+    """The observer that suits the arm of these records: of rests, or, where torque is a motor current, of motion.
+
+    rated_torque (n,) [N·m]. Records of drives whose torque is a current have their friction.
+    """
+    if any(joint.motor is not None for joint in calibration.joints):
+        return MovingObserver(arm, calibration, gravity, rated_torque, config)
+    return Observer.of_records(arm, calibration, gravity, rated_torque, config)

@@ -23,8 +23,6 @@ SPEED_UP, STOP_CREEP = 0.3, 0.8
 """Seconds lost to speeding up and slowing down on a way, and for creeping onto a stop and off it again: estimates."""
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b")
 """One per joint."""
-GHOSTS = 4
-"""Poses drawn per sweep."""
 
 
 def frame_origins(kinematics: Arm, q: Array) -> Array:
@@ -74,7 +72,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
     kinematics, figure = gcomp_arm(arm_file), graph.Figure()
     for sweep in plan.sweeps:
         begin, end = sweep_ends(sweep)
-        poses = begin + np.linspace(0, 1, GHOSTS)[:, None] * (end - begin)
+        poses = begin + np.linspace(0, 1, 4)[:, None] * (end - begin)
         points = np.concatenate(
             [np.vstack([places, np.full((1, 3), np.nan)]) for places in frame_origins(kinematics, poses)]
         )

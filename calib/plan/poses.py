@@ -11,8 +11,6 @@ from gcomp.arrays import Array
 from gcomp.design.selection import select
 from gcomp.gravity.torque import gravity_regressor
 
-SCOUT_CANDIDATES = 300
-"""Random poses among which the scout's are chosen; a choice: n + 3 of them are needed."""
 UNKNOWN = 1e-6
 """Prior information on each parameter: negligible, but it keeps the first poses' matrices regular."""
 Poses = tuple[tuple[float, ...], ...]
@@ -40,7 +38,7 @@ def scout_poses(
     n = kinematics.n
     ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
     generator = np.random.default_rng(seed)
-    poses = ends[:, 0] + generator.random((SCOUT_CANDIDATES, n)) * (ends[:, 1] - ends[:, 0])
+    poses = ends[:, 0] + generator.random((300, n)) * (ends[:, 1] - ends[:, 0])
     if geometry is not None:
         poses = poses[geometry.free(poses)]
         if len(poses) < 2 * (n + 3):

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.plan.rough_gravity import GravityGuess
+from calib.plan.stop_selection import PRIOR_GAIN
 from calib.plan.types import Sweep
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import predict_covariance
@@ -16,8 +17,6 @@ SIDE = 0.05
 SCATTER = 1.3
 """Scatter of readings over the noise of their samples, since joints never rest completely: as the fits of
 tests/campaigns/random_arms.py find it."""
-HOPELESS = 0.15
-"""Standard deviation beyond which more averaging cannot help a gain: that known beforehand (`PRIOR_GAIN`)."""
 
 
 def predicted_gain_std(
@@ -70,5 +69,5 @@ def predicted_gain_std(
 
 def worst_gain_std(std: Array) -> float:
     """Largest standard deviation among the gains that averaging can improve; 0 if there is none."""
-    known = std[std < HOPELESS]
+    known = std[std < PRIOR_GAIN]  # beyond it more averaging cannot help
     return float(known.max()) if len(known) else 0.0

@@ -90,12 +90,12 @@ def choose_stops(
     return select(information, prior, counts, cost=travel)
 
 
-def guessed_moments(kinematics: Arm, seed: int, draws: int = 3) -> list[Array]:
-    """Mass moments (2n,) of plausible arms of these dimensions, for planning before anything was measured."""
+def guessed_moments(kinematics: Arm, seed: int) -> list[Array]:
+    """Mass moments (2n,) of three plausible arms of these dimensions, for planning before anything was measured."""
     generator = np.random.default_rng(seed)
     length = np.hypot(kinematics.a, kinematics.d)
     beyond = np.cumsum((length + 0.1)[::-1])[::-1]
-    return [(generator.normal(size=(kinematics.n, 2)) * beyond[:, None]).ravel() for _ in range(draws)]
+    return [(generator.normal(size=(kinematics.n, 2)) * beyond[:, None]).ravel() for _ in range(3)]
 
 
 def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, slot: int, speed: Array) -> Array:

@@ -24,8 +24,6 @@ from gcomp.arrays import Array
 
 APPROACH = 0.03
 """Each step is approached over at least this way [rad]."""
-GAP = 0.02
-"""Distance from a stop at which creeping begins [rad]."""
 RETRIES = 3
 """How often a joint that slipped or stalled is tried again before the sweep gives up."""
 
@@ -212,7 +210,7 @@ class _StepPass(SweepPass):
         goal = np.array(sweep.rest)
         stops = np.array(sweep.stops, dtype=np.int64) * ~np.array(sweep.servo)
         for joint in np.flatnonzero(stops):
-            goal[joint] = mover.before_stop(int(joint), int(stops[joint]), GAP)
+            goal[joint] = mover.before_stop(int(joint), int(stops[joint]), 0.02)  # from there it creeps
         goal[sweep.joint] = target - direction * APPROACH
         mover.travel(goal, self.acceleration)
         if stops.any():

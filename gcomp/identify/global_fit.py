@@ -41,14 +41,13 @@ class GlobalFit:
     null_space: tuple[str, ...]
     """Parameters that the readings cannot separate, one sentence per null direction."""
     hopeless: tuple[str, ...]
-    """Parameters that are determined, but with a standard deviation beyond `max_std`."""
+    """Parameters that are determined, but with a standard deviation beyond MAX_STD."""
     residual: Array
     """Reading minus model (K, n) [N·m]; NaN for readings that do not count."""
     chi2: float
     """Sum of squared residuals over their variance."""
     dof: int
     """Counted readings minus the rank."""
-    iterations: int
     converged: bool
 
     @property
@@ -81,7 +80,6 @@ def identify_global(
     priors: Mapping[str, Prior] | None = None,
     loss: str = "linear",
     position_sigma: ArrayLike = 0.0,
-    max_std: Mapping[str, float] | None = None,
 ) -> GlobalFit:
     """Estimate the families `unknown` by weighted least squares on the readings that count.
 
@@ -103,7 +101,7 @@ def identify_global(
             break
         other = solve(problem, first)
         outcome = other if other.cost < outcome.cost else outcome
-    return _report(problem, outcome, {**MAX_STD, **(max_std or {})})
+    return _report(problem, outcome)
 
 
 def _starts(problem: LeastSquaresProblem, begin: Parameters) -> Iterator[Parameters]:
@@ -182,11 +180,11 @@ def _names_and_std(problem: LeastSquaresProblem, information: Information) -> tu
     return names, std
 
 
-def _report(problem: LeastSquaresProblem, outcome: Outcome, max_std: Mapping[str, float]) -> GlobalFit:
+def _report(problem: LeastSquaresProblem, outcome: Outcome) -> GlobalFit:
     n, information = problem.arm.n, outcome.information
     names, std = _names_and_std(problem, information)
     values = np.where(np.isinf(std), np.nan, outcome.vector)
-    limit = np.concatenate([np.full(place.stop - place.start, max_std[f]) for f, place in family_slices(n).items()])
+    limit = np.concatenate([np.full(place.stop - place.start, MAX_STD[f]) for f, place in family_slices(n).items()])
     beyond = (std > limit * problem.unit)[problem.free] & information.determined
     complete = Parameters.from_vector(outcome.vector, n)
     return GlobalFit(
@@ -201,6 +199,5 @@ def _report(problem: LeastSquaresProblem, outcome: Outcome, max_std: Mapping[str
         residual=problem.readings.torque - predict(problem.arm, complete, problem.readings),
         chi2=outcome.chi2,
         dof=outcome.dof,
-        iterations=outcome.iterations,
         converged=outcome.converged,
     )

@@ -17,8 +17,6 @@ from gcomp.identify.sensor_model import predict, predict_and_jacobian
 BLOCK_ROWS = 192
 """Rows per update. A factorisation this small stays in the cache and on one thread; from 384 rows LAPACK uses threads,
 which on a busy machine is ten to a hundred times slower."""
-MAX_ITERATIONS = 60
-"""Fits of sweeps take 3 or 4, hardly determined ones some 20."""
 SETTLED, STALLED, EXACT = 1e-7, 1e-5, 1e-16
 """Converged if a step can lower the cost by less than the first share of it (a hundredth of that with fixed weights, as
 convergence is then quadratic), or if no step lowers it and the gain expected is below the second share. The third is
@@ -124,7 +122,6 @@ class Outcome:
     cost: float
     chi2: float
     dof: int
-    iterations: int
     converged: bool
 
 
@@ -133,9 +130,9 @@ def solve(problem: LeastSquaresProblem, first: Parameters) -> Outcome:
     vector, damping, converged = first.vector, 0.0, False
     weight = problem.weights(vector)
     cost = problem.cost(vector, weight)
-    iterations = 0
-    while iterations < MAX_ITERATIONS and not converged:
-        iterations += 1
+    for _ in range(60):  # fits of sweeps take 3 or 4, hardly determined ones some 20
+        if converged:
+            break
         triangle, target = problem.factor(vector, weight)
         spectrum = Spectrum.of(triangle, problem.unit[problem.free])
         along = spectrum.left.T @ target
@@ -151,7 +148,7 @@ def solve(problem: LeastSquaresProblem, first: Parameters) -> Outcome:
         if problem.reweighted:
             weight = problem.weights(vector)
             cost = problem.cost(vector, weight)
-    return _finish(problem, vector, cost, iterations, converged)
+    return _finish(problem, vector, cost, converged)
 
 
 def _step(
@@ -176,7 +173,7 @@ def _step(
     return None, cost, damping
 
 
-def _finish(problem: LeastSquaresProblem, vector: Array, cost: float, iterations: int, converged: bool) -> Outcome:
+def _finish(problem: LeastSquaresProblem, vector: Array, cost: float, converged: bool) -> Outcome:
     """Covariance and goodness of fit at the end, from the weights without the loss."""
     weight = problem.weights(vector, robust=False)
     information = analyse(problem.factor(vector, weight)[0], problem.unit[problem.free])
@@ -189,7 +186,7 @@ def _finish(problem: LeastSquaresProblem, vector: Array, cost: float, iterations
     if problem.loss != "linear":
         factor = _robust_factor(problem, np.abs(scaled), information.rank)
         information = replace(information, covariance=information.covariance * factor)
-    return Outcome(vector, information, cost, float(scaled @ scaled), dof, iterations, converged)
+    return Outcome(vector, information, cost, float(scaled @ scaled), dof, converged)
 
 
 def _robust_factor(problem: LeastSquaresProblem, size: Array, rank: int) -> float:

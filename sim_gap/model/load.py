@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gcomp.arm.model_tree import HAND, coupled_joints, upwards
 
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.errors import BadInput
 from armlink.model_file import compile_spec, is_urdf, read_model
+from gcomp.arm.model_file import HAND, coupled_joints, upwards
 from gcomp.arrays import Array
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 from sim_gap.model.solver_friction import creep_speeds

@@ -6,10 +6,10 @@ from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.loop_messages import Batch
-from calib.observer.choice import observer_of
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import DriftFinding
 from calib.observer.events import Event
+from calib.observer.observer import observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arrays import Array
 

@@ -26,8 +26,6 @@ MOST_CONNECTIONS = 1280
 """More than all that `admission` lets in together."""
 ACCEPTED_AT_ONCE = 32
 """Connections accepted in one go: those that find no room are closed before the next go."""
-WAITING = 512
-"""Connections that the kernel holds until they are accepted; beyond it connect() on the Unix socket fails."""
 FILES = 4096
 """Open files that the daemon asks the system for, as far as its hard limit allows."""
 CLOSING_SECONDS = 2
@@ -127,7 +125,7 @@ class _ApiServer(uvicorn.Server):
         """As uvicorn's, whose backlog is both the kernel's queue and what is accepted in one go."""
         await super().startup(sockets)
         for listening in sockets or ():
-            listening.listen(WAITING)
+            listening.listen(512)  # beyond them connect() on the Unix socket fails
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

@@ -31,25 +31,15 @@ ALIKE = 2.0
 is measured."""
 FITTED = 5
 """Rows of a joint that its own parameters take up."""
-NEXT = 0.2
-"""Rows of a joint are neighbours if it moved less between them [rad]."""
-LEARNING_ROUNDS = 3
-"""Linearisations of learning, each with the scatter found by the one before."""
-UNTOLD_WARMTH = 0.01
-"""Doubt of a gain where no temperature is known: a drive that warms by 10 K loses a hundredth."""
-TOLD_WARMTH = 5e-4
-"""Doubt of a gain where it is: drives tell whole kelvins."""
-USUAL = Doubt()
 
 
 class MotorBelief:
     """Parameters and covariance of an arm's drives, and the standard deviation of a row."""
 
-    def __init__(
-        self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated: Array, doubt: Doubt = USUAL
-    ) -> None:
-        """Of records of creep sweeps; rated torques (n,) [N·m]. `doubt` is of what the records do not hold."""
+    def __init__(self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated: Array) -> None:
+        """Of records of creep sweeps; rated torques (n,) [N·m]."""
         self.arm, self.rated, n = arm, rated, arm.n
+        doubt = Doubt()  # of what the records do not hold
         motors = [_motor(joint.motor) for joint in calibration.joints]
         self._at = family_slices(n)
         self.mean = np.zeros(self._at["rho"].stop)
@@ -106,7 +96,8 @@ class MotorBelief:
         covariance = jacobian @ self.covariance @ jacobian.T
         covariance[np.diag_indices(len(rows))] += self.sigma[rows.joint] ** 2
         untold = np.array([np.isnan(each.temperature - self.reference_temperature[each.joint]) for each in passages])
-        by_gain = jacobian[:, self._at["gain"]] * np.where(untold, UNTOLD_WARMTH, TOLD_WARMTH)[:, None]
+        # a drive that warms by 10 K loses a hundredth; drives tell whole kelvins
+        by_gain = jacobian[:, self._at["gain"]] * np.where(untold, 0.01, 5e-4)[:, None]
         return rows.reading - predicted, jacobian, covariance + by_gain @ by_gain.T
 
     def learn(self, passages: Sequence[Passage]) -> Self:
@@ -117,7 +108,7 @@ class MotorBelief:
         rows = self.rows(belief.learnt)
         model = CreepModel(self.arm, rows)
         belief.mean = first_mean
-        for _ in range(LEARNING_ROUNDS):
+        for _ in range(3):  # linearisations, each with the scatter found by the one before
             predicted, jacobian = model.linearised(belief.mean)
             noise = belief.sigma[rows.joint] ** 2
             target = rows.reading - predicted + jacobian @ (belief.mean - first_mean)
@@ -138,7 +129,7 @@ class MotorBelief:
             own = np.flatnonzero(rows.joint == j)
             square = residual[own] ** 2
             variance = (square.sum() + USUAL_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + USUAL_ROWS)
-            near = np.abs(np.diff(rows.position[own, j])) < NEXT
+            near = np.abs(np.diff(rows.position[own, j])) < 0.2  # [rad]: neighbours
             common = float((residual[own][1:] * residual[own][:-1])[near].sum() / max(square[1:][near].sum(), 1e-12))
             found[j] = np.sqrt(variance * (1 + 2 * min(max(common, 0.0), 1.0)))
         return found

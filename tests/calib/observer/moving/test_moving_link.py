@@ -13,8 +13,8 @@ from calib.creep.plan import plan_creep
 from calib.creep.record import calibration_record, gravity_record
 from calib.creep.run import run_creep
 from calib.motion.trajectory import trajectory
-from calib.observer.choice import observer_of
 from calib.observer.events import Event
+from calib.observer.observer import observer_of
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth

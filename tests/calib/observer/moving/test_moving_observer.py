@@ -15,10 +15,9 @@ from calib.creep.fit import fit_rows
 from calib.creep.plan import plan_creep
 from calib.creep.record import calibration_record, gravity_record
 from calib.daemon.view.event_text import describe
-from calib.observer.choice import observer_of
 from calib.observer.events import Event
 from calib.observer.moving.observer import MovingObserver
-from calib.observer.observer import Observer
+from calib.observer.observer import Observer, observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
 
 SEED = 4
