@@ -16,7 +16,14 @@ from sim_gap.position_gap.judge import LEAST_SHRINK, Stage, groups_of
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.search import PRICE
 from sim_gap.position_gap.training.export import WRITTEN
-from sim_gap.position_gap.training.replay import LONGEST_S, SHORT_S, Simulated, less, replay_rms, simulated
+from sim_gap.position_gap.training.replay import (
+    LONGEST_S,
+    SHORT_S,
+    Simulated,
+    replay_rms,
+    simulated_model,
+    without_groups,
+)
 from sim_gap.position_gap.training.spread import interval, payload_centre
 from sim_gap.residuals.location import Location
 from sim_gap.search.estimate import Value
@@ -221,14 +228,16 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
     def gap(arm: Simulated, longest: float = LONGEST_S) -> Array:
         return replay_rms(arm, found.recordings, found.gains, longest, found.heldout_touched)
 
-    after = gap(simulated(found.sim, made))
+    after = gap(simulated_model(found.sim, made))
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
     effects = []
     for cause, stage in taken:
         if cause.effect not in WRITTEN or np.isnan(after).all():
             continue
         others = [group for group in groups if group != stage.group]
-        alone, without = (gap(less(found.sim, found.search, made, some), SHORT_S) for some in (others, [stage.group]))
+        alone, without = (
+            gap(without_groups(found.sim, found.search, made, some), SHORT_S) for some in (others, [stage.group])
+        )
         effects.append(EffectRollout(cause.effect, cause.joints, alone, without))
     effects.sort(key=lambda each: -float(np.nanmax(each.without)))
     return Rollout(longest, found.moved_before, after, tuple(effects), closed_loop=True)

@@ -15,11 +15,11 @@ from armlink.recording.recording import Recording
 from sim_gap.checks.column_order import find_changed_order
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
-from sim_gap.checks.jumps import find_jumps, find_seam, unwrapped
+from sim_gap.checks.jumps import find_jumps, find_seam, unwrap
 from sim_gap.checks.mapping import SURE, find_mapping
-from sim_gap.checks.mounting import as_mounted
-from sim_gap.checks.rigid_fit import ChannelMotion, beside_slow_torques, fit_rigid, motion_of
-from sim_gap.checks.sampling import even_times, find_dropped, find_time_unit, without_held, without_repeats
+from sim_gap.checks.mounting import find_mounting
+from sim_gap.checks.rigid_fit import ChannelMotion, fit_beside_slow_torques, fit_rigid, motion_of
+from sim_gap.checks.sampling import drop_held, drop_repeats, even_times, find_dropped, find_time_unit
 from sim_gap.checks.small_zero import find_small_zero
 from sim_gap.checks.torque_delay import find_delay, find_short_delay
 from sim_gap.checks.torque_source import find_gain_command, find_same, find_source, find_unsigned
@@ -86,11 +86,11 @@ def check_recording(
     """Check and correct one recording. Raises BadInput for a finding that is not certain."""
     for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
         raise BadInput(f"{label}: {finding.sentence()}")
-    recording, wrapped = unwrapped(recording)
+    recording, wrapped = unwrap(recording)
     for finding in find_jumps(recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
-    recording, repeated = without_repeats(recording)
-    recording, held = without_held(recording)
+    recording, repeated = drop_repeats(recording)
+    recording, held = drop_held(recording)
     recording, jitter = even_times(recording, stated)
     same = find_same(recording, stated)
     for finding in same:
@@ -101,7 +101,7 @@ def check_recording(
     s = _prepared(recording, arm, label, stated)
     for channel in s.channels:
         motion = motion_of(s, channel)
-        mounted = as_mounted(arm, motion)
+        mounted = find_mounting(arm, motion)
         for look in (_unsigned, _mapping, _source):
             findings = look(arm, mounted, s, motion, recording, stated)
             found += findings
@@ -115,7 +115,7 @@ def check_recording(
             if channel not in s.channels:  # taken for another one
                 break
             motion = motion_of(s, channel)
-            mounted = as_mounted(arm, motion)
+            mounted = find_mounting(arm, motion)
     for finding in find_beyond_range(arm, recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, velocity = sound_velocity(recording, stated)
@@ -182,7 +182,7 @@ def _source(
     stated: Corrections,
 ) -> list[RecordingFinding]:
     """Findings on the channel's scale and on what it is a reading of."""
-    fit = beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
+    fit = fit_beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
     scale = (
         find_joint_scale(mounted, motion, stated)
         or find_scale(arm, fit, motion, stated)

@@ -8,10 +8,10 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.training.export import WRITTEN
-from sim_gap.position_gap.training.replay import Simulated, commanded, less, replay, simulated
+from sim_gap.position_gap.training.replay import Simulated, commanded_rows, replay, simulated_model, without_groups
 from sim_gap.report.effect_text import WORDS, advice, sentence
 from sim_gap.report.figures import BLUE, GREY, ORANGE
-from sim_gap.report.time_figures import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, without
+from sim_gap.report.time_figures import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, lines_without_each
 
 
 def position_sections(answer: Diagnosis) -> list[Section]:
@@ -55,13 +55,13 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
         return replay(arm.with_gain(gain), recording, SHOWN_S)
 
     made = found.beside or found.export
-    t, after, measured = moved(simulated(found.sim, made))
+    t, after, measured = moved(simulated_model(found.sim, made))
     if not len(t):
         return None
     command = recording.position_command
     assert command is not None
     lines: list[Line] = [
-        ("command", command[commanded(recording, SHOWN_S)], GREY, True),
+        ("command", command[commanded_rows(recording, SHOWN_S)], GREY, True),
         ("measured", measured, "black", True),
     ]
     if found.nominal_has_controller:
@@ -69,7 +69,9 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
     lines.append(("corrected model", after, BLUE, True))
     left_out = list(dict.fromkeys(cause.effect for cause in causes if cause.effect in WRITTEN))[:MOST_LEFT_OUT]
     groups = [[stage.group for stage in found.stages if stage.group[0].partition("@")[0] == e] for e in left_out]
-    lines += without(left_out, [moved(less(found.sim, found.search, made, own))[1] for own in groups])
+    lines += lines_without_each(
+        left_out, [moved(without_groups(found.sim, found.search, made, own))[1] for own in groups]
+    )
     return lines_over_time(t - t[0], names, lines, "rad")
 
 
