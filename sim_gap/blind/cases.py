@@ -15,7 +15,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm, compile_arm, inverse, mjcf
 from sim_gap.blind.plant.plant import simulate
-from sim_gap.blind.plant.sensors import record
+from sim_gap.blind.plant.sensors import columns_at, record
 from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, label, recipes
 from sim_gap.blind.true_arm import Log
 
@@ -30,7 +30,7 @@ def gap(arm: BenchArm, columns: dict[str, Array]) -> dict[str, list[float]]:
     from scipy.signal import butter, sosfiltfilt
 
     t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RATE)
-    even = {k: _even(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
+    even = {k: columns_at(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
     low = butter(4, 6.0, fs=RATE, output="sos")
     q = sosfiltfilt(butter(4, 15.0, fs=RATE, output="sos"), even["q"], axis=0)
     v = np.gradient(q, 1.0 / RATE, axis=0)
@@ -62,10 +62,6 @@ def largest_fall(before: dict[str, list[float]], after: dict[str, list[float]]) 
 def is_visible(fall: dict[str, Any]) -> bool:
     """Whether the gap caused by an effect exceeds that of every arm clearly."""
     return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > VISIBLE_LEAST)
-
-
-def _even(t: Array, own: Array, values: Array) -> Array:
-    return np.column_stack([np.interp(t, own, column) for column in values.T])
 
 
 Values = TypeVar("Values")

@@ -10,23 +10,23 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm, draw_arm, mjcf
-from sim_gap.blind.cases import draw_withheld, largest_fall, make_all, parse_words, write_csv
+from sim_gap.blind.cases import ROUNDS, draw_withheld, largest_fall, make_all, parse_words, write_csv
 from sim_gap.blind.effects.drawn_effect import Values
 from sim_gap.blind.motion import KINDS, RATE, MotionLimits, trajectory
 from sim_gap.blind.plant.controller import ServoLaw, ServoRun, Servos
 from sim_gap.blind.plant.plant import simulate
+from sim_gap.blind.plant.sensors import JITTER_S, columns_at
 from sim_gap.blind.scene import Scene
 from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO, UNKNOWN, ServoChange, draw_effect
 from sim_gap.blind.true_arm import Log, sound_arm
 
-ROUNDS, ATTEMPTS = 4, 200
+ATTEMPTS = 200
 NONE_SHARE, UNKNOWN_SHARE = 0.12, 0.3
 """Shares of cases without an effect, and of those whose model has no controller."""
 VISIBLE_RATIO, VISIBLE_COUNTS = 3.0, 2.0
 """Least factor on a joint's gap, and least increase of it in counts of the encoder, by an effect that shows."""
 FOLLOWED = 0.6
 """Largest deviation from the command of an arm under control [rad]."""
-JITTER_S = 4e-4
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def recorded(run: ServoRun, log: Log, hz: float, random: np.random.Generator) ->
     sent = run.command[np.rint(t * RATE).astype(int)]
     t[1:] += np.clip(JITTER_S * random.standard_normal(len(t) - 1), -0.2 / hz, 0.2 / hz)
     step = run.truth.encoder_step
-    q = np.column_stack([np.interp(t, clock, column) for column in log.position.T])
+    q = columns_at(t, clock, log.position)
     q = np.rint(q / step + 0.2 * random.standard_normal(q.shape)) * step
     return {"t": t, "q": q, "q_cmd": sent}
 

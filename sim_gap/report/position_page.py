@@ -9,7 +9,7 @@ from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.training.export import WRITTEN
 from sim_gap.position_gap.training.replay import Simulated, commanded_rows, replay, simulated_model, without_groups
-from sim_gap.report.effect_text import WORDS, advice, sentence
+from sim_gap.report.effect_text import WORDS, advice, parameter_rows, sentence
 from sim_gap.report.figures import BLUE, GREY, ORANGE
 from sim_gap.report.time_figures import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, lines_without_each
 
@@ -22,7 +22,7 @@ def position_sections(answer: Diagnosis) -> list[Section]:
     html += paragraphs(answer.notes)
     header = ("effect", "joints", "RMS before [rad]", "after [rad]", "confidence", "or")
     causes = ReportTable(header, [_cause_row(cause) for cause in answer.causes], "Causes, on held-out data.", texts=2)
-    rows = [row for cause in (*answer.causes, *answer.minor) for row in _parameter_rows(cause)]
+    rows = [row for cause in (*answer.causes, *answer.minor) for row in parameter_rows(cause)]
     parameters = ReportTable(
         ("effect", "joint", "parameter", "value", "95 % interval", "unit"), rows, "Fitted parameters.", texts=3
     )
@@ -83,12 +83,4 @@ def _cause_row(cause: Cause) -> list[str]:
         f"{cause.gap_after:.3g}",
         f"{cause.confidence:.2f}",
         ", ".join(cause.confounded_with),
-    ]
-
-
-def _parameter_rows(cause: Cause) -> list[list[str]]:
-    return [
-        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
-        for joint, values in cause.parameters.items()
-        for name, v in values.items()
     ]

@@ -17,11 +17,9 @@ from sim_gap.blind.effects.drawn_effect import (
     set_entry,
     sign,
 )
+from sim_gap.blind.plant.plant import STEP
 from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.true_arm import SharedMotor, TrueArm
-
-STEP_S = 5e-4
-"""Time step of the plant [s]: springs must be slower."""
 
 
 def ripple(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
@@ -94,7 +92,7 @@ def _stiffest(scene: Scene) -> Array:
     """Stiffness of a stiff gear that the time step still resolves, (n,)."""
     link = np.maximum(scene.inertia - scene.arm.armature, 2e-3)
     reduced = link * scene.arm.armature / (link + scene.arm.armature)
-    return np.asarray(np.minimum(0.04 * reduced / STEP_S**2, 4e4))
+    return np.asarray(np.minimum(0.04 * reduced / STEP**2, 4e4))
 
 
 def coupling(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:

@@ -10,7 +10,7 @@ from sim_gap.blind.arms import draw_arm
 from sim_gap.blind.motion import RATE
 from sim_gap.blind.plant.controller import FINE, ServoLaw, ServoRun, Servos
 from sim_gap.blind.plant.drive import STIFFEST, Bristles, PlantDrives
-from sim_gap.blind.plant.sensors import SENSOR_BITS, record
+from sim_gap.blind.plant.sensors import record
 from sim_gap.blind.servo_cases import ServoRecipe, draw, recorded
 from sim_gap.blind.true_arm import Log, TrueArm, sound_arm
 
@@ -52,7 +52,7 @@ def test_a_sensor_reads_the_torque_in_whole_steps() -> None:
     arm.torque_noise[:], arm.torque_gain[:], arm.torque_offset[:] = 0.0, 1.0, 0.0
     torque = np.tile(np.array([7.0, -3.0, 0.1]), (500, 1))
     read = record(arm, Log(torque, torque, torque, torque, torque), 250.0, False, torque, np.random.default_rng(0))
-    step = 4.0 * 10.0 / 2**SENSOR_BITS
+    step = 4.0 * 10.0 / 2**16
     np.testing.assert_allclose(read["tau"] / step, np.rint(read["tau"] / step), atol=1e-6)
     assert np.abs(read["tau"] - torque[0]).max() <= 0.5 * step + 1e-12
 
