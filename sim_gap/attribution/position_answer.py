@@ -9,6 +9,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.position_notes import notes, running_free
+from sim_gap.attribution.verdict import EXPLAINED
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.identify import Identified, columns_of_effect, identify
@@ -28,8 +29,6 @@ from sim_gap.position_gap.training.spread import interval, payload_centre
 from sim_gap.residuals.location import Location
 from sim_gap.search.estimate import Value
 
-EXPLAINED = 0.3
-"""Largest share of the gap's RMS that may remain."""
 STRUCTURE = 2.0
 """Remaining gap, in margins, from which an unknown controller may not be of the kind that was fitted."""
 ALMOST = 0.75

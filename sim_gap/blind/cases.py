@@ -20,7 +20,7 @@ from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, label, recipes
 from sim_gap.blind.true_arm import Log
 
 VISIBLE_RATIO, VISIBLE_LEAST = 3.0, 0.08
-"""Least factor on some held-out RMS, and least increase of it [N·m], by a visible effect."""
+"""Least factor on some held-out gap, and least increase of it [N·m], by a visible effect."""
 MOVING = 0.03
 """Motor channels count only above this speed [rad/s]: at rest friction is undetermined."""
 
@@ -59,9 +59,9 @@ def largest_fall(before: dict[str, list[float]], after: dict[str, list[float]]) 
     return {"channel": channel, "joint": f"joint_{j + 1}", "before": b, "after": a, "shrink": 1.0 - a / max(b, 1e-9)}
 
 
-def is_visible(fall: dict[str, Any]) -> bool:
+def is_visible(fall: dict[str, Any], least: float = VISIBLE_LEAST) -> bool:
     """Whether the gap caused by an effect exceeds that of every arm clearly."""
-    return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > VISIBLE_LEAST)
+    return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > least)
 
 
 Values = TypeVar("Values")

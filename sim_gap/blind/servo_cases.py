@@ -10,21 +10,22 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm, draw_arm, mjcf
-from sim_gap.blind.cases import ROUNDS, draw_withheld, largest_fall, make_all, parse_words, write_csv
+from sim_gap.blind.cases import ROUNDS, draw_withheld, is_visible, largest_fall, make_all, parse_words, write_csv
 from sim_gap.blind.effects.drawn_effect import Values
 from sim_gap.blind.motion import KINDS, RATE, MotionLimits, trajectory
 from sim_gap.blind.plant.controller import ServoLaw, ServoRun, Servos
 from sim_gap.blind.plant.plant import simulate
 from sim_gap.blind.plant.sensors import JITTER_S, columns_at
+from sim_gap.blind.recipe import NONE_SHARE
 from sim_gap.blind.scene import Scene
 from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO, UNKNOWN, ServoChange, draw_effect
 from sim_gap.blind.true_arm import Log, sound_arm
 
 ATTEMPTS = 200
-NONE_SHARE, UNKNOWN_SHARE = 0.12, 0.3
-"""Shares of cases without an effect, and of those whose model has no controller."""
-VISIBLE_RATIO, VISIBLE_COUNTS = 3.0, 2.0
-"""Least factor on a joint's gap, and least increase of it in counts of the encoder, by an effect that shows."""
+UNKNOWN_SHARE = 0.3
+"""Share of cases whose model has no controller."""
+VISIBLE_COUNTS = 2.0
+"""Least increase of a joint's gap by an effect that shows, in counts of the encoder."""
 FOLLOWED = 0.6
 """Largest deviation from the command of an arm under control [rad]."""
 
@@ -173,7 +174,7 @@ def judge_drawing(drawing: ServoDrawing, logs: Sequence[Log]) -> tuple[dict[str,
     steady = all(_steady(run, log) for run, log in zip(drawing.runs[1:], logs, strict=True))
     falls = [largest_fall(*gaps)] if drawing.change is not None else []
     least = VISIBLE_COUNTS * drawing.runs[0].truth.encoder_step
-    seen = all(f["before"] > VISIBLE_RATIO * f["after"] and f["before"] - f["after"] > least for f in falls)
+    seen = all(is_visible(fall, least) for fall in falls)
     return {"with": gaps[0], "without": gaps[1], "falls": falls}, steady and seen
 
 

@@ -10,7 +10,7 @@ from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, hypotheses, permute
-from sim_gap.checks.rigid_fit import FEW, ChannelMotion, fit_model, fit_models, least_costs, rows_of
+from sim_gap.checks.rigid_fit import FEW, SCREENED, ChannelMotion, fit_model, fit_models, least_costs, rows_of
 from sim_gap.checks.torque_unit import find_absent
 from sim_gap.model.rigid_body import RigidArm
 
@@ -56,8 +56,6 @@ def _torque_orders(arm: RigidArm, few: ChannelMotion, orders: Sequence[tuple[int
 CLEAR = 0.6
 """Fall of the cost, with an order in a part of the rows, from which it is asked about: on sound recordings of real arms
 none reaches 0.1, on those with two torques exchanged from the middle on they reach 1.2 and more."""
-SCREENED = 0.3
-"""Share of that fall that an order must reach on few rows to be looked at."""
 UNEVEN = 1.0
 """Fall of the cost from all rows to one half of them from which a torque may be absent from the other."""
 TRIED, LOCATED = np.linspace(0.25, 0.75, 3), np.linspace(0.05, 0.95, 37)

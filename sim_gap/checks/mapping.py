@@ -19,6 +19,7 @@ from sim_gap.checks.hypotheses import Hypothesis, hypotheses, put_in_order
 from sim_gap.checks.mounting import find_load, find_mounting
 from sim_gap.checks.rigid_fit import (
     FEW,
+    SCREENED,
     STRONG_SHARE,
     ChannelMotion,
     RigidFit,
@@ -41,8 +42,6 @@ that no arm has, or if any other change does as much: it may be chance, of a hun
 of the thousands of orders of more than two joints."""
 TWICE = 2.0
 """Times a fall by which that of a change that is doubted must be larger to be asked about instead."""
-SCREENED = 0.3
-"""Share of that fall that a hypothesis must reach on few rows."""
 ALIKE = 0.05
 """Difference of the falls below which two changes cannot be told from each other."""
 NEARLY = 0.4

@@ -18,6 +18,8 @@ ROWS = 1500
 """Rows that the fit looks at."""
 FEW = 5
 """One in this many of them is enough to see that a hypothesis is wrong."""
+SCREENED = 0.3
+"""Share of the fall from which something is certain that it must reach on few rows to be looked at."""
 TURNING = 0.02
 """Speed from which friction has its full sign [rad/s]."""
 MOVING_SHARE = 0.3
