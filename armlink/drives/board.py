@@ -78,6 +78,12 @@ class Board:
         self.slow_came = True
         self.on_slow(joint)
 
+    def taken(self) -> None:
+        """What drives that send by their own clock told is in a sample now, and in none after it."""
+        for joint, asked in enumerate(self.asked):
+            if not asked:
+                self.position[joint] = self.sensor[joint] = math.nan
+
     def drop(self) -> None:
         """Forget positions and sensor torques that were replies: what comes from now on belongs to the next sample."""
         if all(self.asked):

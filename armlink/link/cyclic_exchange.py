@@ -96,6 +96,8 @@ class Loop:
         """Newest motor torque of each joint whenever it came [N·m]; for the gate, never for a sample."""
         self.latest_velocity = [math.nan] * self.n
         """Newest velocity of each joint whenever it came [rad/s]; for the gate, never for a sample."""
+        self.on_cycle: Callable[[], object] = lambda: None
+        """Called at the end of each cycle."""
         self.slow_seen = [-math.inf] * self.n
         """When the motor torque of each joint last came, by the clock [s]."""
         self.speed_seen = [-math.inf] * self.n
@@ -244,6 +246,7 @@ class Loop:
         timely = None if board.awaited <= 0 and not self._owed_for else self._timely()
         sample = self.sample(now)
         sample.timely, sample.delay = timely, delay
+        self.on_cycle()
         return sample
 
     def _collect(self, now: float, until: float) -> float:
@@ -392,6 +395,7 @@ class Loop:
         else:
             motor, velocity = self._nothing.copy(), self._nothing.copy()
         torque = values.torque(np.array(board.sensor), motor)
+        board.taken()
         for joint in self._keep(position, self.latest_position):
             self.seen[joint] = now
             self._note_time(joint, board.owed[joint] + 1, self._collected)

@@ -80,8 +80,9 @@ def refusal(
             )
         if why == gate.VELOCITY:
             return (
-                f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, limit {limit.overspeed:.3g} "
-                f"(max_velocity and its margin){_by_positions(now, other)}: less torque, or a higher max_velocity"
+                f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, limit "
+                f"{gate.speed_limit(limit, other):.3g} (max_velocity and its margin){_by_positions(now, other)}: less "
+                "torque, or a higher max_velocity"
             )
         if why == gate.WINDOW:
             lower, upper = limit.lower - limit.outside, limit.upper + limit.outside

@@ -94,6 +94,8 @@ class Link(Calibrations):
         self._limits: list[Limits] = []
         self._hold: ArmHold | None = None
         self._overloaded = overloaded
+        self.tell: Tell = lambda text: log.debug("%s: %s", self.arm.name, text)
+        """Told what start() does with an arm that is out."""
 
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
@@ -109,9 +111,6 @@ class Link(Calibrations):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         """See `close`."""
         self.close(cause_of(error))
-
-    def _say(self, text: str) -> None:
-        log.debug("%s: %s", self.arm.name, text)
 
     def close(self, cause: EndCause = EndCause.DONE, tell: Tell | None = None) -> None:
         """Bring the arm to its end (`armlink.link.ends`), and close the bus; `tell` is told what is being done.
@@ -206,7 +205,7 @@ class Link(Calibrations):
         `to_enable`; BusFault, BadInput.
         """
         if self.falls:
-            end(self, EndCause.DONE, self._say)
+            end(self, EndCause.DONE, self.tell)
         self._hold = self._hold or ArmHold(self.bus, self.addresses)
         missing = [
             f"{self.names[group.places[joint]]} ({self.section.joints[group.places[joint]].settings.address})"
@@ -339,9 +338,11 @@ class Link(Calibrations):
         self._forget()
         self.commander.settle()
         self.turns.require(positions_before_power(self.commander, self.set_up_positions.tolist(), self._since))
+        self._held = self.falls  # what has power by now is not dropped by whatever ends the walk
         try:
             sample = self.commander.walk(Power.ON)
         except BusFault as fault:
+            self._held = self.falls and Power.ON in self.commander.powers
             self._mind_overload(fault)
             raise
         self._forget()

@@ -38,6 +38,8 @@ SILENT = 3.0
 TALK_EVERY = 7e-3
 """Samples wait for each other for this long [s]: waking the job costs as much as half a cycle. While rows are played,
 the job is not heard more often either, and replies are waited for in those cycles alone."""
+SIGN_EVERY = 1.0
+"""Time between two signs of life [s]."""
 ENABLING = ("enable", "recover")
 
 
@@ -65,11 +67,16 @@ class DriveLoop:
         self._unpickled: Future[Controller] | None = None
         """A controller that is on its way."""
         self._heard = time.monotonic()
+        self._signed = -math.inf
+        """When the job was last told that this process makes cycles [s]."""
+        link.commander.loop.on_cycle = self._sign_of_life
 
     def run(self, ending: Ending) -> EndCause:
         """Until the job says how the arm is to end, or SIGTERM is for this process alone; raises Closed where the job
         has gone."""
         while not ending.due:
+            if ending.orphaned:
+                raise Closed
             if not self._busy:
                 for message in self._channel.receive():
                     self._heard = time.monotonic()
@@ -116,12 +123,11 @@ class DriveLoop:
 
     def _call(self, call: Call) -> None:
         link = self._link
+        link.tell = tell = lambda text: self._tell(call.id, text)
         try:
             kwargs = dict(call.kwargs)
             if callable(call.what):
-                answer = LoopAnswer(
-                    call.id, call.what(link, lambda text: self._tell(call.id, text), *call.args, **kwargs)
-                )
+                answer = LoopAnswer(call.id, call.what(link, tell, *call.args, **kwargs))
             else:
                 found = getattr(link, call.what)
                 answer = LoopAnswer(call.id, found(*call.args, **kwargs) if callable(found) else found)
@@ -143,6 +149,16 @@ class DriveLoop:
         self._end = next((each for each in messages if isinstance(each, End)), self._end)
         if any(isinstance(each, Cut | End) for each in messages):
             raise KeyboardInterrupt
+
+    def _sign_of_life(self) -> None:
+        """Tell the job now and then that cycles are made, whatever call they are made in: it would take silence for a
+        hang."""
+        now = time.monotonic()
+        if now - self._signed >= SIGN_EVERY:
+            self._signed = now
+            self._channel.put(Told(0, ""))
+            with contextlib.suppress(Closed):
+                self._channel.flush()
 
     def _keep(self) -> None:
         """Hold the joints, which were stopped."""

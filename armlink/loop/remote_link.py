@@ -275,7 +275,8 @@ class RemoteLink:
                     self._stopped = message
                 case Told():
                     self._heard = time.monotonic()
-                    self._tell_on(message.text)
+                    if message.text:
+                        self._tell_on(message.text)
                 case _:
                     self._samples.append(message)
 

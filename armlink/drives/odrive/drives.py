@@ -4,10 +4,8 @@ The drive's cyclic messages, its watchdog and its limits are set over USB: CANSi
 """
 
 import math
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from statistics import median
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -23,6 +21,7 @@ from armlink.drives.odrive.frames import (
     PASSTHROUGH,
     POSITION_CONTROL,
     TORQUE_CONTROL,
+    VELOCITY_CONTROL,
     AxisError,
     AxisState,
     Message,
@@ -67,8 +66,6 @@ ASK_AGAIN = 0.25
 """A request that shows in no heartbeat is sent again after this time [s]."""
 PATIENCE = 0.5
 """Longest wait for heartbeat, estimates and torques at the start [s]."""
-RECENT = 3
-"""Positions of which the middle one is held: one false reading among them does not count."""
 LARGEST_POSITION = 1e5
 """No motor's position is larger [rev]; a larger one is no reading."""
 
@@ -81,8 +78,6 @@ class _ODriveState:
     heartbeat: frames.Heartbeat | None = None
     position: float = math.nan
     """[rad]."""
-    recent: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
-    """The newest positions [rad]."""
     requested: int = 0
     """Torques that were asked for, and come besides the cyclic ones."""
     came: set[int] = field(default_factory=set)
@@ -210,19 +205,16 @@ class ODriveDrives(BasicDrives):
         known = self._known[joint]
         state = known.heartbeat.state if known.heartbeat else AxisState.UNDEFINED
         on = state == AxisState.CLOSED_LOOP
-        held, known.sent, known.stopping = known.sent, None, False
+        known.sent, known.stopping = None, False
         if order.power is Power.ON and on:
             return self._input(joint, order)
         if order.power is Power.ON and order.walk and known.heartbeat is not None:
             return self._towards_on(joint, order, now)
         if order.power is Power.STOPPED and on:
-            # no state in which it holds without its host: hold by input, where it stands now
+            # no state in which it holds without its host: no speed by input, whatever its position reads
             known.stopping = True
-            # by the middle one of its newest positions: a false one may be what it is stopped for
-            at = median(known.recent or [known.position])
-            if held is not None and held.power is Power.STOPPED:
-                at = held.position
-            return self._input(joint, Order(Power.STOPPED, False, Mode.POSITION, at, 0.0, 0.0, 0.0, 0.0))
+            known.sent = Order(Power.STOPPED, False, Mode.POSITION, known.position, 0.0, 0.0, 0.0, 0.0)
+            return self._controlled(joint, VELOCITY_CONTROL, Message.INPUT_VELOCITY, pack(Message.INPUT_VELOCITY, 0, 0))
         if (
             order.power is not Power.ON
             and (on or state == AxisState.UNDEFINED)
@@ -250,17 +242,21 @@ class ODriveDrives(BasicDrives):
         known = self._known[joint]
         if known.limits is None:
             raise BusFault(f"{self.names[joint]}: a command before the set-up")
-        control = TORQUE_CONTROL if order.mode == Mode.TORQUE else POSITION_CONTROL
-        if control == TORQUE_CONTROL:
+        if order.mode == Mode.TORQUE:
             most = known.limits.max_torque * (1 - 2.0**-23)
-            data = pack(Message.INPUT_TORQUE, max(-most, min(most, _checked(order.torque))))
-            frame = identifier(self._settings[joint].node, Message.INPUT_TORQUE), data
+            control, message = TORQUE_CONTROL, Message.INPUT_TORQUE
+            data = pack(message, max(-most, min(most, _checked(order.torque))))
         else:
+            control, message = POSITION_CONTROL, Message.INPUT_POSITION
             data = frames.input_position(_checked(order.position) / TURN, _checked(order.velocity) / TURN, 0.0)
-            frame = identifier(self._settings[joint].node, Message.INPUT_POSITION), data
-        told = _order_of(*frame)
+        told = _order_of(identifier(self._settings[joint].node, message), data)
         assert told is not None
         known.sent = told._replace(power=order.power)
+        return self._controlled(joint, control, message, data)
+
+    def _controlled(self, joint: int, control: int, message: Message, data: bytes) -> list[Frame]:
+        """An input, after its control mode where that changes."""
+        known, frame = self._known[joint], (identifier(self._settings[joint].node, message), data)
         if known.mode == control:
             return [frame]
         known.mode = control
@@ -299,7 +295,6 @@ class ODriveDrives(BasicDrives):
             if not abs(position) < LARGEST_POSITION or not math.isfinite(velocity):
                 return None
             known.position = position * TURN
-            known.recent.append(known.position)
             return Reading(joint, known.position, velocity * TURN)
         if message == Message.TORQUES and known.requested:
             known.requested -= 1

@@ -164,6 +164,8 @@ def _child(end: socket.socket, options: LoopOptions, inherited: socket.socket | 
         channel.put(Started(prepare()))
     try:
         while not ending.due:
+            if ending.orphaned:
+                raise Closed
             for message in loop.run() or [Alive()]:
                 channel.put(message, isinstance(message, Batch))
             channel.flush()
