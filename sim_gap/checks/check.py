@@ -128,7 +128,7 @@ def _prepared(recording: Recording, arm: RigidArm, label: str, stated: Correctio
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _ChannelView:
     """One torque channel of a recording as the checks look at it."""
 
     arm: RigidArm
@@ -149,12 +149,12 @@ class _View:
         return motion_of(_prepared(corrected, self.arm, self.s.label, self.stated), self.motion.channel)
 
 
-def _view(arm: RigidArm, s: PreparedSignals, channel: str, recording: Recording, stated: Corrections) -> _View:
+def _view(arm: RigidArm, s: PreparedSignals, channel: str, recording: Recording, stated: Corrections) -> _ChannelView:
     motion = motion_of(s, channel)
-    return _View(arm, find_mounting(arm, motion), s, motion, recording, stated)
+    return _ChannelView(arm, find_mounting(arm, motion), s, motion, recording, stated)
 
 
-def _unsigned(view: _View) -> list[RecordingFinding]:
+def _unsigned(view: _ChannelView) -> list[RecordingFinding]:
     """Joints that read amounts, unless they do not with the channel's delay taken off."""
     found = find_unsigned(view.mounted, view.motion, view.stated)
     if not found or goes_one_way(view.recording):
@@ -165,7 +165,7 @@ def _unsigned(view: _View) -> list[RecordingFinding]:
     return [] if not find_unsigned(view.mounted, view.in_time(delay[0]), view.stated) else found
 
 
-def _mapping(view: _View) -> list[RecordingFinding]:
+def _mapping(view: _ChannelView) -> list[RecordingFinding]:
     """Findings on clock, order, sign, zero and angle unit, in the order in which they are corrected."""
     arm, mounted, motion, stated = view.arm, view.mounted, view.motion, view.stated
     if goes_one_way(view.recording):
@@ -182,7 +182,7 @@ def _mapping(view: _View) -> list[RecordingFinding]:
     return [*delay, *find_mapping(arm, view.in_time(delay[0]), stated, follows)]
 
 
-def _source(view: _View) -> list[RecordingFinding]:
+def _source(view: _ChannelView) -> list[RecordingFinding]:
     """Findings on the channel's scale and on what it is a reading of."""
     arm, mounted, motion, stated = view.arm, view.mounted, view.motion, view.stated
     fit = fit_beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
