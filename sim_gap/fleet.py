@@ -106,7 +106,7 @@ def diagnose_case(case: Case) -> dict[str, Any]:
     """The JSON result of one case with what is watched, or `{"error": line}` if it cannot be diagnosed."""
     from armlink.recording.files import load_recording
     from sim_gap.attribution.diagnose import diagnose
-    from sim_gap.trends import watched
+    from sim_gap.trends import watched_parameters
 
     paths = [*case.train, *case.heldout]
     try:
@@ -115,7 +115,7 @@ def diagnose_case(case: Case) -> dict[str, Any]:
         answer = diagnose(case.sim, recordings[:count], recordings[count:], labels=[str(path) for path in paths])
     except ArmlinkError as error:
         return {"error": str(error)}
-    return answer.to_json() | {"watched": watched(answer)}
+    return answer.to_json() | {"watched": watched_parameters(answer)}
 
 
 def diagnose_fleet(cases: list[Case], client: Any) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -1,8 +1,9 @@
 """Wear of a fleet's joints: which parameter of which arm changes, since when, and which arm differs from the others.
 
 A search reports what is large enough to explain the gap, so that a small play is in no answer, and what is near the
-threshold comes and goes from day to day. To follow wear, the same effects are fitted every day (`watched`), all at once
-beside the causes found: a change of a tenth of a degree of play is far below what a single diagnosis would name.
+threshold comes and goes from day to day. To follow wear, the same effects are fitted every day
+(`watched_parameters`), all at once beside the causes found: a change of a tenth of a degree of play is far below what a
+single diagnosis would name.
 
 A series is one parameter (friction of joint 2, say) of one arm over its dated diagnoses: those that are watched at
 every joint, and those of the causes. Diagnoses of one arm on one motion share their systematic errors, so that a change
@@ -33,7 +34,7 @@ MOVES = 0.05
 """Share of the samples in motion from which a joint's parameters are estimated."""
 
 
-def watched(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+def watched_parameters(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Watched parameters with 95 % intervals, of each joint that moves; none without a torque channel."""
     made = diagnosis.internals
     if not isinstance(made, Internals) or made.nominal is None:

@@ -12,7 +12,7 @@ from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
-from sim_gap.search.model_selection import golden
+from sim_gap.search.model_selection import golden_section
 from sim_gap.search.term import Term
 
 
@@ -46,7 +46,7 @@ def body_of(estimate: EffectEstimate) -> Term | None:
     return next((term for term in estimate.terms if term.effect == "link.payload"), None)
 
 
-def placed(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
+def numbered_by_body(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
     """The held-out recordings, each numbered by whether it was made with the body that training recordings have.
 
     By its groups if there are any; else by the sum of squares that remains with and without the body. If it is mounted
@@ -104,7 +104,7 @@ def _mounted(estimate: EffectEstimate, s: PreparedSignals, layout: ChannelLayout
 
     step = 2.0 * np.pi / 12
     start = min((step * k for k in range(12)), key=left)
-    angle = golden(left, start - step, start + step)
+    angle = golden_section(left, start - step, start + step)
     angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
     return left(angle), replace(s, mount=angle)
 
@@ -195,7 +195,7 @@ def _turn(s: PreparedSignals, one: Array, other: Array) -> float:
     return float(np.arctan2(np.cross(across[0], across[1]) @ s.arm.axis[-1], across[0] @ across[1]))
 
 
-def lacking(estimate: EffectEstimate, heldout: ResidualSet) -> list[int]:
+def recordings_with_another_body(estimate: EffectEstimate, heldout: ResidualSet) -> list[int]:
     """Indices of held-out recordings that differ from all training recordings by a body.
 
     Nothing in the training data then separates the body from errors of the arm's own masses: all of them have one that

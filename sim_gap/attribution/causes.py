@@ -138,7 +138,7 @@ class _Scorer:
         return np.asarray(np.sqrt(out))
 
 
-def ordered(estimate: EffectEstimate, scorer: _Scorer) -> list[CauseStep]:
+def order_of_effects(estimate: EffectEstimate, scorer: _Scorer) -> list[CauseStep]:
     """Effects in the order in which each, added to the earlier ones, lowers the held-out RMS of some joint most."""
     groups: dict[str, list[Term]] = defaultdict(list)
     for term in estimate.terms:
@@ -237,7 +237,7 @@ def causes(
     fitted = _Scorer(estimate, estimate.store.data)
     law_test = LawTest(estimate.store, estimate.terms)
     hints: list[Term] = []
-    for step in ordered(estimate, scorer):
+    for step in order_of_effects(estimate, scorer):
         main = relevant_terms(step, estimate, heldout, scorer, quiet)
         if quiet and main and steadiness(estimate, heldout, main) < STEADY:
             main = ()
@@ -253,7 +253,7 @@ def causes(
     return [replace(each, fall=min(each.fall, missed)) if each.confidence < HINT else each for each in found], minor
 
 
-def founded_ones(found: Sequence[Cause], minor: Sequence[Cause]) -> tuple[list[Cause], list[Cause]]:
+def founded_causes(found: Sequence[Cause], minor: Sequence[Cause]) -> tuple[list[Cause], list[Cause]]:
     """The causes that say more than that noise is uneven, for a gap within its margins; the others are minor.
 
     They are more than a guess, even where a general law would do as well, or rivals share their evidence.
@@ -297,6 +297,6 @@ def _cause(
     )
 
 
-def left_over(data: ResidualSet, explained: dict[Row, Array]) -> dict[Row, Array]:
+def remainder(data: ResidualSet, explained: dict[Row, Array]) -> dict[Row, Array]:
     """Residual less the sum of the terms, (K,) per row."""
     return {row: values - explained[row] for row, values in data.values.items()}

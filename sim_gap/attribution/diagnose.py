@@ -15,10 +15,17 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
 from sim_gap.attribution.answer import Internals, answer
-from sim_gap.attribution.bodies import CLEARLY, body_of, groups_of, lacking, mounts, placed
-from sim_gap.attribution.causes import causes, founded_ones
+from sim_gap.attribution.bodies import (
+    CLEARLY,
+    body_of,
+    groups_of,
+    mounts,
+    numbered_by_body,
+    recordings_with_another_body,
+)
+from sim_gap.attribution.causes import causes, founded_causes
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.attribution.friction_compensation import held_in_commands, missing_in_readings
+from sim_gap.attribution.friction_compensation import find_compensations, held_in_commands
 from sim_gap.attribution.position_answer import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_quiet, is_within
@@ -34,7 +41,7 @@ from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.model_selection import select_model
-from sim_gap.search.stepwise import StepwiseSearch
+from sim_gap.search.stepwise_search import StepwiseSearch
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
@@ -114,7 +121,7 @@ def diagnose(
     library = library_without(withhold)
     search, estimate = _fitted(fit, library)
     judge = _placed(estimate, judge)
-    if "link.payload" in library and (lent := lacking(estimate, judge)):
+    if "link.payload" in library and (lent := recordings_with_another_body(estimate, judge)):
         more, rest, recordings = _lent(fit, judge, heldout, lent)
         other, again = _fitted(more, library)
         if body_of(again) is not None:
@@ -125,20 +132,20 @@ def diagnose(
     within = is_within(judge) and is_within(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet, within=within)
     if within:
-        found, minor = founded_ones(found, minor)
+        found, minor = founded_causes(found, minor)
     if quiet and not found:
         made = answer(Internals(sim, fit, judge, None, tuple(heldout), estimate), [], [], heldout_is)
     else:
         made = answer(Internals(sim, fit, judge, estimate, tuple(heldout), estimate), found, minor, heldout_is)
-    compensated += missing_in_readings(estimate, (fit, judge))
+    compensated += find_compensations(estimate, (fit, judge))
     told = tuple(each.sentence() for each in compensated)
     aside = (*told, *unchecked_note(recordings))
     return replace(made, checks=findings, notes=(*made.notes, *aside), friction_compensation=tuple(compensated))
 
 
 def _placed(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
-    """The held-out recordings by the body that they have (`placed`), without what disturbed the arm."""
-    judge = placed(estimate, heldout)
+    """The held-out recordings by the body that they have (`numbered_by_body`), without what disturbed the arm."""
+    judge = numbered_by_body(estimate, heldout)
     return without_disturbances(judge, estimate.predict(judge))
 
 

@@ -144,7 +144,7 @@ class _Friction:
     """Standard error, from blocks of time [N·m]."""
 
 
-def missing_in_readings(estimate: EffectEstimate | None, sets: Sequence[ResidualSet]) -> list[Compensation]:
+def find_compensations(estimate: EffectEstimate | None, sets: Sequence[ResidualSet]) -> list[Compensation]:
     """Recordings in which joints have none of the friction that most others show, or drive themselves on.
 
     It must be more than half of the joints that show friction at all: a controller compensates an arm's, and one joint

@@ -10,7 +10,7 @@ from sim_gap.effects.laws import LAWS
 from sim_gap.residuals.layout import ChannelLayout
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.normal_equations import NormalEquations
-from sim_gap.search.stepwise import StepwiseSearch
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
 CONTAINED = 1e-6

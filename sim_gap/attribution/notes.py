@@ -164,7 +164,7 @@ def _at_rest(data: ResidualSet) -> tuple[str, ...]:
     )
 
 
-def besides_notes(aside: Sequence[Location]) -> tuple[str, ...]:
+def aside_notes(aside: Sequence[Location]) -> tuple[str, ...]:
     """A note for each gap at rest, in creep or above the band that nothing known accounts for."""
     where = {"rest": "at rest", "creep": "in creep and around reversals"}
     return tuple(

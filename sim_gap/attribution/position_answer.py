@@ -9,6 +9,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.position_notes import notes, running_free
+from sim_gap.attribution.verdict import EXPLAINED
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.identify import Identified, columns_of_effect, identify
@@ -16,13 +17,18 @@ from sim_gap.position_gap.judge import LEAST_SHRINK, Stage, groups_of
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.search import PRICE
 from sim_gap.position_gap.training.export import WRITTEN
-from sim_gap.position_gap.training.replay import LONGEST_S, SHORT_S, Simulated, less, replay_rms, simulated
+from sim_gap.position_gap.training.replay import (
+    LONGEST_S,
+    SHORT_S,
+    Simulated,
+    replay_rms,
+    simulated_model,
+    without_groups,
+)
 from sim_gap.position_gap.training.spread import interval, payload_centre
 from sim_gap.residuals.location import Location
 from sim_gap.search.estimate import Value
 
-EXPLAINED = 0.3
-"""Largest share of the gap's RMS that may remain."""
 STRUCTURE = 2.0
 """Remaining gap, in margins, from which an unknown controller may not be of the kind that was fitted."""
 ALMOST = 0.75
@@ -221,14 +227,16 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
     def gap(arm: Simulated, longest: float = LONGEST_S) -> Array:
         return replay_rms(arm, found.recordings, found.gains, longest, found.heldout_touched)
 
-    after = gap(simulated(found.sim, made))
+    after = gap(simulated_model(found.sim, made))
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
     effects = []
     for cause, stage in taken:
         if cause.effect not in WRITTEN or np.isnan(after).all():
             continue
         others = [group for group in groups if group != stage.group]
-        alone, without = (gap(less(found.sim, found.search, made, some), SHORT_S) for some in (others, [stage.group]))
+        alone, without = (
+            gap(without_groups(found.sim, found.search, made, some), SHORT_S) for some in (others, [stage.group])
+        )
         effects.append(EffectRollout(cause.effect, cause.joints, alone, without))
     effects.sort(key=lambda each: -float(np.nanmax(each.without)))
     return Rollout(longest, found.moved_before, after, tuple(effects), closed_loop=True)

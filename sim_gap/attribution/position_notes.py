@@ -6,9 +6,9 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Rollout
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.training.bands import SHARE
-from sim_gap.position_gap.training.export import Exported, widened
+from sim_gap.position_gap.training.export import Exported, widened_joints
 from sim_gap.position_gap.training.spread import interval, undecided_scale
-from sim_gap.position_gap.training.unreached_limits import described
+from sim_gap.position_gap.training.unreached_limits import describe
 from sim_gap.position_gap.windows import Windows
 
 FAR = 3.0
@@ -39,7 +39,7 @@ def notes(found: Identified) -> list[str]:
         listed = ", ".join(names[j] for j in sorted(found.search.resting))
         assumed = "a controller that holds it is assumed" if found.search.open_controller else "the model's values stay"
         out.append(f"{listed}: no training recording commands a motion here, so nothing can be fitted: {assumed}")
-    if limits := described(found.spread.limits, names):
+    if limits := describe(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
     out += [*_early(found), *_touching(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
     if found.export is not None and found.export.lines:
@@ -116,7 +116,7 @@ def _ranges(found: Identified) -> list[str]:
     names, own = found.sim.arm.names, found.sim.mujoco_model.jnt_range[list(found.sim.joints)]
     out = [
         f"{names[j]} (model {own[j, 0]:.2f} to {own[j, 1]:.2f} rad, corrected {low:.2f} to {high:.2f} rad)"
-        for j in widened(found.sim)
+        for j in widened_joints(found.sim)
         for low, high in [found.sim.arm.range[j]]
     ]
     return [f"moves beyond the model's joint range, where a simulation would stop: {', '.join(out)}"] if out else []

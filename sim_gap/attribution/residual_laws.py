@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.residuals.disregarded_rows import regimes, slides
+from sim_gap.residuals.disregarded_rows import regimes_left_out, slides
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
@@ -128,7 +128,7 @@ def as_effects(laws: Sequence[ResidualLaw], names: Sequence[str]) -> list[JointE
 def _samples(data: ResidualSet) -> dict[Row, Mask]:
     """Samples of the comparison and those in creep, for a row that is quiet but for creep, (K,) per row."""
     out = {row: valid.copy() for row, valid in data.valid.items()}
-    for (row, regime), mask in regimes(data).items():
+    for (row, regime), mask in regimes_left_out(data).items():
         if regime == "creep" and slides(data, row):
             out[row] |= mask
     return out

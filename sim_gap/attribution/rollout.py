@@ -16,7 +16,7 @@ from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import spec_of, with_effects
 from sim_gap.better_model.effects_module import joint_effects
-from sim_gap.better_model.export import Written, written
+from sim_gap.better_model.export import Written, model_files
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.preprocess import CHANNELS
@@ -69,7 +69,7 @@ class RollOuts:
             entries += self.laws if terms else ()
             own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
             return corrected.model, forward_effects, own
-        files = written(self.sim, self.estimate, NAME, terms, number, self.laws if terms else (), self.spec, mount)
+        files = model_files(self.sim, self.estimate, NAME, terms, number, self.laws if terms else (), self.spec, mount)
         model, module = _compiled(files), _loaded(files)
         return model, module, module.Effects(model, module.EFFECTS, module.JOINTS or self.sim.arm.names)
 

@@ -36,7 +36,7 @@ def confidence(signs: Signs, rivals: int) -> float:
     return min(sure, 1.0 / (1 + rivals) + 0.2) if rivals else sure
 
 
-def founded(signs: Signs, rivals: int = 0) -> bool:
+def is_founded(signs: Signs, rivals: int = 0) -> bool:
     """Whether a cause accounts for the gap on its row, even if a general law or one of its rivals would too."""
     return confidence(replace(signs, outside=np.inf), min(rivals, 1)) >= FOUNDED
 
@@ -86,7 +86,7 @@ def share_left(data: ResidualSet, left: dict[Row, Array]) -> float:
     return float(min(np.sum(shares) / max(np.sum(weights), 1e-9), 1.0)) if shares else 0.0
 
 
-def closed(data: ResidualSet, left: dict[Row, Array]) -> bool:
+def is_closed(data: ResidualSet, left: dict[Row, Array]) -> bool:
     """Whether the gap is closed: what remains is a small share of its RMS, and near the noise in every row.
 
     A row is near the noise within NEAR times its margin, or with no more than ROW_LEFT of its own RMS left.
@@ -113,9 +113,9 @@ def verdict(
     quiet = all(rms <= data.margin[row] for row, rms in row_rms(data, left).items())
     if not found:
         return "no_gap" if quiet and not unsettled else "unexplained"
-    if not (quiet or closed(data, left)) or not all(closed(*each) for each in sets[1:]):
+    if not (quiet or is_closed(data, left)) or not all(is_closed(*each) for each in sets[1:]):
         return "unexplained"
-    if not any(founded(cause.signs, len(cause.confounded_with)) for cause in found):
+    if not any(is_founded(cause.signs, len(cause.confounded_with)) for cause in found):
         return "unexplained"
     weak = any(cause.confidence < HINT and carries(cause, found) for cause in found)
     return "ambiguous" if weak or found[0].confounded_with else "explained"

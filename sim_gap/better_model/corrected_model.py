@@ -9,13 +9,13 @@ import numpy as np
 
 from armlink.errors import BadInput
 from gcomp.arrays import Array
-from sim_gap.effects.base import tilted
-from sim_gap.effects.link import mounted, pseudo_inertia
+from sim_gap.effects.base import tilt_gravity
+from sim_gap.effects.link import mount_matrix, pseudo_inertia
 from sim_gap.model.load import SimModel, linear_part, read_spec
 from sim_gap.model.rigid_body import inertial_of
 from sim_gap.residuals.preprocess import ABSENT
-from sim_gap.search.about import inertial_change
 from sim_gap.search.estimate import EffectEstimate
+from sim_gap.search.estimate_signals import inertial_change
 from sim_gap.search.term import Term
 
 
@@ -109,13 +109,13 @@ def with_effects(
         *(term for term in chosen if term.effect == "position.offset" and term.place in bent),
     }
     held = tuple(term for term in chosen if term.effect in HELD and in_model(term, number) and term not in left_out)
-    turn = mounted(sim.arm.axis[-1], mount)
+    turn = mount_matrix(sim.arm.axis[-1], mount)
     links = [(term, turn @ estimate.of(term) if term.effect == "link.payload" else estimate.of(term)) for term in held]
     changed = _set_links(model, sim, links, number)
     for term in held:
         c, joint = estimate.of(term), sim.joints[term.place]
         if term.effect == "base.tilt":
-            model.opt.gravity[:] = tilted(sim.arm.gravity, c)
+            model.opt.gravity[:] = tilt_gravity(sim.arm.gravity, c)
         elif term.effect.split(".")[0] not in ("link", "position") and term.effect != "transmission.coupling":
             _joint(model, joint, term.effect, c, added=estimate.store.data.layout.motor is not None)
     for place, offset in offsets(estimate, held).items():
@@ -141,20 +141,20 @@ def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> boo
     joint = joints[link]
     body, anchor = int(model.jnt_bodyid[joint]), model.jnt_pos[joint]
     total = body_parameters(model, body, anchor, np.eye(3)) + added
-    if not exists(total):
+    if not may_exist(total):
         fixed = _fixed_to(model, body, joints)
         whole = total + sum((_seen_from(model, other, body, anchor) for other in fixed), np.zeros(10))
-        if fixed and exists(whole):
+        if fixed and may_exist(whole):
             total = whole
             for other in fixed:
                 model.body_mass[other], model.body_inertia[other] = LEFT_KG, LEFT_KG
-    mass, centre, about = split(total)
+    mass, centre, about = mass_centre_inertia(total)
     values, axes = np.linalg.eigh(about)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     model.body_mass[body], model.body_ipos[body] = mass, anchor + centre
-    model.body_inertia[body] = possible(values)
+    model.body_inertia[body] = closest_possible(values)
     mujoco_quaternion(model.body_iquat[body], axes)
-    return bool(np.allclose(possible(values), values, rtol=1e-3, atol=1e-9) and mass == total[0])
+    return bool(np.allclose(closest_possible(values), values, rtol=1e-3, atol=1e-9) and mass == total[0])
 
 
 def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
@@ -197,7 +197,7 @@ def mujoco_quaternion(out: Array, axes: Array) -> None:
     mujoco.mju_mat2Quat(out, axes.ravel())
 
 
-def exists(inertial: Array) -> bool:
+def may_exist(inertial: Array) -> bool:
     return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
 
 
@@ -272,13 +272,13 @@ def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
         stiffness[joint] = total
 
 
-def possible(principal: Array) -> Array:
+def closest_possible(principal: Array) -> Array:
     """The closest physical principal moments of inertia (none exceeds the sum of the other two), (3,)."""
     spread = np.maximum(0.5 * principal.sum() - principal, 1e-6)  # kg·m²
     return np.asarray(spread.sum() - spread)
 
 
-def split(inertial: Array) -> tuple[float, Array, Array]:
+def mass_centre_inertia(inertial: Array) -> tuple[float, Array, Array]:
     """Mass, centre of mass and inertia about it (3, 3) from ten inertial parameters about the origin."""
     mass = max(float(inertial[0]), 1e-6)
     centre = inertial[1:4] / mass

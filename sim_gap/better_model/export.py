@@ -37,7 +37,7 @@ class Written:
     """Effects that the module holds."""
 
 
-def written(
+def model_files(
     sim: SimModel,
     estimate: EffectEstimate | None,
     name: str,
@@ -90,7 +90,7 @@ def write_model(
     lists them in a comment. A module of an earlier model of that name is removed if there is none now. Raises BadInput
     if the nominal model did not come from a file or a file cannot be written.
     """
-    files = written(sim, estimate, path.name, laws=laws)
+    files = model_files(sim, estimate, path.name, laws=laws)
     text, lines = files.xml, files.lines
     if path.suffix == URDF:
         text, lines = urdf_of(files.spec.compile(), urdf_behind(sim.path), lines)

@@ -11,7 +11,7 @@ from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
 from gcomp.arm.model_file import parse_xml
 from gcomp.arrays import Array
-from sim_gap.better_model.corrected_model import body_parameters, split
+from sim_gap.better_model.corrected_model import body_parameters, mass_centre_inertia
 from sim_gap.model.load import linear_part
 
 
@@ -76,7 +76,7 @@ def _changed(model: Any, source: Path) -> ET.Element:
     joints = {model.joint(joint).name: joint for joint in range(model.njnt)}
     for link in root.iter("link"):
         if (body := bodies.get(link.get("name", ""))) is not None and model.body_mass[body] > 0.0:
-            _put_inertial(link, *split(body_parameters(model, body, np.zeros(3), np.eye(3))))
+            _put_inertial(link, *mass_centre_inertia(body_parameters(model, body, np.zeros(3), np.eye(3))))
     for joint in root.iter("joint"):
         if (number := joints.get(joint.get("name", ""))) is not None:
             _put_dynamics(joint, model, number)

@@ -1,6 +1,6 @@
 """Arms drawn at random: 3 to 7 hinges, plausible links, any mounting; written as MJCF.
 
-The nominal arm is that of `sim.xml`; `perturbed` is the arm that the plant simulates, with small errors everywhere.
+The nominal arm is that of `sim.xml`; `perturb` is the arm that the plant simulates, with small errors everywhere.
 """
 
 from dataclasses import dataclass, replace
@@ -97,7 +97,7 @@ def draw_arm(random: np.random.Generator, joints: int | None = None) -> BenchArm
     )
 
 
-def perturbed(arm: BenchArm, random: np.random.Generator) -> BenchArm:
+def perturb(arm: BenchArm, random: np.random.Generator) -> BenchArm:
     """The arm with manufacturing errors: mass moments and rotors about 1 %, inertias 2 %, masses 0.3 %."""
     n, small = arm.n, np.clip(random.normal(0.0, 0.5, (3, arm.n)), -1.0, 1.0)
     return replace(
@@ -198,7 +198,7 @@ def _steiner(point: Array) -> Array:
     return np.asarray(point @ point * np.eye(3) - np.outer(point, point))
 
 
-def compiled(arm: BenchArm) -> Any:
+def compile_arm(arm: BenchArm) -> Any:
     """The arm's links and rotors as a MuJoCo model without friction, damping or limits."""
     import mujoco
 

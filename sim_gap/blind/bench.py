@@ -16,7 +16,8 @@ from typing import Any
 
 from armlink.errors import ArmlinkError, BadInput, Refused
 from sim_gap.blind.cases import HELDOUT_S, TRAIN_S
-from sim_gap.blind.score import answer_name, score, score_positions
+from sim_gap.blind.position_score import score_positions
+from sim_gap.blind.score import answer_name, score
 
 MANIFEST = "manifest.json"
 SCHEMA = "armlink.blind-seal/1"

@@ -13,14 +13,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.arms import BenchArm, compiled, inverse, mjcf
+from sim_gap.blind.arms import BenchArm, compile_arm, inverse, mjcf
 from sim_gap.blind.plant.plant import simulate
-from sim_gap.blind.plant.sensors import record
+from sim_gap.blind.plant.sensors import columns_at, record
 from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, label, recipes
 from sim_gap.blind.true_arm import Log
 
 VISIBLE_RATIO, VISIBLE_LEAST = 3.0, 0.08
-"""Least factor on some held-out RMS, and least increase of it [N·m], by a visible effect."""
+"""Least factor on some held-out gap, and least increase of it [N·m], by a visible effect."""
 MOVING = 0.03
 """Motor channels count only above this speed [rad/s]: at rest friction is undetermined."""
 
@@ -30,12 +30,12 @@ def gap(arm: BenchArm, columns: dict[str, Array]) -> dict[str, list[float]]:
     from scipy.signal import butter, sosfiltfilt
 
     t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RATE)
-    even = {k: _even(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
+    even = {k: columns_at(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
     low = butter(4, 6.0, fs=RATE, output="sos")
     q = sosfiltfilt(butter(4, 15.0, fs=RATE, output="sos"), even["q"], axis=0)
     v = np.gradient(q, 1.0 / RATE, axis=0)
     a = np.gradient(v, 1.0 / RATE, axis=0)
-    motor = inverse(compiled(arm), q, v, a)
+    motor = inverse(compile_arm(arm), q, v, a)
     link = motor - arm.armature * a
     motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / 0.02)  # rad/s
     out = {}
@@ -59,13 +59,9 @@ def largest_fall(before: dict[str, list[float]], after: dict[str, list[float]]) 
     return {"channel": channel, "joint": f"joint_{j + 1}", "before": b, "after": a, "shrink": 1.0 - a / max(b, 1e-9)}
 
 
-def visible(fall: dict[str, Any]) -> bool:
+def is_visible(fall: dict[str, Any], least: float = VISIBLE_LEAST) -> bool:
     """Whether the gap caused by an effect exceeds that of every arm clearly."""
-    return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > VISIBLE_LEAST)
-
-
-def _even(t: Array, own: Array, values: Array) -> Array:
-    return np.column_stack([np.interp(t, own, column) for column in values.T])
+    return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > least)
 
 
 Values = TypeVar("Values")
@@ -138,7 +134,7 @@ def _judged(drawing: CaseDrawing, logs: list[Log], rate: float) -> Judged:
         falls = [largest_fall(recorded[0], less) for less in others]
     steady = all(_steady(run.command, log) for run, log in zip(runs, logs, strict=True))
     found = {"with": gaps[0], "without": gaps[-1], "falls": falls}
-    return Judged(recordings[0], found, steady and (bool(drawing.recipe.several) or all(visible(f) for f in falls)))
+    return Judged(recordings[0], found, steady and (bool(drawing.recipe.several) or all(is_visible(f) for f in falls)))
 
 
 def _steady(command: Array, log: Log) -> bool:
@@ -215,10 +211,10 @@ def main() -> None:
     given = parse_words(str(__doc__))
     low, _, high = given.effects.partition("-")
     make_all(make_cases, recipes(given.seed, given.cases, (int(low), int(high)) if high else None), given)
-    (given.labels / "withhold.txt").write_text("\n".join(withheld(given.labels)), encoding="utf-8")
+    (given.labels / "withhold.txt").write_text("\n".join(draw_withheld(given.labels)), encoding="utf-8")
 
 
-def withheld(labels: Path, each: int = 2) -> list[str]:
+def draw_withheld(labels: Path, each: int = 2) -> list[str]:
     """Lines "case effect": the first `each` single-effect cases of every effect that the recording can separate."""
     chosen: dict[str, list[str]] = {}
     for path in sorted(labels.glob("*.json")):

@@ -8,10 +8,10 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm, draw_arm
 from sim_gap.blind.effects import DRAWS, EFFECTS
-from sim_gap.blind.effects.drawn import Drawn
+from sim_gap.blind.effects.drawn_effect import DrawnEffect
 from sim_gap.blind.motion import KINDS, MotionLimits, trajectory
 from sim_gap.blind.scene import Scene
-from sim_gap.blind.true_arm import PlantRun, sound
+from sim_gap.blind.true_arm import PlantRun, sound_arm
 
 ATTEMPTS = 600
 """Number of arms drawn for a case before it is left out; backlash, the rarest, takes some hundred."""
@@ -53,7 +53,7 @@ class CaseDrawing:
 
     recipe: CaseRecipe
     nominal: BenchArm
-    drawn: tuple[Drawn, ...]
+    drawn: tuple[DrawnEffect, ...]
     motions: dict[str, tuple[str, ...]]
     train: PlantRun
     heldout: PlantRun
@@ -112,16 +112,16 @@ def draw(recipe: CaseRecipe, train_s: float, heldout_s: float, first: int = 0) -
     return None
 
 
-def _named(effects: tuple[str, ...], scene: Scene, random: np.random.Generator) -> tuple[Drawn, ...] | None:
+def _named(effects: tuple[str, ...], scene: Scene, random: np.random.Generator) -> tuple[DrawnEffect, ...] | None:
     """These effects on one arm; None if it cannot show one of them or they exclude each other."""
     drawn = [DRAWS[effect](scene, random) for effect in effects]
     found = tuple(d for d in drawn if d)
     return found if len(found) == len(drawn) and (len(found) < 2 or _compatible(*found)) else None
 
 
-def _several(count: int, scene: Scene, random: np.random.Generator) -> tuple[Drawn, ...] | None:
+def _several(count: int, scene: Scene, random: np.random.Generator) -> tuple[DrawnEffect, ...] | None:
     """`count` different effects that the arm can show together; None if it cannot show as many."""
-    found: list[Drawn] = []
+    found: list[DrawnEffect] = []
     tip = scene.arm.names[-1]
     for effect in random.permutation(EFFECTS).tolist():
         drawn = DRAWS[effect](scene, random)
@@ -132,7 +132,7 @@ def _several(count: int, scene: Scene, random: np.random.Generator) -> tuple[Dra
     return None
 
 
-def _distinct(first: Drawn, second: Drawn, tip: str) -> bool:
+def _distinct(first: DrawnEffect, second: DrawnEffect, tip: str) -> bool:
     """Whether slow motion can separate two effects of one arm: a payload counts as one of the last joint, a tilt as one
     of any."""
     if {first.effect, second.effect} not in INDISTINCT:
@@ -146,7 +146,7 @@ def _distinct(first: Drawn, second: Drawn, tip: str) -> bool:
 def _assemble(
     recipe: CaseRecipe,
     scene: Scene,
-    drawn: tuple[Drawn, ...],
+    drawn: tuple[DrawnEffect, ...],
     motions: dict[str, tuple[str, ...]],
     command: Array,
     random: np.random.Generator,
@@ -159,13 +159,13 @@ def _assemble(
     seed = int(random.integers(2**31))
     feed = {number: scene.feed_forward(q) for number, q in enumerate((scene.command, command))}
 
-    whole = sound(nominal, scene.rated, np.random.default_rng(seed))
+    whole = sound_arm(nominal, scene.rated, np.random.default_rng(seed))
     for effect in drawn:
         effect.apply(whole)
     bandwidth = whole.bandwidth  # the same controller for all runs
 
-    def run(effects: tuple[Drawn, ...], number: int) -> PlantRun:
-        truth = sound(nominal, scene.rated, np.random.default_rng(seed))
+    def run(effects: tuple[DrawnEffect, ...], number: int) -> PlantRun:
+        truth = sound_arm(nominal, scene.rated, np.random.default_rng(seed))
         for effect in effects:
             effect.apply(truth)
         truth.bandwidth = bandwidth
@@ -186,7 +186,7 @@ def _limits(arm: BenchArm, random: np.random.Generator) -> MotionLimits:
     return MotionLimits(arm.lower, arm.upper, velocity, acceleration)
 
 
-def _compatible(first: Drawn, second: Drawn) -> bool:
+def _compatible(first: DrawnEffect, second: DrawnEffect) -> bool:
     """Whether two effects can be combined: on a common joint, neither may overwrite the other."""
     same = set(first.joints) & set(second.joints)
     rewriting = {"transmission.coupling", "friction.stribeck", "friction.asymmetric", "transmission.elasticity"}

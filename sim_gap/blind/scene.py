@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.arms import BenchArm, compiled, controlled_inertia, inverse
+from sim_gap.blind.arms import BenchArm, compile_arm, controlled_inertia, inverse
 from sim_gap.blind.motion import RATE, derivatives
 
 THIN = 25
@@ -28,7 +28,7 @@ class Scene:
 
     @cached_property
     def model(self) -> Any:
-        return compiled(self.arm)
+        return compile_arm(self.arm)
 
     @cached_property
     def motion(self) -> tuple[Array, Array, Array]:
@@ -74,13 +74,13 @@ class Scene:
 
     def change(self, other: BenchArm) -> Array:
         """Change of the link-side torque with another arm in place of this one, (K', n)."""
-        model = compiled(other)
+        model = compile_arm(other)
         return inverse(model, *self.motion) - other.armature * self.motion[2] - self.torque
 
     def change_at_rest(self, other: BenchArm) -> Array:
         """Change of the gravity torque with another arm in place of this one, (K', n)."""
         still = np.zeros_like(self.motion[0])
-        return inverse(compiled(other), self.motion[0], still, still) - self.gravity
+        return inverse(compile_arm(other), self.motion[0], still, still) - self.gravity
 
     def feed_forward(self, command: Array) -> Array:
         """Nominal torque along a trajectory at `motion.RATE`, rotors included (K, n)."""

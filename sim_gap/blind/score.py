@@ -1,4 +1,4 @@
-"""The scores of blind checks (docs/formats.md) from judged answers: shares, confusion matrix. Pure functions."""
+"""The score of blind checks (docs/formats.md) from judged answers: shares, confusion matrix. Pure functions."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -29,11 +29,11 @@ def score(answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping
     return {
         "schema": SCHEMA,
         **parts,
-        "meets": meets(parts),
+        "meets": meets_bounds(parts),
         "confusion": confusion(whole),
         "by_effect": by_effect(whole),
         "calibration": calibration(whole),
-        "cases": [row(j) for j in judged],
+        "cases": [case_row(j) for j in judged],
     }
 
 
@@ -59,7 +59,7 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
         "extra_confident": share([bool(j.blamed) for j in some]),
         "joints": {"precision": precision, "recall": recall, "f1": _f1(precision, recall)},
         "no_effect": {"cases": len(none), "false_alarms": share([j.verdict != "no_gap" for j in none])},
-        "several": several([j for j in judged if j.kind == "several"]),
+        "several": score_several([j for j in judged if j.kind == "several"]),
         "two": {"cases": len(two), "both_found": share([set(j.found) == set(j.truth) for j in two])},
         "parameters": {
             "count": len(errors),
@@ -75,7 +75,7 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
     }
 
 
-def several(judged: Sequence[Judgement]) -> dict[str, Any]:
+def score_several(judged: Sequence[Judgement]) -> dict[str, Any]:
     """Shares over the cases with many effects: true effects named, confident causes that are false."""
     shown, placed = (sum(len(getattr(j, name)) for j in judged) for name in ("shown", "placed"))
     return {
@@ -144,7 +144,7 @@ def calibration(judged: Sequence[Judgement]) -> list[dict[str, Any]]:
     return out
 
 
-def row(j: Judgement) -> dict[str, Any]:
+def case_row(j: Judgement) -> dict[str, Any]:
     """One case as a row of the table of all cases."""
     return {
         "case": j.case,
@@ -164,7 +164,7 @@ def row(j: Judgement) -> dict[str, Any]:
     }
 
 
-def meets(result: Mapping[str, Any]) -> dict[str, bool]:
+def meets_bounds(result: Mapping[str, Any]) -> dict[str, bool]:
     """Whether the score meets each of the project's bounds (for at least 150 cases); a share over no case does not."""
     known, blind = result["label_withheld"], result["effect_withheld"]
     least = {
@@ -199,39 +199,3 @@ def _f1(precision: float | None, recall: float | None) -> float | None:
 
 def _finite(x: float) -> float | None:
     return x if np.isfinite(x) else None
-
-
-POSITIONS_SCHEMA = "armlink.blind-positions/1"
-NAMED_SHARE, FALSE_SHARE = 0.85, 0.03
-"""Required share of first causes that are right or named as confounded, and of answers with a false cause above 0.8."""
-
-
-def score_positions(
-    answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Score all answers (by name) against the labels (by case); shares over no case are None."""
-    judged: list[Judgement] = []
-    for name, answer in answers.items():
-        case, _, withheld = name.partition(WITHHELD)
-        if labels[case].get("clear", True):
-            judged.append(judge(answer, labels[case], withheld))
-    whole = [j for j in judged if not j.withheld]
-    told = [j for j in whole if j.tellable and j.kind == "single"]
-    named, false = share([j.named for j in told]), share([bool(j.blamed) for j in judged])
-    shares = {"named_where_tellable": named, "false_confident": false}
-    met = {
-        "named_where_tellable": named is not None and named >= NAMED_SHARE,
-        "false_confident": false is not None and false <= FALSE_SHARE,
-    }
-    return {
-        "schema": POSITIONS_SCHEMA,
-        "answers": len(judged),
-        "tellable": len(told),
-        **shares,
-        "label_withheld": label_withheld(whole),
-        "meets": met,
-        "confusion": confusion(whole),
-        "by_effect": by_effect(whole),
-        "calibration": calibration(judged),
-        "cases": [row(j) for j in judged],
-    }

@@ -10,23 +10,24 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm, draw_arm, mjcf
-from sim_gap.blind.cases import largest_fall, make_all, parse_words, withheld, write_csv
-from sim_gap.blind.effects.drawn import Values
+from sim_gap.blind.cases import ROUNDS, draw_withheld, is_visible, largest_fall, make_all, parse_words, write_csv
+from sim_gap.blind.effects.drawn_effect import Values
 from sim_gap.blind.motion import KINDS, RATE, MotionLimits, trajectory
 from sim_gap.blind.plant.controller import ServoLaw, ServoRun, Servos
 from sim_gap.blind.plant.plant import simulate
+from sim_gap.blind.plant.sensors import JITTER_S, columns_at
+from sim_gap.blind.recipe import NONE_SHARE
 from sim_gap.blind.scene import Scene
-from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO, UNKNOWN, ServoChange, drawn
-from sim_gap.blind.true_arm import Log, sound
+from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO, UNKNOWN, ServoChange, draw_effect
+from sim_gap.blind.true_arm import Log, sound_arm
 
-ROUNDS, ATTEMPTS = 4, 200
-NONE_SHARE, UNKNOWN_SHARE = 0.12, 0.3
-"""Shares of cases without an effect, and of those whose model has no controller."""
-VISIBLE_RATIO, VISIBLE_COUNTS = 3.0, 2.0
-"""Least factor on a joint's gap, and least increase of it in counts of the encoder, by an effect that shows."""
+ATTEMPTS = 200
+UNKNOWN_SHARE = 0.3
+"""Share of cases whose model has no controller."""
+VISIBLE_COUNTS = 2.0
+"""Least increase of a joint's gap by an effect that shows, in counts of the encoder."""
 FOLLOWED = 0.6
 """Largest deviation from the command of an arm under control [rad]."""
-JITTER_S = 4e-4
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def draw(recipe: ServoRecipe, lengths: tuple[float, float], first: int) -> Servo
         scene = Scene(arm, trajectory(training, lengths[0], limits, random))
         omega = 2 * np.pi * random.uniform(2.5, 5.0, n)
         law = _law(scene.inertia * omega**2, 2.0 * random.uniform(0.7, 1.1) * scene.inertia * omega)
-        change = drawn(recipe.effect, scene, law, random) if recipe.effect else None
+        change = draw_effect(recipe.effect, scene, law, random) if recipe.effect else None
         if recipe.effect and change is None:
             continue
         other = trajectory((held,), lengths[1], limits, random)
@@ -116,7 +117,7 @@ def _assemble(
     small = np.random.default_rng([seed, 5]).uniform(0.99, 1.01, (2, nominal.n))
 
     def run(number: int, *, wrong: bool, perfect: bool = False) -> ServoRun:
-        truth = sound(nominal, scene.rated, np.random.default_rng(seed))
+        truth = sound_arm(nominal, scene.rated, np.random.default_rng(seed))
         own = _law(law.stiffness * small[0], law.damping * small[1])
         if perfect:
             own, truth.arm = _law(law.stiffness, law.damping), nominal
@@ -160,12 +161,12 @@ def recorded(run: ServoRun, log: Log, hz: float, random: np.random.Generator) ->
     sent = run.command[np.rint(t * RATE).astype(int)]
     t[1:] += np.clip(JITTER_S * random.standard_normal(len(t) - 1), -0.2 / hz, 0.2 / hz)
     step = run.truth.encoder_step
-    q = np.column_stack([np.interp(t, clock, column) for column in log.position.T])
+    q = columns_at(t, clock, log.position)
     q = np.rint(q / step + 0.2 * random.standard_normal(q.shape)) * step
     return {"t": t, "q": q, "q_cmd": sent}
 
 
-def judged(drawing: ServoDrawing, logs: Sequence[Log]) -> tuple[dict[str, Any], bool]:
+def judge_drawing(drawing: ServoDrawing, logs: Sequence[Log]) -> tuple[dict[str, Any], bool]:
     """Gap against the nominal model with and without the effect [rad], and whether the case is good."""
     rows = slice(round(1.0 * RATE), None)
     real, without, ideal = (log.position[rows] for log in logs)
@@ -173,7 +174,7 @@ def judged(drawing: ServoDrawing, logs: Sequence[Log]) -> tuple[dict[str, Any], 
     steady = all(_steady(run, log) for run, log in zip(drawing.runs[1:], logs, strict=True))
     falls = [largest_fall(*gaps)] if drawing.change is not None else []
     least = VISIBLE_COUNTS * drawing.runs[0].truth.encoder_step
-    seen = all(f["before"] > VISIBLE_RATIO * f["after"] and f["before"] - f["after"] > least for f in falls)
+    seen = all(is_visible(fall, least) for fall in falls)
     return {"with": gaps[0], "without": gaps[1], "falls": falls}, steady and seen
 
 
@@ -193,7 +194,7 @@ def make_cases(wanted: Sequence[ServoRecipe], out: Path, labels: Path, train_s: 
         if not drawings:
             return
         logs = iter(simulate([run for d in drawings for run in d.runs[1:]], Servos))
-        seen = [(d, held, *judged(d, held)) for d in drawings for held in [[next(logs) for _ in range(3)]]]
+        seen = [(d, held, *judge_drawing(d, held)) for d in drawings for held in [[next(logs) for _ in range(3)]]]
         last = number == ROUNDS - 1
         good = [each for each in seen if each[3] or last]
         trained = simulate([d.runs[0] for d, *_ in good], Servos) if good else []
@@ -259,7 +260,7 @@ def _whole(change: ServoChange, drawing: ServoDrawing, joint: str) -> Values:
 def main() -> None:
     given = parse_words(str(__doc__))
     make_all(make_cases, recipes(given.seed, given.cases), given)
-    (given.labels / "withhold.txt").write_text("\n".join(withheld(given.labels, 1)[::3]), encoding="utf-8")
+    (given.labels / "withhold.txt").write_text("\n".join(draw_withheld(given.labels, 1)[::3]), encoding="utf-8")
 
 
 if __name__ == "__main__":

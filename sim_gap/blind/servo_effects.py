@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sim_gap.blind.effects import DRAWS
-from sim_gap.blind.effects.drawn import Drawn, Values, pick, sign
+from sim_gap.blind.effects.drawn_effect import DrawnEffect, Values, pick, sign
 from sim_gap.blind.plant.controller import ServoLaw
 from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.true_arm import TrueArm
@@ -35,7 +35,7 @@ class ServoChange:
     parameters: dict[str, Values]
     arm: Callable[[TrueArm], None] = lambda true: None
     law: Callable[[ServoLaw], None] = lambda law: None
-    drawn: Drawn | None = None
+    drawn: DrawnEffect | None = None
     undecided: str = ""
     confused_with: tuple[str, ...] = ()
     implied: tuple[str, ...] = field(default=())
@@ -118,7 +118,7 @@ UNKNOWN = (
 does damping, which a servo makes as well as friction does."""
 
 
-def drawn(effect: str, scene: Scene, law: ServoLaw, random: np.random.Generator) -> ServoChange | None:
+def draw_effect(effect: str, scene: Scene, law: ServoLaw, random: np.random.Generator) -> ServoChange | None:
     """One effect at a size that shows, None if this arm cannot show it."""
     if effect in OF_THE_SERVO:
         return OF_THE_SERVO[effect](scene, law, random)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gcomp.arrays import Array, Mask
-from sim_gap.blind.arms import BenchArm, perturbed
+from sim_gap.blind.arms import BenchArm, perturb
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ class TrueArm:
         return float(2 * np.pi / 2**self.encoder_bits)
 
 
-def sound(nominal: BenchArm, rated: Array, random: np.random.Generator) -> TrueArm:
+def sound_arm(nominal: BenchArm, rated: Array, random: np.random.Generator) -> TrueArm:
     """The arm without effects: small errors of all nominal parameters, a little friction, sensor noise."""
     n = nominal.n
     zero, one, never = np.zeros(n), np.ones(n), np.full(n, np.inf)
     return TrueArm(
-        arm=perturbed(nominal, random),
+        arm=perturb(nominal, random),
         coulomb=nominal.frictionloss * random.uniform(0.98, 1.02, n) + random.uniform(0.01, 0.04, n),
         viscous=nominal.damping * random.uniform(0.98, 1.02, n) + random.uniform(0.0, 0.02, n),
         breakaway=zero.copy(),

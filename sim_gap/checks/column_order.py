@@ -9,8 +9,8 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.hypotheses import Hypothesis, hypotheses, permuted
-from sim_gap.checks.rigid_fit import FEW, ChannelMotion, changed, fit_model, fit_models, least_costs, rows_of
+from sim_gap.checks.hypotheses import Hypothesis, hypotheses, permute
+from sim_gap.checks.rigid_fit import FEW, SCREENED, ChannelMotion, fit_model, fit_models, least_costs, rows_of
 from sim_gap.checks.torque_unit import find_absent
 from sim_gap.model.rigid_body import RigidArm
 
@@ -29,10 +29,10 @@ def likely_orders(arm: RigidArm, motion: ChannelMotion) -> list[tuple[tuple[int,
         return []
     few = rows_of(motion, slice(None, None, max(1, len(motion.q) // 50)))
     orders = list(permutations(range(arm.n)))[1:]
-    moved = [permuted(order, ("q", "v", "a"))(few) for order in orders]
+    moved = [permute(order, ("q", "v", "a"))(few) for order in orders]
     made = arm.carried(*(np.concatenate([getattr(each, name) for each in moved]) for name in ("q", "v", "a")))
     found = [(order, False, True) for order in _torque_orders(arm, few, orders)]
-    both = [permuted(order, ("reading",))(each) for order, each in zip(orders, moved, strict=True)]
+    both = [permute(order, ("reading",))(each) for order, each in zip(orders, moved, strict=True)]
     for whole, motions in ((True, both), (False, moved)):
         pairs = list(zip(np.split(made, len(motions)), motions, strict=True))
         roughly = np.argsort(least_costs(pairs))[:ROUGHLY].tolist()
@@ -45,7 +45,7 @@ def _torque_orders(arm: RigidArm, few: ChannelMotion, orders: Sequence[tuple[int
     """The likely orders of the torques alone: what is left of a joint's reading does not depend on the others'."""
     model, n = arm.carried(few.q, few.v, few.a), arm.n
     rolled = [np.roll(np.arange(n), -k).tolist() for k in range(n)]
-    fits = fit_models([(model, permuted(order, ("reading",))(few)) for order in rolled])
+    fits = fit_models([(model, permute(order, ("reading",))(few)) for order in rolled])
     costs = np.empty((n, n))  # of each joint with each column
     for order, fit in zip(rolled, fits, strict=True):
         costs[np.arange(n), order] = fit.cost
@@ -56,8 +56,6 @@ def _torque_orders(arm: RigidArm, few: ChannelMotion, orders: Sequence[tuple[int
 CLEAR = 0.6
 """Fall of the cost, with an order in a part of the rows, from which it is asked about: on sound recordings of real arms
 none reaches 0.1, on those with two torques exchanged from the middle on they reach 1.2 and more."""
-SCREENED = 0.3
-"""Share of that fall that an order must reach on few rows to be looked at."""
 UNEVEN = 1.0
 """Fall of the cost from all rows to one half of them from which a torque may be absent from the other."""
 TRIED, LOCATED = np.linspace(0.25, 0.75, 3), np.linspace(0.05, 0.95, 37)
@@ -114,4 +112,4 @@ def _in_part(motion: ChannelMotion, order: Hypothesis, late: bool, share: float)
     """The motion with an order of its readings before, or after, a share of the rows."""
     row = round(share * len(motion.q))
     before, after = (motion, order.change(motion)) if late else (order.change(motion), motion)
-    return changed(motion, reading=np.concatenate([before.reading[:row], after.reading[row:]]))
+    return replace(motion, reading=np.concatenate([before.reading[:row], after.reading[row:]]))

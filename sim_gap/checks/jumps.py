@@ -10,7 +10,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.rigid_fit import TURNING
-from sim_gap.checks.sampling import filled
+from sim_gap.checks.sampling import fill
 
 JUMP, TIMES = 0.05, 8.0
 """Step from row to row from which a position jumps [rad], and its speed over what is usual at the joint."""
@@ -33,7 +33,7 @@ TOGETHER = "were separate pieces joined here, or are rows missing?"
 SETTLED = "give each piece as a recording of its own, or --clock t=0 if it is right"
 
 
-def unwrapped(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
+def unwrap(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     """The recording with joints that turn on where their positions wrap around."""
     found, position = [], recording.position.copy()
     for j, q in enumerate(position.T):
@@ -90,7 +90,7 @@ def find_seam(recording: Recording, stated: Corrections) -> list[RecordingFindin
     if "t" in stated.clock or recording.velocity is None or recording.t.size < 10 * NEAR:
         return []
     t, time = recording.t, np.diff(recording.t)[:, None]
-    q, v = (filled(t, values, np.isfinite(values)) for values in (recording.position, recording.velocity))
+    q, v = (fill(t, values, np.isfinite(values)) for values in (recording.position, recording.velocity))
     allowed = 0.5 * time * np.abs(np.diff(v, axis=0))
     beyond = np.maximum(np.abs(np.diff(q, axis=0) - 0.5 * time * (v[1:] + v[:-1])) - allowed, 0.0)
     slope = (v[2:] - v[:-2]) / (t[2:] - t[:-2])[:, None]

@@ -15,10 +15,11 @@ from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.column_order import likely_orders
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.hypotheses import Hypothesis, hypotheses, ordered
-from sim_gap.checks.mounting import as_loaded, as_mounted
+from sim_gap.checks.hypotheses import Hypothesis, hypotheses, put_in_order
+from sim_gap.checks.mounting import find_load, find_mounting
 from sim_gap.checks.rigid_fit import (
     FEW,
+    SCREENED,
     STRONG_SHARE,
     ChannelMotion,
     RigidFit,
@@ -41,8 +42,6 @@ that no arm has, or if any other change does as much: it may be chance, of a hun
 of the thousands of orders of more than two joints."""
 TWICE = 2.0
 """Times a fall by which that of a change that is doubted must be larger to be asked about instead."""
-SCREENED = 0.3
-"""Share of that fall that a hypothesis must reach on few rows."""
 ALIKE = 0.05
 """Difference of the falls below which two changes cannot be told from each other."""
 NEARLY = 0.4
@@ -88,13 +87,13 @@ def find_mapping(
 ) -> list[RecordingFinding]:
     """Findings on order, sign, zero and angle unit of a motion, one after the other.
 
-    `mounted` is the arm `as_mounted` in this motion, if it is known. `follows` are the channels (of `dq`, `q_cmd`)
-    whose columns agree with the positions' as they are recorded, so that what is wrong with a position is wrong with
-    theirs. All findings are corrected, or none is. A slight fall counts only if every joint concerned is explained
-    then, and one that is not large is certain only then: a model that was fitted to another motion leaves some of them
-    to chance.
+    `mounted` is what `find_mounting` gives for this motion, if it is known. `follows` are the channels (of `dq`,
+    `q_cmd`) whose columns agree with the positions' as they are recorded, so that what is wrong with a position is
+    wrong with theirs. All findings are corrected, or none is. A slight fall counts only if every joint
+    concerned is explained then, and one that is not large is certain only then: a model that was fitted to another
+    motion leaves some of them to chance.
     """
-    fit = _as_an_arm(mounted or as_mounted(arm, motion), motion)
+    fit = _as_an_arm(mounted or find_mounting(arm, motion), motion)
     orders = _orders(arm, motion, stated, follows) if _is_odd(fit) else []
     taken: list[HypothesisTest] = []
     while len(taken) < 2 * arm.n and not (taken and taken[-1].doubted):
@@ -128,14 +127,14 @@ def _orders(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: 
         return []
     positions, torque = ("q", *follows), motion.channel
     return [
-        ordered(arm, order, (*(positions if moved else ()), *((torque,) if read else ())), torque)
+        put_in_order(arm, order, (*(positions if moved else ()), *((torque,) if read else ())), torque)
         for order, moved, read in likely_orders(arm, motion)
     ]
 
 
 def _as_an_arm(mounted: RigidArm, motion: ChannelMotion) -> RigidFit:
     """The fit as it stands, gravity, a tool and springs included where they explain it: effects of the arm."""
-    model = as_loaded(mounted, motion).carried(motion.q, motion.v, motion.a)
+    model = find_load(mounted, motion).carried(motion.q, motion.v, motion.a)
     plain, sprung = fit_model(model, motion), fit_model(model, motion, springs=True)
     beside = (sprung.scale > PLAUSIBLE[0]) | (sprung.own_share < STRONG_SHARE)  # not in place of gravity
     return replace(plain, explained=np.where(beside & (sprung.explained > SPRUNG), sprung.explained, plain.explained))

@@ -18,7 +18,7 @@ TOOL_REACH = 0.4
 is twice as far away as the link's own centre of mass."""
 
 
-def as_mounted(arm: RigidArm, motion: ChannelMotion) -> RigidArm:
+def find_mounting(arm: RigidArm, motion: ChannelMotion) -> RigidArm:
     """The arm with gravity along the axis that fits best, if that is better than the nominal one.
 
     A tilted base is an effect of the arm, which the diagnosis finds; no fault of the data must be seen in it.
@@ -41,7 +41,7 @@ def as_mounted(arm: RigidArm, motion: ChannelMotion) -> RigidArm:
     return arm if upside_down and opposite.sum() < found.sum() + 0.3 else turned
 
 
-def as_loaded(arm: RigidArm, motion: ChannelMotion, without: int | None = None) -> RigidArm:
+def find_load(arm: RigidArm, motion: ChannelMotion, without: int | None = None) -> RigidArm:
     """The arm with the body at its last link that fits best, if it explains the readings and may exist.
 
     Args:

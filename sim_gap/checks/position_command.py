@@ -11,7 +11,7 @@ from armlink.recording.recording import TORQUE_CHANNELS, Recording
 from gcomp.arrays import Array
 from sim_gap.checks.finding import RecordingFinding, exchange_option
 from sim_gap.checks.joint_range import find_beyond_range, find_counts, find_far
-from sim_gap.checks.sampling import even_times, find_dropped, without_repeats
+from sim_gap.checks.sampling import drop_repeats, even_times, find_dropped
 from sim_gap.model.rigid_body import RigidArm
 
 FOLLOWS = 0.5
@@ -52,7 +52,7 @@ def check_position_only(
         )
         for finding in chain(*looks):
             raise BadInput(f"{label}: {finding.sentence()}")
-        recording, repeated = without_repeats(recording)
+        recording, repeated = drop_repeats(recording)
         recording, jitter = even_times(recording, stated)
         dropped = [] if repeated else find_dropped(recording)
         checked.append(recording)

@@ -18,6 +18,8 @@ ROWS = 1500
 """Rows that the fit looks at."""
 FEW = 5
 """One in this many of them is enough to see that a hypothesis is wrong."""
+SCREENED = 0.3
+"""Share of the fall from which something is certain that it must reach on few rows to be looked at."""
 TURNING = 0.02
 """Speed from which friction has its full sign [rad/s]."""
 MOVING_SHARE = 0.3
@@ -134,7 +136,7 @@ def _telling(motion: ChannelMotion) -> Mask:
     return np.asarray(moving | (motion.channel == "tau") | (moving.mean(0) < MOVING_LEAST))
 
 
-def beside_slow_torques(arm: RigidArm, motion: ChannelMotion, fit: RigidFit) -> RigidFit:
+def fit_beside_slow_torques(arm: RigidArm, motion: ChannelMotion, fit: RigidFit) -> RigidFit:
     """The fit with the friction that remains beside a drift of the reading and a spring across the joint.
 
     In a motion with few reversals a torque that grows with time or position varies with the direction, too.
@@ -208,7 +210,3 @@ def _positive_fit(gram: Array, signs: Sequence[tuple[float, ...]]) -> tuple[floa
 def rows_of(motion: ChannelMotion, rows: slice) -> ChannelMotion:
     q, v, a, reading = (x[rows] for x in (motion.q, motion.v, motion.a, motion.reading))
     return ChannelMotion(q, v, a, reading, motion.channel)
-
-
-def changed(motion: ChannelMotion, **values: Array) -> ChannelMotion:
-    return replace(motion, **values)  # type: ignore[arg-type]

@@ -125,7 +125,7 @@ def _roughness(t: Array, position: Array) -> float:
     return float((np.sqrt(np.mean(off**2, axis=0)) / spread).sum())
 
 
-def without_repeats(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
+def drop_repeats(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     """The recording without rows that repeat the one before while the arm moves."""
     columns = np.column_stack(list(recording.channels().values()))
     same = np.concatenate([[False], np.all((columns[1:] == columns[:-1]) | ~np.isfinite(columns[1:]), axis=1)])
@@ -172,7 +172,7 @@ HELD = 0.3
 """Share of the rows in fast motion that repeat all positions, from which they are held."""
 
 
-def without_held(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
+def drop_held(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     """The recording with positions that were read less often than the rows come, and repeated, filled in between."""
     same = _repeats(recording.position) & fast_rows(recording.position)
     share = float(same.sum()) / max(float(fast_rows(recording.position).sum()), 1.0)
@@ -180,8 +180,8 @@ def without_held(recording: Recording) -> tuple[Recording, list[RecordingFinding
         return recording, []
     velocity, known = recording.velocity, np.repeat(~same[:, None], recording.n, axis=1)
     if velocity is not None and np.mean(_repeats(velocity)[same]) > 0.5:
-        velocity = filled(recording.t, velocity, known)
-    position = filled(recording.t, recording.position, known)
+        velocity = fill(recording.t, velocity, known)
+    position = fill(recording.t, recording.position, known)
     evidence = f"repeats in {share:.0%} of the rows in motion while torques change: it is read less often; interpolated"
     found = RecordingFinding("duplicate", "q", "all", evidence, "record at the rate at which positions are read", True)
     return replace(recording, position=position, velocity=velocity), [found]
@@ -192,7 +192,7 @@ def _repeats(values: Array) -> Mask:
     return np.concatenate([[False], np.all(values[1:] == values[:-1], axis=1)])
 
 
-def filled(t: Array, values: Array, known: Mask) -> Array:
+def fill(t: Array, values: Array, known: Mask) -> Array:
     """Values (K, n), along straight lines between those that are `known` (K, n); columns without any are 0."""
     return np.column_stack(
         [np.interp(t, t[k], x[k]) if k.any() else np.zeros_like(t) for k, x in zip(known.T, values.T, strict=True)]

@@ -1,13 +1,14 @@
 """Zeros of positions that are off by some tenths of a radian: a calibration lost, or another one in the model."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from scipy.optimize import minimize_scalar
 
 from armlink.recording.corrections import Corrections
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.mounting import as_loaded, as_mounted, body_at
-from sim_gap.checks.rigid_fit import FEW, ChannelMotion, changed, fit_model, fit_rigid, rows_of
+from sim_gap.checks.mounting import body_at, find_load, find_mounting
+from sim_gap.checks.rigid_fit import FEW, ChannelMotion, fit_model, fit_rigid, rows_of
 from sim_gap.model.rigid_body import RigidArm
 
 STEP, STEPS = 0.1, 4
@@ -55,7 +56,7 @@ def find_small_zero(
 
 
 def _as_it_is(arm: RigidArm, motion: ChannelMotion) -> RigidArm:
-    return as_loaded(as_mounted(arm, motion), motion)
+    return find_load(find_mounting(arm, motion), motion)
 
 
 def least_cost(arm: RigidArm, motion: ChannelMotion, joint: int) -> tuple[float, int, float]:
@@ -79,4 +80,4 @@ def _cost(arm: RigidArm, motion: ChannelMotion, joint: int, angle: float) -> flo
 def _moved(motion: ChannelMotion, joint: int, angle: float) -> ChannelMotion:
     q = motion.q.copy()
     q[:, joint] += angle
-    return changed(motion, q=q)
+    return replace(motion, q=q)

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.rigid_fit import FEW, FLOOR, ChannelMotion, fit_model, fit_models
+from sim_gap.checks.rigid_fit import FEW, FLOOR, SCREENED, ChannelMotion, fit_model, fit_models
 from sim_gap.model.rigid_body import RigidArm
 
 LAG, LAG_STEP = 1.5, 0.02
@@ -17,8 +17,8 @@ LAG, LAG_STEP = 1.5, 0.02
 OWN_LAG = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 0.12)}
 """Delays of a channel between which they are an effect of drive or sensor, which the diagnosis finds by itself [s]:
 sensors read late, drives follow a command late, and positions are some milliseconds old."""
-SURE, SCREENED = 0.7, 0.3
-"""Fall of the cost from which a delay is certain; share of it that a delay must reach on few rows to be looked at."""
+SURE = 0.7
+"""Fall of the cost from which a delay is certain."""
 SEVERAL, SURE_OF_SEVERAL = 3, 0.4
 """Number of joints whose common delay is certain with a smaller fall; sound recordings of such arms reach 0.33, with
 which a link sensor's reading may truly be late, and those of one joint 0.45, as a motion that repeats looks alike."""

@@ -1,12 +1,14 @@
 """Sign of rectified readings, and source of a torque channel."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.mapping import FITS
-from sim_gap.checks.rigid_fit import ChannelMotion, RigidFit, changed, fit_model
+from sim_gap.checks.rigid_fit import ChannelMotion, RigidFit, fit_model
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import PreparedSignals
 
@@ -30,7 +32,7 @@ def find_unsigned(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> 
     """Readings that are never negative although the model's torque changes its sign."""
     model = arm.carried(motion.q, motion.v, motion.a)
     plain_fit = fit_model(model, motion)
-    signed_fit = fit_model(model, changed(motion, reading=np.abs(motion.reading) * np.sign(model)))
+    signed_fit = fit_model(model, replace(motion, reading=np.abs(motion.reading) * np.sign(model)))
     falls = plain_fit.cost - signed_fit.cost
     found = []
     for j in range(arm.n):

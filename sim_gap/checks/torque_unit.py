@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.mounting import as_loaded
+from sim_gap.checks.mounting import find_load
 from sim_gap.checks.rigid_fit import STRONG_CORRELATION, ChannelMotion, RigidFit, fit_rigid
 from sim_gap.model.rigid_body import RigidArm
 
@@ -65,14 +65,14 @@ def find_joint_scale(arm: RigidArm, motion: ChannelMotion, stated: Corrections) 
     alone, for it may follow a wrong one; a spring is tried beside it. A joint is asked about if none explains it, and
     as many others are in the model's unit.
     """
-    loaded = as_loaded(arm, motion)
+    loaded = find_load(arm, motion)
     fit = fit_rigid(loaded, motion)
     found = []
     follows = _follows(fit)
     odd = (fit.scale < JOINTS[0]) | (fit.scale > JOINTS[1])
     for j in np.flatnonzero(follows & odd).tolist():
         column = f"{motion.channel}_{j + 1}"
-        others = as_loaded(arm, motion, without=j)
+        others = find_load(arm, motion, without=j)
         alone = fit_rigid(others, motion)
         own = alone.own_share * alone.spread
         scales = np.array([each.scale[j] for each in (fit, alone, fit_rigid(others, motion, springs=True))])

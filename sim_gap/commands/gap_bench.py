@@ -61,7 +61,7 @@ def bench(
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from sim_gap.blind.bench import diagnose_files, run_bench
-    from sim_gap.blind.real import KNOWN, run_real
+    from sim_gap.blind.real_recordings import KNOWN, run_real
     from sim_gap.blind.tables import show, show_positions, show_real
 
     if json is not None and str(json) != "-" and not json.resolve().parent.is_dir():

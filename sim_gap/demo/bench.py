@@ -26,7 +26,7 @@ from sim_bus.truth import Truth
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.narrator import Report
-from sim_gap.model.load import compiled
+from sim_gap.model.load import compile_model
 
 RANGE_SHARE = 0.35
 """Amplitude of the recorded motion at most, as a share of half the joint's range."""
@@ -151,7 +151,7 @@ def record_pair(
 
 def diagnose_recordings(arm_path: Path, recordings: tuple[Recording, Recording]) -> Diagnosis:
     """The recordings against the arm's nominal model, in another process."""
-    return diagnose(compiled(arm_path), recordings[:1], recordings[1:], labels=["train", "heldout"])
+    return diagnose(compile_model(arm_path), recordings[:1], recordings[1:], labels=["train", "heldout"])
 
 
 @dataclass(frozen=True, eq=False)

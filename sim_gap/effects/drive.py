@@ -22,7 +22,7 @@ from sim_gap.effects.effect import (
     added_or_taken_off,
     as_shape,
     between,
-    late,
+    delay_effect,
 )
 from sim_gap.residuals.preprocess import PreparedSignals
 
@@ -83,8 +83,8 @@ EFFECTS = (
         Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
         Plausibility(prior_penalty=0, allows=_above_nominal),
     ),
-    late("actuator.lag", _missing(_lag), 0.01, LONGEST),
-    late("actuator.delay", _missing(_delay), 0.01, LONGEST),
+    delay_effect("actuator.lag", _missing(_lag), 0.01, LONGEST),
+    delay_effect("actuator.delay", _missing(_delay), 0.01, LONGEST),
     InverseEffect(
         "actuator.saturation",
         _missing(_clipped),

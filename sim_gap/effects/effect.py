@@ -225,7 +225,7 @@ CLIPPED = 0.2
 NEAR_ONE = between(0.6, 1.6)
 
 
-def late(effect_id: str, signature: Signature, start: float, longest: float) -> InverseEffect:
+def delay_effect(effect_id: str, signature: Signature, start: float, longest: float) -> InverseEffect:
     """An effect whose shape is a time: the search starts at `start` and goes up to `longest` [s]."""
 
     def allows(coefficients: Array, shape: Shape, _beneath: Beneath) -> bool:

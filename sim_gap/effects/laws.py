@@ -12,7 +12,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.effect import InverseEffect, Plausibility, Shape, Signature
-from sim_gap.effects.position import moving, reads
+from sim_gap.effects.position import position_effect, reading_moves
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
 
@@ -120,7 +120,7 @@ _LAWS = (
         "law.position_reading",
         "position",
         "any error of the position sensor that is constant or proportional to the position",
-        moving(reads(lambda q: (np.ones_like(q), q, 0 * q, np.ones_like(q), 0 * q, 0 * q))),
+        position_effect(reading_moves(lambda q: (np.ones_like(q), q, 0 * q, np.ones_like(q), 0 * q, 0 * q))),
     ),
     Law("law.body", "link", "any rigid body fixed to a link", Signature(_body)),
     Law("law.gravity", "base", "gravity of another direction or size", Signature(_gravity, whole_arm=True)),

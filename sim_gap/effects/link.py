@@ -15,7 +15,7 @@ LIGHT_KG = 1e-6
 """Least absolute mass of which a centre is taken [kg]."""
 
 
-def point(mass: float, moment: Array) -> Array:
+def point_mass(mass: float, moment: Array) -> Array:
     """Ten parameters of a point mass (negative if it is taken away) from its mass and first moment."""
     centre = moment / mass if abs(mass) > LIGHT_KG else np.zeros(3)
     inertia = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
@@ -23,7 +23,7 @@ def point(mass: float, moment: Array) -> Array:
 
 
 def point_slopes(mass: float, moment: Array) -> Array:
-    """Derivative of `point` in mass and moment, (10, 4); of its first four rows alone without a mass."""
+    """Derivative of `point_mass` in mass and moment, (10, 4); of its first four rows alone without a mass."""
     out = np.vstack([np.eye(4), np.zeros((6, 4))])
     if abs(mass) > LIGHT_KG:
         centre = moment / mass
@@ -32,7 +32,7 @@ def point_slopes(mass: float, moment: Array) -> Array:
     return out
 
 
-def mounted(axis: Array, angle: float) -> Array:
+def mount_matrix(axis: Array, angle: float) -> Array:
     """Mass and first moment of a body that is turned about an axis (3,) by an angle, from those before, (4, 4)."""
     x, y, z = axis
     hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -53,7 +53,7 @@ def moment_to_inertia(centre: Array) -> Array:
     return out
 
 
-def moved(inertial: Array, moment: Array) -> Array:
+def move_mass(inertial: Array, moment: Array) -> Array:
     """A link whose first moment is larger by `moment` (3,): its centre moves, mass and inertia about it stay, (10,)."""
     mass = max(float(inertial[0]), 1e-9)
     old, new = inertial[1:4] / mass, (inertial[1:4] + moment) / mass
@@ -129,15 +129,15 @@ def _payload_slopes(signals: PreparedSignals, layout: ChannelLayout, shape: Shap
 
 def _mount(signals: PreparedSignals) -> Array:
     """Mass and first moment of the body in a recording, from those that it has in the others, (4, 4)."""
-    return mounted(signals.arm.axis[-1], signals.mount)
+    return mount_matrix(signals.arm.axis[-1], signals.mount)
 
 
 def _has(signals: PreparedSignals, shape: Shape) -> bool:
     """Whether a recording was made with the body of this shape."""
-    return signals.number != ABSENT and (not shape or signals.number in numbers(shape))
+    return signals.number != ABSENT and (not shape or signals.number in recording_numbers(shape))
 
 
-def numbers(shape: Shape) -> tuple[int, ...]:
+def recording_numbers(shape: Shape) -> tuple[int, ...]:
     """Numbers of the recordings, from 1, in a shape that holds them as bits."""
     bits = int(shape[0]) if shape else 0
     return tuple(k + 1 for k in range(bits.bit_length()) if bits >> k & 1)
@@ -196,7 +196,7 @@ EFFECTS = (
     ),
     InverseEffect(
         "link.payload",
-        Signature(_payload, whole_arm=True, recordings=numbers, body=True, slopes=_payload_slopes),
+        Signature(_payload, whole_arm=True, recordings=recording_numbers, body=True, slopes=_payload_slopes),
         Plausibility(
             prior_penalty=0, prior_std=lambda _signals, _place: np.array([20.0, 4.0, 4.0, 4.0]), allows=_near_the_tip
         ),

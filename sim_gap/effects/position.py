@@ -48,7 +48,7 @@ def responses(signals: PreparedSignals, layout: ChannelLayout, joint: int, moves
     return {(layout.against_model, i): change[:, i] for i in range(signals.n)}
 
 
-def moving(moves: Moves, shaped: bool = False) -> Signature:
+def position_effect(moves: Moves, shaped: bool = False) -> Signature:
     """An effect that moves the true joint against its reading; the shape, if any, is the size of its secant."""
     return Signature(
         lambda s, layout, place, shape: responses(
@@ -58,7 +58,7 @@ def moving(moves: Moves, shaped: bool = False) -> Signature:
     )
 
 
-def reads(error: Error) -> Moves:
+def reading_moves(error: Error) -> Moves:
     """Moves for an error of the reading, a function of the reading."""
 
     def moves(signals: PreparedSignals, _layout: ChannelLayout, joint: int) -> Array:
@@ -94,20 +94,20 @@ FROM_ZERO = SearchHints(shapes=((0.0,),), linearised_at=0)
 EFFECTS = (
     InverseEffect(
         "position.offset",
-        moving(reads(lambda q: (np.ones_like(q), 0 * q, 0 * q)), shaped=True),
+        position_effect(reading_moves(lambda q: (np.ones_like(q), 0 * q, 0 * q)), shaped=True),
         Plausibility(prior_std=_small),
         FROM_ZERO,
     ),
     InverseEffect(
         "position.gain",
-        moving(reads(lambda q: (q, np.ones_like(q), 0 * q)), shaped=True),
+        position_effect(reading_moves(lambda q: (q, np.ones_like(q), 0 * q)), shaped=True),
         Plausibility(prior_std=_small, allows=between(-WORST_GAIN, WORST_GAIN)),
         FROM_ZERO,
         parameters_of=as_gain,
     ),
     InverseEffect(
         "position.eccentricity",
-        moving(reads(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
+        position_effect(reading_moves(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
         Plausibility(prior_std=lambda _signals, _place: np.full(2, 0.1), allows=_within_a_few_degrees),
         SearchHints(shapes_for=_far_enough),
         parameters_of=_amplitude_and_phase,

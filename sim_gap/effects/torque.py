@@ -21,7 +21,7 @@ from sim_gap.effects.effect import (
     as_shape,
     as_share_of_shape,
     between,
-    late,
+    delay_effect,
 )
 from sim_gap.residuals.preprocess import PreparedSignals
 
@@ -29,7 +29,7 @@ GRADUAL = (0.25, 0.75, 1.25, 1.75)
 """Half widths of the plays of a hysteresis that sets in gradually, as in strain gauges, as shares of their mean."""
 
 
-def largest(signals: Sequence[PreparedSignals], joint: int, share: float = 0.98) -> float:
+def largest_torque(signals: Sequence[PreparedSignals], joint: int, share: float = 0.98) -> float:
     """Quantile of a joint's absolute model torque [N·m]."""
     return float(np.quantile(np.concatenate([np.abs(s.model[:, joint]) for s in signals]), share))
 
@@ -45,13 +45,13 @@ def _distorted(distort: Callable[[Array, Shape, float], Array]) -> Signature:
 
 def _shares(*shares: float) -> Callable[[Sequence[PreparedSignals], int], tuple[Shape, ...]]:
     """Starting levels as shares of the joint's usual largest torque."""
-    return lambda signals, place: tuple((share * largest(signals, place),) for share in shares)
+    return lambda signals, place: tuple((share * largest_torque(signals, place),) for share in shares)
 
 
 def _exceeded(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     """Levels that the torque exceeds during some of the time [N·m]."""
     shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
-    return tuple((largest(signals, place, share),) for share in shares)
+    return tuple((largest_torque(signals, place, share),) for share in shares)
 
 
 def _stays_behind(torque: Array, shape: Shape, rate: float) -> Array:
@@ -134,5 +134,5 @@ EFFECTS = (
         SearchHints(shapes_for=_exceeded),
         parameters_of=as_shape,
     ),
-    late("timing.delay", Signature.at_sensor(_delayed, "any", "distortion"), 0.005, 0.1),
+    delay_effect("timing.delay", Signature.at_sensor(_delayed, "any", "distortion"), 0.005, 0.1),
 )

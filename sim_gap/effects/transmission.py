@@ -21,7 +21,7 @@ from sim_gap.effects.effect import (
     between,
     positive,
 )
-from sim_gap.effects.position import moving
+from sim_gap.effects.position import position_effect
 from sim_gap.model.rigid_body import CREEP
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
@@ -151,6 +151,8 @@ EFFECTS = (
         SearchHints(shapes_for=_neighbours, discrete=frozenset({0}), alternatives=_own_rotors, canonical=_outer_joint),
         parameters_of=_coupled,
     ),
-    InverseEffect("transmission.elasticity", moving(_bend), Plausibility(allows=positive), parameters_of=_stiffness),
-    InverseEffect("transmission.backlash", moving(_play), Plausibility(allows=between(0.0, 0.3))),
+    InverseEffect(
+        "transmission.elasticity", position_effect(_bend), Plausibility(allows=positive), parameters_of=_stiffness
+    ),
+    InverseEffect("transmission.backlash", position_effect(_play), Plausibility(allows=between(0.0, 0.3))),
 )

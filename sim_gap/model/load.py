@@ -160,10 +160,10 @@ def load_model(
 
 def load_compiled(source: Any) -> Any:
     """The `mujoco.MjModel` of a path, or the one given. Raises BadInput."""
-    return compiled(Path(source)) if isinstance(source, str | Path) else source
+    return compile_model(Path(source)) if isinstance(source, str | Path) else source
 
 
-def compiled(path: Path) -> Any:
+def compile_model(path: Path) -> Any:
     """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
     return compile_spec(read_spec(path), path)
 

@@ -120,9 +120,9 @@ class RigidArm:
         for j in reversed(range(self.n)):
             up = self.parent[j]
             if up >= 0:
-                force = out_of(turns[j], forces[j])
+                force = out_of_frame(turns[j], forces[j])
                 forces[up] = forces[up] + force
-                couples[up] = couples[up] + out_of(turns[j], couples[j]) - cross(force, self.offset[j])
+                couples[up] = couples[up] + out_of_frame(turns[j], couples[j]) - cross(force, self.offset[j])
         return forces, couples
 
     def regressor(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
@@ -163,7 +163,7 @@ class RigidArm:
             if self.parent[j] >= 0:
                 lever = self.offset[j]
                 push = push + cross(alpha, lever) + cross(omega, cross(omega, lever))
-            omega, alpha, push = into(turn, omega), into(turn, alpha), into(turn, push)
+            omega, alpha, push = into_frame(turn, omega), into_frame(turn, alpha), into_frame(turn, push)
             spin = self.axis[j][:, None] * v[:, j]
             alpha = alpha + self.axis[j][:, None] * a[:, j] + cross(omega, spin)
             turns.append(turn)
@@ -207,12 +207,12 @@ def cross(x: Array, y: Array) -> Array:
     return out
 
 
-def into(turn: Array, vector: Array) -> Array:
+def into_frame(turn: Array, vector: Array) -> Array:
     """Into the rotated frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
     return np.asarray(np.einsum("jik,jk->ik", turn, vector))
 
 
-def out_of(turn: Array, vector: Array) -> Array:
+def out_of_frame(turn: Array, vector: Array) -> Array:
     """Out of the rotated frame: R x."""
     return np.asarray(np.einsum("ijk,jk->ik", turn, vector))
 
@@ -274,7 +274,7 @@ def _below(arm: RigidArm, motion: LinkMotion, v: Array, joint: int, start: Chang
             continue
         (omega, alpha, push), above, lever = changes[up], moves[up][0], arm.offset[link]
         push = push + cross(alpha, lever) + cross(omega, cross(above, lever)) + cross(above, cross(omega, lever))
-        omega, alpha, push = (into(turns[link], x) for x in (omega, alpha, push))
+        omega, alpha, push = (into_frame(turns[link], x) for x in (omega, alpha, push))
         changes[link] = omega, alpha + cross(omega, arm.axis[link][:, None] * v[:, link]), push
     return changes
 
@@ -304,7 +304,7 @@ def _passed_on(
             continue
         if link == joint and turned is not None:
             force, couple = force + turned[0], couple + turned[1]
-        force = out_of(turns[link], force)
+        force = out_of_frame(turns[link], force)
         passed[up, 0] += force
-        passed[up, 1] += out_of(turns[link], couple) - cross(force, arm.offset[link])
+        passed[up, 1] += out_of_frame(turns[link], couple) - cross(force, arm.offset[link])
     return out

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.base import across
+from sim_gap.effects.base import axes_across
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.position_gap.tracks import MODEL_HZ
 from sim_gap.position_gap.windows import Windows
@@ -56,7 +56,7 @@ def with_columns(data: Windows) -> Windows:
         made |= {f"moment{link}.{axis}": regressor[:, :, link, 1 + k] for k, axis in enumerate("xyz")}
         made[f"zero{link}.angle"] = _of_an_angle(arm, q, v, a, link)
     still = np.zeros_like(q)
-    for k, axis in enumerate(across(arm.gravity)):
+    for k, axis in enumerate(axes_across(arm.gravity)):
         made[f"tilt.angle_{k + 1}"] = arm.torque(q, still, still, np.cross(arm.gravity, axis))
     columns = {}
     for name, rows in made.items():

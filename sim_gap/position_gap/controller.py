@@ -13,7 +13,7 @@ from sim_gap.position_gap.fit import LoopFit, batch, evaluate, improve, residual
 from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.position_gap.search import PRICE, LoopSearch
 from sim_gap.position_gap.selection import Progress
-from sim_gap.position_gap.windows import Windows, thinned_moving
+from sim_gap.position_gap.windows import Windows, thin_moving
 
 RESTS_RAD = 0.002
 """Way of a command over all recordings below which it rests [rad]."""
@@ -115,7 +115,7 @@ def starting_fit(search: LoopSearch, own: Nominal, progress: Progress) -> tuple[
     at_rest = rests(search.data)
     search = replace(search, resting=frozenset(np.flatnonzero(at_rest).tolist()))
     search = replace(search, nominal=_holding(search, at_rest & ~np.isfinite(own.kp)))
-    few = replace(search, data=thinned_moving(search.data, 8))  # windows on which controllers are compared
+    few = replace(search, data=thin_moving(search.data, 8))  # windows on which controllers are compared
     fits: dict[str, LoopFit] = {}
     scores: dict[str, float] = {}
     for kind, parts in kinds.items():

@@ -23,21 +23,21 @@ from sim_gap.position_gap.search import (
     Group,
     LoopSearch,
     effects_at,
-    merged,
+    merge_joint,
     price,
     shared_of,
     size_of,
     start_of,
-    taken_out,
+    without_group,
 )
-from sim_gap.position_gap.selection import Progress, removable_at, select, without_each
+from sim_gap.position_gap.selection import Progress, removable_at, removals, select
 
 PLAINEST = "plainest"
 PLAIN = "friction.coulomb", "friction.viscous"
 ITERATIONS = 12
 
 
-def plainest(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
+def plainest_fit(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
     """The fit with these alone at each joint that has anything else; nothing if none has."""
     kept = [
         effect for effect in EFFECTS if effect in search.kept or (effect in PLAIN and effect not in search.excluded)
@@ -46,11 +46,11 @@ def plainest(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
     more = [j for j in range(search.data.joints) if not {*fit.active[j]} <= {*names}]
     other = fit
     for effect in shared_of(fit, search):
-        other = taken_out(search, other, (effect, ()))
+        other = without_group(search, other, (effect, ()))
     for j in more:
         for effect in effects_at(fit, j):
             if effect not in kept:
-                other = taken_out(search, other, (effect, (j,)))
+                other = without_group(search, other, (effect, (j,)))
     if not more and not fit.shared:
         return
     point = {name: values.copy() for name, values in other.point.items()}
@@ -65,7 +65,7 @@ def plainest(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
 ROTORS = "actuator.rotor_inertia"
 
 
-def at_other_scales(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
+def fits_at_other_scales(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
     """The fit from each smaller scale, the rotors that the model states free; none if there are none to free."""
     if ROTORS in search.excluded:
         return
@@ -101,7 +101,7 @@ class Other:
     """Probability that this is the right one of both."""
 
 
-def settled(search: LoopSearch, fit: LoopFit, progress: Progress) -> tuple[LoopFit, list[Other]]:
+def settle(search: LoopSearch, fit: LoopFit, progress: Progress) -> tuple[LoopFit, list[Other]]:
     """The fit without effects that pay in a recording or two and not in the others, and the other choices."""
     dropped: list[Other] = []
     for _ in range(ROUNDS):
@@ -113,7 +113,7 @@ def settled(search: LoopSearch, fit: LoopFit, progress: Progress) -> tuple[LoopF
         taken = _best_of(better)
         dropped += [replace(each, fit=fit, likely=1.0 - each.likely) for each in taken]
         for each in taken:
-            fit = merged(fit, each.fit, each.group[1][0]) if each.group[1] else each.fit
+            fit = merge_joint(fit, each.fit, each.group[1][0]) if each.group[1] else each.fit
         fit = improve(search.data, fit, search.scales, 4)
     return fit, [each for each in _others(search, fit, progress) if each.likely <= 0.5] + dropped
 
@@ -127,18 +127,18 @@ def _best_of(others: list[Other]) -> list[Other]:
 
 def _others(search: LoopSearch, fit: LoopFit, progress: Progress) -> Iterator[Other]:
     """The fit without each effect that may be taken out."""
-    for j, effect, other in without_each(search, fit, removable_at(search, fit)):
+    for j, effect, other in removals(search, fit, removable_at(search, fit)):
         least = float(price(search, len(EFFECTS[effect].parameters))[j])
         yield Other((effect, (j,)), other, _doubt(search, fit, other, (j,), least))
     own = replace(search, excluded=search.excluded | {e.partition("@")[0] for e in shared_effects(search.data.arm)})
     for effect in shared_of(fit, search):
         progress(f"without {effect}")
-        other = improve(search.data, select(own, taken_out(search, fit, (effect, ()))), search.scales, 4)
+        other = improve(search.data, select(own, without_group(search, fit, (effect, ()))), search.scales, 4)
         more = PRICE * (size_of(fit) - size_of(other))
         yield Other((effect, ()), other, _doubt(search, fit, other, range(search.data.joints), more))
-    for other in at_other_scales(search, fit):
+    for other in fits_at_other_scales(search, fit):
         yield from _of_each_joint(search, fit, other, ROTORS)
-    for other in plainest(search, fit):
+    for other in plainest_fit(search, fit):
         yield from _of_each_joint(search, fit, other, PLAINEST)
 
 
@@ -151,7 +151,7 @@ def _of_each_joint(search: LoopSearch, fit: LoopFit, other: LoopFit, called: str
     for j, own in enumerate(other.active):
         if own != fit.active[j]:
             more = PRICE * (len(fit.active[j]) - len(own))
-            yield Other((called, (j,)), merged(fit, other, j), _doubt(search, fit, other, (j,), more))
+            yield Other((called, (j,)), merge_joint(fit, other, j), _doubt(search, fit, other, (j,), more))
 
 
 def _doubt(search: LoopSearch, fit: LoopFit, other: LoopFit, joints: Iterable[int], least: float) -> float:

@@ -6,9 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.parameters import FARTHEST, LOGARITHMIC, PARAMETERS, Scales, moved, relative, with_gain
+from sim_gap.position_gap.parameters import (
+    FARTHEST,
+    LOGARITHMIC,
+    PARAMETERS,
+    Scales,
+    gain_companions,
+    relative_step,
+    step_parameter,
+)
 from sim_gap.position_gap.simulate import simulate
-from sim_gap.position_gap.windows import Windows, of_joints
+from sim_gap.position_gap.windows import Windows, choose_joints
 
 DAMPINGS = (1e-6, 1e-2, 0.1, 1.0, 10.0, 100.0)
 """Levenberg-Marquardt dampings tried together in every step."""
@@ -82,8 +90,8 @@ def jacobian(
         point = {name: values.copy() for name, values in fit.point.items()}
         for j, own in enumerate(names):
             if k < len(own):
-                point[own[k]][j] = moved(own[k], fit.point[own[k]][j], steps[j][k], scales, j)
-                for name in with_gain(own) if own[k] == "kp" else ():
+                point[own[k]][j] = step_parameter(own[k], fit.point[own[k]][j], steps[j][k], scales, j)
+                for name in gain_companions(own) if own[k] == "kp" else ():
                     point[name][j] *= np.exp(steps[j][k])
         points.append(point)
     points += [{**fit.point, name: fit.point[name] + DIFFERENCE} for name in shared]
@@ -91,8 +99,8 @@ def jacobian(
     now, out = all_residuals[0], []
     for j, own in enumerate(names):
         columns = [(all_residuals[1 + k][:, j] - now[:, j]) / step for k, step in enumerate(steps[j])]
-        for name in with_gain(own):
-            share = relative(name, fit.point[name][j], scales, j)
+        for name in gain_companions(own):
+            share = relative_step(name, fit.point[name][j], scales, j)
             columns[own.index("kp")] -= share * columns[own.index(name)]
         columns += [(all_residuals[1 + width + s][:, j] - now[:, j]) / DIFFERENCE for s in range(len(shared))]
         out.append(np.stack(columns) if columns else np.zeros((0, *now[:, j].shape)))
@@ -102,7 +110,7 @@ def jacobian(
 def _difference(name: str, value: float, scales: Scales, joint: int) -> float:
     """Step of a finite difference in the parameter's own coordinate, away from the highest value where that is near."""
     step = 0.01 if name in LOGARITHMIC else DIFFERENCE
-    return -step if moved(name, value, step, scales, joint) >= PARAMETERS[name].high else step
+    return -step if step_parameter(name, value, step, scales, joint) >= PARAMETERS[name].high else step
 
 
 def improve(data: Windows, fit: LoopFit, scales: Scales, iterations: int = 6) -> LoopFit:
@@ -143,7 +151,7 @@ def _improved_part(data: Windows, fit: LoopFit, scales: Scales, iterations: int,
         return fit if fit.rms is not None else evaluate(data, fit)
     some = LoopFit({name: values[joints] for name, values in fit.point.items()}, tuple(fit.active[j] for j in joints))
     sizes = Scales(**{name: values[joints] for name, values in vars(scales).items()})
-    better = improve(of_joints(data, joints), some, sizes, iterations)
+    better = improve(choose_joints(data, joints), some, sizes, iterations)
     assert better.rms is not None
     fit = fit if fit.rms is not None else evaluate(data, fit)
     assert fit.rms is not None
@@ -179,10 +187,10 @@ def stepped(
     for j, (own, each) in enumerate(zip(names, steps, strict=True)):
         step = dict(zip(own, each.tolist(), strict=True))
         scale = float(np.clip(step.get("kp", 0.0), -FARTHEST, FARTHEST))
-        for name in set(with_gain(own)).difference(LOGARITHMIC):
-            step[name] += (np.exp(scale) - 1.0 - scale) * relative(name, point[name][j], scales, j)
+        for name in set(gain_companions(own)).difference(LOGARITHMIC):
+            step[name] += (np.exp(scale) - 1.0 - scale) * relative_step(name, point[name][j], scales, j)
         for name, size in step.items():
-            point[name][j] = moved(name, float(point[name][j]), size, scales, j)
+            point[name][j] = step_parameter(name, float(point[name][j]), size, scales, j)
     for name, size in zip(fit.shared, common.tolist(), strict=True):
         point[name] = np.clip(point[name] + size, *data.ranges[name])
     return point

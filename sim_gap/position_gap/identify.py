@@ -13,21 +13,29 @@ from gcomp.arrays import Array, Mask
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.columns import shared_effects, with_columns
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of, starting_fit
-from sim_gap.position_gap.doubt import settled
+from sim_gap.position_gap.doubt import settle
 from sim_gap.position_gap.fit import LoopFit, evaluate, improve
 from sim_gap.position_gap.judge import Stage, groups_of, rms_on, stages
-from sim_gap.position_gap.nominal_motion import OwnMotion, nominal_solver, other_solver, own_motion, priced, solvers
-from sim_gap.position_gap.search import LoopSearch, balanced, counted, effects_at, merged, taken_out, without
+from sim_gap.position_gap.nominal_motion import OwnMotion, full_score, nominal_solver, other_solver, own_motion, solvers
+from sim_gap.position_gap.search import (
+    LoopSearch,
+    balance,
+    effects_at,
+    merge_joint,
+    weigh_kinds,
+    without_effect,
+    without_group,
+)
 from sim_gap.position_gap.selection import select_about
-from sim_gap.position_gap.sound import Sound, sound
-from sim_gap.position_gap.surface import Surface, find_surface, touched
+from sim_gap.position_gap.sound_arm import SoundGap, split_gap
+from sim_gap.position_gap.surface import Surface, find_surface, rows_of_touch
 from sim_gap.position_gap.training.bands import Band, band
-from sim_gap.position_gap.training.export import Exported, exported, native_fit, wide_enough, with_module
-from sim_gap.position_gap.training.jackknife import left_out
+from sim_gap.position_gap.training.export import Exported, export_fit, export_with_module, native_fit, widen_ranges
+from sim_gap.position_gap.training.jackknife import leave_out
 from sim_gap.position_gap.training.replay import Simulated, replay_rms
 from sim_gap.position_gap.training.spread import Covariance, alternatives, covariance, covariance_within, vague_limits
-from sim_gap.position_gap.training.unreached_limits import unreached
-from sim_gap.position_gap.windows import Windows, thinned, thinned_moving, windows_of
+from sim_gap.position_gap.training.unreached_limits import find_unreached
+from sim_gap.position_gap.windows import Windows, thin, thin_moving, windows_of
 
 SEARCHED, FITTED, JUDGED = 16, 32, 48
 """Most windows of the search, of the final fit and of the judgement."""
@@ -55,7 +63,7 @@ class Identified:
     heldout_before: Array
     heldout_after: Array
     margin: Array
-    sound: Sound | None
+    sound: SoundGap | None
     """The nominal model's gap beside what small errors make of it; None if the controller had to be found."""
     own: OwnMotion | None
     """The motion that the nominal model makes along the training commands; None if the controller had to be found."""
@@ -97,21 +105,21 @@ def identify(
     """
     scale = gain_scales(gains, labels)
     recordings = [*train, *heldout]
-    sim = wide_enough(sim, recordings)
+    sim = widen_ranges(sim, recordings)
     progress("reading motion and model torques")
     surface = find_surface(sim.arm, recordings)
     whole = windows_of(sim.arm, train, labels[: len(train)], scales=scale[: len(train)], surface=surface)
-    fitted = with_columns(thinned_moving(whole, FITTED))
+    fitted = with_columns(thin_moving(whole, FITTED))
     other = windows_of(sim.arm, heldout, labels[len(train) :], fitted.dt, scale[len(train) :], surface)
-    judged = with_columns(thinned(other, JUDGED))
+    judged = with_columns(thin(other, JUDGED))
     own = nominal_controller(sim)
-    data = thinned_moving(fitted, SEARCHED)
+    data = thin_moving(fitted, SEARCHED)
     nominal = nominal_point(fitted, own)
     scales, floor = scales_of(fitted), noise_floor(fitted)
     never = frozenset(withhold) | _frozen(sim, fitted)
-    search = LoopSearch(balanced(data), scales, nominal, floor, never)
+    search = LoopSearch(balance(data), scales, nominal, floor, never)
     kinds = solvers(sim, search) if own.complete else []
-    apart = tuple(touched(surface, sim.arm, recording) for recording in recordings)
+    apart = tuple(rows_of_touch(surface, sim.arm, recording) for recording in recordings)
     itself, moved = None, np.full(sim.n, np.nan)
     if own.complete:
         search = nominal_solver(search, kinds)
@@ -120,29 +128,29 @@ def identify(
         model = Simulated(sim.mujoco_model, tuple(sim.joints))
         moved = replay_rms(model, heldout, scale[len(train) :], apart=apart[len(train) :])
     search, start, kind = starting_fit(search, own, progress)
-    search = replace(search, data=counted(search, data, start))
+    search = replace(search, data=weigh_kinds(search, data, start))
     fit = select_about(search, replace(start, rms=None), progress)
     if kinds and (solver := other_solver(search, fit, kinds)):
         progress("with another solver")
         there = replace(search, nominal={**search.nominal, **solver})
         again = select_about(there, replace(start.with_values(**solver), rms=None), progress)
-        search, fit = (there, again) if priced(there, again) < priced(search, fit) else (search, fit)
+        search, fit = (there, again) if full_score(there, again) < full_score(search, fit) else (search, fit)
     progress("final fit")
-    search = replace(search, data=counted(search, fitted, fit))
+    search = replace(search, data=weigh_kinds(search, fitted, fit))
     fit = improve(search.data, replace(fit, rms=None), scales, 6)
-    fit, others = settled(search, fit, progress)
+    fit, others = settle(search, fit, progress)
     if itself is not None:
         fit = not_worse(search, fit, itself.gaps.max(0))
     progress("each effect on held-out data")
     margin = _margin(search, fit)
-    split = sound(search, judged, margin) if own.complete else None
+    split = split_gap(search, judged, margin) if own.complete else None
     matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
-    few = counted(search, data, fit)
+    few = weigh_kinds(search, data, fit)
     found = tuple(stages(replace(search, data=few), evaluate(few, fit), judged, matters))
     before = _bare(search, fit, own.complete)
     native = native_fit(search, fit)
     spread = replace(covariance(search, fit), others=alternatives(others))
-    spread = replace(spread, limits=unreached(search, fit, vague_limits(spread)))
+    spread = replace(spread, limits=find_unreached(search, fit, vague_limits(spread)))
     return Identified(
         sim=sim,
         search=search,
@@ -153,7 +161,7 @@ def identify(
         stages=found,
         spread=spread,
         within=covariance_within(search, fit),
-        band=band(replace(search, data=fitted), fit, spread, left_out(search, fit), judged),
+        band=band(replace(search, data=fitted), fit, spread, leave_out(search, fit), judged),
         train_before=rms_on(fitted, before),
         train_after=rms_on(fitted, fit),
         heldout_before=rms_on(judged, before),
@@ -163,8 +171,8 @@ def identify(
         own=itself,
         moved_before=moved,
         native=native,
-        export=exported(sim, search, fit, native) if sim.path is not None else None,
-        beside=with_module(sim, search, fit) if sim.path is not None else None,
+        export=export_fit(sim, search, fit, native) if sim.path is not None else None,
+        beside=export_with_module(sim, search, fit) if sim.path is not None else None,
         recordings=tuple(heldout),
         gains=tuple(scale[len(train) :]),
         surface=surface,
@@ -202,7 +210,7 @@ def _bare(search: LoopSearch, fit: LoopFit, complete: bool) -> LoopFit:
     if complete:
         return LoopFit({name: values.copy() for name, values in search.nominal.items()}, ((),) * search.data.joints)
     for group in groups_of(fit, search):
-        fit = taken_out(search, fit, group)
+        fit = without_group(search, fit, group)
     return improve(search.data, replace(fit, rms=None), search.scales, 6)
 
 
@@ -220,11 +228,11 @@ def not_worse(search: LoopSearch, fit: LoopFit, gap: Array) -> LoopFit:
     bare = fit
     for j in range(search.data.joints):
         for effect in effects_at(fit, j):
-            bare = without(search, bare, effect, j)
+            bare = without_effect(search, bare, effect, j)
     left = rms_on(search.data, bare)
     needless = (rms_on(search.data, fit) > left) | (np.minimum(left, gap) < 2.0 * search.floor)
     for j in np.flatnonzero(needless).tolist():
-        fit = merged(fit, bare, j)
+        fit = merge_joint(fit, bare, j)
     return evaluate(search.data, fit) if needless.any() else fit
 
 

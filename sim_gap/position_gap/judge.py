@@ -9,7 +9,7 @@ from gcomp.arrays import Array
 from sim_gap.position_gap.fit import LoopFit, evaluate, improve
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.rivals import rivals_of
-from sim_gap.position_gap.search import Group, LoopSearch, effect_there, shared_of, taken_out
+from sim_gap.position_gap.search import Group, LoopSearch, effect_there, shared_of, without_group
 from sim_gap.position_gap.windows import Windows
 
 LEAST_SHRINK = 0.05
@@ -65,14 +65,14 @@ def stages(search: LoopSearch, fit: LoopFit, heldout: Windows, matters: Array) -
         left = fit
         for group in groups:
             if group not in some:
-                left = taken_out(search, left, group)
+                left = without_group(search, left, group)
         return improve(search.data, left, search.scales, 4)
 
     current = with_only(())
     before, final, out = _rms(heldout, current), _rms(heldout, fit), []
     for number, (group, trial) in enumerate(_ordered(search, groups, with_only, current, matters), start=1):
         after = final if number == len(groups) else _rms(heldout, trial)
-        bare = improve(search.data, taken_out(search, fit, group), search.scales, 4)
+        bare = improve(search.data, without_group(search, fit, group), search.scales, 4)
         falls = [_shrink(search, heldout, *pair) for pair in ((before, after), (_rms(heldout, bare), final))]
         share = np.maximum(*falls)
         lowers = bool((share > LEAST_SHRINK).any())

@@ -23,10 +23,10 @@ from sim_gap.position_gap.columns import with_columns
 from sim_gap.position_gap.fit import LoopFit, Point, evaluate, improve
 from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.search import PRICE, LoopSearch, size_of
-from sim_gap.position_gap.selection import pruned
+from sim_gap.position_gap.selection import prune
 from sim_gap.position_gap.tracks import period_of, smoothing
-from sim_gap.position_gap.training.replay import OPENING_S, Simulated, commanded, judged, replay
-from sim_gap.position_gap.windows import thinned, windows_of
+from sim_gap.position_gap.training.replay import OPENING_S, Simulated, commanded_rows, judged_rows, replay
+from sim_gap.position_gap.windows import thin, windows_of
 
 
 def solvers(sim: SimModel, search: LoopSearch) -> list[dict[str, Array]]:
@@ -66,14 +66,14 @@ def other_solver(search: LoopSearch, fit: LoopFit, kinds: Sequence[Point]) -> di
             continue
         there = replace(search, nominal={**own, **kind})
         moved = improve(there.data, replace(fit.with_values(**kind), rms=None), there.scales, 4)
-        needed = pruned(there, moved)
+        needed = prune(there, moved)
         fewer = size_of(fit) - size_of(needed) >= search.data.joints
-        found.append((priced(there, needed) - PRICE * search.data.joints * (1 if fewer else -1), kind))
-    better = [each for each in found if each[0] < priced(search, fit)]
+        found.append((full_score(there, needed) - PRICE * search.data.joints * (1 if fewer else -1), kind))
+    better = [each for each in found if each[0] < full_score(search, fit)]
     return dict(min(better, key=lambda each: each[0])[1]) if better else None
 
 
-def priced(search: LoopSearch, fit: LoopFit) -> float:
+def full_score(search: LoopSearch, fit: LoopFit) -> float:
     return float(search.score(fit).sum()) + PRICE * size_of(fit)
 
 
@@ -127,7 +127,7 @@ class OwnMotion:
         if not some:
             return np.zeros(self.sim.n)
         data = windows_of(self.sim.arm, some, ["the model's own motion"] * len(some), search.data.dt, scales)
-        data = with_columns(thinned(data, 8))
+        data = with_columns(thin(data, 8))
         exact = replace(search, data=data, floor=np.full(self.sim.n, 1e-6))  # nothing was read with noise
         as_it_moves = nominal_solver(exact, kinds).nominal
         return rms_on(data, LoopFit(as_it_moves, ((),) * data.joints))
@@ -144,10 +144,10 @@ def own_motion(
     made, (gaps, rougher, noise, bends) = [], np.full((4, len(recordings), sim.n), np.inf)
     for k, (recording, scale, left_out) in enumerate(zip(recordings, scales, apart, strict=True)):
         t, positions, measured = replay(itself.with_gain(scale), recording)
-        part = commanded(recording)
+        part = commanded_rows(recording)
         made.append(replace(slice_rows(recording, part), position=positions))
         period = period_of(recording)
-        rows = judged(t, left_out[part]) & np.isfinite(measured).all(axis=1)
+        rows = judged_rows(t, left_out[part]) & np.isfinite(measured).all(axis=1)
         if rows.sum() * period >= OPENING_S and rows.sum() >= 20:  # rows that tell a gap and its noise
             gap = (positions - measured)[rows]
             smooth, moved = smoothing(period, period), positions[rows]

@@ -114,7 +114,9 @@ FARTHEST = 1.5
 """Logarithm of the largest factor of one step of a fit."""
 
 
-def moved(name: str, value: float, step: float, scales: Scales, joint: int, farthest: float = FARTHEST) -> float:
+def step_parameter(
+    name: str, value: float, step: float, scales: Scales, joint: int, farthest: float = FARTHEST
+) -> float:
     """A parameter's value after a step in its own coordinate, within its bounds.
 
     `farthest` is the logarithm of the largest factor on a gain.
@@ -127,11 +129,11 @@ def moved(name: str, value: float, step: float, scales: Scales, joint: int, fart
     return float(np.clip(new, low, high))
 
 
-def relative(name: str, value: float, scales: Scales, joint: int) -> float:
+def relative_step(name: str, value: float, scales: Scales, joint: int) -> float:
     """Step in a parameter's own coordinate per relative change of its value."""
     return 1.0 if name in LOGARITHMIC else value / float(scales.of(name)[joint])
 
 
-def with_gain(own: Sequence[str]) -> tuple[str, ...]:
+def gain_companions(own: Sequence[str]) -> tuple[str, ...]:
     """Those of a joint's parameters that go with its gain where all torques change together; none without a gain."""
     return tuple(name for name in own if name in WITH_TORQUE and name != "kp") if "kp" in own else ()

@@ -9,7 +9,7 @@ from gcomp.arrays import Array
 from sim_gap.position_gap.columns import shared_effects
 from sim_gap.position_gap.fit import LoopFit, improve, jacobian
 from sim_gap.position_gap.parameters import EFFECTS
-from sim_gap.position_gap.search import PRICE, Group, LoopSearch, taken_out, with_effect
+from sim_gap.position_gap.search import PRICE, Group, LoopSearch, with_effect, without_group
 from sim_gap.position_gap.selection import expected_shared, ranked
 
 
@@ -71,7 +71,7 @@ def _of_the_arm(search: LoopSearch, fit: LoopFit, group: Group, bare: LoopFit) -
     worth = {
         other: expected_shared(search, bare, now, slopes, offered, names) for other, names in others.items() if names
     }
-    rest = taken_out(search, fit, group)
+    rest = without_group(search, fit, group)
     tried: dict[str, str] = {}
     for other in sorted(worth, key=lambda each: -worth[each]):
         tried.setdefault(other.partition("@")[0], other)

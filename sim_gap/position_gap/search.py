@@ -1,7 +1,7 @@
 """An effect put into a fit or taken out of it, and the windows as a search of effects counts them.
 
 A joint that swings free goes astray by tenths of a radian where one that is held is off by milliradians: of both
-together a sum of squares shows the swing alone. So both kinds of windows count as much (`balanced`).
+together a sum of squares shows the swing alone. So both kinds of windows count as much (`balance`).
 """
 
 from collections.abc import Mapping
@@ -132,7 +132,7 @@ def start_of(search: LoopSearch, name: str, joint: int) -> float:
     return float(np.clip(search.scales.of(name)[joint], PARAMETERS[name].low, PARAMETERS[name].high))
 
 
-def without(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> LoopFit:
+def without_effect(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> LoopFit:
     """The fit without an effect at one joint: its parameters are those of the nominal model."""
     names = EFFECTS[effect].parameters
     point = {name: values.copy() for name, values in fit.point.items()}
@@ -143,14 +143,14 @@ def without(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> LoopFi
     return replace(fit, point=point, active=tuple(active), rms=None)
 
 
-def taken_out(search: LoopSearch, fit: LoopFit, group: Group) -> LoopFit:
+def without_group(search: LoopSearch, fit: LoopFit, group: Group) -> LoopFit:
     effect, joints = group
     if not joints:
         names = set(shared_effects(search.data.arm)[effect])
         point = {name: 0.0 * x if name in names else x for name, x in fit.point.items()}
         return replace(fit, point=point, shared=tuple(n for n in fit.shared if n not in names), rms=None)
     for j in joints:
-        fit = without(search, fit, effect, j)
+        fit = without_effect(search, fit, effect, j)
     return fit
 
 
@@ -158,7 +158,7 @@ def effect_there(fit: LoopFit, effect: str, joint: int) -> bool:
     return EFFECTS[effect].parameters[0] in fit.active[joint]
 
 
-def acts(point: Mapping[str, Array], effect: str, joint: int) -> bool:
+def is_active(point: Mapping[str, Array], effect: str, joint: int) -> bool:
     """Whether an effect changes the motion of a joint, fitted or not: its first parameter is not neutral."""
     first = EFFECTS[effect].parameters[0]
     return bool(point[first][joint] != PARAMETERS[first].neutral)
@@ -177,7 +177,7 @@ def only(fit: LoopFit, tried: dict[int, str]) -> LoopFit:
     return replace(fit, active=tuple(own if j in tried else () for j, own in enumerate(fit.active)), shared=())
 
 
-def merged(fit: LoopFit, other: LoopFit, joint: int) -> LoopFit:
+def merge_joint(fit: LoopFit, other: LoopFit, joint: int) -> LoopFit:
     point = {name: values.copy() for name, values in fit.point.items()}
     for name in point:
         point[name][joint] = other.point[name][joint]
@@ -190,17 +190,17 @@ LEAST_COUNT = 0.02
 """Least weight of a window, over one of the other kind."""
 
 
-def counted(search: LoopSearch, data: Windows, fit: LoopFit | None = None) -> Windows:
+def weigh_kinds(search: LoopSearch, data: Windows, fit: LoopFit | None = None) -> Windows:
     """The windows as a search counts them: both kinds as much, and nothing of joints that rest, of which any friction
     holds the place."""
-    data = balanced(data, fit)
+    data = balance(data, fit)
     if not search.resting:
         return data
     moves = [j not in search.resting for j in range(data.joints)]
     return replace(data, weight=data.weight * np.array(moves, float)[:, None])
 
 
-def balanced(data: Windows, fit: LoopFit | None = None) -> Windows:
+def balance(data: Windows, fit: LoopFit | None = None) -> Windows:
     """The windows, with each in which a joint's servo is mostly off counted less, such that both kinds leave as much.
 
     What they leave is what the fit leaves of them; without a fit, the way to the command, and the motion while there is

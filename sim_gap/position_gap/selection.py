@@ -17,49 +17,49 @@ from sim_gap.position_gap.search import (
     LEVELS,
     PRICE,
     LoopSearch,
-    acts,
     effect_there,
     effects_at,
+    is_active,
     level_of,
-    merged,
+    merge_joint,
     only,
     price,
     start_of,
     with_effect,
-    without,
+    without_effect,
 )
 
 DOUBTFUL = 4.0
 """Expected loss, in prices, up to which it is tried whether an effect is needed."""
 
 
-def pruned(search: LoopSearch, fit: LoopFit) -> LoopFit:
+def prune(search: LoopSearch, fit: LoopFit) -> LoopFit:
     """The fit without effects whose removal costs less than their price."""
     for _ in range(2):
         before, best, changed = search.score(fit), fit, False
         doubtful = _doubtful(search, fit)
         removable = [[e for e in each if (j, e) in doubtful] for j, each in enumerate(removable_at(search, fit))]
         losses: list[list[tuple[float, str, LoopFit]]] = [[] for _ in removable]
-        for j, effect, trial in without_each(search, fit, removable):
+        for j, effect, trial in removals(search, fit, removable):
             losses[j].append((float((search.score(trial) - before)[j]), effect, trial))
         for j, each in enumerate(losses):
             if each:
                 loss, effect, trial = min(each, key=lambda item: item[0])
                 if loss < price(search, len(EFFECTS[effect].parameters))[j]:
-                    best, changed = merged(best, trial, j), True
+                    best, changed = merge_joint(best, trial, j), True
         if not changed:
             break
         fit = improve(search.data, best, search.scales, 4)
     return fit
 
 
-def without_each(search: LoopSearch, fit: LoopFit, removable: list[list[str]]) -> Iterator[tuple[int, str, LoopFit]]:
+def removals(search: LoopSearch, fit: LoopFit, removable: list[list[str]]) -> Iterator[tuple[int, str, LoopFit]]:
     """Joint, effect and the fit without it, that joint fitted again; for every effect of each joint's list."""
     for rank in range(max((len(each) for each in removable), default=0)):
         tried = {j: each[rank] for j, each in enumerate(removable) if rank < len(each)}
         trial = fit
         for j, effect in tried.items():
-            trial = without(search, trial, effect, j)
+            trial = without_effect(search, trial, effect, j)
         kept = trial.active
         trial = replace(improve(search.data, only(trial, tried), search.scales, 3), active=kept, shared=fit.shared)
         for j, effect in tried.items():
@@ -103,7 +103,7 @@ def removable_at(search: LoopSearch, fit: LoopFit) -> list[list[str]]:
 
 def _removable(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> bool:
     needed = any(effect in EFFECTS[other].needs for other in effects_at(fit, joint))
-    return effect not in search.kept and (not needed or acts(search.nominal, effect, joint))
+    return effect not in search.kept and (not needed or is_active(search.nominal, effect, joint))
 
 
 def ranked(search: LoopSearch, fit: LoopFit, own: Sequence[str]) -> list[list[tuple[float, str]]]:
@@ -120,7 +120,7 @@ def ranked(search: LoopSearch, fit: LoopFit, own: Sequence[str]) -> list[list[tu
         columns = answers[at : at + len(each)]
         at += len(each)
         for j in range(search.data.joints):
-            if effect_there(fit, effect, j) or not all(acts(fit.point, need, j) for need in EFFECTS[effect].needs):
+            if effect_there(fit, effect, j) or not all(is_active(fit.point, need, j) for need in EFFECTS[effect].needs):
                 continue
             share = _explained(now[:, j], slopes[j], columns[:, :, j], signed=_one_sided(fit, effect, j))
             expected = -0.5 * float(search.samples[j]) * np.log(max(1.0 - share, 1e-6))
@@ -220,7 +220,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         open_joints &= changed
         if not open_joints:
             break
-    return pruned(search, fit)
+    return prune(search, fit)
 
 
 def select_about(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> LoopFit:
@@ -245,7 +245,7 @@ def _better(search: LoopSearch, one: LoopFit, other: LoopFit) -> LoopFit:
         whole = scores.sum(axis=1) + PRICE * np.array([len(one.shared), len(other.shared)])
         return one if whole[0] <= whole[1] else other
     for j in np.flatnonzero(scores[1] < scores[0]).tolist():
-        one = merged(one, other, j)
+        one = merge_joint(one, other, j)
     return evaluate(search.data, one)
 
 
@@ -269,7 +269,7 @@ def _own_round(
         for j, effect in tried.items():
             fall = before[j] - score[j]
             if fall > price(search, len(EFFECTS[effect].parameters))[j] and score[j] < best_score[j]:
-                best, changed = merged(best, trial, j), changed | {j}
+                best, changed = merge_joint(best, trial, j), changed | {j}
                 best_score[j] = score[j]
     return (evaluate(search.data, best) if changed else fit), changed
 

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
-from sim_gap.model.rigid_body import RigidArm, into
+from sim_gap.model.rigid_body import RigidArm, into_frame
 from sim_gap.position_gap.tracks import in_one_order, period_of
 
 REST = 0.03
@@ -71,11 +71,11 @@ def heights(arm: RigidArm, q: Array, link: int) -> tuple[Array, Array]:
     height: Array = np.zeros(len(q))
     for j in chain:
         height = height + arm.offset[j] @ up
-        up = into(turns[j], up)
+        up = into_frame(turns[j], up)
     return height, up
 
 
-def touched(surface: Surface | None, arm: RigidArm, recording: Recording) -> Mask:
+def rows_of_touch(surface: Surface | None, arm: RigidArm, recording: Recording) -> Mask:
     """Rows of a recording at which the arm touches, (K,); none without a surface."""
     if surface is None:
         return np.zeros(len(recording.t), bool)

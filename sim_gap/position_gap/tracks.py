@@ -9,7 +9,7 @@ from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.resampling import bridged, coverage, low_pass
+from sim_gap.residuals.resampling import coverage, interpolate_even, low_pass
 
 SMOOTH_HZ, SMOOTH_SHARE = 15.0, 0.16
 """Pass band of the recorded motion: at most this, and this share of the recording's rate [Hz]."""
@@ -54,7 +54,7 @@ def track_of(arm: RigidArm, recording: Recording, label: str, dt: float) -> Reco
         raise BadInput(f"{label}: neither a torque channel nor a commanded position: record tau_1 … or q_cmd_1 …")
     period = period_of(recording)
     t = np.arange(recording.t[0], recording.t[-1], dt)
-    raw = bridged(recording.t, recording.position, t, label, "q")
+    raw = interpolate_even(recording.t, recording.position, t, label, "q")
     smooth = smoothing(period, dt)
     q = smooth(raw)
     v = np.gradient(q, dt, axis=0)

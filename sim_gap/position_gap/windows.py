@@ -170,12 +170,12 @@ def _cut(
     return out
 
 
-def thinned(data: Windows, count: int) -> Windows:
+def thin(data: Windows, count: int) -> Windows:
     """At most `count` of the windows, evenly spread over the recordings."""
-    return data if data.count <= count else of_windows(data, _even(data.count, count))
+    return data if data.count <= count else choose_windows(data, _even(data.count, count))
 
 
-def thinned_moving(data: Windows, count: int) -> Windows:
+def thin_moving(data: Windows, count: int) -> Windows:
     """The same, and for each joint that moves less in these than elsewhere the windows of its most and fastest motion.
 
     Of a joint that rests in all windows anything fits: no gain, and any friction. Of one that is slow in all of them
@@ -189,19 +189,19 @@ def thinned_moving(data: Windows, count: int) -> Windows:
     for speed, share in ((mean, MOVES), (most, FAST)):
         rests = speed[:, chosen].max(1) < share * speed.max(1)
         chosen = np.unique([*chosen, *speed[rests].argmax(1)])
-    return of_windows(data, chosen)
+    return choose_windows(data, chosen)
 
 
 def _even(total: int, count: int) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, total - 1, count).round().astype(np.intp))
 
 
-def of_windows(data: Windows, chosen: NDArray[np.intp]) -> Windows:
+def choose_windows(data: Windows, chosen: NDArray[np.intp]) -> Windows:
     values: dict[str, Any] = {name: x[..., chosen] for name, x in vars(data).items() if isinstance(x, np.ndarray)}
     return replace(data, **values, columns={name: x[..., chosen] for name, x in data.columns.items()})
 
 
-def of_joints(data: Windows, joints: Sequence[int]) -> Windows:
+def choose_joints(data: Windows, joints: Sequence[int]) -> Windows:
     chosen = list(joints)
     arrays = {name: x for name, x in vars(data).items() if isinstance(x, np.ndarray) and x.ndim >= 2}
     values: dict[str, Any] = {name: x[..., chosen, :] for name, x in arrays.items()}

@@ -6,11 +6,11 @@ import numpy as np
 import plotly.graph_objects as go
 
 from gcomp.arrays import Array
-from sim_gap.attribution.causes import left_over
+from sim_gap.attribution.causes import remainder
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.report.effect_text import CHANNEL_WORDS
-from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, stacked, thinned
+from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, drawn_samples, stack
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 from sim_gap.search.estimate import EffectEstimate
@@ -51,7 +51,7 @@ def cause_figure(answer: Diagnosis, cause: Cause) -> Any:
         return None
     row = max(sizes, key=lambda each: sizes[each])
     quantity = AGAINST.get(cause.effect, AGAINST.get(cause.effect.split(".")[0], "time"))
-    chosen = thinned(data.valid[row])
+    chosen = drawn_samples(data.valid[row])
     x = abscissa(data, row[1], quantity)[chosen]
     left = (data.values[row] - all_of_them[row] + own[row])[chosen]
     figure = go.Figure()
@@ -77,7 +77,7 @@ def abscissa(data: ResidualSet, joint: int, quantity: str) -> Array:
     if quantity == "time":
         return data.time
     names = {"velocity": "v", "position": "q", "load": "model", "acceleration": "a"}
-    return stacked(data, names[quantity])[:, joint]
+    return stack(data, names[quantity])[:, joint]
 
 
 def is_of(term: Term, cause: Cause, names: tuple[str, ...]) -> bool:
@@ -93,12 +93,12 @@ def law_figure(answer: Diagnosis, law: ResidualLaw) -> Any:
     """Residual that the effects leave of the law's row on held-out data, over its quantity; the law with its band."""
     data, estimate = answer.internals.heldout, answer.internals.estimate
     row, joint = (law.channel, law.joint), answer.names[law.joint]
-    left = (data.values if estimate is None else left_over(data, estimate.predict(data)))[row]
+    left = (data.values if estimate is None else remainder(data, estimate.predict(data)))[row]
     if law.directed:
-        left = left * np.sign(stacked(data, "direction")[:, law.joint])
+        left = left * np.sign(stack(data, "direction")[:, law.joint])
     figure = go.Figure()
     if law.quantity != "temperature":
-        chosen = thinned(data.valid[row])
+        chosen = drawn_samples(data.valid[row])
         x = abscissa(data, law.joint, law.quantity)[chosen]
         x = np.abs(x) if law.directed and law.quantity in ("velocity", "load") else x
         marker = {"color": GREY, "size": 5, "opacity": 0.75}

@@ -1,6 +1,6 @@
-"""The verdict of a diagnosis in a sentence."""
+"""The verdict of a diagnosis in a sentence, and its parameters in rows."""
 
-from sim_gap.attribution.diagnosis import HINT, Diagnosis
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis
 
 WORDS = {"explained": "explained", "ambiguous": "ambiguous", "unexplained": "not explained", "no_gap": "no gap"}
 """Verdicts as a heading."""
@@ -36,3 +36,12 @@ def sentence(answer: Diagnosis) -> str:
         return f"Cause ambiguous: {first.effect} fits, and so does {rivals}; to separate them, {first.separate_by}"
     share = f"{1.0 - answer.unexplained:.0%}"
     return f"Gap explained: {share} of it on held-out data, most of it by {first.effect}"
+
+
+def parameter_rows(cause: Cause) -> list[list[str]]:
+    """Rows of a table of what was fitted: effect, joint, parameter, value, interval, unit."""
+    return [
+        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
+        for joint, values in cause.parameters.items()
+        for name, v in values.items()
+    ]

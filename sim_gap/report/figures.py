@@ -74,9 +74,9 @@ def residual_panels(answer: Diagnosis, channel: str) -> Any:
         horizontal_spacing=0.04,
         shared_yaxes=True,
     )
-    sides = [stacked(data, name) for _, name in columns]
+    sides = [stack(data, name) for _, name in columns]
     for line, j in enumerate(joints, start=1):
-        chosen = thinned(data.valid[channel, j])
+        chosen = drawn_samples(data.valid[channel, j])
         left, fit = data.values[channel, j][chosen], None if explained is None else explained[channel, j][chosen]
         for column, x in enumerate((*(side[:, j] for side in sides), data.time), start=1):
             _panel(figure, line, column, x[chosen], left, fit)
@@ -88,12 +88,12 @@ def residual_panels(answer: Diagnosis, channel: str) -> Any:
     return figure
 
 
-def stacked(data: ResidualSet, name: str) -> Array:
+def stack(data: ResidualSet, name: str) -> Array:
     """A quantity of the signals (`v`, `q`, `a`, `model`) at the rate of the comparison, concatenated, (K, n)."""
     return np.concatenate([s.filtered(getattr(s, name)) for s in data.signals])
 
 
-def thinned(valid: Mask) -> NDArray[np.intp]:
+def drawn_samples(valid: Mask) -> NDArray[np.intp]:
     """Indices of the samples that are drawn: some hundreds of the valid ones."""
     rows = np.flatnonzero(valid)
     return rows[:: max(1, len(rows) // 600)]

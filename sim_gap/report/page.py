@@ -8,7 +8,7 @@ from calib.report.page import ReportSection as Section
 from calib.report.page import ReportTable, html_of, paragraph, paragraphs, render, verdict_line
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.report.cause_figures import cause_figure, law_figure
-from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, sentence
+from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, parameter_rows, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
 from sim_gap.report.position_page import position_sections
 from sim_gap.report.time_figures import torque_over_time
@@ -43,7 +43,7 @@ def _verdict(answer: Diagnosis) -> Section:
         tables.append(
             ReportTable(
                 ("effect", "joint", "parameter", "value", "95 % interval", "unit"),
-                [row for cause in answer.causes for row in _parameter_rows(cause)],
+                [row for cause in answer.causes for row in parameter_rows(cause)],
                 "Fitted parameters.",
                 texts=3,
             )
@@ -63,14 +63,6 @@ def _cause_row(cause: Cause) -> list[str]:
         f"{cause.gap_after:.3g}",
         f"{cause.shrink:.0%}",
         f"{cause.confidence:.2f}",
-    ]
-
-
-def _parameter_rows(cause: Cause) -> list[list[str]]:
-    return [
-        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
-        for joint, values in cause.parameters.items()
-        for name, v in values.items()
     ]
 
 

@@ -22,7 +22,7 @@ Line = tuple[str, Array, str, bool]
 """Name, values (K, n), colour, and whether it is shown before its name is clicked."""
 
 
-def without(names: Sequence[str], values: Sequence[Array]) -> list[Line]:
+def lines_without_each(names: Sequence[str], values: Sequence[Array]) -> list[Line]:
     """Lines of the corrected model without one effect each, hidden at first."""
     return [
         (f"without {name}", each, colour, False) for name, each, colour in zip(names, values, COLOURS, strict=False)
@@ -78,6 +78,6 @@ def torque_over_time(answer: Diagnosis, channel: str) -> Any:
             own = tuple(term for term in estimate.terms if is_of(term, cause, answer.names))
             share = stacked(estimate.predict(data, terms=own))
             kept[cause.effect] = kept.get(cause.effect, corrected) - share
-        lines += without(list(kept), list(kept.values()))
+        lines += lines_without_each(list(kept), list(kept.values()))
     t = data.time[shown] - data.time[0]
     return lines_over_time(t, [answer.names[j] for _, j in rows], lines, "N·m")

@@ -108,7 +108,7 @@ def _spikes(t: Array, values: Array) -> Mask:
     return out
 
 
-def around_spikes(t: Array, spikes: Sequence[Mask], times: Array) -> Mask:
+def are_near_spikes(t: Array, spikes: Sequence[Mask], times: Array) -> Mask:
     """Whether work times (k,) are near a spike of a joint in any of its channels, (k, n).
 
     `spikes` are those of each channel at times `t`, (K, n) each. Joints that would lose too much time lose none.
@@ -123,7 +123,7 @@ def around_spikes(t: Array, spikes: Sequence[Mask], times: Array) -> Mask:
     return np.asarray(near & (near.mean(0) <= MOST))
 
 
-def counted(spikes: Mapping[str, Mask], channels: Mapping[str, Array | None]) -> tuple[Spikes, ...]:
+def count_spikes(spikes: Mapping[str, Mask], channels: Mapping[str, Array | None]) -> tuple[Spikes, ...]:
     """Numbers of spikes of each channel and joint that has any."""
     return tuple(
         Spikes(channel, int(joint), int(mask[:, joint].sum()), int(np.isfinite(values[:, joint]).sum()))

@@ -8,7 +8,7 @@ import numpy as np
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
 from sim_gap.residuals.channel_quality import spectrum
-from sim_gap.residuals.disturbances import calm, disturbances, far_off
+from sim_gap.residuals.disturbances import are_far_off, calm_weight, disturbances
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.location import Location
 from sim_gap.residuals.preprocess import BAND_HZ, CHANNELS, PreparedSignals
@@ -30,7 +30,7 @@ SMOOTH, FEW_BINS, BROAD = 5, 6, 2.0
 of a line's power from which it counts before the line."""
 
 
-def regimes(data: ResidualSet) -> dict[tuple[Row, str], Mask]:
+def regimes_left_out(data: ResidualSet) -> dict[tuple[Row, str], Mask]:
     """Samples at rest and in creep of each motor row that the comparison leaves out, (K,)."""
     share = np.concatenate([s.filtered(s.moving) for s in data.signals])
     out = {}
@@ -45,10 +45,10 @@ def regimes(data: ResidualSet) -> dict[tuple[Row, str], Mask]:
     return out
 
 
-def left_out(data: ResidualSet) -> float:
+def share_left_out(data: ResidualSet) -> float:
     """Share of all samples that no row judges: not read, stuck, or near impacts of a gear."""
     judged = {row: data.valid[row].copy() for row in data.rows}
-    for (row, _), mask in regimes(data).items():
+    for (row, _), mask in regimes_left_out(data).items():
         judged[row] |= mask
     return 1.0 - float(np.mean([mask.mean() for mask in judged.values()]))
 
@@ -65,12 +65,12 @@ def without_disturbances(data: ResidualSet, explained: Mapping[Row, Array]) -> R
         for row in data.rows:
             valid, joint = data.valid[row][part], row[1]
             rest = (data.values[row] - explained[row])[part] * valid
-            far[:, joint] |= far_off(rest, valid, data.floor[row], data.margin[row])
+            far[:, joint] |= are_far_off(rest, valid, data.floor[row], data.margin[row])
             judged[:, joint] |= valid
             left[:, joint] = np.maximum(left[:, joint], np.abs(rest))
         found = disturbances(data.time[part], far, judged, left)
         if found:
-            quiet = calm(s.t, found)[:, None]
+            quiet = calm_weight(s.t, found)[:, None]
             known = {channel: there * quiet for channel, there in s.known.items()}
             s = replace(s, known=known, disturbances=(*s.disturbances, *found))
         signals.append(s)
@@ -84,14 +84,16 @@ def slides(data: ResidualSet, row: Row) -> bool:
     return int(data.valid[row].sum()) >= FEWEST
 
 
-def slow(data: ResidualSet, explained: Mapping[Row, Array], friction: Array, known: Collection[Row]) -> list[Location]:
+def slow_gaps(
+    data: ResidualSet, explained: Mapping[Row, Array], friction: Array, known: Collection[Row]
+) -> list[Location]:
     """Rows at rest and in creep; `friction` (n,) is the known dry friction [N·m], which may take any value there.
 
     A location is `clear` if more remains there than that friction and the row's margin. Of a joint that does not slide
     in the training data, which `known` then does not hold, the friction is not known: nothing is clear there.
     """
     names, out = data.signals[0].arm.names, []
-    for (row, regime), mask in regimes(data).items():
+    for (row, regime), mask in regimes_left_out(data).items():
         if mask.sum() < FEWEST:
             continue
         raw, left = data.values[row][mask], (data.values[row] - explained[row])[mask]
@@ -101,7 +103,7 @@ def slow(data: ResidualSet, explained: Mapping[Row, Array], friction: Array, kno
     return out
 
 
-def fast(data: ResidualSet, recordings: Sequence[Recording]) -> list[Location]:
+def fast_gaps(data: ResidualSet, recordings: Sequence[Recording]) -> list[Location]:
     """Lines and resonances above the pass band: the largest of each channel and joint, with frequency and RMS [N·m]."""
     names, best = data.signals[0].arm.names, dict[Row, Location]()
     for recording in recordings:

@@ -92,7 +92,7 @@ def by_joint(data: ResidualSet, left: dict[Row, Array] | None = None) -> Array:
     return np.asarray(np.sqrt(squares))
 
 
-def combined(data: ResidualSet, levels: dict[Row, float]) -> Array:
+def combine_by_joint(data: ResidualSet, levels: dict[Row, float]) -> Array:
     """A level per row (noise floor, margin), combined per joint as in `by_joint`, (n,)."""
     squares = np.zeros(data.layout.n)
     for channel, joint in data.rows:

@@ -20,14 +20,14 @@ from sim_gap.model.rigid_body import CREEP, LinkMotion, RigidArm, Wrenches, torq
 from sim_gap.residuals.channel_quality import (
     Spikes,
     Stuck,
-    around_spikes,
+    are_near_spikes,
     band_noise,
-    counted,
+    count_spikes,
     spikes_of,
     stuck_intervals,
 )
 from sim_gap.residuals.disturbances import Disturbance
-from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
+from sim_gap.residuals.resampling import SLOW_HZ, coverage, decimation, interpolate_even, low_pass
 
 SLIDES, MOST_CREEP = 1.5, 0.2
 """Speed from which a joint of a simulation slides, over that up to which it creeps; the most that it is [rad/s]."""
@@ -288,14 +288,14 @@ def prepare(
     band = min(BAND_HZ, rate / 5.0)
     if band < 0.5:
         raise BadInput(f"{label}: {rate:.3g} rows a second are too few: record at 10 Hz or more")
-    thin = thinner(1.0 / raw_step, stride)
-    q = thin(bridged(recording.t, recording.position, even, label, "q"))
+    thin = decimation(1.0 / raw_step, stride)
+    q = thin(interpolate_even(recording.t, recording.position, even, label, "q"))
     smooth = low_pass(min(SMOOTH_HZ, 0.4 * rate), rate)
     times = even[::stride]
     spline = make_interp_spline(times, smooth(q), k=5)
     q, v, a = (np.asarray(spline(times, order)) for order in range(3))
     if rate < SLOW_HZ and recording.velocity is not None and np.isfinite(recording.velocity).all():
-        v = smooth(thin(bridged(recording.t, recording.velocity, even, label, "dq")))
+        v = smooth(thin(interpolate_even(recording.t, recording.velocity, even, label, "dq")))
         a = np.asarray(make_interp_spline(times, v, k=5)(times, 1))
     reading, known, noise = {}, {}, {}
     channels = {channel: getattr(recording, name) for channel, name in CHANNELS.items()}
@@ -304,19 +304,19 @@ def prepare(
         values = np.where(spiked, np.nan, channels[channel])
         if not np.isfinite(values).any():
             continue
-        reading[channel] = thin(bridged(recording.t, values, even, label, channel))
+        reading[channel] = thin(interpolate_even(recording.t, values, even, label, channel))
         known[channel] = coverage(recording.t, values, even)[::stride]
         noise[channel] = np.array([band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
-    near = around_spikes(recording.t, list(spikes.values()), times)
+    near = are_near_spikes(recording.t, list(spikes.values()), times)
     known = {channel: there * ~near for channel, there in known.items()}
     clock = times - (times[0] if start is None else start)
     temperature = _warmth(recording, times)
     signals = PreparedSignals(
         label, rate, band, clock, q, v, a, reading, known, noise, arm, temperature, number, groups
     )
-    return _without_stuck(replace(signals, spikes=counted(spikes, channels)), recording)
+    return _without_stuck(replace(signals, spikes=count_spikes(spikes, channels)), recording)
 
 
 def _warmth(recording: Recording, times: Array) -> Array | None:

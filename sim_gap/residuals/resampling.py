@@ -14,7 +14,7 @@ SLOW_HZ = 60.0
 late."""
 
 
-def bridged(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
+def interpolate_even(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
     """Values on the even time base, by cubic splines for a channel that is slow and even, else linear.
 
     Raises BadInput if a whole column is missing.
@@ -47,7 +47,7 @@ def coverage(t: Array, values: Array, even: Array) -> Array:
     return out
 
 
-def thinner(rate: float, stride: int) -> Callable[[Array], Array]:
+def decimation(rate: float, stride: int) -> Callable[[Array], Array]:
     """Decimation by `stride` of a signal at `rate` [Hz], after a low pass."""
     if stride == 1:
         return lambda x: x

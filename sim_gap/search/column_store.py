@@ -8,7 +8,7 @@ import numpy as np
 from gcomp.arrays import Array, Mask
 from sim_gap.residuals.layout import Columns, Row
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.about import About, Values, about
+from sim_gap.search.estimate_signals import EstimateSignals, Values, signals_about
 from sim_gap.search.term import Term
 
 UNCHANGED, LINEAR = 1e-12, 1e-9
@@ -90,8 +90,8 @@ class ColumnStore:
         return np.asarray(np.max(moved, axis=0) > CLOSE * np.max(size, axis=0))
 
     @cached_property
-    def about(self) -> list[About]:
-        return [about(s, self.data.layout, self.values) for s in self.data.signals]
+    def about(self) -> list[EstimateSignals]:
+        return [signals_about(s, self.data.layout, self.values) for s in self.data.signals]
 
     def release(self) -> None:
         """Free what the columns were computed from and no others will be."""
@@ -173,7 +173,7 @@ class ColumnStore:
         linear = np.abs(whole).max(initial=0.0) * LINEAR
         return beside if any(np.abs(x).max(initial=0.0) > linear for x in beside.values()) else {}
 
-    def _of(self, one: About, term: Term) -> tuple[Columns, Columns]:
+    def _of(self, one: EstimateSignals, term: Term) -> tuple[Columns, Columns]:
         """Columns of a term in one recording and what it is beside them, at the work rate."""
         layout, signature = self.data.layout, term.form.signature
         values = self.values.get(term)
@@ -193,7 +193,7 @@ class ColumnStore:
                 beside = {}
         return layout.compared(own), layout.compared(beside)
 
-    def _through(self, one: About, term: Term, plain: Columns) -> Columns:
+    def _through(self, one: EstimateSignals, term: Term, plain: Columns) -> Columns:
         """Derivatives of the readings: what changes the torque goes through sensor and motor as they are found."""
         layout, side = self.data.layout, term.form.signature.side
         if side == "motor":
@@ -219,7 +219,7 @@ class ColumnStore:
         return out
 
 
-def _alike(ours: Sequence[About], theirs: Sequence[About]) -> Mask | None:
+def _alike(ours: Sequence[EstimateSignals], theirs: Sequence[EstimateSignals]) -> Mask | None:
     """Joints with torques close in two estimates, (n,); None unless angles, gravity and gains are close."""
     same = np.ones(len(ours[0].motor_gain), bool)
     for one, other in zip(ours, theirs, strict=True):
@@ -235,7 +235,7 @@ def _alike(ours: Sequence[About], theirs: Sequence[About]) -> Mask | None:
     return same
 
 
-def _own_gain(one: About, joint: int) -> float:
+def _own_gain(one: EstimateSignals, joint: int) -> float:
     return float(one.sensor_gain[joint, joint])
 
 

@@ -13,7 +13,7 @@ from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.normal_equations import CORRELATED, NormalEquations
-from sim_gap.search.stepwise import StepwiseSearch
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import shares_a_factor
 

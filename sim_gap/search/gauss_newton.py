@@ -9,9 +9,9 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.feasible import pins
+from sim_gap.search.feasibility import pins
 from sim_gap.search.normal_equations import NormalEquations
-from sim_gap.search.stepwise import StepwiseSearch
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
 AGREED = 5e-3
@@ -24,7 +24,7 @@ SLOW = 0.5
 Values = dict[Term, Array]
 
 
-def converged(
+def converge(
     nominal: ColumnStore, terms: Sequence[Term], start: Values | None = None
 ) -> tuple[ColumnStore, list[Term]]:
     """Columns of the terms about their own coefficients (`values` of the store), and the terms that remain plausible.

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import ChannelLayout
-from sim_gap.search.stepwise import StepwiseSearch
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
 CONSTANT = "actuator.gain"

@@ -7,7 +7,7 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.trends import WATCHED, watched
+from sim_gap.trends import WATCHED, watched_parameters
 
 SMALL = np.radians(0.1)
 
@@ -15,7 +15,7 @@ SMALL = np.radians(0.1)
 def of(wrong: Wrong, **options) -> dict[tuple[str, str], float]:
     answer = diagnose(model(), [record(model(), wrong, 7, seconds=20.0, rate=50.0, **options)])
     assert "transmission.backlash" not in {cause.effect for cause in (*answer.causes, *answer.minor)}
-    return {(one["effect"], one["joint"]): one["value"] for one in watched(answer)}
+    return {(one["effect"], one["joint"]): one["value"] for one in watched_parameters(answer)}
 
 
 def test_a_play_that_no_answer_names_is_seen():

@@ -1,7 +1,7 @@
 """The blind form of the effects: magnitudes that show in a recording, put into the true arm."""
 
 from sim_gap.blind.effects import actuator, friction, link, position, torque, transmission
-from sim_gap.blind.effects.drawn import Draw
+from sim_gap.blind.effects.drawn_effect import Draw
 
 DRAWS: dict[str, Draw] = {
     **link.DRAWS,

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm
-from sim_gap.blind.effects.drawn import Draw, Drawn, sensor_level
+from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, sensor_level
 from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.true_arm import TrueArm
 
@@ -21,7 +21,7 @@ def _scale(scene: Scene, other: BenchArm, joints: NDArray[np.intp], random: np.r
     return float(1.0 / (rms(scene.change(other)) / sensor_level(scene, random))[joints].max())
 
 
-def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def mass_moment(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """A shifted centre of mass, across the link's own axis, so that its own joint shows it."""
     arm, level = scene.arm, sensor_level(scene, random)
     shift = random.uniform(0.15, 0.3)
@@ -40,11 +40,11 @@ def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:
 
         values = dict(zip(XYZ, moment.tolist(), strict=True))
         why, others = ("", ()) if weighs else (UPRIGHT, ("link.inertia",))
-        return Drawn.at(scene, link, "link.mass_moment", values, apply, undecided=why, confused_with=others)
+        return DrawnEffect.at(scene, link, "link.mass_moment", values, apply, undecided=why, confused_with=others)
     return None
 
 
-def inertia(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def inertia(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Additional inertia, mostly about the joint's own axis, that no shift of mass explains."""
     arm, level = scene.arm, 1.3 * sensor_level(scene, random)
     for link in random.permutation(arm.n).tolist():
@@ -58,7 +58,7 @@ def inertia(scene: Scene, random: np.random.Generator) -> Drawn | None:
         def apply(true: TrueArm, link: int = link, added: Array = added) -> None:
             true.arm = _thicker(true.arm, link, added)
 
-        return Drawn.at(scene, link, "link.inertia", {name: float(added[r, c]) for name, r, c in INERTIA}, apply)
+        return DrawnEffect.at(scene, link, "link.inertia", {name: float(added[r, c]) for name, r, c in INERTIA}, apply)
     return None
 
 
@@ -68,7 +68,7 @@ def _thicker(arm: BenchArm, link: int, added: Array) -> BenchArm:
     return out
 
 
-def payload(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def payload(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     arm, tip = scene.arm, scene.arm.n - 1
     com = arm.com[tip] * 1.5 + random.uniform(-0.06, 0.06, 3)
     light = _loaded(arm, 0.5, com)
@@ -79,7 +79,7 @@ def payload(scene: Scene, random: np.random.Generator) -> Drawn | None:
     def apply(true: TrueArm) -> None:
         true.arm = _loaded(true.arm, mass, com)
 
-    return Drawn("link.payload", {"arm": {"mass": mass, **dict(zip(XYZ, com.tolist(), strict=True))}}, apply)
+    return DrawnEffect("link.payload", {"arm": {"mass": mass, **dict(zip(XYZ, com.tolist(), strict=True))}}, apply)
 
 
 def _loaded(arm: BenchArm, mass: float, com: Array) -> BenchArm:
@@ -87,7 +87,7 @@ def _loaded(arm: BenchArm, mass: float, com: Array) -> BenchArm:
     return arm.with_added(arm.n - 1, mass, mass * com, about)
 
 
-def tilt(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def tilt(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """The base rotated by a small angle about an axis across gravity."""
     arm = scene.arm
     down = arm.gravity / np.linalg.norm(arm.gravity)
@@ -106,7 +106,7 @@ def tilt(scene: Scene, random: np.random.Generator) -> Drawn | None:
     )  # the two base axes closest to perpendicular to gravity
     aligned = np.abs(down).max() > 0.999
     values = {f"angle_{k + 1}": float(turn[axis]) for k, axis in enumerate(named)} if aligned else {}
-    return Drawn("base.tilt", {"arm": values}, apply)
+    return DrawnEffect("base.tilt", {"arm": values}, apply)
 
 
 def _tilted(arm: BenchArm, turn: Array) -> BenchArm:

@@ -6,15 +6,23 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm
-from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, replaced, reversals, sensor_level, sign
+from sim_gap.blind.effects.drawn_effect import (
+    OFTEN,
+    Draw,
+    DrawnEffect,
+    motor_level,
+    pick,
+    reversals,
+    sensor_level,
+    set_entry,
+    sign,
+)
+from sim_gap.blind.plant.plant import STEP
 from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.true_arm import SharedMotor, TrueArm
 
-STEP_S = 5e-4
-"""Time step of the plant [s]: springs must be slower."""
 
-
-def ripple(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def ripple(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Torque lost to the meshing gear: amplitude·sin(cycles·θ + phase), slow enough to pass a 6 Hz filter."""
     fastest = np.quantile(np.abs(scene.motion[1]), 0.9, axis=0)
     j = int(random.integers(scene.arm.n))
@@ -28,10 +36,10 @@ def ripple(scene: Scene, random: np.random.Generator) -> Drawn | None:
     def apply(true: TrueArm) -> None:
         true.ripple[j] = list(values.values())
 
-    return Drawn.at(scene, j, "transmission.ripple", values, apply)
+    return DrawnEffect.at(scene, j, "transmission.ripple", values, apply)
 
 
-def spring(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def spring(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """A cable bundle across the joint: −stiffness·(θ − rest) on the link."""
     q = scene.motion[0]
     wanted = 1.3 * np.maximum(sensor_level(scene, random), 0.2) / q.std(0)
@@ -42,7 +50,7 @@ def spring(scene: Scene, random: np.random.Generator) -> Drawn | None:
     def apply(true: TrueArm) -> None:
         true.spring[j] = stiffness, rest
 
-    return Drawn.at(scene, j, "transmission.spring", {"stiffness": stiffness, "rest": rest}, apply)
+    return DrawnEffect.at(scene, j, "transmission.spring", {"stiffness": stiffness, "rest": rest}, apply)
 
 
 def _turn_felt(scene: Scene, error: Array) -> Array:
@@ -50,7 +58,7 @@ def _turn_felt(scene: Scene, error: Array) -> Array:
     return np.array([rms(scene.slope[:, :, j] * error[:, j, None]).max() for j in range(scene.arm.n)])
 
 
-def elasticity(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def elasticity(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Rotor and link with a spring between them; the position sensor is at the rotor."""
     stiffness_of = rms(scene.torque) / random.uniform(0.015, 0.04)  # from the RMS deflection [rad]
     resonance, stiffest = (2 * np.pi * 4.0) ** 2 * scene.inertia, _stiffest(scene)
@@ -60,11 +68,11 @@ def elasticity(scene: Scene, random: np.random.Generator) -> Drawn | None:
         return None
     j = int(random.choice(np.flatnonzero(fit)))
     stiffness = float(stiffness_of[j])
-    put = replaced(lambda true: true.stiffness, j, stiffness)
-    return Drawn.at(scene, j, "transmission.elasticity", {"stiffness": stiffness}, put)
+    put = set_entry(lambda true: true.stiffness, j, stiffness)
+    return DrawnEffect.at(scene, j, "transmission.elasticity", {"stiffness": stiffness}, put)
 
 
-def backlash(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def backlash(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Backlash between rotor and link, on a joint whose torque changes sign often."""
     level = np.maximum(sensor_level(scene, random), 0.2)
     wanted = 2.2 * level / np.maximum(_turn_felt(scene, np.ones_like(scene.torque)), 1e-9)
@@ -77,17 +85,17 @@ def backlash(scene: Scene, random: np.random.Generator) -> Drawn | None:
     def apply(true: TrueArm) -> None:
         true.backlash[j], true.stiffness[j] = play, stiffness
 
-    return Drawn.at(scene, j, "transmission.backlash", {"width": play}, apply)
+    return DrawnEffect.at(scene, j, "transmission.backlash", {"width": play}, apply)
 
 
 def _stiffest(scene: Scene) -> Array:
     """Stiffness of a stiff gear that the time step still resolves, (n,)."""
     link = np.maximum(scene.inertia - scene.arm.armature, 2e-3)
     reduced = link * scene.arm.armature / (link + scene.arm.armature)
-    return np.asarray(np.minimum(0.04 * reduced / STEP_S**2, 4e4))
+    return np.asarray(np.minimum(0.04 * reduced / STEP**2, 4e4))
 
 
-def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def coupling(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """The motor of a joint also turns with its neighbour; the nominal model does not have that motor."""
     n = scene.arm.n
     j = int(random.integers(1, n))
@@ -118,7 +126,7 @@ def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
         "viscous": viscous,
     }
     own = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
-    return Drawn.at(scene, j, "transmission.coupling", values, apply, nominal, own)
+    return DrawnEffect.at(scene, j, "transmission.coupling", values, apply, nominal, own)
 
 
 DRAWS: dict[str, Draw] = {

@@ -10,7 +10,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.blind.motion import RATE
-from sim_gap.blind.plant.drive import padded
+from sim_gap.blind.plant.drive import pad_rows
 from sim_gap.blind.true_arm import PlantRun
 
 BLOCK = 256
@@ -23,8 +23,8 @@ class PidControllers:
     def __init__(self, runs: Sequence[PlantRun], reading: Array, width: int) -> None:
         """`reading` (B, width): initial readings [rad]."""
         self.runs = runs
-        inertia = padded([run.inertia for run in runs], width)
-        omega = padded([run.truth.bandwidth for run in runs], width)
+        inertia = pad_rows([run.inertia for run in runs], width)
+        omega = pad_rows([run.truth.bandwidth for run in runs], width)
         self.stiffness, self.damping = inertia * omega**2, 2 * DAMPING_RATIO * inertia * omega
         self.integral = self.stiffness / 1.5  # s
         self.resolution = np.array([[run.truth.encoder_step] for run in runs])
@@ -93,10 +93,11 @@ class Servos:
         self.runs = runs
         laws = [run.law for run in runs if isinstance(run, ServoRun)]
         self.stiffness, self.damping, self.integral, self.dead = (
-            padded([getattr(law, name) for law in laws], width) for name in ("stiffness", "damping", "integral", "dead")
+            pad_rows([getattr(law, name) for law in laws], width)
+            for name in ("stiffness", "damping", "integral", "dead")
         )
-        self.step = padded([law.slew for law in laws], width, np.inf) / RATE
-        self.late = padded([law.delay for law in laws], width) * RATE
+        self.step = pad_rows([law.slew for law in laws], width, np.inf) / RATE
+        self.late = pad_rows([law.delay for law in laws], width) * RATE
         self.smooth = 1.0 - np.exp(-2 * np.pi * 200.0 / RATE)  # low pass of the velocity [Hz]
         self.before, self.target = reading.copy(), reading.copy()
         self.velocity, self.error_sum = np.zeros_like(reading), np.zeros_like(reading)

@@ -26,11 +26,11 @@ class Bristles:
         """`inertia` (B, width): least inertia that each motor moves [kg·m²]; `step` [s]."""
         width = inertia.shape[1]
         self.coulomb, self.viscous, self.breakaway, self.load = (
-            padded([getattr(t, name) for t in truths], width)
+            pad_rows([getattr(t, name) for t in truths], width)
             for name in ("coulomb", "viscous", "breakaway", "load_friction")
         )
-        self.fade = 1.0 / padded([t.stribeck_velocity for t in truths], width, 1.0) ** 2
-        self.asymmetry = padded([t.asymmetry for t in truths], width)
+        self.fade = 1.0 / pad_rows([t.stribeck_velocity for t in truths], width, 1.0) ** 2
+        self.asymmetry = pad_rows([t.asymmetry for t in truths], width)
         self.rows = np.array([t.breakaway.any() or t.asymmetry.any() or t.load_friction.any() for t in truths])
         largest = np.maximum(self.coulomb + self.breakaway, 0.05)
         self.bristle = np.minimum(largest / 2e-4, STIFFEST * inertia / step**2)
@@ -56,7 +56,7 @@ class Bristles:
         return np.asarray(self.bristle[:k] * z + self.bristle_damping[:k] * rate + self.viscous[:k] * v)
 
 
-def padded(rows: Sequence[Array], width: int, fill: float = 0.0) -> Array:
+def pad_rows(rows: Sequence[Array], width: int, fill: float = 0.0) -> Array:
     """Rows of different lengths as one array (B, width)."""
     out = np.full((len(rows), width), fill)
     for row, values in zip(out, rows, strict=True):
@@ -73,35 +73,35 @@ class PlantDrives:
         """`inertia` (B, width): least inertia that each motor moves [kg·m²]; `angle`, `torque` at rest; `step` [s]."""
         width = angle.shape[1]
         self.step, self.count = step, 0
-        self.current = padded(torque, width)
-        lag = padded([t.motor_lag for t in truths], width, step)
+        self.current = pad_rows(torque, width)
+        lag = pad_rows([t.motor_lag for t in truths], width, step)
         self.follow = 1.0 - np.exp(-step / np.maximum(lag, 0.1 * step))
-        self.limit = padded([t.motor_limit for t in truths], width, np.inf)
-        self.gain = padded([t.motor_gain for t in truths], width, 1.0)
-        delay = np.rint(padded([t.motor_delay for t in truths], width) / step).astype(int)
+        self.limit = pad_rows([t.motor_limit for t in truths], width, np.inf)
+        self.gain = pad_rows([t.motor_gain for t in truths], width, 1.0)
+        delay = np.rint(pad_rows([t.motor_delay for t in truths], width) / step).astype(int)
         self.late = _Cells(delay > 0)
         self.wait = delay[self.late.all]
         self.queue = np.repeat(self.current[None], int(delay.max()) + 1, axis=0)
         self.bristles = Bristles(truths, inertia, step)
-        self.ripple = [padded([t.ripple[:, c] for t in truths], width) for c in range(3)]
-        self.spring, self.rest = (padded([t.spring[:, c] for t in truths], width) for c in range(2))
+        self.ripple = [pad_rows([t.ripple[:, c] for t in truths], width) for c in range(3)]
+        self.spring, self.rest = (pad_rows([t.spring[:, c] for t in truths], width) for c in range(2))
         self.shared = [(b, s) for b, t in enumerate(truths) for s in t.shared]
-        self.armature = padded([np.where(t.elastic, 0.0, t.arm.armature) for t in truths], width)
+        self.armature = pad_rows([np.where(t.elastic, 0.0, t.arm.armature) for t in truths], width)
         self.passed = self.current.copy()
         self.carried = self.current.copy()
         self._sense(truths, width)
         self._two_masses(truths, angle)
 
     def _sense(self, truths: Sequence[TrueArm], width: int) -> None:
-        self.position_gain = padded([t.position_gain for t in truths], width, 1.0)
-        self.position_offset = padded([t.position_offset for t in truths], width)
-        self.bent = _Cells(padded([t.eccentricity[:, 0] for t in truths], width) != 0.0)
+        self.position_gain = pad_rows([t.position_gain for t in truths], width, 1.0)
+        self.position_offset = pad_rows([t.position_offset for t in truths], width)
+        self.bent = _Cells(pad_rows([t.eccentricity[:, 0] for t in truths], width) != 0.0)
         self.amplitude, self.phase = (
-            padded([t.eccentricity[:, c] for t in truths], width)[self.bent.all] for c in range(2)
+            pad_rows([t.eccentricity[:, c] for t in truths], width)[self.bent.all] for c in range(2)
         )
 
     def _two_masses(self, truths: Sequence[TrueArm], angle: Array) -> None:
-        self.soft = _Cells(np.isfinite(padded([t.stiffness for t in truths], angle.shape[1], np.inf)))
+        self.soft = _Cells(np.isfinite(pad_rows([t.stiffness for t in truths], angle.shape[1], np.inf)))
         rows = list(zip(*(cells.tolist() for cells in self.soft.all), strict=True))
         self.stiffness = np.array([truths[b].stiffness[j] for b, j in rows])
         self.half_play = np.array([0.5 * truths[b].backlash[j] for b, j in rows])

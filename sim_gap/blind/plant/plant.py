@@ -20,6 +20,7 @@ from sim_gap.blind.true_arm import Log, PlantRun, TrueArm
 
 SUBSTEPS = 4
 STEP = 1.0 / (RATE * SUBSTEPS)
+"""Time step [s]: springs must be slower."""
 CHANNELS = ("position", "torque", "motor", "command", "angle")
 
 

@@ -21,11 +21,13 @@ def record(
     t = _times(clock[-1], rate, random)
     shape = (len(t), truth.n)
     step = truth.encoder_step
-    torque = _at(t, clock, _sensor(truth, log.torque, clock)) + truth.torque_noise * random.standard_normal(shape)
+    torque = columns_at(t, clock, _sensor(truth, log.torque, clock)) + truth.torque_noise * random.standard_normal(
+        shape
+    )
     limit = truth.torque_limit
     resolution = 4.0 * truth.rated / 2**16  # bits over four times the rated torque
-    motor = _at(t, clock, log.motor) + truth.motor_noise * random.standard_normal(shape)
-    position = _at(t, clock, log.position) / step + 0.4 * random.standard_normal(shape)
+    motor = columns_at(t, clock, log.motor) + truth.motor_noise * random.standard_normal(shape)
+    position = columns_at(t, clock, log.position) / step + 0.4 * random.standard_normal(shape)
     last = (t * RATE + 1e-9).astype(int)  # rows end before the log does
     columns = {
         "t": t,
@@ -38,7 +40,7 @@ def record(
         "q_cmd": command[last],
     }
     if velocity:
-        columns["dq"] = _at(t, clock, _drive_velocity(log.position, step, random))
+        columns["dq"] = columns_at(t, clock, _drive_velocity(log.position, step, random))
     return columns
 
 
@@ -53,7 +55,8 @@ def _times(duration: float, rate: float, random: np.random.Generator) -> Array:
     return np.asarray(np.sort(t)[kept])
 
 
-def _at(t: Array, clock: Array, values: Array) -> Array:
+def columns_at(t: Array, clock: Array, values: Array) -> Array:
+    """Columns (K, n) at other times, along straight lines."""
     return np.column_stack([np.interp(t, clock, column) for column in values.T])
 
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.position_gap.fit import LoopFit, Point, batch, residuals, stepped
-from sim_gap.position_gap.search import LoopSearch, merged
+from sim_gap.position_gap.search import LoopSearch, merge_joint
 from sim_gap.position_gap.training.spread import Alternative, Covariance
 from sim_gap.position_gap.training.unreached_limits import LIMITS, draw_limits
-from sim_gap.position_gap.windows import thinned
+from sim_gap.position_gap.windows import thin
 
 
 def draw(
@@ -47,7 +47,7 @@ def _within(
     reach: Array,
 ) -> list[Point]:
     """The points, with the steps halved of each joint that goes further than `reach`; of all, where they share some."""
-    data = thinned(search.data, 16)
+    data = thin(search.data, 16)
     count = np.maximum(data.weight.sum((0, 2)), 1.0)
     unmoved = residuals(data, batch([fit.point]))[0]
     points, share = list(points), np.ones((len(points), data.joints))
@@ -98,7 +98,7 @@ def _points(fit: LoopFit, spread: Covariance, count: int, random: np.random.Gene
         point = fit if chosen is None else chosen.fit
         for j in range(len(fit.active)) if chosen is None else ():
             if (own := _chosen([other for other in there if other.joint == j], random)) is not None:
-                point = merged(point, own.fit, j)
+                point = merge_joint(point, own.fit, j)
         out.append(point)
     return out
 

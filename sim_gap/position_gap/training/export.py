@@ -12,17 +12,23 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.better_model.corrected_model import body_parameters, mujoco_quaternion, possible, spec_of, split
+from sim_gap.better_model.corrected_model import (
+    body_parameters,
+    closest_possible,
+    mass_centre_inertia,
+    mujoco_quaternion,
+    spec_of,
+)
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.urdf import xml_comment
-from sim_gap.effects.base import tilted
+from sim_gap.effects.base import tilt_gravity
 from sim_gap.model.load import SimModel
 from sim_gap.model.solver_friction import solver_parameters
 from sim_gap.position_gap.columns import payload_inertia, shared_effects
 from sim_gap.position_gap.fit import LoopFit, improve
 from sim_gap.position_gap.parameters import EFFECTS
-from sim_gap.position_gap.search import LoopSearch, effect_there, taken_out, without
+from sim_gap.position_gap.search import LoopSearch, effect_there, without_effect, without_group
 
 BEYOND = 0.02
 """Distance beyond the end of its range from which a joint of the model would have to go on [rad]; stops are soft."""
@@ -30,7 +36,7 @@ BESIDE = 0.01
 """Room beside the positions and commands that were seen [rad]."""
 
 
-def wide_enough(sim: SimModel, recordings: Sequence[Recording]) -> SimModel:
+def widen_ranges(sim: SimModel, recordings: Sequence[Recording]) -> SimModel:
     """The model with `arm.range` widened to the recorded positions, where they leave it."""
     ranges = sim.arm.range.copy()
     seen = np.concatenate([recording.position for recording in recordings])
@@ -40,7 +46,7 @@ def wide_enough(sim: SimModel, recordings: Sequence[Recording]) -> SimModel:
     return replace(sim, arm=replace(sim.arm, range=ranges))
 
 
-def widened(sim: SimModel) -> list[int]:
+def widened_joints(sim: SimModel) -> list[int]:
     own = sim.mujoco_model.jnt_range[list(sim.joints)]
     limited = sim.mujoco_model.jnt_limited[list(sim.joints)].astype(bool)
     wider = (sim.arm.range[:, 0] < own[:, 0]) | (sim.arm.range[:, 1] > own[:, 1])
@@ -102,9 +108,9 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
             continue
         for j in range(search.data.joints):
             if effect_there(fit, effect, j):
-                bare = without(search, bare, effect, j)
+                bare = without_effect(search, bare, effect, j)
     for effect in _shared_beside(search, fit, held):
-        bare = taken_out(search, bare, (effect, ()))
+        bare = without_group(search, bare, (effect, ()))
     bare = bare.with_values(kd=np.zeros(search.data.joints), feed=np.zeros(search.data.joints))
     loaded = fit.point["load"] * search.data.load.mean(axis=(0, 2))
     dry = fit.point["stribeck"] * ("friction.stribeck" not in held) + loaded * ("friction.load" not in held)
@@ -117,7 +123,7 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
     return improve(search.data, replace(bare, active=tuple(wanted), rms=None), search.scales, 6)
 
 
-def exported(
+def export_fit(
     sim: SimModel, search: LoopSearch, fit: LoopFit, native: LoopFit, held: Collection[str] = NATIVE
 ) -> Exported:
     """MJCF of the native fit, which has the effects `held`, and the effects of the whole fit that it leaves out."""
@@ -133,7 +139,7 @@ def exported(
     )
     compiled = spec.compile()
     unit = float(np.degrees(1.0)) if spec.compiler.degree else 1.0
-    wider = widened(sim)
+    wider = widened_joints(sim)
     for j, joint in enumerate(sim.joints):
         _set_joint(spec.joints[joint], native, j, unit)
         actuator = _set_actuator(spec, spec.joints[joint].name, native, j)
@@ -142,7 +148,7 @@ def exported(
     for link, change in _link_changes(search, native).items():
         _set_body(spec, compiled, sim.joints[link], change)
     angles = [float(native.point.get(f"tilt.angle_{k}", np.zeros(1))[0]) for k in (1, 2)]
-    spec.option.gravity = tilted(sim.arm.gravity, np.array(angles))
+    spec.option.gravity = tilt_gravity(sim.arm.gravity, np.array(angles))
     spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
     spec.option.integrator = _implicit()
     _set_friction(spec, sim, native)
@@ -152,14 +158,14 @@ def exported(
     return Exported(comment + spec.to_xml(), tuple(left), native)
 
 
-def with_module(sim: SimModel, search: LoopSearch, fit: LoopFit) -> Exported | None:
+def export_with_module(sim: SimModel, search: LoopSearch, fit: LoopFit) -> Exported | None:
     """MJCF that is to be used with a module for friction that MJCF cannot hold; None if there is no such friction."""
     if not any(effect_there(fit, effect, j) for effect in IN_MODULE for j in range(sim.n)):
         return None
-    return written_with_module(sim, search, fit, native_fit(search, fit, WRITTEN))
+    return export_beside_module(sim, search, fit, native_fit(search, fit, WRITTEN))
 
 
-def written_with_module(sim: SimModel, search: LoopSearch, fit: LoopFit, native: LoopFit) -> Exported:
+def export_beside_module(sim: SimModel, search: LoopSearch, fit: LoopFit, native: LoopFit) -> Exported:
     """MJCF of a native fit, with the effects that a module applies beside it and those of the whole fit left out."""
     effects: list[JointEffect] = []
     for effect in IN_MODULE:
@@ -169,7 +175,7 @@ def written_with_module(sim: SimModel, search: LoopSearch, fit: LoopFit, native:
                 pairs = zip(own.reported, own.parameters, strict=True)
                 values = {called: float(native.point[name][j]) for called, name in pairs}
                 effects.append((effect, sim.arm.names[j], values))
-    return replace(exported(sim, search, fit, native, WRITTEN), effects=tuple(effects))
+    return replace(export_fit(sim, search, fit, native, WRITTEN), effects=tuple(effects))
 
 
 def _shared_beside(search: LoopSearch, fit: LoopFit, held: Collection[str]) -> list[str]:
@@ -268,7 +274,7 @@ def _set_body(spec: Any, compiled: Any, joint: int, change: Array) -> None:
     index = int(compiled.jnt_bodyid[joint])
     anchor = compiled.jnt_pos[joint]
     total = body_parameters(compiled, index, anchor, np.eye(3)) + change
-    mass, centre, about = split(total)
+    mass, centre, about = mass_centre_inertia(total)
     values, turned = np.linalg.eigh(about)
     turned[:, 2] *= np.sign(np.linalg.det(turned))
     quaternion = np.zeros(4)
@@ -276,5 +282,5 @@ def _set_body(spec: Any, compiled: Any, joint: int, change: Array) -> None:
     body = spec.bodies[index]
     body.explicitinertial = True
     body.mass, body.ipos, body.iquat = mass, anchor + centre, quaternion
-    body.inertia = possible(values)
+    body.inertia = closest_possible(values)
     body.fullinertia = [np.nan] * 6

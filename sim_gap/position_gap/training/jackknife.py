@@ -13,7 +13,7 @@ from scipy.linalg import eigh
 from gcomp.arrays import Array
 from sim_gap.position_gap.fit import LoopFit, batch, improve, jacobian, residuals
 from sim_gap.position_gap.search import LoopSearch
-from sim_gap.position_gap.windows import Windows, of_windows
+from sim_gap.position_gap.windows import Windows, choose_windows
 
 ALONE = 0.03
 """Share of the information about a direction that the others are taken to have at least, without a group."""
@@ -84,14 +84,14 @@ def recordings_or_thirds(data: Windows) -> NDArray[np.intp]:
     return np.arange(data.count) * FOLDS // data.count if data.of_one_recording else data.recording
 
 
-def left_out(search: LoopSearch, fit: LoopFit) -> LeftOutFits:
+def leave_out(search: LoopSearch, fit: LoopFit) -> LeftOutFits:
     """A fit to all other windows for each group of them."""
     data, groups = search.data, recordings_or_thirds(search.data)
     fits = []
     for group in np.unique(groups):
         others = np.flatnonzero(groups != group)
         fits.append(
-            improve(of_windows(data, others), replace(fit, rms=None), search.scales, STEPS) if len(others) else fit
+            improve(choose_windows(data, others), replace(fit, rms=None), search.scales, STEPS) if len(others) else fit
         )
     return LeftOutFits(groups, tuple(fits))
 
@@ -101,5 +101,5 @@ def gaps_left_out(search: LoopSearch, left: LeftOutFits) -> Array:
     out = np.zeros_like(search.data.measured)
     for group, alone in zip(np.unique(left.groups), left.fits, strict=True):
         own = np.flatnonzero(left.groups == group)
-        out[..., own] = residuals(of_windows(search.data, own), batch([alone.point]))[0]
+        out[..., own] = residuals(choose_windows(search.data, own), batch([alone.point]))[0]
     return out

@@ -12,8 +12,8 @@ from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.better_model.native_drives import hold
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.search import Group, LoopSearch, taken_out
-from sim_gap.position_gap.training.export import Exported, written_with_module
+from sim_gap.position_gap.search import Group, LoopSearch, without_group
+from sim_gap.position_gap.training.export import Exported, export_beside_module
 
 OPENING_S = 1.0
 """Time at the start that is not judged [s]."""
@@ -40,7 +40,7 @@ class Simulated:
         return replace(self, model=model)
 
 
-def simulated(sim: SimModel, made: Exported) -> Simulated:
+def simulated_model(sim: SimModel, made: Exported) -> Simulated:
     """A written model with what its module applies."""
     import mujoco
 
@@ -48,12 +48,12 @@ def simulated(sim: SimModel, made: Exported) -> Simulated:
     return Simulated(model, tuple(sim.joints), Effects(model, made.effects, sim.arm.names) if made.effects else None)
 
 
-def less(sim: SimModel, search: LoopSearch, made: Exported, groups: Sequence[Group]) -> Simulated:
+def without_groups(sim: SimModel, search: LoopSearch, made: Exported, groups: Sequence[Group]) -> Simulated:
     """The written model less some effects, the others as they are."""
     fit = made.fit
     for group in groups:
-        fit = taken_out(search, fit, group)
-    return simulated(sim, written_with_module(sim, search, fit, fit))
+        fit = without_group(search, fit, group)
+    return simulated_model(sim, export_beside_module(sim, search, fit, fit))
 
 
 def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> tuple[Array, Array, Array]:
@@ -66,7 +66,7 @@ def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> 
     import mujoco
 
     model, joints = arm.model, list(arm.joints)
-    recording = slice_rows(recording, commanded(recording, longest))
+    recording = slice_rows(recording, commanded_rows(recording, longest))
     given, rows = recording.position_command, len(recording.t)
     assert given is not None
     if not rows:
@@ -113,22 +113,22 @@ def replay_rms(
     gains = gains or [1.0] * len(recordings)
     apart = apart or [np.zeros(len(recording.t), bool) for recording in recordings]
     for recording, gain, left_out in zip(recordings, gains, apart, strict=True):
-        part = commanded(recording, longest)
+        part = commanded_rows(recording, longest)
         if np.diff(recording.t[part]).sum() < 2.0 * OPENING_S:
             continue
         t, positions, measured = replay(arm.with_gain(gain), recording, longest)
-        gap = (positions - measured)[judged(t, left_out[part])]
+        gap = (positions - measured)[judged_rows(t, left_out[part])]
         total += np.nansum(gap**2, axis=0)
         count += np.isfinite(gap).sum(0)
     return np.asarray(np.sqrt(total / np.where(count > 0, count, np.nan)))
 
 
-def judged(t: Array, left_out: Mask) -> Mask:
+def judged_rows(t: Array, left_out: Mask) -> Mask:
     """Replayed rows that are judged, (K,): those after the opening that are not left out."""
     return np.asarray(t - t.min(initial=np.inf) >= OPENING_S) & ~left_out
 
 
-def commanded(recording: Recording, longest: float = LONGEST_S) -> slice:
+def commanded_rows(recording: Recording, longest: float = LONGEST_S) -> slice:
     """Rows of a recording from the first at which all joints are commanded to the first at which one is not, at most
     `longest` [s] later."""
     assert recording.position_command is not None

@@ -23,9 +23,9 @@ from sim_gap.position_gap.columns import UNIT
 from sim_gap.position_gap.doubt import LEAST_FREEDOM, Other
 from sim_gap.position_gap.fit import LoopFit, coordinate
 from sim_gap.position_gap.judge import rms_on
-from sim_gap.position_gap.parameters import FARTHEST, PARAMETERS, moved, relative
+from sim_gap.position_gap.parameters import FARTHEST, PARAMETERS, relative_step, step_parameter
 from sim_gap.position_gap.search import LoopSearch
-from sim_gap.position_gap.sound import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
+from sim_gap.position_gap.sound_arm import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
 from sim_gap.position_gap.training.jackknife import jackknifed, recordings_or_thirds, terms_of
 from sim_gap.position_gap.training.unreached_limits import LIMITS, Unreached
 
@@ -119,7 +119,7 @@ def covariance(search: LoopSearch, fit: LoopFit) -> Covariance:
 
     It counts how far they would move if all that may be off in a sound arm were fitted beside them.
     """
-    free = freed(search, fit)
+    free = free_all(search, fit)
     terms = terms_of(search, free)
     known = _stated(search, fit, terms.names)
     inverse = np.linalg.inv(terms.squares.sum(0) + known)
@@ -160,7 +160,7 @@ def covariance_within(search: LoopSearch, fit: LoopFit) -> Covariance:
     return Covariance(terms.names, matrix + _systematic(search, fit, terms.names))
 
 
-def freed(search: LoopSearch, fit: LoopFit) -> LoopFit:
+def free_all(search: LoopSearch, fit: LoopFit) -> LoopFit:
     """The fit with all free that may be off in a sound arm, with the stated values that set the scale of a fitted gain,
     and with the mass moments of all links where something of the whole arm was fitted."""
     open_at = (_open(search, fit, j, own) for j, own in enumerate(errors_of(search)[:-1]))
@@ -220,7 +220,9 @@ def _values(search: LoopSearch, fit: LoopFit, names: Sequence[tuple[int, str]]) 
     """Change of a parameter's own coordinate per relative change of it, (K,)."""
     return np.array(
         [
-            coordinate(fit, search.scales, j, name) if j < 0 else relative(name, fit.point[name][j], search.scales, j)
+            coordinate(fit, search.scales, j, name)
+            if j < 0
+            else relative_step(name, fit.point[name][j], search.scales, j)
             for j, name in names
         ]
     )
@@ -234,7 +236,7 @@ def _besides(search: LoopSearch, names: Sequence[tuple[int, str]]) -> Array:
     return np.diag(np.square(own))
 
 
-def shifted(search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, name: str) -> tuple[Array, Array]:
+def shifts_of(search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, name: str) -> tuple[Array, Array]:
     """Where the other fits have a parameter, from where the fit has it, in its own coordinate, and their odds.
 
     Fits that have no such effect say nothing of its size.
@@ -254,7 +256,7 @@ def undecided_scale(search: LoopSearch, fit: LoopFit, spread: Covariance) -> lis
     out = []
     for j, own in enumerate(fit.active):
         if "kp" in own:
-            shifts, odds = shifted(search, fit, spread, j, "kp")
+            shifts, odds = shifts_of(search, fit, spread, j, "kp")
             within = float(spread.matrix[(at := spread.names.index((j, "kp"))), at])
             share, mean = odds / (1.0 + odds.sum()), float(odds @ shifts) / (1.0 + float(odds.sum()))
             if within + float(share @ shifts**2) - mean**2 > LOOSE**2:
@@ -277,12 +279,12 @@ def interval(
             value, most = float(fit.point[name][joint]), float(limit.levels[limit.weights > 0.0].max())
             return value, limit.least, max(most, value), PARAMETERS[name].unit
     deviation = float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
-    below, above = quantiles(*shifted(search, fit, spread, joint, name), deviation)
+    below, above = quantiles(*shifts_of(search, fit, spread, joint, name), deviation)
     if joint < 0:
         value, (least, most) = float(fit.point[name][0]), search.data.ranges[name]
         return value, max(value + below, least), min(value + above, most), UNIT[name.partition(".")[2]]
     value = float(fit.point[name][joint])
-    low, high = (moved(name, value, step, search.scales, joint, ANYTHING) for step in (below, above))
+    low, high = (step_parameter(name, value, step, search.scales, joint, ANYTHING) for step in (below, above))
     return value, low, high, PARAMETERS[name].unit
 
 

@@ -16,7 +16,7 @@ from sim_gap.model.load import urdf_behind
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.search import effect_there
 from sim_gap.position_gap.training.draws import draw
-from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, exported, native_fit
+from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, export_fit, native_fit
 
 
 def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> None:
@@ -54,7 +54,7 @@ def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
 
 def _beside(found: Identified, path: Path) -> dict[Path, str | None]:
     """Text of each file that may stand beside the corrected model; None for those that must not."""
-    model, module, other, made = module_model(path), module_path(path), batched(found), found.beside
+    model, module, other, made = module_model(path), module_path(path), export_batched(found), found.beside
     out: dict[Path, str | None] = {batch_path(path): None if other is None else other.xml, model: None, module: None}
     if made is not None:
         told = [f"{effect} {joint}" for effect, joint, _ in made.effects]
@@ -63,13 +63,13 @@ def _beside(found: Identified, path: Path) -> dict[Path, str | None]:
     return out
 
 
-def batched(found: Identified) -> Exported | None:
+def export_batched(found: Identified) -> Exported | None:
     """The corrected model without PID actuators, fitted again without them; None if it has none."""
     native = found.native
     if not any(effect_there(native, effect, j) for effect in set(NATIVE) - BATCHED for j in range(found.sim.n)):
         return None
     bare = native_fit(found.search, native, BATCHED)
-    return exported(found.sim, found.search, found.fit, bare, BATCHED)
+    return export_fit(found.sim, found.search, found.fit, bare, BATCHED)
 
 
 def batch_path(path: Path) -> Path:

@@ -42,7 +42,7 @@ class Unreached:
     """Lowest level that the training motion admits."""
 
 
-def unreached(search: LoopSearch, fit: LoopFit, vague: Collection[tuple[int, str]] = ()) -> tuple[Unreached, ...]:
+def find_unreached(search: LoopSearch, fit: LoopFit, vague: Collection[tuple[int, str]] = ()) -> tuple[Unreached, ...]:
     """The limits that neither the model states nor the fit has, where some level of them is admitted; and of those that
     the fit has the `vague` ones (joint, name), where no level above it costs much. Nothing of joints that rest."""
     out: list[Unreached] = []
@@ -92,7 +92,7 @@ def draw_limits(limits: Sequence[Unreached], count: int, random: np.random.Gener
     return out
 
 
-def described(limits: Sequence[Unreached], names: Sequence[str]) -> str:
+def describe(limits: Sequence[Unreached], names: Sequence[str]) -> str:
     """The limits and their least values in words; nothing if there is none."""
     told = []
     for name, what, unit in (("limit", "torque", "N·m"), ("slew", "speed of the command", "rad/s")):

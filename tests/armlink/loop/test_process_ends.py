@@ -29,6 +29,8 @@ OUT = 1.2
 """Where the job holds the pendulum: most of its weight pulls [rad]."""
 FASTEST = 0.8 + 1.0
 """Speed of parking, and what may come on top [rad/s]."""
+CAUGHT = 4.0
+"""Where this machine was so busy that the drive missed its host for link.deadline: it let go, and was caught."""
 JOB = """
 import sys
 import numpy as np
@@ -54,12 +56,13 @@ class Pendulum:
 
     def __init__(self, served: serving.Served, path: Path, bus: str) -> None:
         self.served, self.path, self.bus = served, path, bus
-        self.fastest = 0.0
+        self.fastest, self.let_go = 0.0, False
         self.job: subprocess.Popen[str] | None = None
         after_each_step(served.arm.plant, self._look)
 
     def _look(self) -> None:
         self.fastest = max(self.fastest, abs(float(self.served.arm.plant.velocity[0])))
+        self.let_go = self.let_go or (not self.powered and abs(float(self.served.arm.plant.position[0])) > 0.2)
 
     @property
     def powered(self) -> bool:
@@ -76,7 +79,7 @@ class Pendulum:
         )
         assert self.job.stdout is not None
         loop = int(self.job.stdout.readline())
-        self.fastest = 0.0
+        self.fastest, self.let_go = 0.0, False
         return loop
 
     def send(self, number: signal.Signals) -> None:
@@ -87,7 +90,7 @@ class Pendulum:
     def require_parked(self) -> None:
         assert serving.wait_for(lambda: not self.powered, 30.0), "it still has power"
         assert abs(self.served.angle) < 0.1
-        assert self.fastest < FASTEST
+        assert self.fastest < (CAUGHT if self.let_go else FASTEST)
 
 
 @pytest.fixture
@@ -215,7 +218,7 @@ def test_a_daemon_that_is_stopped_parks_the_arm_first(
         [*command, "--store", tmp_path / "records.db"], stderr=log, start_new_session=True
     ) as daemon:  # fmt: skip
         assert serving.wait_for(lambda: pendulum.powered and (tmp_path / "state" / "api.sock").exists(), 60.0)
-        pendulum.fastest = 0.0
+        pendulum.fastest, pendulum.let_go = 0.0, False
         os.killpg(daemon.pid, signal.SIGTERM)
         assert daemon.wait(longest) == 0
     pendulum.require_parked()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
-from sim_gap.attribution.bodies import _turn, lacking, placed
+from sim_gap.attribution.bodies import _turn, numbered_by_body, recordings_with_another_body
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import ABSENT, PreparedSignals, prepare
@@ -36,13 +36,13 @@ def loaded_second() -> EffectEstimate:
 
 
 def test_another_recording_is_numbered_by_whether_the_body_explains_it(loaded_second: EffectEstimate) -> None:
-    heldout = placed(loaded_second, data(signals(LOADED, 3), signals(BARE, 4)))
+    heldout = numbered_by_body(loaded_second, data(signals(LOADED, 3), signals(BARE, 4)))
     assert [s.number for s in heldout.signals] == [2, ABSENT]
 
 
 def test_a_recording_with_a_body_that_no_training_recording_has_is_said() -> None:
     alone = EffectEstimate(ColumnStore(data(signals(BARE, 1, 1))), [Term("torque.offset", 0)])
-    assert lacking(alone, data(signals(LOADED, 3), signals(BARE, 4))) == [0]
+    assert recordings_with_another_body(alone, data(signals(LOADED, 3), signals(BARE, 4))) == [0]
 
 
 def test_a_body_is_turned_if_it_is_as_heavy_and_its_moment_as_large() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_gap.attribution import notes, rollout
-from sim_gap.attribution.causes import ordered, steadiness
+from sim_gap.attribution.causes import order_of_effects, steadiness
 from sim_gap.attribution.diagnosis import Rollout
 from sim_gap.attribution.position_answer import _where
 from sim_gap.attribution.position_notes import running_free
@@ -28,7 +28,7 @@ def test_the_effect_that_takes_most_off_any_joint_comes_first() -> None:
         heldout=SimpleNamespace(layout=SimpleNamespace(n=2)),
         rms=lambda terms: np.ones(2) - sum((falls[term] for term in terms), np.zeros(2)),
     )
-    steps = ordered(SimpleNamespace(terms=(COULOMB, OFFSET)), scorer)
+    steps = order_of_effects(SimpleNamespace(terms=(COULOMB, OFFSET)), scorer)
     assert [step.effect for step in steps] == ["torque.offset", "friction.coulomb"]
     np.testing.assert_allclose(steps[1].before, [0.5, 1.0])
 

@@ -19,7 +19,7 @@ from sim_gap.blind.plant.plant import simulate
 from sim_gap.blind.plant.sensors import _stays_behind, record
 from sim_gap.blind.recipe import CaseRecipe
 from sim_gap.blind.scene import Scene
-from sim_gap.blind.true_arm import Log, PlantRun, sound
+from sim_gap.blind.true_arm import Log, PlantRun, sound_arm
 
 ALL = {
     "link.mass_moment",
@@ -67,7 +67,9 @@ def no_effect() -> tuple[PlantRun, Log]:
     random = np.random.default_rng(3)
     arm = draw_arm(random, 5)
     scene = Scene(arm, trajectory(("sines",), 8.0, limits(5), random))
-    run = PlantRun(sound(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 7)
+    run = PlantRun(
+        sound_arm(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 7
+    )
     return run, simulate([run])[0]
 
 
@@ -120,7 +122,7 @@ def test_a_run_is_the_same_whoever_its_neighbours_are(no_effect: tuple[PlantRun,
     arm = draw_arm(random, 7)
     scene = Scene(arm, trajectory(("points",), 2.0, limits(7), random))
     other = PlantRun(
-        sound(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 1
+        sound_arm(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 1
     )
     beside = simulate([short, other])[0]
     for name in ("position", "torque", "motor", "command"):
@@ -176,7 +178,7 @@ def test_a_short_motion_from_point_to_point_moves_and_comes_back() -> None:
 def _bristles(coulomb: float) -> Bristles:
     random = np.random.default_rng(0)
     arm = draw_arm(random, 3)
-    truth = sound(arm, np.full(3, 10.0), random)
+    truth = sound_arm(arm, np.full(3, 10.0), random)
     truth.coulomb[:], truth.viscous[:] = coulomb, 0.0
     return Bristles([truth], np.full((1, 3), 0.1), 5e-4)
 

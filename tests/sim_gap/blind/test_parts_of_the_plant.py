@@ -12,7 +12,7 @@ from sim_gap.blind.plant.controller import FINE, ServoLaw, ServoRun, Servos
 from sim_gap.blind.plant.drive import STIFFEST, Bristles, PlantDrives
 from sim_gap.blind.plant.sensors import record
 from sim_gap.blind.servo_cases import ServoRecipe, draw, recorded
-from sim_gap.blind.true_arm import Log, TrueArm, sound
+from sim_gap.blind.true_arm import Log, TrueArm, sound_arm
 
 STEP = 5e-4
 """Of the plant [s]."""
@@ -20,7 +20,7 @@ STEP = 5e-4
 
 def truth(rated: float = 10.0) -> TrueArm:
     random = np.random.default_rng(0)
-    return sound(draw_arm(random, 3), np.full(3, rated), random)
+    return sound_arm(draw_arm(random, 3), np.full(3, rated), random)
 
 
 def test_a_drive_with_a_lag_follows_a_step_by_all_but_one_eth_in_that_time() -> None:

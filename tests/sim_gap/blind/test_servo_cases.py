@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from armlink.recording.files import load_recording
-from sim_gap.blind.score import score_positions
+from sim_gap.blind.position_score import score_positions
 from sim_gap.blind.servo_cases import ServoRecipe, make_cases, recipes
 from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO
 from sim_gap.position_gap.training.replay import Simulated, replay_rms

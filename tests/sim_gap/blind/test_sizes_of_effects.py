@@ -8,7 +8,7 @@ import pytest
 
 from sim_gap.blind import recipe
 from sim_gap.blind.effects import actuator, friction, torque, transmission
-from sim_gap.blind.effects.drawn import Drawn
+from sim_gap.blind.effects.drawn_effect import DrawnEffect
 from sim_gap.blind.recipe import OTHER_PAIR, CaseRecipe
 from sim_gap.blind.servo_effects import integral
 from sim_gap.blind.tables import _percent
@@ -142,8 +142,8 @@ def test_a_single_effect_is_kept_whatever_arm_is_drawn(hopeless: list[tuple[str,
 def test_of_several_effects_a_payload_counts_as_one_of_the_last_link(monkeypatch: pytest.MonkeyPatch) -> None:
     """Slow motion cannot separate it from a mass moment of that link; it can from one of another link."""
 
-    def drawn(effect: str, joint: str) -> Drawn:
-        return Drawn(effect, {joint: {}}, lambda true: None)
+    def drawn(effect: str, joint: str) -> DrawnEffect:
+        return DrawnEffect(effect, {joint: {}}, lambda true: None)
 
     arm = SimpleNamespace(arm=SimpleNamespace(names=("joint_1", "joint_2")))
     for joint, found in (("joint_2", False), ("joint_1", True)):

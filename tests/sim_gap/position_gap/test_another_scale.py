@@ -9,7 +9,7 @@ from servo_arm import model_text, record
 
 from sim_gap.model.load import load_model
 from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
-from sim_gap.position_gap.doubt import at_other_scales, settled
+from sim_gap.position_gap.doubt import fits_at_other_scales, settle
 from sim_gap.position_gap.fit import LoopFit, improve
 from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.windows import windows_of
@@ -35,24 +35,24 @@ def stated_too_heavy() -> tuple[LoopSearch, LoopFit]:
 @pytest.mark.long
 def test_rotors_that_are_stated_too_heavy_are_found(stated_too_heavy) -> None:
     search, fit = stated_too_heavy
-    other = min(at_other_scales(search, fit), key=lambda each: search.score(each).sum())
+    other = min(fits_at_other_scales(search, fit), key=lambda each: search.score(each).sum())
     assert other.point["armature"] == pytest.approx([ROTOR, ROTOR], rel=0.2)
     assert other.point["kp"] == pytest.approx([GAIN, GAIN], rel=0.05)
     assert (search.score(other) < search.score(fit)).all()
-    found, _ = settled(search, fit, lambda stage: None)
+    found, _ = settle(search, fit, lambda stage: None)
     assert all("armature" in own for own in found.active)
 
 
 def test_rotors_that_are_right_stay_as_stated() -> None:
-    found, _ = settled(*fitted_with(ROTOR), lambda stage: None)
+    found, _ = settle(*fitted_with(ROTOR), lambda stage: None)
     assert not any("armature" in own for own in found.active)
 
 
 def test_without_stated_rotors_or_with_them_withheld_there_is_no_other_scale(stated_too_heavy) -> None:
     search, fit = stated_too_heavy
     withheld = replace(search, excluded=frozenset({"actuator.rotor_inertia"}))
-    assert list(at_other_scales(withheld, fit)) == []
+    assert list(fits_at_other_scales(withheld, fit)) == []
     weightless = replace(search, nominal={**search.nominal, "armature": np.zeros(2)})
-    assert list(at_other_scales(weightless, fit)) == []
+    assert list(fits_at_other_scales(weightless, fit)) == []
     known = replace(fit, active=tuple((*own, "armature") for own in fit.active))
-    assert list(at_other_scales(search, known)) == []
+    assert list(fits_at_other_scales(search, known)) == []

@@ -12,7 +12,7 @@ from sim_gap.attribution.diagnose import diagnose
 from sim_gap.model.load import load_model
 from sim_gap.position_gap.controller import nominal_controller, nominal_point
 from sim_gap.position_gap.fit import LoopFit, evaluate
-from sim_gap.position_gap.search import LEAST_COUNT, balanced
+from sim_gap.position_gap.search import LEAST_COUNT, balance
 from sim_gap.position_gap.windows import Windows, windows_of
 
 GAIN, BRAKE, GEAR = 15.0, 0.8, 0.01
@@ -47,22 +47,22 @@ def test_both_kinds_of_windows_count_as_much_where_a_swing_leaves_more(swinging)
     held, free = left(data, fit, off)
     assert free[0] > 4.0 * held[0]
     assert free[1] < held[1]
-    same = left(balanced(data, fit), fit, off)
+    same = left(balance(data, fit), fit, off)
     np.testing.assert_allclose(same[:, 0], held[0], rtol=1e-9)
     np.testing.assert_array_equal(same[:, 1], (held[1], free[1]))
-    np.testing.assert_array_equal(balanced(data).weight > 0.0, data.weight > 0.0)
-    assert (balanced(data).weight[:, off] <= data.weight[:, off]).all()
+    np.testing.assert_array_equal(balance(data).weight > 0.0, data.weight > 0.0)
+    assert (balance(data).weight[:, off] <= data.weight[:, off]).all()
 
 
 def test_servos_that_are_never_off_or_always_change_nothing(swinging) -> None:
     data, fit = swinging
     on = replace(data, served=np.ones_like(data.served))
-    assert balanced(on, fit) is on
-    never = balanced(replace(data, served=np.zeros_like(data.served)), fit)
+    assert balance(on, fit) is on
+    never = balance(replace(data, served=np.zeros_like(data.served)), fit)
     np.testing.assert_array_equal(never.weight, data.weight)
     perfect = replace(data, measured=data.measured + 100.0 * (data.served.mean(0) < 0.5))
     off = data.served.mean(0) < 0.5
-    assert balanced(perfect, fit).weight[:, off].max() == pytest.approx(LEAST_COUNT)
+    assert balance(perfect, fit).weight[:, off].max() == pytest.approx(LEAST_COUNT)
 
 
 @pytest.mark.long

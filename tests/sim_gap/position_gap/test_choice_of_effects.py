@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from servo_arm import fitted
 
-from sim_gap.position_gap.doubt import Other, _tail, plainest, settled
+from sim_gap.position_gap.doubt import Other, _tail, plainest_fit, settle
 from sim_gap.position_gap.fit import LoopFit, improve
-from sim_gap.position_gap.search import PRICE, LoopSearch, effect_there, taken_out, with_effect
+from sim_gap.position_gap.search import PRICE, LoopSearch, effect_there, with_effect, without_group
 from sim_gap.position_gap.training.draws import draw
 from sim_gap.position_gap.training.spread import (
     Covariance,
@@ -52,7 +52,7 @@ def test_one_recording_says_nothing_of_others() -> None:
 def test_an_effect_that_the_arm_does_not_have_is_taken_out_and_friction_stays(several) -> None:
     search, fit = several
     more = improve(search.data, with_effect(search, fit, "transmission.spring", 1), search.scales)
-    found, others = settled(search, more, quiet)
+    found, others = settle(search, more, quiet)
     assert not effect_there(found, "transmission.spring", 1)
     assert all(effect_there(found, "friction.coulomb", j) for j in (0, 1))
     likely = {each.group: each.likely for each in others}
@@ -65,23 +65,23 @@ def test_a_payload_that_the_arm_does_not_have_is_compared_with_the_joints_own_ef
     names = ("payload.mass", "payload.x", "payload.z")
     point = {**fit.point, **{name: np.zeros(2) for name in names}}
     heavy = improve(search.data, replace(fit, point=point, shared=names, rms=None), search.scales)
-    found, others = settled(search, heavy, quiet)
+    found, others = settle(search, heavy, quiet)
     assert found.shared == ()
     assert [each.likely < 0.5 for each in others if each.group == ("link.payload", ())] == [True]
 
 
 def test_the_plainest_choice_has_gain_and_friction_alone_wherever_there_is_more(several) -> None:
     search, fit = several
-    assert not [*plainest(search, fit)]
+    assert not [*plainest_fit(search, fit)]
     more = fit.with_values(spring=np.array([0.0, 0.2]), offset=np.array([0.0, 0.3]))
     more = replace(more, active=(("kp",), (*fit.active[1], "spring", "offset")), rms=None)
-    (plain,) = plainest(search, more)
+    (plain,) = plainest_fit(search, more)
     assert plain.active[0] == ("kp",)
     assert {*plain.active[1]} == {"kp", "coulomb", "viscous"}
     assert (plain.point["spring"][1], plain.point["offset"][1]) == (0.0, 0.0)
     np.testing.assert_allclose(plain.rms[1], fit.rms[1], rtol=0.05)
     loaded = replace(fit.with_values(**{"payload.mass": np.full(2, 0.3)}), shared=("payload.mass",), rms=None)
-    (plain,) = plainest(search, loaded)
+    (plain,) = plainest_fit(search, loaded)
     assert plain.shared == ()
     assert plain.point["payload.mass"][0] == 0.0
 
@@ -89,7 +89,7 @@ def test_the_plainest_choice_has_gain_and_friction_alone_wherever_there_is_more(
 def test_the_plainest_choice_has_nothing_that_is_withheld(several) -> None:
     search, fit = several
     more = replace(fit, active=((*fit.active[0], "asymmetry"), fit.active[1]), rms=None)
-    (plain,) = plainest(replace(search, excluded=frozenset({"friction.viscous"})), more)
+    (plain,) = plainest_fit(replace(search, excluded=frozenset({"friction.viscous"})), more)
     assert {*plain.active[0]} == {"kp", "coulomb"}
     assert plain.point["viscous"][0] == search.nominal["viscous"][0]
 
@@ -120,7 +120,7 @@ def test_an_interval_reaches_what_another_likely_choice_makes_of_a_gain(several)
 
 def test_an_effect_in_doubt_is_absent_from_its_share_of_the_draws(several) -> None:
     search, fit = several
-    smooth = taken_out(search, fit, ("friction.coulomb", (0,)))
+    smooth = without_group(search, fit, ("friction.coulomb", (0,)))
     others = alternatives([Other(("friction.coulomb", (0,)), smooth, 0.3)])
     found = Covariance([(0, "coulomb"), (1, "coulomb")], np.diag([1e-6, 1e-6]), others=others)
     rows = draw(search, fit, found, 400, seed=2)

@@ -121,7 +121,7 @@ def test_what_no_recording_shows_at_a_stiff_joint_comes_after_what_matters(monke
         gap = np.array([gaps[group]]).T
         return SimpleNamespace(groups=tuple(g for g in fit.groups if g != group), rms=fit.rms + gap)
 
-    monkeypatch.setattr(judge, "taken_out", taken_out)
+    monkeypatch.setattr(judge, "without_group", taken_out)
     monkeypatch.setattr(judge, "groups_of", lambda fit, search: [*gaps])
     monkeypatch.setattr(judge, "improve", lambda data, fit, scales, iterations: fit)
     monkeypatch.setattr(judge, "_rms", lambda data, fit: fit.rms)

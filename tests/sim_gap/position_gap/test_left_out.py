@@ -4,12 +4,12 @@ import numpy as np
 from servo_arm import fitted
 
 from sim_gap.position_gap.training import bands
-from sim_gap.position_gap.training.jackknife import gaps_left_out, left_out
+from sim_gap.position_gap.training.jackknife import gaps_left_out, leave_out
 
 
 def test_each_recording_is_left_out() -> None:
     search, fit = fitted(0.15, 0.35)
-    others = left_out(search, fit)
+    others = leave_out(search, fit)
     assert (others.groups == search.data.recording).all()
     assert len(others.fits) == 2
     gaps = gaps_left_out(search, others)
@@ -21,7 +21,7 @@ def test_each_recording_is_left_out() -> None:
 
 def test_of_a_single_recording_thirds_are_left_out() -> None:
     search, fit = fitted(0.2)
-    others = left_out(search, fit)
+    others = leave_out(search, fit)
     assert len(others.fits) == len(set(others.groups.tolist())) == 3
     assert gaps_left_out(search, others).shape == search.data.measured.shape
 

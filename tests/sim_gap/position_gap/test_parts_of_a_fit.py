@@ -9,7 +9,7 @@ import pytest
 from servo_arm import model_text, record
 
 from armlink.recording.recording import Recording
-from sim_gap.effects.base import tilted
+from sim_gap.effects.base import tilt_gravity
 from sim_gap.model.load import load_model
 from sim_gap.position_gap import judge, rivals, selection
 from sim_gap.position_gap import search as edits
@@ -17,14 +17,14 @@ from sim_gap.position_gap.columns import shared_effects, with_columns
 from sim_gap.position_gap.controller import _from_grid, nominal_controller, nominal_point, scales_of
 from sim_gap.position_gap.fit import LoopFit, batch, coordinate, evaluate, improve, jacobian, residuals
 from sim_gap.position_gap.identify import _frozen, not_worse
-from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, WITH_TORQUE, Scales, relative
+from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, WITH_TORQUE, Scales, relative_step
 from sim_gap.position_gap.search import PRICE, LoopSearch, level_of
 from sim_gap.position_gap.selection import _explained, _shared_round, ranked, select
 from sim_gap.position_gap.simulate import simulate
 from sim_gap.position_gap.tracks import held_command
 from sim_gap.position_gap.training import export, jackknife, spread, training_files
 from sim_gap.position_gap.training import replay as replays
-from sim_gap.position_gap.windows import WARM_S, Windows, of_windows, thinned_moving, windows_of
+from sim_gap.position_gap.windows import WARM_S, Windows, choose_windows, thin_moving, windows_of
 
 TEXT = model_text(kp=15.0, friction=0.2)
 SMOOTH = model_text(kp=3.0, friction=0.0)
@@ -134,7 +134,7 @@ def test_slopes_add_up_to_that_by_the_common_scale_of_all_torques(data: Windows)
     gaps = residuals(data, batch([fit.point, scaled]))
     for j in range(2):
         expected = (gaps[1] - gaps[0])[:, j] / 0.01
-        shares = [relative(name, fit.point[name][j], scales, j) if name in WITH_TORQUE else 0.0 for name in names]
+        shares = [relative_step(name, fit.point[name][j], scales, j) if name in WITH_TORQUE else 0.0 for name in names]
         np.testing.assert_allclose(np.tensordot(shares, slopes[j], 1), expected, atol=1e-12)
 
 
@@ -151,15 +151,15 @@ def test_a_parameter_at_its_highest_value_has_a_slope_too(data: Windows) -> None
 def test_a_joint_that_moves_in_few_windows_moves_in_one_that_is_fitted(data: Windows) -> None:
     """Of a joint that rests in all of them anything fits: no gain, and any friction."""
     count = 40
-    many = replace(of_windows(data, np.zeros(count, int)), recording=np.arange(count))
+    many = replace(choose_windows(data, np.zeros(count, int)), recording=np.arange(count))
     still = np.ones(count)
     still[7] = 0.0
     speed = many.v.copy()
     speed[:, 1] *= 0.1 * still + (1.0 - still)
-    chosen = thinned_moving(replace(many, v=speed), 4)
+    chosen = thin_moving(replace(many, v=speed), 4)
     assert chosen.recording.tolist() == [0, 7, 13, 26, 39]
-    assert thinned_moving(many, 4).recording.tolist() == [0, 13, 26, 39]
-    assert thinned_moving(many, count) is many
+    assert thin_moving(many, 4).recording.tolist() == [0, 13, 26, 39]
+    assert thin_moving(many, count) is many
 
 
 def test_a_joint_that_is_left_worse_than_by_the_model_keeps_the_models_values(data: Windows) -> None:
@@ -197,7 +197,7 @@ def test_what_the_whole_arm_has_stays_where_a_joint_takes_the_models_values(data
 
 def test_a_tilt_turns_the_base_about_its_own_axes() -> None:
     """As it does where a torque is recorded: about the base's x and y, if gravity is along its z."""
-    turned = tilted(np.array([0.0, 0.0, -9.81]), np.array([0.0, 0.1]))
+    turned = tilt_gravity(np.array([0.0, 0.0, -9.81]), np.array([0.0, 0.1]))
     real = TEXT.replace("<option ", f'<option gravity="{" ".join(map(str, turned))}" ')
     sim = load_model(mujoco.MjModel.from_xml_string(TEXT))
     data = with_columns(windows_of(sim.arm, [record(real, 1, 14.0)], ["run"]))
@@ -290,7 +290,7 @@ def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -
     monkeypatch.setattr(edits, "shared_effects", lambda arm: {"base.tilt": ("tilt.x", "tilt.y"), "other": ("z",)})
     names = ("tilt.x", "tilt.y", "z")
     fit = LoopFit({name: np.array([0.3]) for name in (*names, "kp")}, ((),), names)
-    bare = edits.taken_out(SimpleNamespace(data=SimpleNamespace(arm=None)), fit, ("base.tilt", ()))
+    bare = edits.without_group(SimpleNamespace(data=SimpleNamespace(arm=None)), fit, ("base.tilt", ()))
     assert {name: float(x[0]) for name, x in bare.point.items()} == {"tilt.x": 0.0, "tilt.y": 0.0, "z": 0.3, "kp": 0.3}
     assert bare.shared == ("z",)
 

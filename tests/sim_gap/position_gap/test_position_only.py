@@ -17,12 +17,12 @@ from sim_gap.attribution.position_answer import _lowers, _verdict
 from sim_gap.attribution.position_notes import _beyond, _faster, _released
 from sim_gap.position_gap.identify import gain_scales
 from sim_gap.position_gap.training.bands import band
-from sim_gap.position_gap.training.export import with_module
-from sim_gap.position_gap.training.jackknife import left_out
+from sim_gap.position_gap.training.export import export_with_module
+from sim_gap.position_gap.training.jackknife import leave_out
 from sim_gap.position_gap.training.replay import Simulated, replay_rms
 from sim_gap.position_gap.training.training_files import (
     batch_path,
-    batched,
+    export_batched,
     write_actuators,
     write_exported,
     write_samples,
@@ -137,7 +137,7 @@ def test_the_written_model_moves_like_the_arm(answer, tmp_path: Path) -> None:
     before = replay_rms(Simulated(mujoco.MjModel.from_xml_string(model_text(kp=120.0, friction=0.0)), (0, 1)), other)
     assert (replay_rms(Simulated(closed, (0, 1)), other) < 0.3 * before).all()
     assert answer.to_json()["rollout"]["closed_loop"] is True
-    assert batched(answer.internals) is None
+    assert export_batched(answer.internals) is None
     assert not batch_path(tmp_path / "closed.xml").exists()
 
 
@@ -146,7 +146,7 @@ def test_a_model_with_a_slew_limit_is_written_without_pid_too(answer, tmp_path: 
     found = answer.internals
     limited = found.native.with_values(slew=np.array([1.5, np.inf]))
     limited = replace(limited, active=(("kp", "slew", "coulomb", "viscous"), limited.active[1]))
-    other = batched(replace(found, native=limited))
+    other = export_batched(replace(found, native=limited))
     assert other is not None
     model = mujoco.MjModel.from_xml_string(other.xml)
     assert not (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_PID).any()
@@ -157,7 +157,7 @@ def test_a_module_is_written_with_its_model_and_removed_with_it(answer, tmp_path
     found = answer.internals
     rubs = found.fit.with_values(load=np.array([0.3, 0.0]))
     rubs = replace(rubs, active=((*rubs.active[0], "load"), rubs.active[1]))
-    beside = with_module(found.sim, found.search, rubs)
+    beside = export_with_module(found.sim, found.search, rubs)
     write_exported(replace(found, beside=beside), tmp_path / "closed.xml")
     text = (tmp_path / "closed_effects.xml").read_text()
     assert text.startswith("<!-- To be used with closed_effects.py, which applies:\n  friction.load shoulder\n-->")
@@ -218,7 +218,7 @@ def test_the_band_holds_its_share_of_other_motion(answer) -> None:
     assert told["share"] == 0.9
     assert all(0.8 < share <= 0.98 for share in told["holds"])
     found = answer.internals
-    others = left_out(found.search, found.fit)
+    others = leave_out(found.search, found.fit)
     known = band(found.search, found.fit, replace(found.spread, limits=()), others, found.heldout)
     assert ((known.width > 0.0) & (known.width < 0.03 * answer.heldout_before)).all()
     assert all(1.0 < width / own < 25.0 for width, own in zip(told["half_width"], known.width, strict=True))

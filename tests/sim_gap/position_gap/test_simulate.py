@@ -8,7 +8,7 @@ from sim_gap.model.solver_friction import creep_speeds
 from sim_gap.position_gap.controller import nominal_controller, nominal_point
 from sim_gap.position_gap.fit import LoopFit, batch, evaluate, jacobian
 from sim_gap.position_gap.judge import joint_rms
-from sim_gap.position_gap.parameters import Scales, moved
+from sim_gap.position_gap.parameters import Scales, step_parameter
 from sim_gap.position_gap.rivals import _like
 from sim_gap.position_gap.simulate import simulate
 from sim_gap.position_gap.training.export import POSITION_INPUT
@@ -168,5 +168,5 @@ def test_a_spring_does_not_push_away_from_its_rest() -> None:
     """As in the fit of torques; a negative one fits the range of one recording and nothing beyond."""
     data, _ = _windows()
     ones = np.ones(data.joints)
-    assert moved("spring", 0.1, -50.0, Scales(ones, ones, ones, ones), 0) == 0.0
-    assert moved("offset", 0.1, -50.0, Scales(ones, ones, ones, ones), 0) < 0.0
+    assert step_parameter("spring", 0.1, -50.0, Scales(ones, ones, ones, ones), 0) == 0.0
+    assert step_parameter("offset", 0.1, -50.0, Scales(ones, ones, ones, ones), 0) < 0.0

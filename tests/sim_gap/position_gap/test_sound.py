@@ -10,7 +10,7 @@ from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.identify import _margin, noise_floor
 from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.search import LoopSearch
-from sim_gap.position_gap.sound import probable, sound
+from sim_gap.position_gap.sound_arm import probable, split_gap
 from sim_gap.position_gap.windows import windows_of
 
 NOMINAL = model_text(kp=40.0, friction=0.05)
@@ -28,7 +28,7 @@ def split(model, real: str):
     search = LoopSearch(train, scales_of(train), nominal, noise_floor(train))
     fit = evaluate(train, LoopFit(nominal, ((),) * 2))
     margin = _margin(search, fit)
-    return sound(search, heldout, margin), margin, rms_on(train, fit)
+    return split_gap(search, heldout, margin), margin, rms_on(train, fit)
 
 
 def test_errors_of_a_hundredth_are_those_of_a_sound_arm(model) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from servo_arm import JOINTS, fitted
 
-from sim_gap.position_gap import sound
+from sim_gap.position_gap import sound_arm
 from sim_gap.position_gap.fit import LoopFit, batch, improve, residuals
 from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.training import spread
@@ -60,8 +60,8 @@ def test_the_jackknife_is_that_of_the_text_books() -> None:
 
 def test_of_an_arm_that_feels_no_weight_ratios_are_told_better_than_their_scale(weightless, monkeypatch) -> None:
     """Where commands are in time: what is not known of that is not known of the ratio of gain and damping, a time."""
-    monkeypatch.setattr(sound, "LATE_S", 1e-6)
-    monkeypatch.setattr(sound, "APART_S", 1e-6)
+    monkeypatch.setattr(sound_arm, "LATE_S", 1e-6)
+    monkeypatch.setattr(sound_arm, "APART_S", 1e-6)
     search, fit = weightless
     found = covariance(search, fit)
     for j in (0, 1):
@@ -145,7 +145,7 @@ def test_a_payload_is_no_surer_than_the_masses_of_the_model(several) -> None:
     assert [name for j, name in found.names if j < 0] == list(names)
     own = float(np.linalg.norm(search.data.arm.inertial[-1, 1:4]))
     at = found.names.index((-1, "payload.x"))
-    assert np.sqrt(found.matrix[at, at]) > 0.9 * sound.ERROR * own
+    assert np.sqrt(found.matrix[at, at]) > 0.9 * sound_arm.ERROR * own
 
 
 def test_what_a_sound_arm_may_have_beside_an_effect_widens_its_interval(several) -> None:

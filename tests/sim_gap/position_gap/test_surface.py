@@ -13,9 +13,9 @@ from servo_arm import above_a_table, model_text, record
 from armlink.recording.recording import Recording
 from sim_gap.attribution.position_notes import _touching
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.surface import RELEASE_S, Surface, find_surface, touched
+from sim_gap.position_gap.surface import RELEASE_S, Surface, find_surface, rows_of_touch
 from sim_gap.position_gap.training import replay as replays
-from sim_gap.position_gap.windows import thinned, windows_of
+from sim_gap.position_gap.windows import thin, windows_of
 
 HEIGHT, TIP = -0.2, np.array([0.16, 0.0, 0.0])
 REAL = model_text(kp=15.0, friction=0.25)
@@ -38,7 +38,7 @@ def test_the_table_and_the_moments_at_it_are_found(pressing) -> None:
     assert found.joints == (0, 1)
     for recording in pressing:
         at_it = tip_height(recording.position) < HEIGHT + 0.002
-        rows = touched(found, SIM.arm, recording)
+        rows = rows_of_touch(found, SIM.arm, recording)
         assert 0.02 < at_it.mean() < 0.3
         assert rows[at_it].mean() > 0.9
         about = np.convolve(at_it, np.ones(51), "same") > 0
@@ -84,17 +84,17 @@ def test_the_moments_before_and_after_a_touch_are_left_out_too() -> None:
     t = np.arange(0.0, 4.0, 0.02)
     q = np.zeros((len(t), 2))
     q[100:110, 0] = 1.2
-    rows = np.flatnonzero(touched(surface, SIM.arm, Recording(t=t, position=q)))
+    rows = np.flatnonzero(rows_of_touch(surface, SIM.arm, Recording(t=t, position=q)))
     assert t[100] - t[rows[0]] == pytest.approx(0.5 * RELEASE_S, abs=0.021)
     assert t[rows[-1]] - t[109] == pytest.approx(RELEASE_S, abs=0.021)
-    assert not touched(None, SIM.arm, Recording(t=t, position=q)).any()
+    assert not rows_of_touch(None, SIM.arm, Recording(t=t, position=q)).any()
 
 
 def test_an_arm_that_lies_still_on_it_touches() -> None:
     t = np.arange(0.0, 4.0, 0.02)
     still = np.tile([1.2, 0.1], (len(t), 1))
     surface = Surface(1, TIP, float(tip_height(still)[0]), (0, 1))
-    assert touched(surface, SIM.arm, Recording(t=t, position=still)).all()
+    assert rows_of_touch(surface, SIM.arm, Recording(t=t, position=still)).all()
 
 
 def test_an_arm_that_always_lies_in_one_pose_on_it_is_found_and_left_out() -> None:
@@ -109,7 +109,7 @@ def test_an_arm_that_always_lies_in_one_pose_on_it_is_found_and_left_out() -> No
     recording = Recording(t=t, position=q, position_command=q - deep * lever + jitter)
     found = find_surface(SIM.arm, [recording])
     assert found is not None
-    assert touched(found, SIM.arm, recording)[lies].all()
+    assert rows_of_touch(found, SIM.arm, recording)[lies].all()
 
 
 def test_surface_and_windows_do_not_depend_on_the_order_of_recordings(pressing) -> None:
@@ -122,14 +122,14 @@ def test_surface_and_windows_do_not_depend_on_the_order_of_recordings(pressing) 
     )
     np.testing.assert_array_equal(ahead.measured, back.measured)
     np.testing.assert_array_equal(ahead.recording, 2 - back.recording)
-    np.testing.assert_array_equal(thinned(ahead, 5).measured, thinned(back, 5).measured)
+    np.testing.assert_array_equal(thin(ahead, 5).measured, thin(back, 5).measured)
 
 
 def test_what_touches_does_not_count_in_windows(pressing) -> None:
     surface = find_surface(SIM.arm, pressing)
     labels = ["one", "two"]
     all_of_it, without = (windows_of(SIM.arm, pressing, labels, surface=each) for each in (None, surface))
-    share = np.mean([touched(surface, SIM.arm, recording).mean() for recording in pressing])
+    share = np.mean([rows_of_touch(surface, SIM.arm, recording).mean() for recording in pressing])
     left_out = 1.0 - without.weight.sum() / all_of_it.weight.sum()
     assert left_out == pytest.approx(share, abs=0.05)
 

@@ -19,13 +19,13 @@ from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.training.export import (
     IN_MODULE,
     Exported,
-    exported,
+    export_fit,
+    export_with_module,
     native_fit,
-    wide_enough,
-    widened,
-    with_module,
+    widen_ranges,
+    widened_joints,
 )
-from sim_gap.position_gap.training.replay import Simulated, commanded, replay, replay_rms, simulated
+from sim_gap.position_gap.training.replay import Simulated, commanded_rows, replay, replay_rms, simulated_model
 from sim_gap.position_gap.windows import windows_of
 
 GAIN, LOAD = 15.0, 0.4
@@ -55,7 +55,7 @@ def loaded(sim: SimModel, beside: Exported) -> Simulated:
 def test_the_module_holds_friction_under_load_that_the_model_alone_cannot(made) -> None:
     sim, search, fit = made
     assert fit.point["load"] == pytest.approx([LOAD, LOAD], rel=0.15)
-    beside, alone = with_module(sim, search, fit), exported(sim, search, fit, native_fit(search, fit))
+    beside, alone = export_with_module(sim, search, fit), export_fit(sim, search, fit, native_fit(search, fit))
     assert alone.lines == ("friction.load elbow", "friction.load shoulder")
     assert beside.lines == ()
     assert [(effect, joint) for effect, joint, _ in beside.effects] == [
@@ -63,9 +63,9 @@ def test_the_module_holds_friction_under_load_that_the_model_alone_cannot(made) 
         ("friction.load", "elbow"),
     ]
     with_it, without = (
-        replay_rms(each, [OTHER]) for each in (loaded(sim, beside), simulated(sim, replace(beside, effects=())))
+        replay_rms(each, [OTHER]) for each in (loaded(sim, beside), simulated_model(sim, replace(beside, effects=())))
     )
-    left_alone = replay_rms(simulated(sim, alone), [OTHER])
+    left_alone = replay_rms(simulated_model(sim, alone), [OTHER])
     assert (with_it < 0.7 * left_alone).all()
     assert (with_it < 0.3 * without).all()
     assert (with_it < 2.0 * np.pi / 4096.0).all()  # a count of the arm's encoders
@@ -74,13 +74,13 @@ def test_the_module_holds_friction_under_load_that_the_model_alone_cannot(made) 
 def test_the_model_with_a_module_says_what_neither_holds(made) -> None:
     sim, search, fit = made
     fed = replace(fit.with_values(feed=np.array([0.2, 0.0])), active=((*fit.active[0], "feed"), fit.active[1]))
-    beside = with_module(sim, search, fed)
+    beside = export_with_module(sim, search, fed)
     assert beside.lines == ("controller.feed_forward shoulder",)
     assert "controller.feed_forward shoulder" in beside.xml
 
 
 def test_the_replay_leaves_the_model_and_mujoco_as_they_were(made) -> None:
-    arm = loaded(made[0], with_module(*made))
+    arm = loaded(made[0], export_with_module(*made))
     friction = arm.model.dof_frictionloss.copy()
     replay(arm, OTHER)
     np.testing.assert_array_equal(arm.model.dof_frictionloss, friction)
@@ -90,7 +90,7 @@ def test_the_replay_leaves_the_model_and_mujoco_as_they_were(made) -> None:
 def test_a_fit_without_such_friction_needs_no_module(made) -> None:
     sim, search, fit = made
     bare = replace(fit.with_values(load=np.zeros(2)), active=(("kp", "coulomb", "viscous"),) * 2)
-    assert with_module(sim, search, bare) is None
+    assert export_with_module(sim, search, bare) is None
     assert set(IN_MODULE) == {"friction.stribeck", "friction.load", "friction.asymmetric"}
 
 
@@ -118,7 +118,7 @@ def test_a_spring_is_written_in_the_angles_of_the_file(made, tmp_path: Path, com
     _, search, fit = made
     sim = load_model(written(tmp_path, TEXT.replace("<option", f"{compiler}<option", 1)))
     sprung = fit.with_values(spring=np.array([2.0, 0.0]), offset=np.array([0.6, 0.0]))
-    model = mujoco.MjModel.from_xml_string(exported(sim, search, sprung, sprung).xml)
+    model = mujoco.MjModel.from_xml_string(export_fit(sim, search, sprung, sprung).xml)
     assert model.jnt_stiffness.ravel()[0] == pytest.approx(2.0)
     assert model.qpos_spring[0] == pytest.approx(-0.3)
 
@@ -133,10 +133,10 @@ def test_a_joint_of_the_written_model_goes_as_far_as_the_arm(made, tmp_path: Pat
     text = text.replace('name="elbow" axis', f'name="elbow" range="{-9 * unit} {9 * unit}" limited="true" axis')
     text = text.replace('joint="shoulder" kp', 'joint="shoulder" ctrllimited="true" ctrlrange="-9 0.2" kp')
     sim = load_model(written(tmp_path, text))
-    wide = wide_enough(sim, [OTHER])
-    assert widened(sim) == []
-    assert widened(wide) == [0]
-    kept, free = (simulated(each, exported(each, search, fit, native_fit(search, fit))) for each in (sim, wide))
+    wide = widen_ranges(sim, [OTHER])
+    assert widened_joints(sim) == []
+    assert widened_joints(wide) == [0]
+    kept, free = (simulated_model(each, export_fit(each, search, fit, native_fit(search, fit))) for each in (sim, wide))
     assert free.model.jnt_range[0] == pytest.approx([-9.0, shoulder.max() + 0.01])
     assert free.model.jnt_range[1] == pytest.approx([-9.0, 9.0])
     assert elbow.max() < 9.0
@@ -162,7 +162,7 @@ def test_a_joint_of_the_written_model_goes_as_far_as_the_arm(made, tmp_path: Pat
 def test_a_replay_goes_from_the_first_command_to_the_first_that_is_missing(given, longest, expected) -> None:
     command = np.where(np.array(given, bool)[:, None], 0.1, np.nan) * np.ones(2)
     recording = Recording(t=5.0 + 0.1 * np.arange(6), position=np.zeros((6, 2)), position_command=command)
-    assert commanded(recording, longest) == expected
+    assert commanded_rows(recording, longest) == expected
 
 
 def test_a_recording_that_begins_with_the_servos_off_is_replayed_from_where_they_are_on() -> None:

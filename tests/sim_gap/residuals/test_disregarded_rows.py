@@ -9,7 +9,7 @@ from wrong_arms import Wrong, model, record
 
 from armlink.recording.recording import Recording
 from sim_gap.model.load import load_model
-from sim_gap.residuals.disregarded_rows import fast
+from sim_gap.residuals.disregarded_rows import fast_gaps
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
@@ -28,7 +28,7 @@ def places(recording: Recording, more: np.ndarray):
     torque[:, 1] += more
     made = replace(recording, torque=torque)
     signals = prepare(made, load_model(model()).arm)
-    return fast(ResidualSet((signals,), layout_of([signals])), [made])
+    return fast_gaps(ResidualSet((signals,), layout_of([signals])), [made])
 
 
 def ringing(count: int, hertz: float, damping: float) -> np.ndarray:

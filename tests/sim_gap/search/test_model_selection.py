@@ -12,9 +12,9 @@ from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.model_selection import candidates, refine, with_lost, without_doubtful
+from sim_gap.search.model_selection import candidates, refine, replace_doubtful, restore_lost
 from sim_gap.search.normal_equations import NormalEquations, Weighted
-from sim_gap.search.stepwise import StepwiseSearch
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
 
@@ -36,7 +36,7 @@ def test_a_term_that_leaves_much_gives_way_to_several_simpler_ones_at_once():
     before = StepwiseSearch(normal, [payload(normal), offset])
     assert payload(normal) in before.active
     assert before.leaves_much(payload(normal))
-    after = without_doubtful(before)
+    after = replace_doubtful(before)
     assert after.score < before.score
     assert {term.key for term in after.active} >= {("link.mass_moment", 0), ("link.mass_moment", 1), offset.key}
     assert payload(normal) not in after.active
@@ -45,7 +45,7 @@ def test_a_term_that_leaves_much_gives_way_to_several_simpler_ones_at_once():
 def test_a_term_that_explains_its_rows_stays():
     normal = normal_equations(Wrong(payload=0.5))
     search = StepwiseSearch(normal, [payload(normal)])
-    assert without_doubtful(search) is search
+    assert replace_doubtful(search) is search
 
 
 def test_a_step_that_makes_it_worse_is_undone_and_not_tried_again():
@@ -95,7 +95,7 @@ def test_a_limit_that_got_lost_comes_back_at_the_level_at_which_it_can_exist():
     assert level(refined) <= level(search.active[0])
     assert StepwiseSearch(NormalEquations(search.normal.store, [refined]), [refined]).active == [refined]
     far = Term("torque.saturation", 1, (1e-3 * limit,))
-    _, kept = with_lost(search.normal.store, [far], search.normal.store, [])
+    _, kept = restore_lost(search.normal.store, [far], search.normal.store, [])
     assert [term.key for term in kept] == [far.key]
     assert level(kept[0]) < 0.05 * limit
 
@@ -107,7 +107,7 @@ def test_breakaway_that_got_lost_comes_back_with_the_friction_that_it_adds_to():
     signals = prepare(recording, load_model(model()).arm, "a recording")
     store = ColumnStore(ResidualSet((signals,), layout_of([signals])))
     lost = [Term("friction.coulomb", 1), Term("friction.stribeck", 1, (0.1,))]
-    _, kept = with_lost(store, lost, store, [])
+    _, kept = restore_lost(store, lost, store, [])
     assert {term.key for term in kept} == {term.key for term in lost}
 
 

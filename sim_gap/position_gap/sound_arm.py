@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from gcomp.arrays import Array
 from sim_gap.position_gap.fit import LoopFit, jacobian
 from sim_gap.position_gap.judge import rms_on
-from sim_gap.position_gap.parameters import moved
+from sim_gap.position_gap.parameters import step_parameter
 from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.windows import Windows
 
@@ -33,7 +33,7 @@ LEAST_SHOWN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Sound:
+class SoundGap:
     """The gap of the nominal model beside what small errors of its parameters make, (J,) each [rad]."""
 
     usual: Array
@@ -63,7 +63,7 @@ def errors_of(search: LoopSearch) -> list[dict[str, float]]:
     return [*own, {name: size for name, size in links.items() if name in data.columns}]
 
 
-def sound(search: LoopSearch, heldout: Windows, margin: Array) -> Sound:
+def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
     """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
     sizes = errors_of(search)
     deviations = np.array([size for each in sizes for size in each.values()])
@@ -83,7 +83,7 @@ def sound(search: LoopSearch, heldout: Windows, margin: Array) -> Sound:
     pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
     small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
     explained = all(small) and probable(errors, usually, spread)
-    return Sound(usual, np.maximum(pairs[0][0], pairs[1][0]) * margin, explained)
+    return SoundGap(usual, np.maximum(pairs[0][0], pairs[1][0]) * margin, explained)
 
 
 def probable(errors: Array, usually: Array, spread: Array) -> bool:
@@ -116,7 +116,7 @@ def _fit(search: LoopSearch, sizes: list[dict[str, float]], errors: Array) -> Lo
     left = iter(errors)
     for j, own in enumerate(sizes[:-1]):
         for name, size in own.items():
-            point[name][j] = moved(name, point[name][j], size * next(left), search.scales, j)
+            point[name][j] = step_parameter(name, point[name][j], size * next(left), search.scales, j)
     for name, size in sizes[-1].items():
         point[name] = point[name] + size * next(left)
     return LoopFit(point, ((),) * search.data.joints)

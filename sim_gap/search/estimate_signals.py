@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.base import tilted
-from sim_gap.effects.link import mounted, moved, point
+from sim_gap.effects.base import tilt_gravity
+from sim_gap.effects.link import mount_matrix, move_mass, point_mass
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import Found, PreparedSignals
 from sim_gap.search.term import Term
@@ -25,7 +25,7 @@ STAGES = (("timing.delay", "torque.crosstalk"), ("torque.hysteresis",), ("torque
 
 
 @dataclass(frozen=True, eq=False)
-class About:
+class EstimateSignals:
     signals: PreparedSignals
     shares: dict[Term, Columns]
     """Torque that each term adds to the rows [N·m], (K,) each, exact; together they are the estimate's prediction."""
@@ -54,7 +54,7 @@ class _Parts:
         self.shares[term] = rows
 
 
-def about(read: PreparedSignals, layout: ChannelLayout, values: Values) -> About:
+def signals_about(read: PreparedSignals, layout: ChannelLayout, values: Values) -> EstimateSignals:
     """A recording about an estimate; about nothing, the recording itself."""
     parts = _Parts(read)
     bodies = _bodies(parts, layout, values) if values else read.bodies
@@ -78,7 +78,7 @@ def about(read: PreparedSignals, layout: ChannelLayout, values: Values) -> About
     for term, c in values.items():
         if term not in parts.shares:
             parts.add(term, {row: x @ c for row, x in _columns(s, layout, term).items()})
-    return About(s, parts.shares, *_gains(s, values), tuple(stages))
+    return EstimateSignals(s, parts.shares, *_gains(s, values), tuple(stages))
 
 
 def _stage(term: Term) -> int:
@@ -109,7 +109,7 @@ def _bodies(parts: _Parts, layout: ChannelLayout, values: Values) -> Array:
     ours = {term: c for term, c in values.items() if term.form.signature.side == "link"}
     inertial = arm.inertial.copy()
     for term, c in ours.items():
-        body = mounted(arm.axis[-1], read.mount) @ c if term.effect == "link.payload" else c
+        body = mount_matrix(arm.axis[-1], read.mount) @ c if term.effect == "link.payload" else c
         change = inertial_change(term, body, inertial, read.number)
         if change is not None:
             link = arm.n - 1 if term.effect == "link.payload" else term.place
@@ -120,7 +120,7 @@ def _bodies(parts: _Parts, layout: ChannelLayout, values: Values) -> Array:
     arm = arm.with_inertial(inertial)
     for term, c in ours.items():
         if term.effect == "base.tilt":
-            turned, still = tilted(arm.gravity, c), np.zeros_like(read.q)
+            turned, still = tilt_gravity(arm.gravity, c), np.zeros_like(read.q)
             share = arm.torque(read.q, still, still, turned - arm.gravity)
             arm, torque = replace(arm, gravity=turned), torque + share
             parts.add(term, {(channel, j): share[:, j] for j in range(arm.n)})
@@ -157,16 +157,16 @@ def inertial_change(term: Term, c: Array, inertial: Array, number: int) -> Array
     None for a term that does not change them; zero for a body that recording `number` does not have.
     """
     if term.effect == "link.mass_moment":
-        return np.asarray(moved(inertial[term.place], c) - inertial[term.place])
+        return np.asarray(move_mass(inertial[term.place], c) - inertial[term.place])
     if term.effect == "link.inertia":
         return np.asarray(np.concatenate([np.zeros(4), c]))
     if term.effect == "link.payload":
-        return np.asarray(point(float(c[0]), c[1:]) * term.form.signature.present(term.shape, number))
+        return np.asarray(point_mass(float(c[0]), c[1:]) * term.form.signature.present(term.shape, number))
     return None
 
 
 def _gains(s: PreparedSignals, values: Values) -> tuple[Array, Array, Array]:
-    """How readings of sensor and motor change with the torque: `About.sensor_gain`, `motor_gain`, `motor_slope`."""
+    """How readings of sensor and motor change with the torque: `sensor_gain`, `motor_gain` and `motor_slope`."""
     sensor, motor, slope = np.eye(s.n), np.ones(s.n), np.ones_like(s.q)
     gain = np.ones(s.n)
     for term, c in values.items():

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from gcomp.arrays import Array
 from sim_gap.effects.link import pseudo_inertia
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.search.about import inertial_change
-from sim_gap.search.stepwise import StepwiseSearch
+from sim_gap.search.estimate_signals import inertial_change
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
 Matrix = Callable[[Array], Array]

@@ -24,7 +24,7 @@ Apply = Callable[[TrueArm], None]
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnEffect:
     effect: str
     parameters: dict[str, Values]
     """By joint name (`arm` for the whole arm); named as a diagnosis reports them."""
@@ -57,7 +57,7 @@ class Drawn:
         implied: tuple[str, ...] = (),
         undecided: str = "",
         confused_with: tuple[str, ...] = (),
-    ) -> "Drawn":
+    ) -> "DrawnEffect":
         name = scene.arm.names[joint]
         return cls(effect, {name: values}, apply, nominal, implied, undecided, confused_with)
 
@@ -67,11 +67,11 @@ class Drawn:
         return tuple(name for name in self.parameters if name != "arm")
 
 
-Draw = Callable[[Scene, np.random.Generator], Drawn | None]
+Draw = Callable[[Scene, np.random.Generator], DrawnEffect | None]
 """Draws an effect for the arm of a scene; None if the arm cannot show it."""
 
 
-def replaced(array: Callable[[TrueArm], Array], index: int, value: float) -> Apply:
+def set_entry(array: Callable[[TrueArm], Array], index: int, value: float) -> Apply:
     """An effect that sets one entry of an array."""
 
     def apply(true: TrueArm) -> None:
@@ -80,7 +80,7 @@ def replaced(array: Callable[[TrueArm], Array], index: int, value: float) -> App
     return apply
 
 
-def added(array: Callable[[TrueArm], Array], index: int, value: float) -> Apply:
+def add_to_entry(array: Callable[[TrueArm], Array], index: int, value: float) -> Apply:
     """An effect that adds to one entry of an array."""
 
     def apply(true: TrueArm) -> None:

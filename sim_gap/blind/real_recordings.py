@@ -15,7 +15,7 @@ from armlink.recording.recording import Recording, slice_rows
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.blind.bench import seal, verify, write_answer
 from sim_gap.blind.judge import CONFIDENT
-from sim_gap.blind.score import WITHHELD, answer_name
+from sim_gap.blind.score import WITHHELD, answer_name, share
 
 SCHEMA = "armlink.real-bench/1"
 KNOWN = Path(__file__).with_name("real_arms.yaml")
@@ -104,10 +104,10 @@ def score_real(answers: Mapping[str, Mapping[str, Any]], cases: Sequence[Json]) 
     whole = [row for row in rows if not row["withheld"] and row["first_right"] is not None]
     judged = [row for row in rows if row["verdict"] != "refused"]
     shares = {
-        "right_first": _share([row["first_right"] for row in whole]),
-        "named": _share([not row["lacking"] for row in whole]),
-        "false_confident": _share([bool(row["false"]) for row in judged]),
-        "refused_as_known": _share([row["verdict"] == "refused" for row in rows if row["first_right"] is None]),
+        "right_first": share([row["first_right"] for row in whole]),
+        "named": share([not row["lacking"] for row in whole]),
+        "false_confident": share([bool(row["false"]) for row in judged]),
+        "refused_as_known": share([row["verdict"] == "refused" for row in rows if row["first_right"] is None]),
     }
     met = (shares["right_first"] or 0.0) >= RIGHT_FIRST and (shares["false_confident"] or 0.0) <= FALSE
     return {"schema": SCHEMA, **shares, "meets": met, "cases": rows}
@@ -138,7 +138,3 @@ def _named(causes: Sequence[Mapping[str, Any]], effect: str, bounds: Mapping[str
             values = list(cause["parameters"].values())
             return all(any(low <= v[name]["value"] <= high for v in values) for name, (low, high) in bounds.items())
     return False
-
-
-def _share(flags: Sequence[bool]) -> float | None:
-    return sum(flags) / len(flags) if flags else None

@@ -67,7 +67,7 @@ class StepwiseSearch:
         return terms
 
     def _implausible(self, terms: Sequence[Term]) -> Term | None:
-        return next(impossible(self.normal, terms, self.weighted.fit(terms)[1]), None) if terms else None
+        return next(impossible_terms(self.normal, terms, self.weighted.fit(terms)[1]), None) if terms else None
 
     def accept(self, chosen: list[Term], simpler: bool = False) -> bool:
         """Continue with these terms, unless they are worse than those before; true, for a step was tried.
@@ -232,7 +232,7 @@ class StepwiseSearch:
         return self.active
 
 
-def impossible(normal: NormalEquations, terms: Sequence[Term], coefficients: Array) -> Iterator[Term]:
+def impossible_terms(normal: NormalEquations, terms: Sequence[Term], coefficients: Array) -> Iterator[Term]:
     """Those of the terms that cannot exist with their coefficients of a fit (`Weighted.fit`)."""
     ends = np.cumsum([len(normal.at[term]) for term in terms])
     values = {term.key: piece for term, piece in zip(terms, np.split(coefficients, ends)[:-1], strict=True)}
