@@ -20,9 +20,7 @@ def advice(answer: Diagnosis) -> str:
     if answer.verdict == "unexplained":
         return "Change nothing yet: look at where the gap is, check cabling, payload and model there, and record again."
     if answer.verdict == "ambiguous":
-        return (
-            "Record one more motion that separates the candidates; gap plan makes it of the answer in JSON."
-        )
+        return "Record one more motion that separates the candidates; gap plan makes it of the answer in JSON."
     return "Add these effects to the simulation: with --out-model the diagnosis writes the corrected model."
 
 

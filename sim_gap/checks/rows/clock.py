@@ -146,7 +146,7 @@ def find_dropped(recording: Recording) -> list[Finding]:
     if missing < DROPPED or np.mean(np.abs(periods - whole) < NEAR) < EVEN:
         return []
     evidence = f"{missing:.0%} of the samples are missing, up to {whole.max() - 1.0:.0f} in a row"
-    return [Finding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)]
+    return [Finding("dropped", "t", "all", evidence, "record every message; the gaps are interpolated", True)]
 
 
 def fast_rows(position: Array) -> Mask:
