@@ -168,7 +168,7 @@ def creep_seconds(plan: SweepPlan) -> float:
 def creep_speed(sweep: Sweep) -> float:
     """Of a planned creep [rad/s]; raises BadInput for a sweep that has none."""
     if sweep.speed is None:
-        raise BadInput(f"sweep {sweep.name}: no speed: a plan of steps at rest is no plan of creep sweeps")
+        raise BadInput(f"sweep {sweep.name}: no speed: this is a plan of steps at rest, not of creep sweeps")
     return sweep.speed
 
 

@@ -150,9 +150,7 @@ def find_dropped(recording: Recording) -> list[RecordingFinding]:
     if missing < DROPPED or np.mean(np.abs(periods - whole) < NEAR) < EVEN:
         return []
     evidence = f"{missing:.0%} of the samples are missing, up to {whole.max() - 1.0:.0f} in a row"
-    return [
-        RecordingFinding("dropped", "t", "all", evidence, "record every message; the gaps are filled in between", True)
-    ]
+    return [RecordingFinding("dropped", "t", "all", evidence, "record every message; the gaps are interpolated", True)]
 
 
 def fast_rows(position: Array) -> Mask:

@@ -61,7 +61,7 @@ def find_same(recording: Recording, stated: Corrections) -> list[RecordingFindin
     link, motor = recording.torque, recording.motor_torque
     if stated.effort or link is None or motor is None or not np.array_equal(link, motor, equal_nan=True):
         return []
-    evidence = "is that of tau_motor in every sample: these drives have one reading of torque, their motors'"
+    evidence = "equals tau_motor in every sample: these drives have one torque reading, that of their motors"
     return [RecordingFinding("effort_source", "tau", "all", evidence, "--effort-is motor", True)]
 
 
