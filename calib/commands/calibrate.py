@@ -36,7 +36,7 @@ def calibrate(
     from armlink.commands.output import write_json
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm
-    from calib.commands.creep.fits import calibrate_creep
+    from calib.commands.creep_fits import calibrate_creep
     from calib.commands.options import load_sweeps
     from calib.commands.screen import print_lines
     from calib.creep.choice import all_creep

@@ -130,7 +130,7 @@ def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
         _CONSOLE.print(note, style="yellow")
 
 
-def unsettled_said(data: "SweepData") -> list[str]:
+def unsettled_lines(data: "SweepData") -> list[str]:
     """In one line, which readings were taken of an arm that did not stand still; nothing where there are none."""
     if not data.unsettled:
         return []
@@ -141,7 +141,7 @@ def unsettled_said(data: "SweepData") -> list[str]:
     ]
 
 
-def stalls_said(data: "SweepData") -> list[str]:
+def stall_lines(data: "SweepData") -> list[str]:
     """In one line, how often the joints had to be stopped; nothing if they never were."""
     if not data.stalls:
         return []

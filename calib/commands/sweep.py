@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
+from calib.commands.options import KeepGoing
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -35,9 +36,7 @@ def sweep(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Run the whole plan on the simulated arm of the arm file's sim section.")
     ] = False,
-    keep_going: Annotated[
-        int, typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle.")
-    ] = 0,
+    keep_going: KeepGoing = 0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.")] = 0,
     json_file: Annotated[
@@ -139,14 +138,14 @@ def _run(
     from calib.creep.run import run_creep
     from calib.sweep.preflight import find_stops, listen
     from calib.sweep.run import run_sweep
-    from calib.sweep.stalls import bridged
+    from calib.sweep.stalls import repeat_work
 
     link.enable()
     on_stall = screen.on_stall(keep_going)
-    heard = bridged(link, on_stall, lambda: listen(link, arm_file))
+    heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
     found, creeping = heard, sweep_motion(arm_file) == "creep"
     if check_stops and not creeping:
-        found = bridged(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
+        found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
     run = run_creep if creeping else run_sweep
     data = run(
         link,
@@ -169,12 +168,12 @@ def _again(arm: str, bus: str | None, hold: str | None, dry_run: bool) -> list[s
 
 
 def _show(arm_file: "ArmFile", found: "Preflight", data: "SweepData", screen: "SweepScreen", again: list[str]) -> None:
-    from calib.commands.screen import print_lines, print_plan, print_preflight, stalls_said, unsettled_said
+    from calib.commands.screen import print_lines, print_plan, print_preflight, stall_lines, unsettled_lines
 
     assert data.plan is not None
     print_preflight(found)
     print_plan(arm_file, data.plan)
-    print_lines([*unsettled_said(data), *stalls_said(data)], "yellow")
+    print_lines([*unsettled_lines(data), *stall_lines(data)], "yellow")
     if data.manifest.reference_mass and data.plan.sweeps[0].speed is not None:
         bare = data.path.with_name(f"{data.path.name}-again")
         screen.say(f"{data.path} is complete. Now take the mass off and sweep once more without it:")

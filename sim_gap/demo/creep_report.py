@@ -7,7 +7,9 @@ import numpy as np
 from plotly.subplots import make_subplots
 from rich.table import Table
 
-from calib.creep.record import HEADINGS, missing, told, values_told
+from calib.creep.record import HEADINGS, missing
+from calib.creep.record import determined_joints as told
+from calib.creep.record import determined_values as values_told
 from calib.report.figures import COLOURS, GREY, PANEL, verify_figure
 from calib.report.page import ReportSection as Section
 from calib.report.page import ReportTable, bullets, paragraph, paragraphs, render
