@@ -27,8 +27,7 @@ from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
 from calib.observer.observer import observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.data_sets import data_sets
-from calib.sweep.dataset import SweepData
+from calib.sweep.dataset import SweepData, data_sets
 from calib.sweep.run import Progress, run_sweep
 from calib.sweep.verify import Verification, run_verify
 from gcomp.arrays import Array

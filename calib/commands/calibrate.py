@@ -42,7 +42,7 @@ def calibrate(
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm
-    from calib.commands.creep.fits import calibrate_creep
+    from calib.commands.creep_fits import calibrate_creep
     from calib.commands.options import load_sweeps
     from calib.creep.choice import all_creep
     from calib.fit.felt_mass import felt_mass

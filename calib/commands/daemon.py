@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from calib.commands.options import StoreUrl
+
 
 class Policies(StrEnum):
     """Treatment of a drift that was found."""
@@ -50,7 +52,7 @@ def daemon(
     state: Annotated[
         Path | None, typer.Option(help="Directory of journal and recordings; default the user's state directory.")
     ] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    store: StoreUrl = None,
     work: Annotated[
         bool, typer.Option("--work", help="Move the arm among random poses: for trying it on a simulated arm.")
     ] = False,

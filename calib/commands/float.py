@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from armlink.commands.options import Arm, OtherBus
+from calib.commands.options import StoreUrl
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -20,7 +21,7 @@ def hold_afloat(
     record: Annotated[
         str | None, typer.Option(help="Id of a gravity record; default: the current one, else the model's inertials.")
     ] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    store: StoreUrl = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write a summary here; - is standard output.")
     ] = None,

@@ -27,7 +27,7 @@ def identify(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
-    from calib.commands.creep.fits import identify_creep
+    from calib.commands.creep_fits import identify_creep
     from calib.commands.options import load_sweeps
     from calib.creep.choice import all_creep
     from calib.fit.gravity_fit import identify_gravity

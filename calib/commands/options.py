@@ -33,13 +33,22 @@ Replaced = Annotated[
     ),
 ]
 Store = Annotated[str | None, typer.Option(help="Record store: file or database URL; default: state folder.")]
+StoreUrl = Annotated[str | None, typer.Option(help="Record store: file or database URL.")]
+KeepGoing = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        help="Number of stalls of the cycle after which the joints are enabled again without asking.",
+        rich_help_panel="Run",
+    ),
+]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")]
 
 
 def load_sweeps(command: str, directories: list[Path], arm: str | None) -> "tuple[list[SweepData], ArmFile]":
     """Data sets and the arm file that they were made with, or `arm`; raises BadInput."""
     from armlink.errors import BadInput
-    from calib.sweep.data_sets import data_sets
+    from calib.sweep.dataset import data_sets
 
     if not directories:
         raise BadInput(f"{command}: give the directories that sweep wrote")

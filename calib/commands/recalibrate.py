@@ -89,8 +89,7 @@ def _rows(
     from armlink.recording.files import load_recording
     from armlink.torque_calibration import UNCALIBRATED, per_joint
     from calib.field.rows import rows_of_recording, rows_of_sweeps
-    from calib.sweep.data_sets import labels
-    from calib.sweep.dataset import load_data
+    from calib.sweep.dataset import labels, load_data
 
     n = len(arm_file.joint_names)
     blank = per_joint([UNCALIBRATED] * n)

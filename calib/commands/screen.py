@@ -134,7 +134,7 @@ def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
         console.print(note, style="yellow")
 
 
-def unsettled_said(data: "SweepData") -> list[str]:
+def unsettled_lines(data: "SweepData") -> list[str]:
     """In one line, which readings were taken of an arm that did not stand still; nothing where there are none."""
     if not data.unsettled:
         return []
@@ -145,7 +145,7 @@ def unsettled_said(data: "SweepData") -> list[str]:
     ]
 
 
-def stalls_said(data: "SweepData") -> list[str]:
+def stall_lines(data: "SweepData") -> list[str]:
     """In one line, how often the joints had to be stopped; nothing if they never were."""
     if not data.stalls:
         return []

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
+from calib.commands.options import KeepGoing
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -47,14 +48,7 @@ def sweep(
             rich_help_panel="Run",
         ),
     ] = False,
-    keep_going: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Number of stalls of the cycle after which the joints are enabled again without asking.",
-            rich_help_panel="Run",
-        ),
-    ] = 0,
+    keep_going: KeepGoing = 0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.", rich_help_panel="Run")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.", rich_help_panel="Plan")] = 0,
     json_file: Annotated[
@@ -163,14 +157,14 @@ def _run(
     from calib.creep.run import run_creep
     from calib.sweep.preflight import find_stops, listen
     from calib.sweep.run import run_sweep
-    from calib.sweep.stalls import bridged
+    from calib.sweep.stalls import repeat_work
 
     link.enable()
     on_stall = screen.on_stall(keep_going)
-    heard = bridged(link, on_stall, lambda: listen(link, arm_file))
+    heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
     found, creeping = heard, sweep_motion(arm_file) == "creep"
     if check_stops and not creeping:
-        found = bridged(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
+        found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
     run = run_creep if creeping else run_sweep
     data = run(
         link,
@@ -196,12 +190,12 @@ def _show(
     arm_file: "ArmFile", found: "Preflight", data: "SweepData", console: "PlainConsole", again: list[str]
 ) -> None:
     from armlink.commands.plain_console import command_line, suggest
-    from calib.commands.screen import print_lines, print_plan, print_preflight, stalls_said, unsettled_said
+    from calib.commands.screen import print_lines, print_plan, print_preflight, stall_lines, unsettled_lines
 
     assert data.plan is not None
     print_preflight(found, console)
     print_plan(arm_file, data.plan, console)
-    print_lines([*unsettled_said(data), *stalls_said(data)], "yellow", console)
+    print_lines([*unsettled_lines(data), *stall_lines(data)], "yellow", console)
     complete = f"{data.path} is complete, {len(data.readings)} readings"
     if not data.manifest.reference_mass:
         mass = data.plan.reference_mass

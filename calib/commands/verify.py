@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
+from calib.commands.options import JsonFile, KeepGoing, StoreUrl
 
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
@@ -19,19 +20,12 @@ def verify(
     record: Annotated[
         list[str] | None, typer.Option(help="Id of a gravity or calibration record; default: the current ones.")
     ] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    store: StoreUrl = None,
     poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the poses.")] = 0,
-    keep_going: Annotated[
-        int,
-        typer.Option(
-            min=0, help="Number of stalls of the cycle after which the joints are enabled again without asking."
-        ),
-    ] = 0,
+    keep_going: KeepGoing = 0,
     report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> int:
     """Drive to random poses and compare; exit status 1 where a joint's RMS exceeds its tolerance.
 

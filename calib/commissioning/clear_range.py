@@ -29,7 +29,7 @@ class ClearRange:
     """Why the model's limits are not kept."""
 
 
-def narrowed(arm_file: ArmFile) -> ClearRange | None:
+def find_clear_range(arm_file: ArmFile) -> ClearRange | None:
     """A clear range for an arm whose sweeps would collide within the model's limits; None where they would not.
 
     Raises BadInput or Refused as planning does where nothing narrower helps.

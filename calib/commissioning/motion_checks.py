@@ -13,7 +13,7 @@ from calib.arm.sweep_section import sweep_section
 from calib.commissioning.finding import SetupFinding
 from calib.creep.choice import sweep_motion
 from calib.creep.plan import plan_creep
-from calib.plan.bias_torque import pressable
+from calib.plan.bias_torque import pressable_joints
 from calib.plan.collisions import check_plan
 from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
@@ -114,7 +114,7 @@ def _stops(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
     ever = np.zeros(arm.n, dtype=bool)
     for joint in range(arm.n):
         candidates = stop_combinations(arm, joint, sweep_range(section, limits, joint))
-        ever |= pressable(guess, section, limits, candidates).any(axis=0) & (np.arange(arm.n) != joint)
+        ever |= pressable_joints(guess, section, limits, candidates).any(axis=0) & (np.arange(arm.n) != joint)
     for name, pressed in zip(arm.names, ever, strict=True):
         if pressed or arm.n == 1:
             continue

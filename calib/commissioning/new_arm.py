@@ -13,7 +13,7 @@ from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.chain import Chain, find_chains
-from calib.commissioning.clear_range import narrowed
+from calib.commissioning.clear_range import find_clear_range
 from calib.commissioning.draft import Draft, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
 from calib.commissioning.finding import SetupFinding
@@ -87,7 +87,7 @@ def new_arm(
         draft.notes.append(f"tip assumed: the model has {len(chains)} arms; the others end in {others} (--tip)")
     draft.name = name or draft.name
     made = NewArm(out, draft)
-    clear = narrowed(made.parsed())
+    clear = find_clear_range(made.parsed())
     if clear is not None:
         narrow(draft, clear)
     return made
@@ -145,7 +145,7 @@ def _doubtful_rating(match: Match, effort: float) -> SetupFinding:
     return SetupFinding("warning", what, f"{match.joint} (node {drive.node})", remedy)
 
 
-def rewired(content: dict[str, Any], matches: Sequence[Match], bus: dict[str, str | int]) -> dict[str, Any]:
+def rewired_content(content: dict[str, Any], matches: Sequence[Match], bus: dict[str, str | int]) -> dict[str, Any]:
     """An arm file's content with the drives found on a bus: nodes, rated torques and the bus itself."""
     joints = []
     for row, match in zip(content["link"]["joints"], matches, strict=True):

@@ -1,4 +1,4 @@
-"""Whether an arm is swept by creeping or by steps at rest."""
+"""Whether an arm is swept by creeping or by steps at rest, and what no creep of it can show by its geometry alone."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -56,7 +56,7 @@ SHORTEST = 0.005
 """Lever below which the place of the mass hides it [m], root mean square over poses."""
 
 
-def vertical(arm: Arm, joint: int) -> bool:
+def is_vertical(arm: Arm, joint: int) -> bool:
     """Whether a joint's axis is along gravity in every pose."""
     poses = np.random.default_rng(1).uniform(-1.5, 1.5, (20, arm.n))
     return bool(np.all(gravity_levers(arm, poses)[:, joint] < 0.02 * np.linalg.norm(arm.gravity)))

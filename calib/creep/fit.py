@@ -19,8 +19,7 @@ from calib.creep.ripple import ripple_cycles
 from calib.creep.rows import CreepRows
 from calib.creep.scatter import Scatter, scatter
 from calib.creep.solve import CreepSolution, solve
-from calib.sweep.data_sets import digests
-from calib.sweep.dataset import SweepData
+from calib.sweep.dataset import SweepData, digests
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 
@@ -130,26 +129,26 @@ def fit_rows(
     """Fit rows; rated torque (n,) [N·m] scales what is doubted beforehand. Disturbed sweeps are left out by name."""
     doubt = doubt or Doubt()
     left_out: tuple[Disturbed, ...] = ()
-    plain = _fitted(arm, rows, rated, doubt, ripple=False)  # which a contact would be taken for
+    plain = _fit(arm, rows, rated, doubt, ripple=False)  # which a contact would be taken for
     for _ in range(len(rows.sweeps)):
         found = disturbed_sweeps(arm, plain.rows, plain.solution.residual, rated)
         if not found:
             break
         left_out = (*left_out, *found)
         rows = rows.kept(~np.isin(rows.sweep, [each.sweep for each in found]))
-        plain = _fitted(arm, rows, rated, doubt, ripple=False)
-    plain = _fitted(arm, rows, rated, doubt, plain.solution.x)
+        plain = _fit(arm, rows, rated, doubt, ripple=False)
+    plain = _fit(arm, rows, rated, doubt, plain.solution.x)
     plain = replace(plain, disturbed=left_out, sources=sources or {})
     loose = replace(doubt, spring_share=WIDE_SHARE)
-    free = _fitted(arm, rows, rated, loose, plain.solution.x, ripple=False)
+    free = _fit(arm, rows, rated, loose, plain.solution.x, ripple=False)
     pulled = springs(CreepModel(arm, rows, free.ripple), free.solution, rated)
     if not pulled:
         return plain
-    free = _fitted(arm, rows, rated, loose, free.solution.x)
+    free = _fit(arm, rows, rated, loose, free.solution.x)
     return replace(free, disturbed=left_out, springs=pulled, sources=sources or {})
 
 
-def _fitted(
+def _fit(
     arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, start: Array | None = None, ripple: bool = True
 ) -> CreepFit:
     model, slices = CreepModel(arm, rows), family_slices(arm.n)
@@ -163,7 +162,7 @@ def _fitted(
         coulomb = np.maximum(np.abs(x[slices["coulomb"]]), 1e-3 * rated)  # the least that scales the unevenness
         uneven = _unevenness(found, std, coulomb, doubt)
         mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb, uneven)
-        freedom = 1 - _used(found, std) / len(rows)
+        freedom = 1 - _determined_parameters(found, std) / len(rows)
         by_degree = _temperature_std(rows) * x[slices["warming"]][rows.joint] * rows.reading
         scattered = scatter(rows, found.residual, rated, freedom, by_degree, ripple)
         if ripple and not model.ripple.any():
@@ -190,6 +189,6 @@ def _temperature_std(rows: CreepRows) -> float:
     return float(steps.min(initial=1.0)) / np.sqrt(12) if steps.size else 0.0
 
 
-def _used(found: CreepSolution, std: Array) -> float:
+def _determined_parameters(found: CreepSolution, std: Array) -> float:
     """Parameters that the data, and not the prior, determine."""
     return float(np.sum(1 - np.diag(found.covariance) / std**2))

@@ -9,7 +9,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
+from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.creep.design import CreepCandidate, choose
 from calib.creep.parameters import Doubt
 from calib.plan.collisions import POINTS, Geometry
@@ -116,7 +116,7 @@ def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
     for each in chosen:
         for number, one in enumerate(each):
             sweeps.append(_sweep(ground, one, number, creep.speeds[number % len(creep.speeds)]))
-    blind = [ground.arm.names[joint] for joint in range(n) if vertical(ground.arm, joint)]
+    blind = [ground.arm.names[joint] for joint in range(n) if is_vertical(ground.arm, joint)]
     notes = tuple(f"{name}: {VERTICAL}" for name in blind)
     if ground.section.known_point is None and known_lever(ground.arm) < SHORTEST:
         notes = (*notes, f"{arm_file.name}: {NO_LEVER}")

@@ -8,7 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
+from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.creep.fit import QUANTILE, CreepFit
 from calib.creep.parameters import LAST_ZERO
 from calib.fit.gravity_fit import GravityFit
@@ -53,7 +53,7 @@ def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
     zero = fit.std("zero") < 0.9 * fit.prior_std[fit.slices["zero"]]  # the data leave less than all of its doubt
     loaded = bool((fit.rows.mass > 0).any())
     for joint, name in enumerate(fit.names):
-        upright = vertical(fit.arm, joint)
+        upright = is_vertical(fit.arm, joint)
         pull = next((each for each in fit.springs if each.joint == name), None)
         if pull is not None:
             reasons[name, "gain"] = str(pull).removeprefix(f"{name}: ")
@@ -68,16 +68,16 @@ def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
     return reasons
 
 
-def told(fit: CreepFit, family: str) -> Mask:
+def determined_joints(fit: CreepFit, family: str) -> Mask:
     """Joints for which the data determine a family's value (n,); of friction every joint."""
     reasons = missing(fit)
     parameter = next((each for each, of in FAMILY.items() if of == family), None)
     return np.array([parameter is None or (name, parameter) not in reasons for name in fit.names])
 
 
-def values_told(fit: CreepFit, family: str) -> Array:
+def determined_values(fit: CreepFit, family: str) -> Array:
     """A family's estimates (n,), NaN where the data do not determine them."""
-    return np.where(told(fit, family), fit.value(family), np.nan)
+    return np.where(determined_joints(fit, family), fit.value(family), np.nan)
 
 
 def _no_gain(fit: CreepFit, joint: int, loaded: bool) -> str:
@@ -182,7 +182,7 @@ class CreepCalibration:
 
     def value(self, parameter: Value) -> Array:
         """Estimates (n,); the gain is what a drive reads for 1 N·m, 1/k."""
-        return values_told(self.fit, self._family(parameter))
+        return determined_values(self.fit, self._family(parameter))
 
     def std(self, parameter: Value) -> Array:
         """Standard deviations (n,)."""

@@ -11,15 +11,15 @@ from armlink.link.guard import ReadingBounds
 from armlink.loop.driver import ArmDriver
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
-from calib.creep.bins import bin_readings
 from calib.creep.plan import RAMP, CreepGround, check_creep_limits, creep_ends, creep_speed, plan_creep
+from calib.creep.rows import bin_readings
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.collisions import check_creeps
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, PlanLine, StallLine, SweepData, load_data
 from calib.sweep.run import Progress, SweepPass, new_manifest, sparkline
-from calib.sweep.stalls import OnStall, bridged, give_up
+from calib.sweep.stalls import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
 
 
@@ -43,7 +43,7 @@ def run_creep(
     """
     with DataWriter(out, new_manifest(link, arm, reference_mass, on_stall), resume) as writer:
         data = load_data(out)
-        mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), DriveLimits.of(arm)))
+        mover = repeat_work(link, on_stall, lambda: Mover(link, sweep_section(arm), DriveLimits.of(arm)))
         used = data.plan or plan or plan_creep(arm, seed=seed)
         ground = CreepGround.of(arm)
         check_creep_limits(ground, arm, used)

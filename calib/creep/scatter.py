@@ -56,7 +56,7 @@ def scatter(
     sigma, blocks = np.zeros(len(rows)), []
     residual = residual / np.sqrt(max(freedom, 0.2))
     for joint in range(len(rated)):
-        pairs = [_paired(rows, joint, sweep) for sweep in np.unique(rows.sweep[rows.joint == joint])]
+        pairs = [_row_pairs(rows, joint, sweep) for sweep in np.unique(rows.sweep[rows.joint == joint])]
         floor = (1e-4 * float(rated[joint])) ** 2 / 2  # rounding of the sums that the readings are
         alike = _spread([(residual[up] + residual[down]) / 2 for up, down, _ in pairs], floor)
         opposite = _spread([(residual[up] - residual[down]) / 2 for up, down, _ in pairs], floor)
@@ -73,7 +73,7 @@ def scatter(
     return Scatter(sigma, tuple(blocks))
 
 
-def _paired(rows: CreepRows, joint: int, sweep: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+def _row_pairs(rows: CreepRows, joint: int, sweep: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """(Rows upwards, rows downwards at the same places, rows of places that only one direction has), by position."""
     own = np.flatnonzero(rows.sweep == sweep)
     own = own[np.argsort(rows.position[own, joint])]

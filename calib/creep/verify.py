@@ -16,7 +16,7 @@ from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
 from calib.plan.poses import nearest_first
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.stalls import OnStall, give_up, repeated
+from calib.sweep.stalls import OnStall, give_up, repeat_motion
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
@@ -59,7 +59,7 @@ def verify_creeping(
     angles, torques, skipped = list[Array](), list[Array](), 0
     held_out = _poses(ground, poses, seed, mover.position)
     for number, pose in enumerate(held_out, start=1):
-        ways = repeated(mover, on_stall, partial(_both_ways, mover, pose))
+        ways = repeat_motion(mover, on_stall, partial(_both_ways, mover, pose))
         if ways is None:
             skipped += 1
             continue

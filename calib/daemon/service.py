@@ -22,13 +22,13 @@ from armlink.arm_file import ArmFile
 from armlink.loop.messages import LoopAnswer
 from calib.daemon.environment import BusJobs, Environment
 from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
-from calib.daemon.observing.active_records import ActiveRecords
-from calib.daemon.observing.daily_diagnosis import DailyDiagnosis
-from calib.daemon.observing.observation import ActiveObservation
-from calib.daemon.observing.observer_feed import ObserverFeed
-from calib.daemon.observing.observer_storage import ObserverStorage
-from calib.daemon.observing.pose_tours import PoseTours
-from calib.daemon.observing.recalibration_workflow import RecalibrationWorkflow
+from calib.daemon.observation.active_observation import ActiveObservation
+from calib.daemon.observation.active_records import ActiveRecords
+from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
+from calib.daemon.observation.observer_feed import ObserverFeed
+from calib.daemon.observation.observer_storage import ObserverStorage
+from calib.daemon.observation.pose_tours import PoseTours
+from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration, DaemonSection
 from calib.daemon.state.arm_state import ArmState
 from calib.daemon.state.busiest_minute import BusiestMinute

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from calib.fit.findings import FitFinding, effect_finding, encoder_findings, outlier_findings, scatter_findings
 from calib.fit.lags import Lags
 from calib.fit.position_field import PositionField
-from calib.fit.refinement import Extra, Refined, refine
+from calib.fit.refinement import FEWEST, Extra, Refined, refine
 from calib.fit.remaining_doubt import remaining_doubt
 from calib.fit.small_troubles import Setting
 from calib.fit.sweep_readings import SweepReadings
@@ -23,8 +23,6 @@ from gcomp.identify.sensor_model import predict
 
 OUTLIER = 6.0
 """Robust standard deviations of the deleted residual from which a reading is an outlier (docs/theory.md, 5.4)."""
-FEWEST = 8
-"""Smallest number of a joint's readings for a robust standard deviation; a choice."""
 MOST_OUTLIERS = 0.15
 """Largest share of a joint's readings that are left out as outliers; beyond it the model is at fault; a choice."""
 PLATEAU, PLATEAU_POSES = 4.0, 4
@@ -55,8 +53,6 @@ class Goodness:
 
     refined: Refined
     findings: tuple[FitFinding, ...]
-    outliers: Mask
-    """Readings left out as outliers (K, n)."""
     left_out: tuple[LeftOutSweep, ...]
     discrepancy: tuple[Discrepancy, ...]
     """Remaining doubt at a new pose, joint by joint."""
@@ -100,7 +96,7 @@ def examine(
     findings += scatter_findings(kinematics.names, refined, rated, {finding.joint for finding in findings})
     final = encoders or findings  # a wrong position causes the others
     doubt = remaining_doubt(setting, rows, refined)
-    return Goodness(refined, tuple(final), outliers, leave_out(refined, rows), doubt)
+    return Goodness(refined, tuple(final), leave_out(refined, rows), doubt)
 
 
 def _setting(kinematics: Arm, rows: SweepReadings, rated: Array, parameters: Parameters) -> Setting:

@@ -22,8 +22,6 @@ class FeltMass:
     """[kg]."""
     felt: float
     """[kg]."""
-    std: float
-    """Standard deviation of `felt` [kg]; the spread of the gains is not in it."""
 
     @property
     def contradicts(self) -> bool:
@@ -61,9 +59,7 @@ def felt_mass(arm: Arm, readings: StaticReadings) -> FeltMass | None:
             spreads.append(found[1])
     if not shares:
         return None
-    weights = 1 / np.square(spreads)
-    share = float(np.average(shares, weights=weights))
-    return FeltMass(stated, stated * share, stated * float(1 / np.sqrt(weights.sum())))
+    return FeltMass(stated, stated * float(np.average(shares, weights=1 / np.square(spreads))))
 
 
 def _first(columns: Array, values: Array, sigma: Array) -> tuple[float, float] | None:

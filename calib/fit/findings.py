@@ -8,7 +8,7 @@ import numpy as np
 from calib.fit.refinement import Refined
 from calib.fit.sweep_readings import SweepReadings
 from calib.fit.unmodelled_effects import UnmodelledEffect, size_of
-from calib.motion.encoder_bits import stuck_bits
+from calib.motion.encoder_check import stuck_bits
 from gcomp.arrays import Array, Mask
 
 Kind = Literal[

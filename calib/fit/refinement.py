@@ -86,8 +86,6 @@ class Refined:
     linear: Linear
     coefficients: Array
     """Of the extras, in their units (m,)."""
-    freedom: Array
-    """Free readings of each joint (n,)."""
     levels: Levels
     """Of the small troubles."""
     troubles: Troubles
@@ -141,7 +139,6 @@ def refine(
         factor,
         step.linear,
         step.solution[behind],
-        freedom,
         step.levels,
         step.troubles,
         Parameters.from_vector(certainty, kinematics.n),

@@ -15,8 +15,7 @@ from calib.fit.examination import Goodness, examine
 from calib.fit.findings import FitFinding
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
-from calib.sweep.data_sets import digests
-from calib.sweep.dataset import SweepData
+from calib.sweep.dataset import SweepData, digests
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Parameters, Prior
@@ -109,7 +108,7 @@ class SensorFit:
         point, half = self.attachment
         if np.isnan(point).all():
             return "where the reference mass hung is not observable"
-        place = ", ".join(_said(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
+        place = ", ".join(_value_text(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
         moments = [f"{mass:g} kg: {_triple(mass * point)} kg·m" for mass in self.rows.masses if mass]
         return (
             f"the reference mass hung at ({place}) m of the last joint's frame; its mass moment, {'; '.join(moments)}"
@@ -181,7 +180,7 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
         fit=fit,
         rows=rows,
         noise_factor=good.refined.factor,
-        hysteresis=_half_difference(rows.readings.torque - _modelled(arm_file, fit, rows), rows),
+        hysteresis=_half_difference(rows.readings.torque - _model_readings(arm_file, fit, rows), rows),
         friction=_friction(fit, rows),
         goodness=good,
         quantile=_quantiles(good.refined.certainty),
@@ -212,7 +211,7 @@ def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
     return examine(kinematics, rows, fit, priors, arm_file.require_link().rated_torques)
 
 
-def _modelled(arm_file: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:
+def _model_readings(arm_file: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:
     """Torque readings (K, n) by the fitted sensors and moments alone [N·m]."""
     return predict(gcomp_arm(arm_file), fit.complete, rows.readings)
 
@@ -246,10 +245,10 @@ def _gain_ratio(arm_file: ArmFile, rows: SweepReadings) -> Array:
 
 
 def _triple(values: Array) -> str:
-    return f"({', '.join(map(_said, values))})"
+    return f"({', '.join(map(_value_text, values))})"
 
 
-def _said(value: float, interval: str = "") -> str:
+def _value_text(value: float, interval: str = "") -> str:
     return "not observable" if np.isnan(value) else f"{value:.4f}{interval}"
 
 

@@ -79,7 +79,7 @@ class Solved:
     """Number of independent parameters that the rows show."""
 
 
-def solved(columns: Array, target: Array) -> Solved:
+def solve_whitened(columns: Array, target: Array) -> Solved:
     """The fit of whitened columns (K, p) to a whitened target (K,)."""
     u, s, vt, size = _decomposed(columns)
     kept = s > 0
@@ -106,7 +106,7 @@ def _decomposed(columns: Array) -> tuple[Array, Array, Array, Array]:
     return u, np.where(s > max(1e-6 * s[0], 1e-12), s, 0.0), vt, size
 
 
-def smallest_noticed(own: Array, rivals: Iterable[tuple[Array, int]], evidence: float) -> float:
+def smallest_noticed_change(own: Array, rivals: Iterable[tuple[Array, int]], evidence: float) -> float:
     """Size of a change with whitened column (K,) that wins in one case of two: over "none", and over every rival.
 
     Of each rival an orthonormal basis (K, p) and the parameters charged in its BIC.
@@ -199,7 +199,7 @@ class CauseTest:
         entries = [self.entries[index] for index in indices]
         count = columns.shape[1]
         nothing = _CauseFit(entries[0], np.inf, np.inf, np.full(count, np.nan), np.full((count, count), np.nan))
-        found = solved(columns, self._white)
+        found = solve_whitened(columns, self._white)
         hidden_by_arm = [entry.cause for entry in entries] == [
             "payload"
         ] and found.shown == self.belief.kernel.payload_rank
@@ -268,7 +268,7 @@ class CauseTest:
             for entry, basis in zip(self.entries, self._bases, strict=True)
             if basis.size and not kin(entry, winner)
         )
-        return smallest_noticed(own, rivals, self._config.evidence)
+        return smallest_noticed_change(own, rivals, self._config.evidence)
 
     @cached_property
     def _bases(self) -> list[Array]:

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.audit import DOUBTED, audit, confirmed, may_adapt
+from calib.observer.audit import DOUBTED, audit, is_confirmed, may_adapt
 from calib.observer.cause_test import CauseTest, DetectionLimits, Verdict
 from calib.observer.config import ObserverConfig
-from calib.observer.decision import Agreeing, DriftFinding, agreed, decide
+from calib.observer.decision import Agreeing, DriftFinding, decide, windows_agree
 from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
-from calib.observer.moving.observer import MovingObserver
+from calib.observer.motion.observer import MovingObserver
 from calib.observer.rest_detector import RestDetector
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.observer.tracking.tracking import Tracking
@@ -183,7 +183,7 @@ class Observer:
         verdict = test.verdict()
         if verdict.cause == "ambiguous" and len(state.window) < self.config.longest_window:
             return []  # more rows may decide
-        if state.silent and not confirmed(self._tracking, state, test, verdict, self.config):
+        if state.silent and not is_confirmed(self._tracking, state, test, verdict, self.config):
             return []
         found, state.silent = state.silent and verdict.is_drift, False
         window, state.window = state.window, []
@@ -228,7 +228,7 @@ class Observer:
         if first is None or first.joints != agreeing.joints:
             return []
         for joint in verdict.joints:
-            if not agreed(first.test, test, joint, verdict.other(joint), self.config.agreement):
+            if not windows_agree(first.test, test, joint, verdict.other(joint), self.config.agreement):
                 return self._undecided(t, joint, "two windows disagree: still drifting")
         rows = (first.rows + window)[-self.config.longest_window :]
         together = self._tracking.cause_test(rows)

@@ -39,7 +39,7 @@ class Recalibration:
     """After a roll-back of one joint: the change of its sensor, for `Observer.install`; None for a whole record."""
 
 
-def recalibrated(
+def recalibrated_record(
     record: CalibrationRecord, arm: ArmFile, finding: DriftFinding, installed_gain: float, by: str | None
 ) -> CalibrationRecord:
     """The record that follows from `record`, installed, and a finding; its covariance is that of both.
@@ -110,7 +110,7 @@ class Recalibrator:
         """
         j = finding.joint
         held = require_installed(self.record, self._controllers, j) if ask else Calibration(1.0, 0.0)
-        new = recalibrated(self.record, self._arm, finding, held.gain, by)
+        new = recalibrated_record(self.record, self._arm, finding, held.gain, by)
         admit_drift(new, self._reference, j, self._arm)
         self._store.add(new)
         pair = new.joints[j].torque_calibration(held)

@@ -38,7 +38,7 @@ def required_bias(
     return np.where(stops == 0, 0.0, needed)
 
 
-def pressable(guess: GravityGuess, section: SweepSection, limits: DriveLimits, candidates: Candidates) -> Mask:
+def pressable_joints(guess: GravityGuess, section: SweepSection, limits: DriveLimits, candidates: Candidates) -> Mask:
     """Resting joints (C, n) that can be pressed on their stop within max_torque; True for the swept joint."""
     needed = required_bias(guess, section, limits, candidates.stops, candidates.poses)
     needed = needed + SLOWEST * reaction_bound(guess, candidates.joint)

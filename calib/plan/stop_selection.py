@@ -9,7 +9,7 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.design.selection import select, sweep_information, sweep_jacobian
 from gcomp.design.sweep_design import stop_combinations as limit_poses
-from gcomp.design.sweep_design import well_felt
+from gcomp.design.sweep_design import sufficient_levers
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.parameters import Parameters, free_mask
 
@@ -59,7 +59,7 @@ def stop_combinations(kinematics: Arm, joint: int, swept: tuple[float, float]) -
 
 def with_lever(candidates: Candidates) -> Candidates:
     """Those with a sufficient lever of gravity on the swept joint; if there are none, the better half."""
-    return candidates.kept(well_felt(candidates.lever))
+    return candidates.kept(sufficient_levers(candidates.lever))
 
 
 def choose_stops(

@@ -9,7 +9,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.plan.bias_torque import hold_torque, pressable
+from calib.plan.bias_torque import hold_torque, pressable_joints
 from calib.plan.collisions import POINTS, Collided, Geometry
 from calib.plan.poses import require_range, sweep_range
 from calib.plan.rough_gravity import GravityGuess
@@ -61,7 +61,9 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
     if not drivable.any():
         drivable = strongest[:, joint] <= limits.max_torque[joint]
     holdable = (strongest + section.friction * limits.rated <= limits.max_torque).all(axis=1) & drivable
-    pressed = pressable(guess, section, limits, everything).all(axis=1) & holdable  # it must leave its stop again
+    pressed = (
+        pressable_joints(guess, section, limits, everything).all(axis=1) & holdable
+    )  # it must leave its stop again
     if pressed.sum() >= min(section.poses, everything.count):
         return with_lever(everything.kept(pressed)), []
     if not (pressed | holdable).any():

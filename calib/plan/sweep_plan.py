@@ -9,7 +9,7 @@ from calib.arm.kinematics import DriveLimits
 from calib.plan.bias_torque import (
     bias_and_acceleration,
     hold_torque,
-    pressable,
+    pressable_joints,
     reaction_bound,
     required_bias,
     travel_acceleration,
@@ -161,7 +161,7 @@ def _hold(planned: PlannedArm, one: Candidates) -> tuple[Mask, Array | None, flo
     servo = resting & (section.hold == "servo")
     if guess is None:
         return servo, None, section.acceleration
-    servo = servo | (resting & ~pressable(guess, section, limits, one)[0])
+    servo = servo | (resting & ~pressable_joints(guess, section, limits, one)[0])
     needed = required_bias(guess, section, limits, one.stops, one.poses)[0]
     least, largest, _ = hold_torque(guess, section, limits, one.poses)
     spare = limits.max_torque - np.maximum(np.abs(least), np.abs(largest))[0]

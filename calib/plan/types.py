@@ -67,11 +67,3 @@ class SweepPlan(_PlanPart):
     def readings(self) -> int:
         """Static readings of one pass, scout included."""
         return len(self.scout) + sum(sweep.readings for sweep in self.sweeps)
-
-    @property
-    def levers(self) -> dict[int, float]:
-        """Best Γ/g of each swept joint over its sweeps."""
-        best: dict[int, float] = {}
-        for sweep in self.sweeps:
-            best[sweep.joint] = max(sweep.lever, best.get(sweep.joint, 0.0))
-        return best

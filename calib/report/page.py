@@ -90,10 +90,12 @@ def render(path: Path, title: str, sections: Sequence[ReportSection], subtitle: 
 def _figure(figure: Any) -> Markup:
     from plotly.io import to_html
 
-    return Markup(to_html(styled(figure), full_html=False, include_plotlyjs=False, config=SCREEN, validate=False))
+    return Markup(
+        to_html(styled_figure(figure), full_html=False, include_plotlyjs=False, config=SCREEN, validate=False)
+    )
 
 
-def styled(figure: Any) -> dict[str, Any]:
+def styled_figure(figure: Any) -> dict[str, Any]:
     """A plotly figure as its dictionary, with grid, typeface and margins those of the page.
 
     Merged by hand: plotly looks through a template and every axis anew in each figure.

@@ -19,7 +19,7 @@ from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, SweepData, load_data
 from calib.sweep.scout import SCOUT, SLOWER, rough_model, run_scout
-from calib.sweep.stalls import OnStall, bridged, give_up, resume_after, stall_line
+from calib.sweep.stalls import OnStall, give_up, repeat_work, resume_after, stall_line
 from gcomp.arrays import Array
 
 APPROACH = 0.03
@@ -54,7 +54,7 @@ def run_sweep(
     """
     with DataWriter(out, new_manifest(link, arm, reference_mass, on_stall), resume) as writer:
         data = load_data(out)
-        mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), DriveLimits.of(arm)))
+        mover = repeat_work(link, on_stall, lambda: Mover(link, sweep_section(arm), DriveLimits.of(arm)))
         run = _StepPass(mover, writer, progress, on_stall, list(data.readings))
         if data.plan is None:
             first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
@@ -83,8 +83,8 @@ def run_sweep(
 
 def new_manifest(link: ArmDriver, arm: ArmFile, reference_mass: float, on_stall: OnStall) -> Manifest:
     """The manifest of a pass that begins, with what the controllers hold and the drives' numbers; raises BusFault."""
-    installed = bridged(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
-    drives = bridged(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
+    installed = repeat_work(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
+    drives = repeat_work(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
     return Manifest.of(arm, reference_mass, installed, drives)
 
 

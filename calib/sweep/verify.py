@@ -16,7 +16,7 @@ from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.poses import nearest_first, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.stalls import OnStall, give_up, repeated
+from calib.sweep.stalls import OnStall, give_up, repeat_motion
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
@@ -93,7 +93,7 @@ def run_verify(
     mover.hold_all()
     everything, angles, torques, skipped = np.ones(n, dtype=bool), [], [], 0
     for number, pose in enumerate(verify_poses(limits, section, poses, seed, mover.position), start=1):
-        rest = repeated(mover, on_stall, partial(_rest_at, mover, pose, everything))
+        rest = repeat_motion(mover, on_stall, partial(_rest_at, mover, pose, everything))
         if rest is None:
             skipped += 1
             continue

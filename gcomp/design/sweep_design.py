@@ -71,12 +71,12 @@ def candidate_sweeps(arm: Arm, joint: int, steps: int, margin: float = 0.0) -> l
     Sufficient is Γ ≥ 0.3 g; if no combination has that, the better half is taken.
     """
     poses = stop_combinations(arm, joint)
-    good = well_felt(gravity_levers(arm, poses)[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9))
+    good = sufficient_levers(gravity_levers(arm, poses)[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9))
     angles = np.linspace(arm.lower[joint] + margin, arm.upper[joint] - margin, steps)
     return [JointSweep(joint, pose, angles) for pose in poses[good]]
 
 
-def well_felt(lever: Array) -> Mask:
+def sufficient_levers(lever: Array) -> Mask:
     """Levers Γ/g (C,) of at least `MINIMUM_LEVER`; if there is none, the better half."""
     good: Mask = lever >= MINIMUM_LEVER
     return good if good.any() else lever >= np.median(lever)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, as_array, as_batch, as_poses
-from gcomp.gravity.single_pose import compile_single_pose, without_rounding
+from gcomp.gravity.single_pose import compile_single_pose, exact_cosine_and_sine
 
 BLOCK = 5000
 """Poses per block: about two megabytes of work space for seven joints, best in benchmarks/bench_gravity.py. Not a power
@@ -31,7 +31,7 @@ class GravityModel:
         self.arm = arm
         self.beta = as_array("beta", beta, (2 * arm.n,), finite=False)
         self._moments = self.beta[::2] + 1j * self.beta[1::2]
-        self._twists = [without_rounding(alpha) for alpha in arm.alpha]
+        self._twists = [exact_cosine_and_sine(alpha) for alpha in arm.alpha]
 
     def __reduce__(self) -> "tuple[Callable[[Arm, Array], GravityModel], tuple[Arm, Array]]":
         """Pickled without the function of `one`, which is compiled again where it is unpickled."""

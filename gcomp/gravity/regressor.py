@@ -11,7 +11,7 @@ import numpy as np
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.gravity.batch import half_angles
-from gcomp.gravity.single_pose import without_rounding
+from gcomp.gravity.single_pose import exact_cosine_and_sine
 
 BLOCK = 10_000
 """Poses per block: about four megabytes of work space for seven joints, best in benchmarks/bench_gravity.py."""
@@ -63,7 +63,7 @@ def _levers_outwards(arm: Arm, columns: Array, space: "_RegressorBuffers") -> No
             np.negative(into_x[j], out=into_x[j])  # w_j = (−g_y, g_x, 0)
         if j + 1 == arm.n:
             return
-        twist = without_rounding(alpha)
+        twist = exact_cosine_and_sine(alpha)
         x, gx = into_x, into_y[j]
         g_y, g_z = _about_x(twist, Signed(into_x[j], -1.0), g_z, (space.g_y, space.g_z, space.spare[j]))
         y, z = _about_x(twist, Signed(into_y, 1.0), z, (space.y, space.z, space.spare))

@@ -51,7 +51,7 @@ def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool =
         own = slice(2 * i, 2 * i + 2)
         target = readings.torque[rows, i] * weight - regressor[:, 2 * i + 2 :] @ beta[2 * i + 2 :]
         columns, places = regressor[:, own], [2 * i, 2 * i + 1]
-        felt = _felt(arm, regressor, weight)
+        felt = _acting_moments(arm, regressor, weight)
         if not felt[own].all():
             found[own] = False
             columns, places = columns[:, :0], []
@@ -78,7 +78,7 @@ def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool =
     return RecursiveFit(beta, offset, covariance, found)
 
 
-def _felt(arm: Arm, weighted: Array, weight: Array) -> Mask:
+def _acting_moments(arm: Arm, weighted: Array, weight: Array) -> Mask:
     """Moments that act on this joint's torque in these rows."""
     floor = DEAD_COLUMN * float(np.linalg.norm(arm.gravity)) * float(np.linalg.norm(weight))
     felt: Mask = np.linalg.norm(weighted, axis=0) > floor

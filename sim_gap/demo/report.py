@@ -10,7 +10,7 @@ from plotly.subplots import make_subplots
 from rich.table import Table
 
 from calib.creep.fit import CreepFit
-from calib.creep.record import HEADINGS, told
+from calib.creep.record import HEADINGS, determined_joints
 from calib.fit.sensor_fit import SensorFit
 from calib.records.records import Parameter
 from calib.report.figures import COLOURS, GREY, PANEL, add_sweeps, verify_figure
@@ -78,7 +78,7 @@ def _table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> T
 
 
 def _creep_cell(fit: CreepFit, family: str, joint: int) -> str:
-    if not told(fit, family)[joint]:
+    if not determined_joints(fit, family)[joint]:
         return ABSENT
     digits = CREEP_DIGITS[family]
     return f"{fit.value(family)[joint]:.{digits}f} ± {1.96 * fit.std(family)[joint]:.{digits}f}"

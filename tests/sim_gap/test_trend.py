@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from armlink.arm_file import load_arm
 from armlink.recording.mcap import save_mcap
 from calib.daemon.environment import Environment
-from calib.daemon.observing.daily_diagnosis import DailyDiagnosis
+from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.settings import Configuration, DaemonSection, DiagnosisSettings
 from sim_gap.commands.gap import app
 

@@ -72,7 +72,7 @@ def new(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.errors import BadInput
-    from calib.commands.setup.on_bus import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
+    from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
     from calib.commands.setup.terminal import Terminal, hand, parse_stops
     from calib.commissioning.new_arm import new_arm
 
@@ -165,7 +165,7 @@ def _show(console: Any, made: "NewArm") -> None:
 
 
 def _answer(made: "NewArm", step: str) -> dict[str, Any]:
-    from calib.commands.setup.on_bus import SCHEMA
+    from calib.commands.setup.bus_setup import SCHEMA
 
     draft = made.draft
     return {

@@ -17,6 +17,7 @@ SEND_SECONDS = 5.0
 """A client that accepts nothing for this time is cut off [s]."""
 IDLE_SECONDS = 5.0
 """After this time without an item a comment is sent, to find out whether the client is still there [s]."""
+MOST_CLIENTS = 200
 RETRY = b"retry: 2000\n\n"
 """Browsers reconnect after two seconds."""
 
@@ -41,7 +42,7 @@ class Streams:
 
     def make_room(self, owner: str) -> bool:
         """Whether there is room for one more of this process or address; the oldest of who holds most gives way."""
-        if self.clients < 200:
+        if self.clients < MOST_CLIENTS:
             return True
         held = Counter(self._tasks.values())
         most, number = held.most_common(1)[0]

@@ -111,7 +111,6 @@ def _unloaded(q: np.ndarray) -> SweepReadings:
         felt=nothing,
         motor_torque=nothing,
         target=nothing,
-        noise=np.ones(q.shape[1]),
         position_sigma=np.zeros(q.shape[1]),
         resolution=np.zeros(q.shape[1]),
     )

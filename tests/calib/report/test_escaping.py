@@ -96,6 +96,6 @@ def test_a_name_reads_as_it_is(name: str, folder: Path) -> None:
 
 def test_texts_of_figures_are_escaped_for_plotly_too() -> None:
     """It reads tags in them by itself."""
-    made = report_page.styled(graph.Figure().add_bar(x=["<b>a</b>"], y=[1.0], name="<a href='x'>b</a>"))
+    made = report_page.styled_figure(graph.Figure().add_bar(x=["<b>a</b>"], y=[1.0], name="<a href='x'>b</a>"))
     assert made["data"][0]["name"] == "&lt;a href=&#39;x&#39;&gt;b&lt;/a&gt;"
     assert list(made["data"][0]["x"]) == ["&lt;b&gt;a&lt;/b&gt;"]

@@ -11,10 +11,10 @@ from itertools import pairwise
 import numpy as np
 
 from calib.creep.parameters import family_slices
-from calib.observer.cause_test import Verdict, smallest_noticed, solved, span
+from calib.observer.cause_test import Verdict, smallest_noticed_change, solve_whitened, span
 from calib.observer.config import ObserverConfig
-from calib.observer.moving.belief import USUAL_ROWS, MotorBelief
-from calib.observer.moving.passages import Passage
+from calib.observer.motion.belief import USUAL_ROWS, MotorBelief
+from calib.observer.motion.passages import Passage
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
 
@@ -75,7 +75,7 @@ class ChangeTest:
         nothing, config = np.empty(0), self._config
         none = Verdict("none", None, 1.0, nothing, np.empty((0, 0)), {"misfit": self._misfit(self.chi2, 0)})
         if not fits or self.chi2 - fits[0].bic < config.evidence:
-            return none if self._misfit(self.chi2, 0) <= MISFIT else _named(none, "unknown")
+            return none if self._misfit(self.chi2, 0) <= MISFIT else _with_cause(none, "unknown")
         best, others = fits[0], fits[1:]
         scores = np.array([fit.bic for fit in fits] + [self.chi2])
         weight = np.exp(-(scores - best.bic) / 2)
@@ -87,10 +87,10 @@ class ChangeTest:
         cause, joint = best.candidate.name
         found = Verdict(cause, joint, float(1 / weight.sum()), values, covariance, evidence)
         if evidence["misfit"] > MISFIT or (cause == "payload" and values[0] < 0):
-            return _named(found, "unknown")
+            return _with_cause(found, "unknown")
         rivals = [fit.candidate for fit in others if fit.bic - best.bic < config.evidence]
         if rivals:
-            return _named(found, "ambiguous", tuple(each.cause for each in rivals))
+            return _with_cause(found, "ambiguous", tuple(each.cause for each in rivals))
         return found
 
     def denies(self, cause: str, joint: int | None, values: Array) -> bool:
@@ -126,7 +126,7 @@ class ChangeTest:
             return float("nan")
         others = (each.columns for each in self._candidates if each is not own)
         rivals = ((span(columns), columns.shape[1]) for columns in others)
-        return smallest_noticed(own.columns[:, 0], rivals, self._config.evidence)
+        return smallest_noticed_change(own.columns[:, 0], rivals, self._config.evidence)
 
     def _whitened(self, columns: Array) -> Array:
         white: Array = np.linalg.solve(self._root, columns)
@@ -152,7 +152,7 @@ class ChangeTest:
 
     def _least_squares(self, candidate: ChangeHypothesis, target: Array, around: Array | float) -> _ChangeFit:
         """The candidate's parameters from whitened residuals that it has at values `around`."""
-        found = solved(candidate.columns, target)
+        found = solve_whitened(candidate.columns, target)
         bic = found.chi2 + found.shown * float(np.log(len(target)))
         return _ChangeFit(candidate, bic, found.chi2, around + found.values, found.covariance)
 
@@ -182,6 +182,6 @@ def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[Chan
     return found
 
 
-def _named(verdict: Verdict, cause: str, rivals: tuple[str, ...] = ()) -> Verdict:
+def _with_cause(verdict: Verdict, cause: str, rivals: tuple[str, ...] = ()) -> Verdict:
     joint = verdict.joint if cause == "ambiguous" else None
     return Verdict(cause, joint, verdict.confidence, verdict.values, verdict.covariance, verdict.evidence, rivals)

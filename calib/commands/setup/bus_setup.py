@@ -41,7 +41,7 @@ def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path 
     from armlink.drives.registry import found_drives
     from calib.arm.kinematics import gcomp_arm
     from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
-    from calib.commissioning.new_arm import rewired
+    from calib.commissioning.new_arm import rewired_content
 
     arm = load_arm(model)
     arm.require_link()
@@ -57,7 +57,7 @@ def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path 
             matches, findings = match_by_hand(turned, drives, channel, ask)
     finally:
         opened.shutdown()
-    content = rewired(read_yaml(arm.path), matches, bus_keys(bus, out))
+    content = rewired_content(read_yaml(arm.path), matches, bus_keys(bus, out))
     if arm.model_path is not None:
         import os
 
@@ -72,9 +72,9 @@ def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path 
 def drives_by_ids(model: Path) -> bool:
     """Whether the drives of an arm file are found by the ids that stand in it."""
     from armlink.arm_file import load_arm
-    from calib.commissioning.own_copy import by_ids
+    from calib.commissioning.own_copy import drives_have_ids
 
-    return by_ids(load_arm(model))
+    return drives_have_ids(load_arm(model))
 
 
 def copy(model: Path, out: Path, bus: str, new_serial: bool, json_file: Path | None) -> int:

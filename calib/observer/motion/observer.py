@@ -13,9 +13,9 @@ from calib.observer.cause_test import DetectionLimits
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import DriftFinding
 from calib.observer.events import Event, verdict_evidence
-from calib.observer.moving.belief import MotorBelief
-from calib.observer.moving.change_test import ChangeTest
-from calib.observer.moving.passages import Passage, PassageDetector
+from calib.observer.motion.belief import MotorBelief
+from calib.observer.motion.change_test import ChangeTest
+from calib.observer.motion.passages import Passage, PassageDetector
 from calib.observer.saved_values import UNREADABLE
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.records.records import CalibrationRecord, GravityRecord

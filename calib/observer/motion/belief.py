@@ -14,7 +14,7 @@ import numpy as np
 from calib.creep.model import CreepModel
 from calib.creep.parameters import LAST_ZERO, Doubt, family_slices
 from calib.creep.rows import CreepRows
-from calib.observer.moving.passages import Passage
+from calib.observer.motion.passages import Passage
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array

@@ -7,7 +7,7 @@ from concurrent.futures import Future
 
 from armlink.errors import ArmlinkError, BusFault, Refused
 from calib.daemon.environment import BusJobs
-from calib.daemon.observing.observer_feed import Samples
+from calib.daemon.observation.observer_feed import Samples
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
 from calib.daemon.state.event_log import EventLog

@@ -16,7 +16,7 @@ from calib.creep.plan import plan_creep
 from calib.creep.record import calibration_record, gravity_record
 from calib.daemon.view.event_text import describe
 from calib.observer.events import Event
-from calib.observer.moving.observer import MovingObserver
+from calib.observer.motion.observer import MovingObserver
 from calib.observer.observer import Observer, observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
 

@@ -10,7 +10,7 @@ from armlink.commands.output import write_json
 from armlink.commands.plain_console import PlainConsole, results
 from calib.commands.screen import print_intervals, print_lines
 from calib.creep.fit import QUANTILE, CreepFit, fit_creep
-from calib.creep.record import HEADINGS, calibration_record, gravity_record, missing, values_told
+from calib.creep.record import HEADINGS, calibration_record, determined_values, gravity_record, missing
 from calib.creep.run import contacts
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
@@ -68,7 +68,7 @@ def _show(fit: CreepFit, data: list[SweepData], console: PlainConsole) -> None:
     reasons = missing(fit)
     columns = {}
     for family, heading in HEADINGS.items():
-        columns[heading] = (values_told(fit, family), QUANTILE * fit.std(family))
+        columns[heading] = (determined_values(fit, family), QUANTILE * fit.std(family))
     print_intervals("Drives, ± half of the 95 % interval", fit.names, columns, console)
     print_lines([f"{joint} {parameter}: {reason}" for (joint, parameter), reason in reasons.items()], console=console)
     print_lines([*(each.reason for one in data for each in contacts(one)), *fit.findings], "yellow", console)
@@ -83,7 +83,7 @@ def _answer(fit: CreepFit, data: list[SweepData]) -> dict[str, Any]:
                 for each, kept in zip(fit.ci95(family).tolist(), np.isfinite(values), strict=True)
             ],
         }
-        for family, values in ((each, values_told(fit, each)) for each in (*HEADINGS, "asymmetry", "warming"))
+        for family, values in ((each, determined_values(fit, each)) for each in (*HEADINGS, "asymmetry", "warming"))
     }
     return {
         "joints": list(fit.names),

@@ -3,7 +3,7 @@
 from datetime import timedelta
 
 from calib.daemon.environment import Environment
-from calib.daemon.observing.observer_feed import ObserverFeed
+from calib.daemon.observation.observer_feed import ObserverFeed
 from calib.daemon.state.journal import Journal
 from calib.observer.decision import DriftFinding
 

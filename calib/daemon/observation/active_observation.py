@@ -5,9 +5,9 @@ from datetime import datetime
 
 from calib.daemon.environment import BusJobs
 from calib.daemon.loop.loop_messages import Batch
-from calib.daemon.observing.observer_feed import ObserverFeed
-from calib.daemon.observing.observer_storage import ObserverStorage
-from calib.daemon.observing.recalibration_workflow import RecalibrationWorkflow
+from calib.daemon.observation.observer_feed import ObserverFeed
+from calib.daemon.observation.observer_storage import ObserverStorage
+from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.state.event_log import EventLog
 from calib.daemon.state.journal import Journal
 from calib.daemon.view.event_text import describe, one_alarm_a_joint
