@@ -78,9 +78,9 @@ def commands(bench: EndsBench, job: str, seed: int) -> Callable[[], None]:
 
 def signalled(step: Callable[[], None], name: str, seconds: float) -> BaseException:
     """What a signal to this process, after so much real time of its job, raises there."""
-    threading.Timer(seconds, os.kill, (os.getpid(), signal.Signals[name])).start()
     try:
         with terminate_as_interrupt():
+            threading.Timer(seconds, os.kill, (os.getpid(), signal.Signals[name])).start()
             while True:
                 step()
     except (KeyboardInterrupt, Refused) as error:
@@ -141,6 +141,8 @@ def main() -> int:
     parser.add_argument("--job", nargs="*", default=["sweep", "float"])
     parser.add_argument("--cause", nargs="*", default=ALL, choices=ALL)
     asked = parser.parse_args()
+    for number in SIGNALS:  # nohup and a shell's background have a program ignore some
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     failed = 0
     for name, job in itertools.product(asked.family, asked.job):
         found = campaign(name, job, asked.cause, asked.draws, asked.seed)
