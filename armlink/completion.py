@@ -31,7 +31,7 @@ USE = {
 
 
 def candidates(points: dict[str, EntryPoint], words: list[str]) -> list[str]:
-    """What may stand at the place of the last of `words`; nothing where a file is expected."""
+    """Candidates for the last of `words`; none where a file is expected."""
     *before, unfinished = words or [""]
     if not before:
         return _starting(unfinished, [*points, "completion", "--help", "--version"])

@@ -1,4 +1,4 @@
-"""What installed packages contribute to armlink, by group of entry points.
+"""Contributions of installed packages to armlink, by group of entry points.
 
 Looking into every installed package takes tens of milliseconds, and an arm file needs it twice: it is done once in a
 process.
@@ -15,7 +15,7 @@ def contributed(group: str) -> tuple[EntryPoint, ...]:
 
 
 def named(group: str, name: str) -> Any:
-    """What is contributed to a group under a name, loaded; None if nothing is. The first counts."""
+    """The first contribution to a group under a name, loaded; None without one."""
     return next((point.load() for point in contributed(group) if point.name == name), None)
 
 

@@ -42,7 +42,7 @@ class Beside:
     turned: tuple[float, float, float]
     """Rotation about that frame's x, then y, then z axis [rad]."""
     prefix: str
-    """What the names of its bodies and joints begin with."""
+    """Prefix of the names of its bodies and joints."""
 
 
 @dataclass(frozen=True)

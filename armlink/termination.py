@@ -77,7 +77,7 @@ class Presses:
 
 
 def said(name: str, presses: Presses, level: int = logging.WARNING) -> Callable[[str], None]:
-    """What is told at the end of an arm, said once for each phase; raises Dropped where a person pressed twice.
+    """Log the end of an arm, once for each phase; raises Dropped where a person pressed twice.
 
     A text begins with its phase, up to a comma; an empty one only asks whether to go on.
     """

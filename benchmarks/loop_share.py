@@ -104,13 +104,13 @@ def seven_joints(name: str, rate: float, folder: Path) -> Path:
 def simulate(path: str, number: int) -> None:
     """The simulated arm at its end of the pair, until that closes."""
     from armlink.errors import BusFault
-    from sim_bus.bus.server import Server
+    from sim_bus.bus.server import ArmServer
     from sim_bus.simulated_arm import SimulatedArm
     from sim_bus.truth import Truth
 
     arm = load_arm(path)
     bus = PairBus(socket.socket(fileno=number))  # keeps the socket open
-    server = Server(SimulatedArm(arm, Truth.of(arm)), bus)
+    server = ArmServer(SimulatedArm(arm, Truth.of(arm)), bus)
     prepare(SIMULATED)
     print("ready", flush=True)
     try:

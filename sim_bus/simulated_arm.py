@@ -19,17 +19,17 @@ from sim_bus.effects.effect import EffectSetting
 from sim_bus.effects.realism import add_realism
 from sim_bus.effects.registry import imperfections
 from sim_bus.effects.state import Imperfections
-from sim_bus.node.cia402 import State
+from sim_bus.node.cia402 import PowerState
 from sim_bus.node.controller_settings import APPLIED, bring_into_force, power_on_values
 from sim_bus.node.devices import device_of
-from sim_bus.node.drives import Drives
+from sim_bus.node.drives import SimulatedDrives
 from sim_bus.node.nmt import RESET_NODE, NetworkManagement
 from sim_bus.node.node import Node
-from sim_bus.node.object_arrays import Key, Signals
+from sim_bus.node.object_arrays import Key, ObjectArrays
 from sim_bus.node.pdo import Frame, PdoGroup, PdoTable
 from sim_bus.node.supervision import Supervision
 from sim_bus.physics.plant import Plant
-from sim_bus.physics.sensors import Sensors
+from sim_bus.physics.sensors import JointSensors
 from sim_bus.sim_section import sim_section
 from sim_bus.truth import Truth
 
@@ -62,9 +62,9 @@ class SimulatedArm:
         with self._effects_checked():
             state = self._imperfections()
             self.plant = Plant(arm, state)
-        self.sensors = Sensors(arm, truth, state, seed)
-        self._signals = Signals(self.n)
-        self.drives = Drives(arm, self.plant, self.sensors, self._signals)
+        self.sensors = JointSensors(arm, truth, state, seed)
+        self._signals = ObjectArrays(self.n)
+        self.drives = SimulatedDrives(arm, self.plant, self.sensors, self._signals)
         self._sampled = 0.0
         self._synchronous = self._watching = False
         self.nodes = [
@@ -184,7 +184,7 @@ class SimulatedArm:
             self.drive_at[joint].reboot()
 
     def device(self, joint: int) -> Node | SimulatedDrive:
-        """What stands for a joint on the bus: its CANopen node, or its drive of another family."""
+        """The device of a joint on the bus: its CANopen node, or its drive of another family."""
         return self._node_at.get(joint) or self.drive_at[joint]
 
     def joint_of(self, can_id: int) -> int | None:
@@ -364,7 +364,7 @@ class SimulatedArm:
 
     def _state_changed(self, joint: int) -> None:
         node = self._node_at[joint]
-        if node.errors and self.drives.state[joint] is State.SWITCH_ON_DISABLED:
+        if node.errors and self.drives.state[joint] is PowerState.SWITCH_ON_DISABLED:
             node.emergency(0, 0)
         self._watching = self.drives.needs_watch
 

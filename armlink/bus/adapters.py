@@ -8,9 +8,8 @@ import can
 
 from armlink.bus.can_bus import CanBus, MessageBus
 from armlink.bus.in_process import InProcessBus
-from armlink.bus.interface_fault import interface_fault
 from armlink.bus.message_port import MessagePort, receive_message
-from armlink.bus.port import Port
+from armlink.bus.port import Port, interface_fault
 from armlink.bus.sockets.socket_port import SocketPort
 from armlink.bus.sockets.stamped_port import StampedSocketPort
 from armlink.clock import Clock

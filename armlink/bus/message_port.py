@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import can
 
-from armlink.bus.interface_fault import interface_fault
-from armlink.bus.port import CLASSICAL, ERROR, EXTENDED, REMOTE, Frame
+from armlink.bus.port import CLASSICAL, ERROR, EXTENDED, REMOTE, Frame, interface_fault
 
 
 class MessagePort:

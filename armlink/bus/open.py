@@ -5,7 +5,7 @@ from typing import Any
 from armlink.arm_file import Bus, LinkSection
 from armlink.bus.bus_group import BusGroup
 from armlink.bus.can_bus import MessageBus
-from armlink.bus.interface_fault import interface_fault
+from armlink.bus.port import interface_fault
 from armlink.errors import BadInput
 
 VIRTUAL_INTERFACES = ("virtual", "udp_multicast")

@@ -1,9 +1,11 @@
 """Frames and ports: the interface to send and receive on a CAN bus."""
 
+import errno
+import logging
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
-from armlink.errors import BusFault
+from armlink.errors import ArmlinkError, BusFault
 
 Frame = tuple[int, bytes]
 """Identifier, with flags as in SocketCAN, and data. A remote frame has as much data (zeros) as it asks for."""
@@ -77,3 +79,17 @@ class StampedPort(Protocol):
     def take_all(self) -> list[Stamped]:
         """All frames that are there, in the order of their timestamps; raises BusFault."""
         ...
+
+
+logging.getLogger("can").addHandler(logging.NullHandler())  # else what it logs goes to standard error, unasked
+
+
+def interface_fault(error: Exception, name: str, doing: str) -> ArmlinkError:
+    """The exception for an error of an interface while `doing` something on the bus `name`; our own errors stay."""
+    if isinstance(error, ArmlinkError):
+        return error
+    down = errno.ENETDOWN in (getattr(error, "error_code", None), getattr(error, "errno", None))
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    if isinstance(error, NameError | AttributeError | ImportError):  # its library is missed this late
+        reason = f"{reason}: is the interface's driver installed?"
+    return (InterfaceDown if down else BusFault)(f"bus {name}: cannot {doing}: {reason}")

@@ -1,4 +1,4 @@
-"""What all drive families have in common: names, power states, faults told by readings. Families derive from it."""
+"""Base of all drive families: names, power states, faults told by readings. Families derive from it."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -11,8 +11,8 @@ EVENTS_KEPT = 64
 """So many events are kept; a storm of them costs no memory."""
 
 
-class Event(NamedTuple):
-    """What a drive told of itself, such as an emergency."""
+class DriveEvent(NamedTuple):
+    """A drive's message about itself, such as an emergency."""
 
     joint: int
     code: str
@@ -51,7 +51,7 @@ class Board:
         """Whether motor torque or velocity of some joint came."""
         self.errors = 0
         """Frames of a wrong length."""
-        self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self.events: deque[DriveEvent] = deque(maxlen=EVENTS_KEPT)
         """In the order of arrival, the newest."""
         self.readings = [0] * n
         """Readings of each joint; the watch of the bus takes stock of them."""
@@ -77,6 +77,12 @@ class Board:
         self.motor[joint], self.velocity[joint] = motor, velocity
         self.slow_came = True
         self.on_slow(joint)
+
+    def taken(self) -> None:
+        """What drives that send by their own clock told is in a sample now, and in none after it."""
+        for joint, asked in enumerate(self.asked):
+            if not asked:
+                self.position[joint] = self.sensor[joint] = math.nan
 
     def drop(self) -> None:
         """Forget positions and sensor torques that were replies: what comes from now on belongs to the next sample."""

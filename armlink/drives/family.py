@@ -26,8 +26,7 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame
 from armlink.drives.board import Board
-from armlink.drives.findings import Result
-from armlink.drives.found import DriveFinding, FoundDrives
+from armlink.drives.findings import DriveFinding, FoundDrives, Result
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
@@ -93,7 +92,7 @@ class Drives(Protocol):
         ...
 
     def intrusion(self, can_id: int, data: bytes) -> str:
-        """What a frame is that no drive of ours sends, if it can only be of another host that commands; else empty."""
+        """The name of a frame that no drive of ours sends, if only another host that commands sends it; else empty."""
         ...
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
@@ -122,7 +121,7 @@ class Drives(Protocol):
         ...
 
     def sent(self, joint: int) -> Order | None:
-        """What the bytes of the newest `frames` order this drive, decoded from the bytes: the gate checks it before
+        """This drive's order by the bytes of the newest `frames`, decoded from the bytes: the gate checks it before
         they leave. None where they carry no target (they switch it, ask it, stop it)."""
         ...
 
@@ -195,7 +194,7 @@ class Drives(Protocol):
         ...
 
     def details(self, joint: int, sends: bool) -> Mapping[str, Any]:
-        """What else the family knows of a drive, by name, for the monitor; `sends`: its readings come."""
+        """Further state of a drive, by name, for the monitor; `sends`: its readings come."""
         ...
 
     def poll(self, first: bool) -> list[Frame]:

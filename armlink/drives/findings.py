@@ -1,7 +1,47 @@
-"""Results of the self-test of a drive."""
+"""Drives on a bus that no arm file describes yet; findings about drives, and results of their self-test."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
+
+
+@dataclass(frozen=True)
+class FoundDrive:
+    """One drive as it answers."""
+
+    node: int
+    """Its id on the bus."""
+    vendor: int
+    product: int
+    rated_torque: float
+    """[N·m]"""
+    max_torque: float
+    """Most that it is set to [N·m]."""
+    unit: float
+    """One count of its position [rad]."""
+
+
+class FoundDrives(Protocol):
+    """The drives of an open bus."""
+
+    @property
+    def found(self) -> list[FoundDrive]:
+        """In the order of their ids."""
+        ...
+
+    def positions(self) -> dict[int, float]:
+        """Position reading of every drive by its id [rad]; raises BusFault."""
+        ...
+
+
+@dataclass(frozen=True)
+class DriveFinding:
+    """A lack or doubt about a drive, its place, and its remedy."""
+
+    level: Literal["error", "warning", "hint"]
+    what: str
+    where: str
+    remedy: str
+
 
 Outcome = Literal["passed", "failed", "absent", "not run"]
 

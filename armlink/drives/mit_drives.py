@@ -1,4 +1,4 @@
-"""What drives whose MIT command is packed alike have in common (Damiao, CubeMars): commands within limits, damping,
+"""Drives whose MIT command is packed alike (Damiao, CubeMars): commands within limits, damping,
 orders of another host. Each family adds its set-up, its power states and its replies.
 """
 
@@ -32,7 +32,7 @@ POSITION = int(Mode.POSITION)
 
 @dataclass
 class MitKnown:
-    """What is known of one drive."""
+    """Newest state of one drive."""
 
     ranges: Ranges | None = None
     """By which frames are coded; None: not known yet."""

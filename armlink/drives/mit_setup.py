@@ -1,4 +1,4 @@
-"""What the set-up of drives with the MIT law has in common: the window that their frames can carry, and the result."""
+"""Set-up of drives with the MIT law: the window that their frames can carry, and the result."""
 
 from collections.abc import Sequence
 

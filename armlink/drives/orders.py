@@ -1,4 +1,4 @@
-"""What passes between the link and a drive family, in SI units: orders, readings, limits, results of the set-up.
+"""Values between the link and a drive family, in SI units: orders, readings, limits, results of the set-up.
 
 All values are at the drive's own output, in the drive's own sense: the link applies direction, zero and gear of the arm
 file, and the host's torque calibration, before an order reaches a family and after a reading has left it.
@@ -60,7 +60,7 @@ def power_name(code: int) -> str:
 
 
 class Order(NamedTuple):
-    """What one drive is to do in one cycle."""
+    """Target of one drive for one cycle."""
 
     power: Power
     """ON, STOPPED (the safest state that the drive has: hold, else damp, else off) or OFF."""
@@ -97,7 +97,7 @@ def law_torque(order: Order, position: float, velocity: float) -> float:
 
 
 class Reading(NamedTuple):
-    """What one frame of a drive tells; NaN or None where it says nothing."""
+    """Values of one frame of a drive; NaN or None where it has none."""
 
     joint: int
     """Index among the joints of this `Drives`."""
@@ -165,7 +165,7 @@ class ReadingRange(NamedTuple):
 
 @dataclass(frozen=True)
 class Setup:
-    """What the set-up of one drive found; the first cycle starts from it."""
+    """Result of the set-up of one drive; the first cycle starts from it."""
 
     position: float
     """[rad]."""
@@ -178,7 +178,7 @@ class Setup:
     gains: Gains | None = None
     """None: the drive has a position controller of its own, with an integral term."""
     lost: tuple[str, ...] = ()
-    """What the device lacks, each with what is lost by it; for `scan` and `check`."""
+    """Lacks of the device, each with the function that it costs; for `scan` and `check`."""
     notes: tuple[str, ...] = ()
     """Settings that were read or written, for `check`."""
     scales: Mapping[str, float] = field(default_factory=dict)

@@ -5,7 +5,7 @@ from functools import cache
 from armlink.bus.can_bus import CanBus
 from armlink.contributed import contributed, named
 from armlink.drives.family import Family
-from armlink.drives.found import FoundDrives
+from armlink.drives.findings import FoundDrives
 from armlink.errors import BadInput
 
 GROUP = "armlink.drives"

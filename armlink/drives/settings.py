@@ -19,7 +19,7 @@ class DriveSettings(Section):
     gear: Positive = 1.0
     """Turns of the drive's output for one of the joint, where a further gear follows it."""
     turns: Literal["refuse", "auto"] = "refuse"
-    """What is done with a drive that reads its joint beyond the stops by whole turns of its output: it is refused, or
+    """The treatment of a drive that reads its joint beyond the stops by whole turns of its output: it is refused, or
     `zero` is corrected by them at each start, where one number of turns alone puts the joint between its stops."""
     calibration: CalibrationPlace | None = None
     """Who applies gain and offset of the torque reading; None: as the family's traits have it."""

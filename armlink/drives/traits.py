@@ -13,16 +13,16 @@ FrameKind = Literal["11", "29", "fd"]
 
 @dataclass(frozen=True)
 class Traits:
-    """What a drive is like."""
+    """Traits of a drive."""
 
     torque: TorqueSource
     """Whether its torque reading is of a sensor at the joint (link side), or current times torque constant."""
     calibration: CalibrationPlace
     """Who applies gain and offset of the torque reading: the controller itself, or the host (calibration record)."""
     silence: Silence
-    """What it does by itself when its host falls silent, once `set_up` has set its watchdog."""
+    """Its own reaction to a silent host, once `set_up` has set its watchdog."""
     bounds: tuple[Bound, ...]
-    """What the drive itself bounds, whatever the host commands."""
+    """Quantities that the drive itself bounds, whatever the host commands."""
     cadence: Cadence
     """When a reading comes: after SYNC, as the reply to a command, or by the drive's own clock."""
     frame: FrameKind

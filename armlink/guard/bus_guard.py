@@ -234,7 +234,7 @@ class Requests:
 
 
 class Policy:
-    """What may pass: `frames` by identifier (with the flag of 29 bits in bit 31), `stop` frames, `restarts`.
+    """Frames that may pass: `frames` by identifier (with the flag of 29 bits in bit 31), `stop` frames, `restarts`.
 
     A frame in `restarts` means that a drive has forgotten its set-up: what it acknowledged counts no more. The drives
     wait for `deadline` seconds for their host. `fd`: whether frames are CAN FD; without it both may pass.
@@ -306,7 +306,7 @@ class Policy:
         return ""
 
 
-class Port:
+class GuardPort:
     """One raw CAN socket."""
 
     patience = FULL
@@ -363,10 +363,12 @@ class Port:
                 return True
 
 
-class Guard:
+class BusGuard:
     """Passes frames between the two sides until it is closed."""
 
-    def __init__(self, policy: Policy, program: Port, wire: Port, say: Callable[[str], object] | None = None) -> None:
+    def __init__(
+        self, policy: Policy, program: GuardPort, wire: GuardPort, say: Callable[[str], object] | None = None
+    ) -> None:
         """`say` gets one line when the guard closes."""
         self.policy, self.program, self.wire, self._say = policy, program, wire, say or _say
         self.closed = ""
@@ -479,12 +481,12 @@ def main(words: list[str]) -> int:
     ports = []
     for name in (program, wire):
         try:
-            ports.append(Port(name))
+            ports.append(GuardPort(name))
         except OSError as error:
             _say(f"guard: {name}: {error.strerror}: expected a CAN interface that is up")
             return 2
     ports[0].patience = 0.0  # a program that takes no frames must not keep those to the wire waiting
-    guard = Guard(policy, ports[0], ports[1])
+    guard = BusGuard(policy, ports[0], ports[1])
     ended: list[bool] = []
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # which nohup asks for

@@ -1,4 +1,4 @@
-"""What a cycle takes of each bus, before a frame has left. Pure."""
+"""Share of each bus that a cycle takes, before a frame has left. Pure."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -17,6 +17,8 @@ SLOW_CYCLES = 4
 """A drive that sends velocity and state apart from its position does so after every so many SYNCs."""
 EXCESS = 3
 """So many readings more than a drive sends mean a second sender; one may be early, none is sent twice."""
+TORQUE_MEMORY = 10
+"""Positions after which a torque too many is forgotten: a position was lost."""
 
 
 class BusWatch:
@@ -28,6 +30,10 @@ class BusWatch:
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints
         self._slow_readings = [0] * joints
+        self._torques_more = [0.0] * joints
+        """Torques that came alone, less positions, of late; none less than 0."""
+        self._positions_before = [0] * joints
+        """Positions when the newest torque alone came."""
         self._crowded_cycles = 0
         self.others: dict[int, int] = {}
         """Frames of this cycle that were no readings of the fast way, by identifier."""
@@ -52,8 +58,10 @@ class BusWatch:
         self.flooded = False
         self._double_cycles = [0] * len(self._double_cycles)
         self._slow_readings = [0] * len(self.readings)
+        self._torques_more = [0.0] * len(self.readings)
+        self._positions_before = [0] * len(self.readings)
         self.forged: int | None = None
-        """The joint in whose name a second node sends velocities and states; None: no joint."""
+        """The joint in whose name a second node sends torques, velocities or states; None: no joint."""
         self._crowded_cycles = 0
         self._counted = [0] * len(self.readings)
         self._culprit: str | int = ""
@@ -79,6 +87,15 @@ class BusWatch:
         if count >= due + EXCESS:
             self.forged = joint
 
+    def torque_alone(self, joint: int) -> None:
+        """The torque of a joint came apart from its position: once a position, or more often."""
+        positions = self.readings[joint] - self._positions_before[joint]
+        self._positions_before[joint] = self.readings[joint]
+        kept = max(self._torques_more[joint] - (1 + 1 / TORQUE_MEMORY) * positions, 0.0)
+        self._torques_more[joint] = kept + 1.0
+        if kept + 1.0 > EXCESS:
+            self.forged = joint
+
     def cycle_ends(self, frames: int) -> None:
         """Evaluate the completed cycle, with the number of frames sent and received in it."""
         if self._doubled or any(self._double_cycles):
@@ -94,7 +111,7 @@ class BusWatch:
         self.strangers, self._counted = 0, self.readings.copy()
 
     def _most_frequent(self) -> str | int:
-        """What came most often in this cycle: a joint's readings, or a frame in words; empty where nothing came."""
+        """The most frequent of this cycle: a joint's readings, or a frame in words; empty where nothing came."""
         joint = max(range(len(self.readings)), key=lambda each: self.readings[each] - self._counted[each])
         can_id, count = max(self.others.items(), key=lambda each: each[1], default=(0, 0))
         if self.readings[joint] - self._counted[joint] > max(count, 1):
@@ -114,7 +131,7 @@ class BusWatch:
 
     @property
     def culprit(self) -> str | int:
-        """What comes most often on a crowded bus, as `_most_frequent`: the probable source of a flood."""
+        """The most frequent on a crowded bus, as `_most_frequent`: the probable source of a flood."""
         most = self._most_frequent() if self.flooded or self._culprit == "" else ""
         return self._culprit if most == "" else most
 

@@ -13,7 +13,20 @@ from armlink.errors import BusFault, HostLate, Refused, Silence
 from armlink.link.bus_watchdog import SLOW_CYCLES
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.faults import bus_fault, refusal, silence
-from armlink.link.gate import Corroboration, JointLimits, Seen, beyond, hold_at, is_fresh, pass_gate, start_from
+from armlink.link.gate import (
+    CONTRADICTION,
+    EASE_SECONDS,
+    FOLLOWING,
+    TORQUE_MODES,
+    Corroboration,
+    JointLimits,
+    Seen,
+    beyond,
+    hold_at,
+    is_fresh,
+    pass_gate,
+    start_from,
+)
 from armlink.link.integral import Integral
 from armlink.link.joints.groups import by_joint
 from armlink.link.motion_watchdog import MotionWatch
@@ -28,6 +41,10 @@ MEMORY = 1.0
 heartbeat too, which they may miss for twice `link.deadline`."""
 BLAME_SHARE = 0.5
 """A host that was late by this share of `link.deadline` explains a watchdog that acts at the whole of it."""
+JUMP = 0.25
+"""A position this far from where its velocities lead has jumped [rad]: half of the following error that is refused."""
+BELIEVED_AGAIN = 0.1
+"""A reading this near to where its joint was led last is believed again [rad]."""
 LEAD_SHARE = 0.05
 """Of the newest cycle in the mean time from a wake to its frames."""
 OFF, POSITION = int(Mode.OFF), int(Mode.POSITION)
@@ -53,6 +70,10 @@ class Commander:
         self._slow_age = max_age + SLOW_CYCLES * period
         self._modes_of: list[frozenset[int]] = [frozenset()] * self.n
         self._commanded = [OFF] * self.n
+        self._believed: dict[int, float] = {}
+        """Places of joints whose readings are not believed [rad]; NaN where only those readings told it."""
+        self._torque_cycles = [0] * self.n
+        """Cycles that each joint has been under torque control, this one included."""
         self._integrals: list[Integral | None] = [None] * self.n
         self._with_gains = False
         self._caught: set[int] = set()
@@ -60,7 +81,7 @@ class Commander:
         self._mute_cycles = 0
         """Cycles of `keep` in a row in which nothing could be sent."""
         self.motion = MotionWatch(self.n, period)
-        """What the readings prove about the motion."""
+        """Bounds of the joints' speeds by their readings."""
         self._seen_now: list[Seen] = []
         self._due = 0.0
         self.unhurried = False
@@ -90,6 +111,10 @@ class Commander:
         age = 0.0 if command.t is None else now - command.t
         fault = self._fault(now, self._commanded)
         self._seen_now = seen = self._seen(now, fault is None)
+        self._torque_cycles = [
+            0 if mode not in TORQUE_MODES else count + 1 if held.mode in TORQUE_MODES else 1
+            for mode, count, held in zip(modes, self._torque_cycles, passed, strict=True)
+        ]
         others = self._others()
         if self._with_gains:
             self._integrate(modes, torques, seen)
@@ -100,6 +125,7 @@ class Commander:
             passed[joint] = order
             if order.refused:
                 refused = True
+                self._doubt(joint, order.refused, held)
         self._commanded, sent = modes, self.loop.synced
         if self.loop.just_woke:
             self._lead += LEAD_SHARE * (min(now - self.loop.woke, self.period / 4) - self._lead)
@@ -191,13 +217,18 @@ class Commander:
         answers = is_fresh(seen.age, self.max_age) and math.isfinite(seen.position)
         if power is Power.FAULT or not answers or drives.has_restarted(drive):
             return None
+        if self._is_doubtful(joint, seen, others):
+            return None
         if power is Power.ON:
             self._caught.discard(joint)
             target = seen.position if held.mode != POSITION else held.position if goal is None else float(goal[joint])
             torque = 0.0
             if integral is not None:
                 torque = integral.update(limits, POSITION, held.position, held.velocity, seen)
-            return pass_gate(limits, POSITION, torque, target, 0.0, held, seen, others)
+            order = pass_gate(limits, POSITION, torque, target, 0.0, held, seen, others)
+            if order.refused:
+                self._doubt(joint, order.refused, held)
+            return order
         if power is not Power.STOPPED and joint not in self._caught and not drives.own_stop(drive):
             return None
         self._caught.add(joint)
@@ -206,9 +237,26 @@ class Commander:
         order = hold_at(limits, 0.0, seen.position, seen)
         return order._replace(power=Power.ON, walk=True, mode=POSITION)
 
+    def _doubt(self, joint: int, why: str, held: Order) -> None:
+        """A refusal: where no motion explains the reading, the joint is believed to be where it was led before."""
+        jumped = why == FOLLOWING and self.motion.unexplained[joint] > JUMP
+        if why == CONTRADICTION or jumped:
+            self._believed.setdefault(joint, held.position if held.mode == POSITION else math.nan)
+
+    def _is_doubtful(self, joint: int, seen: Seen, others: Corroboration) -> bool:
+        """Whether a joint would be held at a false place: until its reading is back where it was led, it is braked."""
+        believed = self._believed.get(joint)
+        if believed is None:
+            return False
+        if others.contradicted or not abs(seen.position - believed) <= BELIEVED_AGAIN:
+            return True
+        del self._believed[joint]
+        return False
+
     def _braked(self, joint: int, seen: Seen) -> Order:
-        """The order to stop a joint as its drive can, from where it stands."""
-        position = seen.position if math.isfinite(seen.position) else self.passed[joint].position
+        """The order to stop a joint as its drive can, from where it is believed to stand."""
+        places = (self._believed.get(joint, math.nan), seen.position, self.passed[joint].position)
+        position = next(each for each in places if math.isfinite(each))
         return start_from(self.limits[joint], seen.torque, position)._replace(power=Power.STOPPED)
 
     @property
@@ -223,6 +271,7 @@ class Commander:
         Raises BusFault naming the joint that does not get there.
         """
         on = target is Power.ON
+        self._believed.clear()
         self._commanded = [POSITION if on else OFF] * self.n
         since = [math.inf] * self.n
         for _ in range(max(int(ENABLE_SECONDS / self.period), STOP_CYCLES)):
@@ -312,7 +361,8 @@ class Commander:
 
     def _others(self) -> list[Corroboration]:
         motion = self.motion
-        bounds = (motion.proven, motion.ahead, motion.contradicted, self._ordered_torques())
+        eased = [min(count * self.period / EASE_SECONDS, 1.0) for count in self._torque_cycles]
+        bounds = (motion.proven, motion.ahead, motion.contradicted, self._ordered_torques(), eased)
         return [Corroboration(*each) for each in zip(*bounds, strict=True)]
 
     def _ordered_torques(self) -> list[float]:

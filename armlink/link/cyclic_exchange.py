@@ -12,7 +12,7 @@ from armlink.arrays import Array
 from armlink.bus.frame_bits import FIXED_BITS
 from armlink.bus.port import BUS_SHIFT, Frame, Port
 from armlink.clock import Clock
-from armlink.drives.board import Board, Event
+from armlink.drives.board import Board, DriveEvent
 from armlink.drives.family import ANY, FillsBoard
 from armlink.drives.orders import Order, Reading, power_code
 from armlink.errors import BusFault, HostLate
@@ -80,7 +80,7 @@ class Loop:
         for group in self.groups:
             self._route(group)
         self.told: list[Order | None] = [None] * self.n
-        """What the bytes of the newest frames order each joint, at the joint; None where they carry no target."""
+        """Orders of the newest frames by their bytes, at each joint; None where they carry no target."""
         self._leaving: list[Frame] = []
         """Frames of the newest cycle, which have passed the check."""
         self._counted = self._dropped = 0
@@ -96,6 +96,8 @@ class Loop:
         """Newest motor torque of each joint whenever it came [N·m]; for the gate, never for a sample."""
         self.latest_velocity = [math.nan] * self.n
         """Newest velocity of each joint whenever it came [rad/s]; for the gate, never for a sample."""
+        self.on_cycle: Callable[[], object] = lambda: None
+        """Called at the end of each cycle."""
         self.slow_seen = [-math.inf] * self.n
         """When the motor torque of each joint last came, by the clock [s]."""
         self.speed_seen = [-math.inf] * self.n
@@ -244,6 +246,7 @@ class Loop:
         timely = None if board.awaited <= 0 and not self._owed_for else self._timely()
         sample = self.sample(now)
         sample.timely, sample.delay = timely, delay
+        self.on_cycle()
         return sample
 
     def _collect(self, now: float, until: float) -> float:
@@ -368,6 +371,8 @@ class Loop:
         _, position, velocity, motor, sensor, _, power, fault = reading
         if position == position:  # not NaN
             board.reading(joint, position, sensor)
+        elif motor == motor:
+            self.watch.torque_alone(joint)
         if motor == motor:
             board.motor[joint], board.slow_came = motor, True
         if velocity == velocity:
@@ -375,7 +380,7 @@ class Loop:
         if power is not None:
             board.status[joint] = power_code(power)
         if fault:
-            event = Event(joint, "", fault)
+            event = DriveEvent(joint, "", fault)
             if not board.events or board.events[-1] != event:
                 board.events.append(event)
 
@@ -390,6 +395,7 @@ class Loop:
         else:
             motor, velocity = self._nothing.copy(), self._nothing.copy()
         torque = values.torque(np.array(board.sensor), motor)
+        board.taken()
         for joint in self._keep(position, self.latest_position):
             self.seen[joint] = now
             self._note_time(joint, board.owed[joint] + 1, self._collected)

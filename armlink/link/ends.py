@@ -18,7 +18,7 @@ CATCH_SECONDS = 3.0
 
 
 class Response(Enum):
-    """What is done with the arm, in the words of the table in docs/safety.md."""
+    """The treatment of the arm, in the words of the table in docs/safety.md."""
 
     QUICK_STOP = "quick stop: the drives hold"
     HOLD = "hold"
@@ -26,7 +26,7 @@ class Response(Enum):
     LET_GO = "let go"
 
 
-class Cause(Enum):
+class EndCause(Enum):
     """Why the work ends, in the words of the table in docs/safety.md."""
 
     DONE = "the work is done"
@@ -40,16 +40,16 @@ class Cause(Enum):
     DROPPED = "Ctrl-C twice within two seconds, while parking"
 
 
-ENDS: dict[Cause, tuple[Response, Response]] = {
-    Cause.DONE: (Response.QUICK_STOP, Response.PARK),
-    Cause.INTERRUPTED: (Response.QUICK_STOP, Response.PARK),
-    Cause.FAILED: (Response.QUICK_STOP, Response.PARK),
-    Cause.REFUSED: (Response.QUICK_STOP, Response.PARK),
-    Cause.STALLED: (Response.QUICK_STOP, Response.PARK),
-    Cause.FAULT: (Response.QUICK_STOP, Response.PARK),
-    Cause.LOST: (Response.QUICK_STOP, Response.PARK),
-    Cause.SILENT: (Response.HOLD, Response.HOLD),
-    Cause.DROPPED: (Response.QUICK_STOP, Response.LET_GO),
+ENDS: dict[EndCause, tuple[Response, Response]] = {
+    EndCause.DONE: (Response.QUICK_STOP, Response.PARK),
+    EndCause.INTERRUPTED: (Response.QUICK_STOP, Response.PARK),
+    EndCause.FAILED: (Response.QUICK_STOP, Response.PARK),
+    EndCause.REFUSED: (Response.QUICK_STOP, Response.PARK),
+    EndCause.STALLED: (Response.QUICK_STOP, Response.PARK),
+    EndCause.FAULT: (Response.QUICK_STOP, Response.PARK),
+    EndCause.LOST: (Response.QUICK_STOP, Response.PARK),
+    EndCause.SILENT: (Response.HOLD, Response.HOLD),
+    EndCause.DROPPED: (Response.QUICK_STOP, Response.LET_GO),
 }
 """For arms whose drives all hold, and for arms with drives that let go. A silent job has not ended: its arm is held by
 `armlink.loop.process`, which makes the cycles."""
@@ -77,23 +77,23 @@ class Ended(Parked, Protocol):
         ...
 
 
-def cause_of(error: BaseException | None) -> Cause:
+def cause_of(error: BaseException | None) -> EndCause:
     """Why the work ends, by the exception that left it."""
     match error:
         case None:
-            return Cause.DONE
+            return EndCause.DONE
         case KeyboardInterrupt():
-            return Cause.INTERRUPTED
+            return EndCause.INTERRUPTED
         case Stall():
-            return Cause.STALLED
+            return EndCause.STALLED
         case BusFault():
-            return Cause.FAULT
+            return EndCause.FAULT
         case Refused():
-            return Cause.REFUSED
-    return Cause.FAILED
+            return EndCause.REFUSED
+    return EndCause.FAILED
 
 
-def end(link: Ended, cause: Cause, tell: Tell) -> None:
+def end(link: Ended, cause: EndCause, tell: Tell) -> None:
     """Bring an arm to its end; raises nothing. `tell` may raise Dropped: the arm is then let go at once."""
     if not (link.enabled or link.held):
         return
@@ -106,7 +106,7 @@ def end(link: Ended, cause: Cause, tell: Tell) -> None:
     try:
         _stow(link, tell)
     except Dropped:
-        end(link, Cause.DROPPED, tell)
+        end(link, EndCause.DROPPED, tell)
     except BusFault as fault:
         link.let_go()
         with suppress(Dropped):
@@ -115,15 +115,25 @@ def end(link: Ended, cause: Cause, tell: Tell) -> None:
 
 def _stow(link: Ended, tell: Tell) -> None:
     """Catch what fell, park or let down, and take the power."""
+    why = "the arm file has no link.park"
+    if link.section.park is not None:
+        for _ in range(2):  # a joint that fell and was caught on the way has a new way from there
+            _catch(link)
+            try:
+                park(link, tell)
+                return
+            except Refused as blocked:
+                why = str(blocked)
+            except (Dropped, BusFault):
+                raise
+            except Exception as error:  # an error of this program's own is no reason to drop the arm
+                why = f"{type(error).__name__}: {error}"
+    _catch(link)
+    let_down(link, tell, why)
+
+
+def _catch(link: Ended) -> None:
     for _ in range(cycles(link, CATCH_SECONDS)):
         link.keep()
         if all(link.commander.held):
             break
-    why = "the arm file has no link.park"
-    if link.section.park is not None:
-        try:
-            park(link, tell)
-            return
-        except Refused as blocked:
-            why = str(blocked)
-    let_down(link, tell, why)

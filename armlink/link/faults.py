@@ -80,8 +80,9 @@ def refusal(
             )
         if why == gate.VELOCITY:
             return (
-                f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, limit {limit.overspeed:.3g} "
-                f"(max_velocity and its margin){_by_positions(now, other)}: command less torque, or raise max_velocity"
+                f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, limit "
+                f"{gate.speed_limit(limit, other):.3g} (max_velocity and its margin){_by_positions(now, other)}: command "
+                "less torque, or raise max_velocity"
             )
         if why == gate.WINDOW:
             lower, upper = limit.lower - limit.outside, limit.upper + limit.outside
@@ -121,8 +122,8 @@ def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None
         )
     if watch.forged is not None:
         return (
-            f"{names[watch.forged]}: more readings than it sends: a second node sends velocities and states "
-            "in its name: give every node its own id, and find out who sends"
+            f"{names[watch.forged]}: more readings than it sends: a second node sends torques, velocities "
+            "or states in its name: give every node its own id, and find out who sends"
         )
     if dropped:
         return f"{dropped} frames lost: this host reads too slowly: give it more time or less to do"
@@ -130,6 +131,6 @@ def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None
 
 
 def _culprit(names: Sequence[str], watch: BusWatch) -> str:
-    """What fills the bus, in words."""
+    """The sender of most frames, in words."""
     most = watch.culprit
     return f"readings of {names[most]}" if isinstance(most, int) else most

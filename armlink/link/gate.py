@@ -2,7 +2,7 @@
 
 What it limits, and passes on:
 
-- a torque beyond the limit, or changing faster than the rate;
+- a torque beyond the limit, or changing faster than the rate, which grows as torque control begins;
 - a target position outside the window, or moving faster than the velocity limit (a joint that stands outside the window
   is led back into it at that velocity, never further out).
 
@@ -47,6 +47,13 @@ TORQUE_SHARE = 0.15
 """A drive's torque reading may differ so much from what its gains and order come to, as a share of max_torque, ..."""
 TORQUE_RATIO = 0.4
 """... and by this share of the greater besides: scales that are off by 10 to 40 % are for `armlink check --scales`."""
+EASE_SECONDS = 0.5
+"""What a torque does to the joint is not known before it moves: for so long after a joint has come under torque control
+the rate of its torque grows from 0 to max_torque_rate, and its speed limit from EASED_SPEED to the whole [s]. A drive
+that codes torques 3.4 times too large would else be at 2.8 times max_velocity before its positions tell
+(`tests/campaigns/false_readings.py --family six-damiao six-robstride`)."""
+EASED_SPEED = 0.72
+"""Share of the speed limit at the beginning: a little above max_velocity, so that a joint may be under way."""
 LED_BACK = 1e-3
 """Rounding of a target outside the window, on its way back [rad]."""
 
@@ -105,7 +112,7 @@ class Seen(NamedTuple):
 
 
 class Corroboration(NamedTuple):
-    """What a joint's other readings and its order say where one reading would be believed alone."""
+    """Bounds on a reading by a joint's other readings and its order: none is believed alone."""
 
     proven: float = 0.0
     """Speed that its positions prove [rad/s]; 0 where they prove none."""
@@ -115,6 +122,8 @@ class Corroboration(NamedTuple):
     """Its position and velocity readings cannot both be right."""
     ordered_torque: float = math.nan
     """Torque that its newest order comes to by the drive's gains [N·m]; NaN where the drive's law is not known."""
+    eased: float = 1.0
+    """Share of EASE_SECONDS that it has been under torque control, at most 1."""
 
 
 NOTHING_KNOWN = Corroboration()
@@ -144,7 +153,8 @@ def pass_gate(
     if refused:
         return _passed(limits, start_torque, start_position, OFF, STOPPED, refused)
     if mode in TORQUE_MODES:
-        return _passed(limits, _towards(start_torque, torque, limits.torque_step), seen.position, mode, ON)
+        step = limits.torque_step * others.eased
+        return _passed(limits, _towards(start_torque, torque, step), seen.position, mode, ON)
     if mode in POSITION_MODES:
         goal = _towards(start_position, _within(position, limits.lower, limits.upper), limits.position_step)
         if limits.kp:
@@ -212,7 +222,8 @@ def _refusal(
         return ""
     if mode in POSITION_MODES:
         return _servo_refusal(limits, held, seen, others)
-    if not abs(seen.velocity) <= limits.overspeed or others.ahead > limits.overspeed:
+    fastest = speed_limit(limits, others)
+    if not abs(seen.velocity) <= fastest or others.ahead > fastest:
         return VELOCITY
     if others.contradicted:
         return CONTRADICTION
@@ -224,6 +235,11 @@ def _refusal(
         if _is_false_torque(limits, seen.torque, others.ordered_torque):
             return FALSE_TORQUE
     return ""
+
+
+def speed_limit(limits: JointLimits, others: Corroboration) -> float:
+    """Speed at which a joint under torque control is refused [rad/s]."""
+    return limits.overspeed * (EASED_SPEED + (1 - EASED_SPEED) * others.eased)
 
 
 def _is_false_torque(limits: JointLimits, told: float, ordered: float) -> bool:
@@ -250,7 +266,7 @@ def _passed(limits: JointLimits, torque: float, position: float, mode: int, powe
 
 
 def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
-    """What in an order, as its bytes tell it, is beyond a limit, in words; empty if nothing. The last check of all.
+    """The value of an order, by its bytes, that is beyond a limit, in words; empty if none. The last check of all.
 
     `passed` is the order that the bytes stand for: outside the window a target may lie only where the gate led it.
     """

@@ -12,8 +12,8 @@ POSITION_GAIN_ERROR = 0.02
 """A position sensor may read so much more of its range than is true: the stops are found beyond their nominal place."""
 PRESS_IN = 0.05
 """A target may lie this far behind a stop [rad], so that a joint can be pressed against it."""
-OVERSPEED = 1.5
-"""A joint under torque control may turn this many times as fast as max_velocity before it is stopped."""
+OVERSPEED = 1.4
+"""A joint under torque control is refused this many times as fast as max_velocity: it then stops before 1.5 times."""
 SERVO_OVERSPEED = 3.0
 """A joint under position control may, as it takes up a load, turn this many times as fast as max_velocity."""
 SERVO_SPEED = 3.0

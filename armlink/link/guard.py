@@ -10,7 +10,7 @@ from armlink.errors import Refused
 
 
 @dataclass(frozen=True, eq=False)
-class Guard:
+class ReadingBounds:
     """Bounds of n joints; infinite for a joint that has none."""
 
     lower: Array
@@ -21,7 +21,7 @@ class Guard:
     """Greatest distance between position target and reading (n,) [rad]."""
 
     @classmethod
-    def none(cls, n: int) -> "Guard":
+    def none(cls, n: int) -> "ReadingBounds":
         """No bounds."""
         return cls(np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf))
 

@@ -39,7 +39,7 @@ class Lateness:
         return self.longest
 
     def near(self, deadline: float, arm: str) -> str:
-        """What to say of a host whose lateness comes near `link.deadline` [s] of an arm; empty if it does not."""
+        """A warning where the host's lateness comes near `link.deadline` [s] of an arm; else empty."""
         late = self.percentile(0.999)
         if late <= WARN_SHARE * deadline:
             return ""

@@ -23,7 +23,7 @@ from armlink.link.bus_load import overload
 from armlink.link.bus_watchdog import MOST_FRAMES
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
-from armlink.link.ends import Cause, cause_of, end
+from armlink.link.ends import EndCause, cause_of, end
 from armlink.link.faults import bus_fault
 from armlink.link.gate import JointLimits, start_from
 from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, require_ranges, target_window
@@ -85,7 +85,7 @@ class Link(Calibrations):
         """Requests to drives, outside of cycles or between them."""
         self.calibrate_host(simulated=self._lock_step)
         self.setups: list[Setup] = []
-        """What start() found, in joint order."""
+        """Results of start(), in joint order."""
         self._cycling = self._enabled = self._held = False
         self._since = 0.0
         self.position_step = np.full(self.n, np.inf)
@@ -94,6 +94,8 @@ class Link(Calibrations):
         self._limits: list[Limits] = []
         self._hold: ArmHold | None = None
         self._overloaded = overloaded
+        self.tell: Tell = lambda text: log.debug("%s: %s", self.arm.name, text)
+        """Told what start() does with an arm that is out."""
 
     @classmethod
     def open(cls, arm: ArmFile, bus: str | None = None) -> "Link":
@@ -110,10 +112,7 @@ class Link(Calibrations):
         """See `close`."""
         self.close(cause_of(error))
 
-    def _say(self, text: str) -> None:
-        log.debug("%s: %s", self.arm.name, text)
-
-    def close(self, cause: Cause = Cause.DONE, tell: Tell | None = None) -> None:
+    def close(self, cause: EndCause = EndCause.DONE, tell: Tell | None = None) -> None:
         """Bring the arm to its end (`armlink.link.ends`), and close the bus; `tell` is told what is being done.
 
         Ctrl-C no longer raises meanwhile; pressed twice it lets the arm go.
@@ -206,7 +205,7 @@ class Link(Calibrations):
         `to_enable`; BusFault, BadInput.
         """
         if self.falls:
-            end(self, Cause.DONE, self._say)
+            end(self, EndCause.DONE, self.tell)
         self._hold = self._hold or ArmHold(self.bus, self.addresses)
         missing = [
             f"{self.names[group.places[joint]]} ({self.section.joints[group.places[joint]].settings.address})"
@@ -295,7 +294,7 @@ class Link(Calibrations):
         return [drive_limits(row, window, self.period, self.section.deadline) for row, window in pairs]
 
     def guard_rules(self) -> dict[str, Any]:
-        """What a guard of the bus may pass to these drives, as `armlink.guard.bus_guard` takes it; sets nothing.
+        """Frames that a guard of the bus may pass to these drives, as `armlink.guard.bus_guard` takes it; sets nothing.
 
         Raises BusFault where a drive does not answer, BadInput for drives that no guard can check.
         """
@@ -326,7 +325,7 @@ class Link(Calibrations):
         return gate_limits(wanted, gains, self.values.reach(joint, wanted.max_torque))
 
     def calibration_changed(self, joint: int) -> None:
-        """What the gate lets pass follows the host's calibration."""
+        """The gate's limits follow the host's calibration."""
         if self.setups:
             self.commander.limits[joint] = self._gate_limits(joint)
 
@@ -341,9 +340,11 @@ class Link(Calibrations):
         self._forget()
         self.commander.settle()
         self.turns.require(positions_before_power(self.commander, self.set_up_positions.tolist(), self._since))
+        self._held = self.falls  # what has power by now is not dropped by whatever ends the walk
         try:
             sample = self.commander.walk(Power.ON)
         except BusFault as fault:
+            self._held = self.falls and Power.ON in self.commander.powers
             self._mind_overload(fault)
             raise
         self._forget()
@@ -418,7 +419,7 @@ class Link(Calibrations):
         return sample
 
     def _mind_overload(self, error: BaseException) -> None:
-        """What no drive is to blame for: a bus that cannot carry the cycle."""
+        """Raise for a bus that cannot carry the cycle, which no drive is to blame for."""
         if self._overloaded and isinstance(error, BusFault) and not isinstance(error, HostLate):
             error.args = (f"{error}; {self._overloaded}",)
 

@@ -18,7 +18,7 @@ from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import StampedPort
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.board import Event
+from armlink.drives.board import DriveEvent
 from armlink.drives.orders import Order
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.joints.ask import LinkAsk
@@ -63,7 +63,7 @@ class Listener(Calibrations):
         self._ready: deque[tuple[Sample, Commands]] = deque()
         self._sent: Commands = ()
         self._sample: Sample | None = None
-        """What `next` gave last, and the commands for it."""
+        """The last result of `next`, and the commands for it."""
         self._decoded: tuple[Array, Array] | None = None
         self._sync: float | None = None
         self._since: float | None = None
@@ -85,7 +85,7 @@ class Listener(Calibrations):
         return self._loop.stats
 
     @property
-    def emergencies(self) -> deque[Event]:
+    def emergencies(self) -> deque[DriveEvent]:
         """Everything that drives told of themselves; the caller may clear it."""
         return self._loop.board.events
 

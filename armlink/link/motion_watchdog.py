@@ -1,4 +1,4 @@
-"""What the readings of n joints prove about their motion: no reading is believed alone.
+"""Bounds of n joints' speeds, and contradictions, by their readings: no reading is believed alone.
 
 Two readings tell how a joint moves: the velocity that its drive reports, and the differences of its positions. Each is
 taken for what it can prove. A sample was taken no earlier than it was asked for and no later than it was here; two
@@ -8,6 +8,8 @@ or a lost frame did to the time between them. The encoder's resolution widens bo
 - `proven` is a speed that a joint has at the least, by all means over its newest positions and by those of the cycle
   before: one false position is no speed. `ahead` is the one that it has by then at which an order that is made now can
   act, if it goes on as it does, by any of the means.
+- `unexplained` is the way by the positions of which the velocities say nothing: a joint that turned has none, a
+  position that jumped has its jump.
 - `contradicted` joints have positions and velocities that cannot both be right: the way by the one and the way by the
   other differ by more than resolution, lateness and the drive's own filter explain, or the drive tells of a speed above
   the joint's limit of which its positions show nothing.
@@ -27,8 +29,8 @@ ROWS = LAGS[-1] + 1
 PRESENT = 4
 """The first so many lags tell of the present: a mean over up to eight cycles."""
 REACTION_CYCLES = 3
-"""What is not stopped by this reading is stopped by the next: the reading is a cycle old, the next comes a cycle later,
-and an order acts within a third."""
+"""A joint that this reading does not stop is stopped by the next: the reading is a cycle old, the next comes a cycle
+later, and an order acts within a third."""
 MEMORY = 0.5
 """Ways by positions and by velocities are compared over this time [s]: long against a drive's filter, and so short that
 a velocity reading's zero error (half a step of 12 bits, 0.02 rad/s) comes to no more than WAY."""
@@ -96,6 +98,8 @@ class MotionWatch:
         """(n,) [rad/s]; likewise."""
         self.contradicted = [False] * self.n
         """(n,)."""
+        self.unexplained = [0.0] * self.n
+        """Way by the positions less that by the velocities, of late (n,) [rad]."""
         kept = math.ceil(self._delay / self._period)
         self._joints = [_Joint(*each, kept) for each in zip(self._step, self._most, strict=True)]
 
@@ -112,6 +116,7 @@ class MotionWatch:
         rows = zip(position, earliest, latest, velocity, came, strict=True)
         for joint, (own, row) in enumerate(zip(self._joints, rows, strict=True)):
             self.proven[joint], self.ahead[joint], self.contradicted[joint] = self._judged(own, *row)
+            self.unexplained[joint] = abs(own.apart)
 
     def _judged(
         self, own: _Joint, here: float, since: float, until: float, told: float, came: float

@@ -92,8 +92,10 @@ def park(link: Parked, tell: Tell) -> None:
     if stowed is None:
         raise BadInput(f"{link.arm.path}: key link.park is missing: give the pose in which the arm rests without power")
     goal = np.array(stowed.pose)
-    start = link.keep().position
-    start = np.where(np.isfinite(start), start, link.latest_position)
+    link.keep()
+    window = np.array([(each.lower, each.upper) for each in link.commander.limits]).T
+    # a joint outside its window is led back into it by the gate; one that cannot be held has no way to go
+    start = np.where(link.commander.held, np.clip(link.latest_position, *window), goal)
     path = straight(start, goal, speeds(link, stowed.speed), link.period)
     every = cycles(link, TELL_SECONDS)
     for row, target in enumerate(path):

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from armlink.arrays import Array
 from armlink.drives.orders import Mode
-from armlink.link.guard import Guard
+from armlink.link.guard import ReadingBounds
 from armlink.link.lateness import Lateness
 from armlink.torque_calibration import Calibration as Calibration
 
 
 @dataclass(frozen=True)
 class DriveSerial:
-    """What one drive is known by, whatever the arm file says."""
+    """A drive's own serial number, whatever the arm file says."""
 
     number: str = ""
     """Vendor, product and serial number; empty for a drive that tells none, or keeps no calibration."""
@@ -36,7 +36,7 @@ class Command:
     """Target position by the joint's own sensor [rad], (n,)."""
     t: float | None = None
     """When it was decided, by the link's clock [s]; None: now. The gate refuses a command that is too old."""
-    guard: Guard | None = None
+    guard: ReadingBounds | None = None
     """Bounds within which the command holds; the cycle that finds one crossed raises Crossed."""
 
     @classmethod
@@ -56,10 +56,10 @@ class Setpoints:
     """[N·m], (K, n), or (n,) for all rows."""
     position: Array
     """[rad], (K, n)."""
-    guard: Guard | None = None
+    guard: ReadingBounds | None = None
 
     @classmethod
-    def follow(cls, position: Array, guard: Guard | None = None) -> "Setpoints":
+    def follow(cls, position: Array, guard: ReadingBounds | None = None) -> "Setpoints":
         """Every joint under position control along position (K, n) [rad]."""
         n = position.shape[1]
         return cls(np.full(n, Mode.POSITION, np.int8), np.zeros(n), position, guard)

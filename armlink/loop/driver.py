@@ -116,7 +116,7 @@ class ArmDriver(Protocol):
         ...
 
     def drive_serial(self, joint: int) -> DriveSerial:
-        """What the drive of joint 0 … n−1 is known by; raises BusFault."""
+        """Serial number of the drive of joint 0 … n−1; raises BusFault."""
         ...
 
     @property

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from armlink.link.ends import Cause
+from armlink.link.ends import EndCause
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.messages import Drop, End, Told
 from armlink.termination import Dropped
@@ -18,23 +18,29 @@ SILENT_END = 10.0
 """A process that says nothing for this long while it brings its arm to the end hangs [s]."""
 TOLD_EVERY = 0.2
 """[s]."""
-OF_THE_TERMINAL = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
 OF_A_SERVICE = (signal.SIGTERM, signal.SIGABRT)
 """systemd sends them to every process of a unit: at its stop, and where its watchdog has run out."""
+OF_ITS_OWN = (
+    signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT, signal.SIGCHLD,
+    signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFPE, signal.SIGTRAP, signal.SIGSYS,
+)  # fmt: skip
+"""Signals that cannot be ignored, that end no process, or that tell of an error of its own."""
 
 
 class Ending:
-    """Signals of the terminal and of the service manager are left to the job: it ends this process, and says how.
+    """Signals to a group of processes are left to the job, which is in it: it ends this process, and says how.
 
-    A job that does not within GRACE after SIGTERM hangs, and this process then ends by itself.
+    A job that does not within GRACE after SIGTERM hangs, and this process then ends by itself. So it does when the job
+    has gone: its end of the channel may live on in a process that the job has forked.
     """
 
     def __init__(self) -> None:
         """Take over the signals of this process, and leave the terminal."""
         self._asked: float | None = None
+        self._job = os.getppid()
         if os.getsid(0) != os.getpid():
             os.setsid()
-        for number in OF_THE_TERMINAL:
+        for number in signal.valid_signals() - {*OF_A_SERVICE, *OF_ITS_OWN}:
             signal.signal(number, signal.SIG_IGN)
         for number in OF_A_SERVICE:
             signal.signal(number, self._note)
@@ -44,13 +50,18 @@ class Ending:
         """Whether to end although the job is still there."""
         return self._asked is not None and time.monotonic() - self._asked > GRACE
 
+    @property
+    def orphaned(self) -> bool:
+        """Whether the job has gone."""
+        return os.getppid() != self._job
+
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self._asked is None:
             self._asked = time.monotonic()
 
 
 def telling(channel: Channel, aside: Callable[[Any], None] = lambda message: None) -> Callable[[str], None]:
-    """What tells the job how far the end of its arm is, as long as the job is there; raises Dropped when it says so.
+    """Tell the job how far the end of its arm is, as long as the job is there; raises Dropped when it says so.
 
     `aside` takes whatever else the job says meanwhile.
     """
@@ -70,7 +81,7 @@ def telling(channel: Channel, aside: Callable[[Any], None] = lambda message: Non
     return tell
 
 
-def see_out(channel: Channel, runs: Callable[[], bool], cause: Cause, tell: Callable[[str], None]) -> bool:
+def see_out(channel: Channel, runs: Callable[[], bool], cause: EndCause, tell: Callable[[str], None]) -> bool:
     """Have the process at the other end bring its arm to the end, and wait until it has ended; whether it has.
 
     `tell` is told what it does, and may raise Dropped: the arm is then let go. `runs` tells whether the process runs.

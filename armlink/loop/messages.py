@@ -9,7 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.errors import ArmlinkError
-from armlink.link.ends import Cause
+from armlink.link.ends import EndCause
 from armlink.link.types import Sample, Setpoints
 
 
@@ -41,7 +41,7 @@ class Play:
 
 
 @dataclass(frozen=True)
-class Run:
+class RunController:
     """A controller to run."""
 
     id: int
@@ -58,7 +58,7 @@ class Cut:
 class End:
     """Bring the arm to its end, and end."""
 
-    cause: Cause
+    cause: EndCause
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Alive:
 
 
 @dataclass(frozen=True)
-class Answer:
+class LoopAnswer:
     """To an Open (id 0) or a Call."""
 
     id: int
@@ -82,7 +82,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Told:
-    """What a call that is under way is doing; id 0: the end of the arm."""
+    """Progress of a call; id 0: of the end of the arm."""
 
     id: int
     text: str

@@ -19,14 +19,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 
 from armlink.errors import ArmlinkError, BusFault, Refused, Stall
-from armlink.link.ends import Cause
+from armlink.link.ends import EndCause
 from armlink.link.gate import TORQUE_MODES
 from armlink.link.guard import Crossed
 from armlink.link.link import Link
 from armlink.link.types import Command, Controller, Sample, Setpoints
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.ending import Ending, telling
-from armlink.loop.messages import Alive, Answer, Call, Cut, End, Open, Play, Run, Stopped, Told, pack
+from armlink.loop.messages import Alive, Call, Cut, End, LoopAnswer, Open, Play, RunController, Stopped, Told, pack
 from armlink.loop.realtime import prepare
 
 IDLE = 0.05
@@ -38,6 +38,8 @@ SILENT = 3.0
 TALK_EVERY = 7e-3
 """Samples wait for each other for this long [s]: waking the job costs as much as half a cycle. While rows are played,
 the job is not heard more often either, and replies are waited for in those cycles alone."""
+SIGN_EVERY = 1.0
+"""Time between two signs of life [s]."""
 ENABLING = ("enable", "recover")
 
 
@@ -65,11 +67,16 @@ class DriveLoop:
         self._unpickled: Future[Controller] | None = None
         """A controller that is on its way."""
         self._heard = time.monotonic()
+        self._signed = -math.inf
+        """When the job was last told that this process makes cycles [s]."""
+        link.commander.loop.on_cycle = self._sign_of_life
 
-    def run(self, ending: Ending) -> Cause:
+    def run(self, ending: Ending) -> EndCause:
         """Until the job says how the arm is to end, or SIGTERM is for this process alone; raises Closed where the job
         has gone."""
         while not ending.due:
+            if ending.orphaned:
+                raise Closed
             if not self._busy:
                 for message in self._channel.receive():
                     self._heard = time.monotonic()
@@ -83,7 +90,7 @@ class DriveLoop:
             else:
                 self._channel.flush()
                 self._channel.wait(IDLE)
-        return Cause.INTERRUPTED
+        return EndCause.INTERRUPTED
 
     def _handle(self, message: object) -> None:
         match message:
@@ -91,14 +98,14 @@ class DriveLoop:
                 self._call(message)
             case End():
                 self._end = message
-            case Play() | Run() if not self._link.enabled:
+            case Play() | RunController() if not self._link.enabled:
                 self._channel.put(Stopped(self._fault))
             case Play(id, setpoints):
                 if id != self._id:
                     self._begin(id)
                 self._chunks.append(setpoints)
                 self._rows += len(setpoints)
-            case Run(id, controller):
+            case RunController(id, controller):
                 self._begin(id)
                 self._unpickled = self._beside.submit(pickle.loads, controller)
             case Cut() if self._controlled:  # its last torque is right for its last sample alone
@@ -116,17 +123,18 @@ class DriveLoop:
 
     def _call(self, call: Call) -> None:
         link = self._link
+        link.tell = tell = lambda text: self._tell(call.id, text)
         try:
             kwargs = dict(call.kwargs)
             if callable(call.what):
-                answer = Answer(call.id, call.what(link, lambda text: self._tell(call.id, text), *call.args, **kwargs))
+                answer = LoopAnswer(call.id, call.what(link, tell, *call.args, **kwargs))
             else:
                 found = getattr(link, call.what)
-                answer = Answer(call.id, found(*call.args, **kwargs) if callable(found) else found)
+                answer = LoopAnswer(call.id, found(*call.args, **kwargs) if callable(found) else found)
         except ArmlinkError as error:
-            answer = Answer(call.id, error=error)
+            answer = LoopAnswer(call.id, error=error)
         except KeyboardInterrupt:
-            answer = Answer(call.id, error=Refused("interrupted"))
+            answer = LoopAnswer(call.id, error=Refused("interrupted"))
         if link.enabled and (callable(call.what) or call.what in ENABLING):
             self._begin(0)
             self._last = link.last
@@ -141,6 +149,16 @@ class DriveLoop:
         self._end = next((each for each in messages if isinstance(each, End)), self._end)
         if any(isinstance(each, Cut | End) for each in messages):
             raise KeyboardInterrupt
+
+    def _sign_of_life(self) -> None:
+        """Tell the job now and then that cycles are made, whatever call they are made in: it would take silence for a
+        hang."""
+        now = time.monotonic()
+        if now - self._signed >= SIGN_EVERY:
+            self._signed = now
+            self._channel.put(Told(0, ""))
+            with contextlib.suppress(Closed):
+                self._channel.flush()
 
     def _keep(self) -> None:
         """Hold the joints, which were stopped."""
@@ -212,16 +230,16 @@ def main(number: int) -> None:
         try:
             link = Link.open(first.arm, first.bus)
         except ArmlinkError as error:
-            channel.put(Answer(0, error=error))
+            channel.put(LoopAnswer(0, error=error))
             channel.flush(1.0)
             return
-        cause = Cause.FAILED
+        cause = EndCause.FAILED
         try:
-            channel.put(Answer(0, prepare()))
+            channel.put(LoopAnswer(0, prepare()))
             sys.setswitchinterval(SWITCH)
             cause = DriveLoop(channel, link).run(ending)
         except Closed:
-            cause = Cause.LOST
+            cause = EndCause.LOST
         finally:
             link.close(cause, telling(channel))
     except Closed:

@@ -17,12 +17,12 @@ from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.drives.orders import DriveIdentity
 from armlink.errors import BusFault
-from armlink.link.ends import Cause, cause_of
+from armlink.link.ends import EndCause, cause_of
 from armlink.link.park import park
 from armlink.link.types import Calibration, Command, Controller, DriveSerial, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.ending import see_out
-from armlink.loop.messages import Alive, Answer, Call, Cut, Open, Play, Run, Stopped, Told, unpack
+from armlink.loop.messages import Alive, Call, Cut, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, said
 
@@ -48,7 +48,7 @@ class RemoteLink:
         self._numbers = itertools.count(1)
         self._samples: deque[tuple[int, int, bytes]] = deque()
         self._stopped: Stopped | None = None
-        self._answers: dict[int, Answer] = {}
+        self._answers: dict[int, LoopAnswer] = {}
         self._in_force: Command | None = None
         self._torque_sent = self._position_sent = np.full(self.n, np.nan)
         self._step = np.full(self.n, np.inf)
@@ -66,7 +66,7 @@ class RemoteLink:
             self.realtime: Realtime = self._answer(0)
             """Real-time permissions of the process that makes the cycles."""
         except BaseException:
-            self._end(Cause.FAILED)
+            self._end(EndCause.FAILED)
             raise
 
     def __enter__(self) -> Self:
@@ -204,7 +204,7 @@ class RemoteLink:
     def run(self, controller: Controller) -> Samples:
         """As Link.run, in the other process."""
         number = next(self._numbers)
-        self._put(Run(number, pickle.dumps(controller)))
+        self._put(RunController(number, pickle.dumps(controller)))
         yield from self._take(number, sys.maxsize)
 
     def catch_up(self) -> None:
@@ -269,13 +269,14 @@ class RemoteLink:
             raise self._gone() from None
         for message in messages:
             match message:
-                case Answer():
+                case LoopAnswer():
                     self._answers[message.id] = message
                 case Stopped():
                     self._stopped = message
                 case Told():
                     self._heard = time.monotonic()
-                    self._tell_on(message.text)
+                    if message.text:
+                        self._tell_on(message.text)
                 case _:
                     self._samples.append(message)
 
@@ -302,7 +303,7 @@ class RemoteLink:
             f"the process that drives the arm has ended (status {status}): the joints stop by their own deadline"
         )
 
-    def _end(self, cause: Cause) -> None:
+    def _end(self, cause: EndCause) -> None:
         with Presses() as presses:
             tell = said(self.arm.name, presses)
             if not see_out(self._channel, lambda: self._process.poll() is None, cause, tell):

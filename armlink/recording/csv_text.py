@@ -11,7 +11,7 @@ SEPARATORS = ",;\t "
 
 
 @dataclass(frozen=True)
-class Layout:
+class CsvLayout:
     """How the text is to be read."""
 
     header: tuple[str, ...]
@@ -27,7 +27,7 @@ class Layout:
         return self.first[column] if column < len(self.first) else ""
 
 
-def layout_of(content: bytes | bytearray, source: str) -> Layout:
+def layout_of(content: bytes | bytearray, source: str) -> CsvLayout:
     """Layout of a file's content, of which the first lines are looked at. Raises BadInput where it has no header row.
 
     Lines of comment (`#`) may stand above the header row, or the last of them is it.
@@ -46,7 +46,7 @@ def layout_of(content: bytes | bytearray, source: str) -> Layout:
     separator = _separator(text)
     following = lines[above + 1] if above + 1 < len(lines) else ""
     comma = separator != "," and re.search(r"\d,\d", following) is not None
-    return Layout(
+    return CsvLayout(
         tuple(_cells(text, separator, source)),
         above + 1,
         separator,

@@ -44,7 +44,7 @@ MOST_CHUNK = 1 << 28
 """A chunk that unpacks to more bytes is refused; rosbag2 writes less than a thousandth of it."""
 _NANO = 1_000_000_000
 DAMAGED = (McapError, ValueError, OverflowError, OSError, struct.error, ZstdError)
-"""What reading a damaged file raises."""
+"""Raised by the reading of a damaged file."""
 
 
 class RecordingWriter:

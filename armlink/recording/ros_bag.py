@@ -27,7 +27,7 @@ _NANO = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Sample:
+class BagMessage:
     """One message: its stamp [ns], joint names, and the channels that it carries."""
 
     stamp: int
@@ -51,7 +51,7 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
         with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             readable = [c for c in reader.connections if isinstance(c.topic, str) and _short(c.msgtype) in _READERS]
             states = _state_connections(readable, topic, reader.connections, path)
-            samples: dict[str, list[Sample]] = defaultdict(list)
+            samples: dict[str, list[BagMessage]] = defaultdict(list)
             size = 0
             wanted = [*states, *(c for c in readable if c.topic in TOPICS and c not in states)]
             for connection, receipt, raw in reader.messages(connections=wanted):
@@ -84,7 +84,7 @@ def _state_connections(readable: Sequence[Any], topic: str, all_of_them: Iterabl
     return [c for c in readable if c.topic == chosen]
 
 
-def _recording(main: list[Sample], others: dict[str, list[Sample]], source: str) -> Recording:
+def _recording(main: list[BagMessage], others: dict[str, list[BagMessage]], source: str) -> Recording:
     names, alone = main_joints([sample.names for sample in main])
     if len(names) > MOST_JOINTS:
         raise BadInput(f"{source}: {len(names)} joints in the joint states, expected at most {MOST_JOINTS}")
@@ -105,7 +105,7 @@ def _recording(main: list[Sample], others: dict[str, list[Sample]], source: str)
     return Recording(t=(stamps - stamps[0]) / _NANO, names=names, warning=left_out(alone), **channels)
 
 
-def _channels(samples: list[Sample], names: tuple[str, ...], source: str) -> dict[str, Array]:
+def _channels(samples: list[BagMessage], names: tuple[str, ...], source: str) -> dict[str, Array]:
     """Channels of some samples (K, n) in the order of `names`, NaN for joints that a message lacks."""
     found: dict[str, Array] = {}
     for row, sample in enumerate(samples):
@@ -128,12 +128,12 @@ def _stamp(message: Any, receipt: int) -> int:
     return stamp or receipt
 
 
-def _joint_state(message: Any, receipt: int) -> Sample:
+def _joint_state(message: Any, receipt: int) -> BagMessage:
     channels = {"position": message.position, "velocity": message.velocity, "torque": message.effort}
-    return Sample(_stamp(message, receipt), tuple(message.name), channels)
+    return BagMessage(_stamp(message, receipt), tuple(message.name), channels)
 
 
-def _controller_state(message: Any, receipt: int) -> Sample:
+def _controller_state(message: Any, receipt: int) -> BagMessage:
     measured = getattr(message, "feedback", None) or message.actual
     wanted = getattr(message, "reference", None) or message.desired
     channels = {
@@ -142,10 +142,10 @@ def _controller_state(message: Any, receipt: int) -> Sample:
         "torque": measured.effort,
         "position_command": wanted.positions,
     }
-    return Sample(_stamp(message, receipt), tuple(message.joint_names), channels)
+    return BagMessage(_stamp(message, receipt), tuple(message.joint_names), channels)
 
 
-def _dynamic_state(message: Any, receipt: int) -> Sample:
+def _dynamic_state(message: Any, receipt: int) -> BagMessage:
     kinds = {"position": "position", "velocity": "velocity", "torque": "effort"}
     rows = [dict(zip(v.interface_names, v.values, strict=False)) for v in message.interface_values]
     channels = {
@@ -153,14 +153,14 @@ def _dynamic_state(message: Any, receipt: int) -> Sample:
         for channel, kind in kinds.items()
         if any(kind in row for row in rows)
     }
-    return Sample(_stamp(message, receipt), tuple(message.joint_names), channels)
+    return BagMessage(_stamp(message, receipt), tuple(message.joint_names), channels)
 
 
 def _short(kind: str) -> str:
     return kind.rpartition("/")[2]
 
 
-_READERS: dict[str, Callable[[Any, int], Sample]] = {
+_READERS: dict[str, Callable[[Any, int], BagMessage]] = {
     "JointState": _joint_state,
     "JointTrajectoryControllerState": _controller_state,
     "DynamicJointState": _dynamic_state,

@@ -21,7 +21,7 @@ from armlink.arrays import Array
 from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
 from armlink.recording.column_names import joint_names, suggested_map
-from armlink.recording.csv_text import Layout, is_number, layout_of
+from armlink.recording.csv_text import CsvLayout, is_number, layout_of
 from armlink.recording.recording import (
     Recording,
     channel_column,
@@ -256,7 +256,7 @@ def _table(recording: Recording) -> Any:
     return pa.table({name: pa.array(values, from_pandas=True) for name, values in columns_of(recording).items()})
 
 
-def _content(path: Path) -> tuple[bytearray, str, Layout]:
+def _content(path: Path) -> tuple[bytearray, str, CsvLayout]:
     """Complete lines of the file, uncompressed, why it is truncated (empty if it is not), and how it is written."""
     try:
         require_size(path.stat().st_size, str(path))
@@ -296,7 +296,7 @@ def _unpacked(packed: bytes, source: str) -> tuple[bytearray, bool]:
     return content, ended
 
 
-def _looks_whole(content: bytearray, layout: Layout) -> bool:
+def _looks_whole(content: bytearray, layout: CsvLayout) -> bool:
     """Whether a last line without newline is complete: all columns, its last number as long as any above it.
 
     A truncated number has fewer decimals than the others of its column, or is shorter.

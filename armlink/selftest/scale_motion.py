@@ -1,4 +1,4 @@
-"""What the scales of an arm's drives are judged by: readings while a hand, this host or another one moves the arm."""
+"""Motion for the judgement of an arm's scales: readings while a hand, this host or another one moves the arm."""
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -17,8 +17,7 @@ from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.park import speeds, straight
 from armlink.link.types import Command, Sample, Setpoints, Tell
-from armlink.selftest.scales import Evidence, ScaleFinding, gather, judge
-from armlink.selftest.track import Track
+from armlink.selftest.scales import Evidence, ScaleFinding, ScaleTrack, gather, judge
 
 REACH = 0.35
 """Distance by which this host moves every joint to both sides [rad]."""
@@ -36,7 +35,7 @@ TELL_EVERY = 0.5
 
 @dataclass(frozen=True)
 class JointScales:
-    """What was found of one joint."""
+    """The evidence of one joint."""
 
     joint: str
     evidence: tuple[Evidence, ...]
@@ -62,11 +61,11 @@ class Tracks:
         columns = zip(sample.position.tolist(), sample.velocity.tolist(), motor.tolist(), orders, strict=True)
         self._rows.append((sample.t, [(*readings, *_told(order)) for *readings, order in columns]))
 
-    def of(self, joint: int) -> Track:
+    def of(self, joint: int) -> ScaleTrack:
         """The track of one joint."""
         t = np.array([t for t, _ in self._rows])
         table = np.array([row[joint] for _, row in self._rows]).reshape(-1, 8)
-        return Track(t, *table.T)
+        return ScaleTrack(t, *table.T)
 
 
 def _told(order: Order | None) -> tuple[float, ...]:

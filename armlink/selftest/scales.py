@@ -20,7 +20,31 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armlink.arrays import Array
-from armlink.selftest.track import Track
+
+
+@dataclass(frozen=True, eq=False)
+class ScaleTrack:
+    """Readings of one joint and what was commanded at the time, all (K,), NaN where there was none."""
+
+    t: Array
+    """[s]."""
+    position: Array
+    """[rad]."""
+    velocity: Array
+    """[rad/s]."""
+    torque: Array
+    """Motor torque as the drive reports it [N·m], no calibration applied."""
+    target: Array
+    """Commanded position [rad]."""
+    rate: Array
+    """Commanded velocity [rad/s]."""
+    ahead: Array
+    """Commanded torque [N·m]."""
+    kp: Array
+    """[N·m/rad]."""
+    kd: Array
+    """[N·m·s/rad]."""
+
 
 QUANTITIES = ("position", "velocity", "torque")
 OFF = math.log(1.06)
@@ -82,7 +106,9 @@ class ScaleFinding:
         return f"{what} reads {1 / self.factor:.3g} times its true value ({why})"
 
 
-def gather(track: Track, way: float, stop_to_stop: bool, by_current: Sequence[tuple[float, float]]) -> list[Evidence]:
+def gather(
+    track: ScaleTrack, way: float, stop_to_stop: bool, by_current: Sequence[tuple[float, float]]
+) -> list[Evidence]:
     """All evidence of one joint.
 
     `way` is the angle between its stops [rad]; `stop_to_stop`: it was moved from one to the other. `by_current` has
@@ -125,7 +151,7 @@ def judge(evidence: Sequence[Evidence]) -> list[ScaleFinding]:
     ]
 
 
-def integrated(track: Track) -> Evidence | None:
+def integrated(track: ScaleTrack) -> Evidence | None:
     """Velocity integrated over time against the change of position; None where the joint hardly moved."""
     both = np.isfinite(track.position) & np.isfinite(track.velocity)
     t, q, v = track.t[both], track.position[both], track.velocity[both]
@@ -165,7 +191,7 @@ def _rounding(values: Array) -> float:
     return float(steps.min()) / math.sqrt(12.0) if len(steps) else 0.0
 
 
-def law(track: Track) -> list[Evidence]:
+def law(track: ScaleTrack) -> list[Evidence]:
     """Torque against the law of gains, the command of the sample before with the readings of the torque's own sample;
     only coefficients that the motion shows."""
     stiff = track.kp[:-1] * (track.target[:-1] - track.position[1:])
@@ -225,7 +251,7 @@ def _coefficients(design: Array, torque: Array, rounding: Array) -> list[_Coeffi
     return found
 
 
-def between_stops(track: Track, way: float, stop_to_stop: bool) -> Evidence | None:
+def between_stops(track: ScaleTrack, way: float, stop_to_stop: bool) -> Evidence | None:
     """The way that was covered against that between the stops; None where it tells nothing."""
     here = track.position[np.isfinite(track.position)]
     if not len(here) or not way > 0:

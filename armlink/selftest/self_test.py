@@ -234,7 +234,7 @@ class SelfTest:
             link.cycle(Command.hold(target))
 
     def _left_alone(self, joint: int) -> tuple[Silence | None, float]:
-        """What a drive does without commands, None where it does not tell, and after how long [s]; then it is ON."""
+        """The drive's reaction to no commands, None where it does not tell, and its delay [s]; then it is ON."""
         link, limit = self.link, self.link.section.deadline
         group, drive = by_joint(link.groups)[joint]
         self.progress(f"{link.names[joint]}: no commands for {limit * 1e3:.0f} ms")
@@ -264,7 +264,7 @@ class SelfTest:
 
     @staticmethod
     def _reaction(found: Power, free: bool, moved: float) -> Silence:
-        """What a drive did that is in a power state, whose motor is `free`, and that moved so far [rad]."""
+        """The reaction of a drive by its power state, whether its motor is `free`, and its motion [rad]."""
         if found is Power.ON:
             return "keeps on"
         if free:

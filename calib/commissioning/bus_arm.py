@@ -7,7 +7,7 @@ from typing import Any
 
 from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
-from armlink.drives.found import FoundDrives
+from armlink.drives.findings import FoundDrives
 from armlink.errors import BusFault
 from calib.commissioning.drive_match import Ask, Match, moved_node
 

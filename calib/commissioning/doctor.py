@@ -44,6 +44,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
             "error", "key link is missing: no bus and no joint controllers", arm, f"add the section link: {FORMATS}"
         )
     else:
+        yield from _serial(arm_file)
         yield from turn_findings(arm_file)
         if not offline:
             yield from bus_findings(arm_file, bus)
@@ -55,6 +56,18 @@ def _as_finding(error: Exception, arm_file: ArmFile) -> SetupFinding:
     if not what:
         what, remedy = remedy, "correct the arm file or its model"
     return SetupFinding("error", what, str(arm_file.path), remedy)
+
+
+def _serial(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Records are kept under name and serial number: without one, two arms would share them."""
+    if not arm_file.has_serial:
+        yield SetupFinding(
+            "warning",
+            f"serial is {arm_file.serial}: an arm of the same name would get this one's calibrations, so none is"
+            " written to its drives",
+            str(arm_file.path),
+            "give it a serial number before its first sweep (serial: …)",
+        )
 
 
 def _assumed(arm: str, arm_file: ArmFile) -> Iterator[SetupFinding]:

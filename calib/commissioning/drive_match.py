@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from armlink.drives.found import FoundDrive, FoundDrives
+from armlink.drives.findings import FoundDrive, FoundDrives
 from armlink.errors import BadInput, BusFault
 from calib.commissioning.finding import SetupFinding
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
 from armlink.content.atomic_file import write_whole
 from armlink.content.file_content import parse_yaml
-from armlink.drives.found import FoundDrives
+from armlink.drives.findings import FoundDrives
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text

@@ -7,7 +7,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused, Stall
-from armlink.link.guard import Guard
+from armlink.link.guard import ReadingBounds
 from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
 from calib.arm.sweep_section import sweep_section
@@ -146,13 +146,13 @@ class _Pass:
         rows[:, joint] = start[joint] + distance * np.cumsum(rate) / rate.sum()
         return rows
 
-    def _guard(self, joint: int) -> Guard:
+    def _guard(self, joint: int) -> ReadingBounds:
         """The creeping joint may be behind its target by `contact_lead`; the others' sag is no contact."""
         n = self._mover.link.n
         follow = np.full(n, np.inf)
         stiffness = getattr(self._mover.link.arm.require_link().joints[joint].settings, "kp", None)
         follow[joint] = max(self._creep.contact_lead, CONTACT_TORQUE / stiffness if stiffness else 0.0)
-        return Guard(np.full(n, -np.inf), np.full(n, np.inf), follow)
+        return ReadingBounds(np.full(n, -np.inf), np.full(n, np.inf), follow)
 
     def _pause(self) -> None:
         for _ in range(round(PAUSE / self._mover.link.period)):

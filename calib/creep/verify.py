@@ -7,7 +7,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from armlink.link.guard import Guard
+from armlink.link.guard import ReadingBounds
 from armlink.link.types import Sample
 from armlink.loop.driver import ArmDriver
 from calib.arm.drive_limits import Limits
@@ -114,7 +114,7 @@ def _creep(mover: Mover, way: float) -> list[Sample]:
     count = round(abs(way) / SPEED / period)
     rows = start + way * (np.arange(1, count + 1) / count)[:, None]
     n = mover.link.n
-    return mover.follow(rows, Guard(np.full(n, -np.inf), np.full(n, np.inf), np.full(n, STALL)))
+    return mover.follow(rows, ReadingBounds(np.full(n, -np.inf), np.full(n, np.inf), np.full(n, STALL)))
 
 
 def _half_sum(up: list[Sample], down: list[Sample], pose: Array) -> tuple[Array, Array]:

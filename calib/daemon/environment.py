@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Protocol, TypeVar
 
-from armlink.loop.messages import Answer
+from armlink.loop.messages import LoopAnswer
 from calib.install.journaled_write import Controllers
 
 T = TypeVar("T")
@@ -50,7 +50,7 @@ class Port(Protocol):
         """Reads and writes the calibration of every joint; waits for the answer, so only for work that runs aside."""
         ...
 
-    def sweep(self, poses: int, seed: int, /) -> Answer | None:
+    def sweep(self, poses: int, seed: int, /) -> LoopAnswer | None:
         """Ask for a tour of poses; the reply comes as a message unless it is returned."""
         ...
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
-from armlink.link.ends import Cause
+from armlink.link.ends import EndCause
 from armlink.link.types import Tell
-from armlink.loop.messages import Answer, Told
+from armlink.loop.messages import LoopAnswer, Told
 from armlink.termination import Presses, said
 from calib.daemon.environment import Environment
 from calib.daemon.logs import log_in_thread
@@ -96,7 +96,7 @@ class Daemon:
             if self.process.fileno() >= 0:
                 self._loop.remove_reader(self.process.fileno())
             closed, tell = self._loop.create_future(), self._ending()
-            self._bus_ends(lambda: self.process.close(Cause.INTERRUPTED, tell), closed.set_result)
+            self._bus_ends(lambda: self.process.close(EndCause.INTERRUPTED, tell), closed.set_result)
             await closed
             for task in (web, timer, ended):
                 task.cancel()
@@ -194,7 +194,7 @@ class Daemon:
             self._loop.remove_reader(self.process.fileno())
         self.service.take(Down(why))
         process, tell = self.process, said(self.arm.name, self._presses)
-        self._bus_ends(lambda: process.close(Cause.FAILED, tell), self._replace)
+        self._bus_ends(lambda: process.close(EndCause.FAILED, tell), self._replace)
 
     def _replace(self, outcome: Exception | None) -> None:
         self._replacing = False
@@ -251,7 +251,7 @@ class _CurrentProcess:
         self.controllers = LoopControllers(lambda call: process().ask(call))
         self._process = process
 
-    def sweep(self, poses: int, seed: int, /) -> Answer | None:
+    def sweep(self, poses: int, seed: int, /) -> LoopAnswer | None:
         """Ask for a tour of poses."""
         return self._process().sweep(poses, seed)
 

@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from armlink.arm_file import ArmFile
-from armlink.loop.messages import Answer
+from armlink.loop.messages import LoopAnswer
 from calib.daemon.environment import Environment
 from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
 from calib.daemon.observing.active_records import ActiveRecords
@@ -133,7 +133,7 @@ class Service:
             self.arm_state.down(message.reason)
         elif isinstance(message, Progress):
             self.tours.advanced(message)
-        elif isinstance(message, Answer) and message.error is not None:
+        elif isinstance(message, LoopAnswer) and message.error is not None:
             self.tours.refused(str(message.error))
 
     def tick(self) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from armlink.errors import Refused
-from armlink.link.guard import Crossed, Guard
+from armlink.link.guard import Crossed, ReadingBounds
 from armlink.link.integral import slowest_time
 from armlink.link.types import Command, Sample, Samples, Setpoints
 from armlink.loop.driver import ArmDriver
@@ -145,7 +145,7 @@ class Mover:
         """From now on a pressed joint that leaves its stop by more than `slack` [rad] raises Slipped."""
         lower = np.where(self.pressed & (self.side > 0), self._contact - slack, -np.inf)
         upper = np.where(self.pressed & (self.side < 0), self._contact + slack, np.inf)
-        self.command.guard = Guard(lower, upper, np.full(self.link.n, np.inf)) if self.pressed.any() else None
+        self.command.guard = ReadingBounds(lower, upper, np.full(self.link.n, np.inf)) if self.pressed.any() else None
 
     def hold_all(self) -> None:
         """Every joint under position control where it stands."""
@@ -177,8 +177,8 @@ class Mover:
         )
         if not len(path):  # they stand there
             return
-        held = self.command.guard or Guard.none(self.link.n)
-        guard = Guard(held.lower, held.upper, np.where(movable, STALL, np.inf))
+        held = self.command.guard or ReadingBounds.none(self.link.n)
+        guard = ReadingBounds(held.lower, held.upper, np.where(movable, STALL, np.inf))
         targets = np.where(movable, path, self.command.position)
         try:
             samples = list(self._play(Setpoints(self.command.mode, self.command.torque, targets, guard)))
@@ -188,7 +188,7 @@ class Mover:
         self._learn_resolution(seen)
         self._encoders.judge(np.reshape(seen, path.shape), path, movable, self.resolution)
 
-    def follow(self, rows: Array, guard: Guard) -> list[Sample]:
+    def follow(self, rows: Array, guard: ReadingBounds) -> list[Sample]:
         """The samples along targets (K, n) [rad], every joint under position control; raises Stalled, EncoderFault."""
         return list(self._play(Setpoints(self.command.mode, self.command.torque, rows, guard)))
 

@@ -16,7 +16,7 @@ DRIFT_FORM = "JOINT:GAIN:OFFSET@T, for example joint_3:1.03:0.3@20"
 
 
 @dataclass(frozen=True)
-class Drift:
+class SensorDrift:
     """A change of one joint's torque sensor."""
 
     joint: str
@@ -74,14 +74,14 @@ def _value(text: str, item: str) -> float | str:
         raise BadInput(f"--effect {text!r}: value {item!r} is not a number; expected {EFFECT_FORM}") from None
 
 
-def parse_drift(text: str, joints: Sequence[str]) -> Drift:
+def parse_drift(text: str, joints: Sequence[str]) -> SensorDrift:
     """Parse one `--drift`. Raises BadInput."""
     change, at, time = text.partition("@")
     parts = change.split(":")
     try:
         if not at or len(parts) != 3:
             raise ValueError
-        drift = Drift(parts[0], float(parts[1]), float(parts[2]), float(time))
+        drift = SensorDrift(parts[0], float(parts[1]), float(parts[2]), float(time))
     except ValueError:
         raise BadInput(f"--drift {text!r}: expected {DRIFT_FORM}") from None
     if drift.joint not in joints:

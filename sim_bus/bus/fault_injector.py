@@ -9,8 +9,7 @@ import numpy as np
 
 from armlink.errors import BadInput
 from sim_bus.bus.fault_kinds import CANOPEN_FAULTS, Fault
-from sim_bus.drives.false_readings import FALSE_READINGS, QUANTITIES, FalseReadings
-from sim_bus.drives.fault_kinds import DRIVE_KINDS
+from sim_bus.drives.drive_faults import DRIVE_KINDS, FALSE_READINGS, QUANTITIES, FalseReadings
 from sim_bus.drives.simulated_drive import SimulatedDrive
 from sim_bus.node.node import Node
 from sim_bus.node.pdo import Frame, layout

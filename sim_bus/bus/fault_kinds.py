@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from armlink.errors import BadInput
-from sim_bus.drives.false_readings import FALSE_READINGS
-from sim_bus.drives.fault_kinds import DRIVE_KINDS, FaultKind
+from sim_bus.drives.drive_faults import DRIVE_KINDS, FALSE_READINGS, FaultKind
 
 FORM = "ID:JOINT[:VALUE][@T] or ID::VALUE[@T], for example node.silent:joint_2 or bus.off::0.5@3"
 

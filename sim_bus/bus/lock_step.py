@@ -16,7 +16,7 @@ from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.bus.fault_injector import BUS_OFF, ERROR_FLAG, HOST_REFUSES, Injector
 from sim_bus.bus.fault_kinds import Fault, parse_fault
-from sim_bus.bus.wire_timing import Line, Wire
+from sim_bus.bus.wire_timing import TimedArm, TimedWire
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -64,9 +64,9 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
             if load:
                 arm.attach_mass(load)
         self.arm = arm
-        self.line: Line = arm
+        self.line: TimedArm = arm
         """The arm, or the fault injector or wire in front of it."""
-        self.wire: Wire | None = None
+        self.wire: TimedWire | None = None
         self.errors = 0
         """Error frames received."""
         self._injector: Injector | None = None
@@ -75,7 +75,7 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
         self.channel_info = f"simulated arm {arm.arm.name}"
         bitrate = options.pop("bitrate", arm.arm.require_link().bus.bitrate)
         if options.pop("timing", False):
-            self.line = self.wire = Wire(arm, bitrate)
+            self.line = self.wire = TimedWire(arm, bitrate)
         self._outbox = self.line.outbox
         super().__init__(channel=channel, **options)
 

@@ -11,10 +11,10 @@ from armlink.bus.port import BUS_SHIFT, InterfaceDown
 from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BusFault
 from sim_bus.bus.control_pipe import ControlPipe
-from sim_bus.bus.effect_options import Drift
+from sim_bus.bus.effect_options import SensorDrift
 from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import Fault
-from sim_bus.bus.wire_timing import Line
+from sim_bus.bus.wire_timing import TimedArm
 from sim_bus.simulated_arm import SimulatedArm
 
 LARGEST_LAG = 0.25
@@ -30,14 +30,14 @@ LOCKSTEP_PATIENCE = 1.0
 INTERRUPTED, TERMINATED = 130, 0
 
 
-class Server:
+class ArmServer:
     """Passes frames between bus and arm."""
 
     def __init__(
         self,
         arm: SimulatedArm,
         bus: CanBus,
-        drifts: Sequence[Drift] = (),
+        drifts: Sequence[SensorDrift] = (),
         lockstep: bool = False,
         now: Callable[[], float] = time.monotonic,
         faults: Sequence[Fault] = (),
@@ -56,7 +56,7 @@ class Server:
             self._numbered.sort(key=lambda each: each[0] == max(synced, default=bus.tags[joints[-1].bus]))
         *self._others, (self._leading_tag, self._leading) = self._numbered
         """The last of several buses with CANopen nodes provides SYNC: a host sends to them in order."""
-        self._line: Line = arm
+        self._line: TimedArm = arm
         self._control, self._injector = control, None if control is None and not faults else Injector(arm)
         if self._injector is not None:
             self._line = self._injector

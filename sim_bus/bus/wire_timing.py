@@ -22,7 +22,7 @@ TRANSMIT_QUEUE = 10
 """Length of a host's transmit queue: SocketCAN's default (txqueuelen)."""
 
 
-class Line(Protocol):
+class TimedArm(Protocol):
     """The arm, or what takes its place."""
 
     outbox: deque[Frame]
@@ -34,10 +34,10 @@ class Line(Protocol):
         """Advance simulated time [s]."""
 
 
-class Wire:
+class TimedWire:
     """A wire of `bitrate` [bit/s] in front of `line`, with on_frame(), advance() and `outbox` of the arm."""
 
-    def __init__(self, line: Line, bitrate: int, transmit_queue: int = TRANSMIT_QUEUE) -> None:
+    def __init__(self, line: TimedArm, bitrate: int, transmit_queue: int = TRANSMIT_QUEUE) -> None:
         """An idle bus."""
         self.line, self.bitrate, self.transmit_queue = line, bitrate, transmit_queue
         self.outbox: deque[Frame] = deque()

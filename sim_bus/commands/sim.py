@@ -58,7 +58,7 @@ def sim(
     from sim_bus.bus.control_pipe import ControlPipe
     from sim_bus.bus.effect_options import parse_drift, parse_effect
     from sim_bus.bus.fault_kinds import parse_fault
-    from sim_bus.bus.server import Server
+    from sim_bus.bus.server import ArmServer
     from sim_bus.sim_section import with_realism
     from sim_bus.simulated_arm import SimulatedArm
     from sim_bus.truth import Truth
@@ -90,7 +90,7 @@ def sim(
             f"{described.name}: {simulated.n} joints, {_addresses(described)} on {endpoint.channel_info}; "
             f"stop with Ctrl-C"
         )
-        server = Server(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
+        server = ArmServer(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
         server.on_wrong = lambda wrong: console.print(f"sim: {wrong}")
         return server.run()
     finally:

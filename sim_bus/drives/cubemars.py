@@ -4,12 +4,11 @@ import math
 from collections.abc import Callable
 
 from armlink.bus.port import EXTENDED, REMOTE
-from armlink.drives.cubemars.frames import NO_COMMAND, Reply, pack_reply
+from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, pack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.mit_packing import Ranges, Special, special_of, unpack_command
-from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
 
 LOOP_RATE = 40_000.0
 """Cycles of the drive's loop a second: those of the open firmware that it descends from, bgkatz/motorcontrol."""
@@ -77,7 +76,7 @@ class CubeMarsDrive(SimulatedDrive):
         told, coding = self.told(), self.coding
         feedback = told._replace(position=self._shown(told.position))
         temperature = int(MOTOR_TEMPERATURE + self.motor.heating)
-        self.answer(self.reply, pack_reply(Reply(self.address, feedback, temperature, self.error), coding))
+        self.answer(self.reply, pack_reply(CubeMarsReply(self.address, feedback, temperature, self.error), coding))
 
     def trip(self) -> None:
         """CAN timeout: its command becomes one of no torque; motor mode goes on."""

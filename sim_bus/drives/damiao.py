@@ -12,14 +12,14 @@ from armlink.drives.damiao.frames import (
     REGISTERS_ID,
     TIMEOUT_UNIT,
     WRITE,
-    Register,
-    Reply,
-    State,
+    DamiaoRegister,
+    DamiaoReply,
+    DamiaoStatus,
     pack_reply,
     pack_value,
     unpack_value,
 )
-from armlink.drives.damiao.models import MODELS
+from armlink.drives.damiao.settings import MODELS
 from armlink.drives.mit_packing import MitCommand, Ranges, Special, special_of, unpack_command
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
@@ -52,10 +52,10 @@ class DamiaoDrive(SimulatedDrive):
             64: 0.0, 65: 0.0, 80: 0.0, 81: 0.0,
         }  # fmt: skip
         self.registers = dict(self._stored)
-        self.state = State.DISABLED
+        self.state = DamiaoStatus.DISABLED
         self.command = NO_COMMAND
         self._coded: object = None
-        """What `coding` was made of."""
+        """Source of `coding`."""
         self._coding = Ranges(position, velocity, torque)
 
     @property
@@ -72,7 +72,7 @@ class DamiaoDrive(SimulatedDrive):
     @property
     def patience(self) -> float:
         """See SimulatedDrive."""
-        return self.registers[Register.TIMEOUT] * TIMEOUT_UNIT
+        return self.registers[DamiaoRegister.TIMEOUT] * TIMEOUT_UNIT
 
     def receive(self, can_id: int, data: bytes) -> None:
         """A command, or a register request that names this drive."""
@@ -84,20 +84,20 @@ class DamiaoDrive(SimulatedDrive):
         special = special_of(data)
         if special is not None:
             self._obey(special)
-        elif can_id == self.registers[Register.COMMAND_ID] and self.registers[10] == MIT_MODE:
+        elif can_id == self.registers[DamiaoRegister.COMMAND_ID] and self.registers[10] == MIT_MODE:
             self.command = unpack_command(data, self.coding)
         self.heard = self.now
-        if self.state is State.ENABLED:
+        if self.state is DamiaoStatus.ENABLED:
             self._follow()
         self._reply()
 
     def _obey(self, special: Special) -> None:
-        if special is Special.ENABLE and self.state is State.DISABLED:
-            self.state, self.command = State.ENABLED, NO_COMMAND
-        elif (special is Special.DISABLE and self.state is State.ENABLED) or (
-            special is Special.CLEAR_ERROR and self.state is not State.ENABLED and not self.latched
+        if special is Special.ENABLE and self.state is DamiaoStatus.DISABLED:
+            self.state, self.command = DamiaoStatus.ENABLED, NO_COMMAND
+        elif (special is Special.DISABLE and self.state is DamiaoStatus.ENABLED) or (
+            special is Special.CLEAR_ERROR and self.state is not DamiaoStatus.ENABLED and not self.latched
         ):
-            self._stop(State.DISABLED)
+            self._stop(DamiaoStatus.DISABLED)
 
     def _follow(self) -> None:
         command, coding = self.command, self.coding
@@ -105,7 +105,7 @@ class DamiaoDrive(SimulatedDrive):
         target = command.position + position - _wrapped(position, coding.position)
         self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.torque)
 
-    def _stop(self, state: State) -> None:
+    def _stop(self, state: DamiaoStatus) -> None:
         self.state, self.command = state, NO_COMMAND
         self.motor.free()
 
@@ -118,15 +118,15 @@ class DamiaoDrive(SimulatedDrive):
         motor, coding = self.motor, self.coding
         told = self.told()
         feedback = told._replace(position=_wrapped(told.position, coding.position))
-        drive = int(self.registers[Register.COMMAND_ID])
-        reply = Reply(drive, self.state, feedback, STAGE, int(MOTOR_TEMPERATURE + motor.heating))
-        self.answer(int(self.registers[Register.REPLY_ID]), pack_reply(reply, coding))
+        drive = int(self.registers[DamiaoRegister.COMMAND_ID])
+        reply = DamiaoReply(drive, self.state, feedback, STAGE, int(MOTOR_TEMPERATURE + motor.heating))
+        self.answer(int(self.registers[DamiaoRegister.REPLY_ID]), pack_reply(reply, coding))
 
     def _register(self, data: bytes) -> None:
         drive, request, register = struct.unpack_from("<HBB", data)
-        if drive != self.registers[Register.COMMAND_ID]:
+        if drive != self.registers[DamiaoRegister.COMMAND_ID]:
             return
-        reply_id = int(self.registers[Register.REPLY_ID])
+        reply_id = int(self.registers[DamiaoRegister.REPLY_ID])
         if request == REFRESH:
             self._reply()
         elif request == STORE:
@@ -141,11 +141,11 @@ class DamiaoDrive(SimulatedDrive):
     def _write(self, register: int, value: float) -> None:
         if register in INTEGER_REGISTERS:
             value = int(value)
-        if register == Register.CONTROL_MODE:
+        if register == DamiaoRegister.CONTROL_MODE:
             if "mode.refused" in self.faults or value not in (1, 2, 3, 4):
                 return
             self.command = NO_COMMAND
-            if self.state is State.ENABLED:
+            if self.state is DamiaoStatus.ENABLED:
                 self._follow()
         if register in (21, 22, 23) and not 0.0 < value < 1e6:
             return
@@ -153,18 +153,18 @@ class DamiaoDrive(SimulatedDrive):
 
     def trip(self) -> None:
         """Torque off, state D, until the error is cleared."""
-        self._stop(State.LOST_COMMUNICATION)
+        self._stop(DamiaoStatus.LOST_COMMUNICATION)
 
     def reboot(self) -> None:
         """See SimulatedDrive."""
         self.registers = dict(self._stored)
-        self._stop(State.DISABLED)
+        self._stop(DamiaoStatus.DISABLED)
 
     def inject(self, fault: str, value: float) -> None:
         """See SimulatedDrive."""
         super().inject(fault, value)
         if fault == "drive.mode":
-            self.registers[Register.CONTROL_MODE] = int(value)
+            self.registers[DamiaoRegister.CONTROL_MODE] = int(value)
 
     def lose_feedback(self) -> None:
         """Replies stop; the drive itself goes on."""
@@ -176,7 +176,7 @@ class DamiaoFront:
     def __init__(self, drives: list[DamiaoDrive]) -> None:
         """`drives` have different command ids."""
         self.drives = drives
-        ids = [int(drive.registers[Register.COMMAND_ID]) for drive in drives]
+        ids = [int(drive.registers[DamiaoRegister.COMMAND_ID]) for drive in drives]
         self._commanded = {
             drive_id + offset: drive
             for drive_id, drive in zip(ids, drives, strict=True)
@@ -195,7 +195,7 @@ class DamiaoFront:
 
     def joint_of(self, can_id: int) -> int | None:
         """See Front; None where several drives share a reply id."""
-        found = [drive.joint for drive in self.drives if drive.registers[Register.REPLY_ID] == can_id]
+        found = [drive.joint for drive in self.drives if drive.registers[DamiaoRegister.REPLY_ID] == can_id]
         return found[0] if len(found) == 1 else None
 
 

@@ -5,15 +5,15 @@ from zlib import crc32
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.contributed import contributed
-from armlink.drives.damiao.models import MODELS
+from armlink.drives.damiao.settings import MODELS
 from armlink.errors import BadInput
 from sim_bus.drives.cubemars import CubeMarsDrive, CubeMarsFront
 from sim_bus.drives.damiao import DamiaoDrive, DamiaoFront
-from sim_bus.drives.front import Front
 from sim_bus.drives.moteus import MoteusDrive, MoteusFront
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.odrive import ODriveAxis, ODriveFront, cyclic_periods
 from sim_bus.drives.robstride import RobStrideDrive, RobStrideFront
+from sim_bus.drives.simulated_drive import Front
 
 Send = Callable[[int, bytes], None]
 Joint = tuple[LinkJoint, Motor]

@@ -16,16 +16,21 @@ from armlink.drives.moteus.frames import (
     REPLY_WANTED,
     WRITE,
     WRITE_ERROR,
-    Mode,
-    Register,
+    MoteusMode,
+    MoteusRegister,
     Subframe,
     identifier,
     pack_reply,
     unpack,
 )
-from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import (
+    BUS_VOLTAGE,
+    MOTOR_TEMPERATURE,
+    STAGE_TEMPERATURE,
+    AddressedFront,
+    SimulatedDrive,
+)
 
 TURN = 2 * math.pi
 DEFAULT_TIMEOUT = 0.1
@@ -39,18 +44,18 @@ NO_REGISTER = 1
 HOME_OUTPUT = 2
 """Home state: positions are those of the output."""
 COMMANDS = {
-    Register.COMMAND_POSITION: math.nan,
-    Register.COMMAND_VELOCITY: 0.0,
-    Register.COMMAND_TORQUE: 0.0,
-    Register.COMMAND_KP_SCALE: 1.0,
-    Register.COMMAND_KD_SCALE: 1.0,
-    Register.COMMAND_MAX_TORQUE: math.nan,
-    Register.COMMAND_STOP_POSITION: math.nan,
-    Register.COMMAND_WATCHDOG: math.nan,
+    MoteusRegister.COMMAND_POSITION: math.nan,
+    MoteusRegister.COMMAND_VELOCITY: 0.0,
+    MoteusRegister.COMMAND_TORQUE: 0.0,
+    MoteusRegister.COMMAND_KP_SCALE: 1.0,
+    MoteusRegister.COMMAND_KD_SCALE: 1.0,
+    MoteusRegister.COMMAND_MAX_TORQUE: math.nan,
+    MoteusRegister.COMMAND_STOP_POSITION: math.nan,
+    MoteusRegister.COMMAND_WATCHDOG: math.nan,
     0x028: math.nan,
     0x029: math.nan,
     0x02A: math.nan,
-    Register.COMMAND_ILIMIT_SCALE: 1.0,
+    MoteusRegister.COMMAND_ILIMIT_SCALE: 1.0,
     0x02C: math.nan,
     0x02D: 0.0,
 }
@@ -64,7 +69,7 @@ class MoteusDrive(SimulatedDrive):
         """As configured for its joint: gains tuned, encoder at the output."""
         super().__init__(motor, send)
         self.address, self.serial = drive, serial
-        self.mode, self.fault_code = Mode.STOPPED, 0
+        self.mode, self.fault_code = MoteusMode.STOPPED, 0
         self.command: dict[int, float] = dict(COMMANDS)
         self._gains = motor.tuned
         self._target = self._integral = 0.0
@@ -73,13 +78,13 @@ class MoteusDrive(SimulatedDrive):
     @property
     def patience(self) -> float:
         """See SimulatedDrive; a command's watchdog of 0 or NaN stands for the default."""
-        asked = self.command[Register.COMMAND_WATCHDOG]
+        asked = self.command[MoteusRegister.COMMAND_WATCHDOG]
         return asked if asked > 0 else DEFAULT_TIMEOUT
 
     @property
     def watches(self) -> bool:
         """See SimulatedDrive."""
-        return super().watches and self.mode is Mode.POSITION
+        return super().watches and self.mode is MoteusMode.POSITION
 
     def receive(self, can_id: int, data: bytes) -> None:
         """A frame whose destination is this controller."""
@@ -111,10 +116,10 @@ class MoteusDrive(SimulatedDrive):
 
     def _write(self, values: dict[int, float]) -> list[Subframe]:
         """Take the registers of a frame; errors for those that cannot be written."""
-        unknown = [number for number in values if number not in COMMANDS and number != Register.MODE]
-        if Register.MODE in values:
+        unknown = [number for number in values if number not in COMMANDS and number != MoteusRegister.MODE]
+        if MoteusRegister.MODE in values:
             self.command = COMMANDS | {number: value for number, value in values.items() if number in COMMANDS}
-            self._enter(int(values[Register.MODE]) if math.isfinite(values[Register.MODE]) else 0)
+            self._enter(int(values[MoteusRegister.MODE]) if math.isfinite(values[MoteusRegister.MODE]) else 0)
         else:
             known = {number: value for number, value in values.items() if number in COMMANDS}
             self.command |= known
@@ -124,12 +129,12 @@ class MoteusDrive(SimulatedDrive):
         """Registers of the reply to a host's usual frame."""
         position, velocity, torque = self.told()
         return {
-            Register.MODE: self.mode,
-            Register.POSITION: position / TURN * self._shown("position"),
-            Register.VELOCITY: velocity / TURN * self._shown("velocity"),
-            Register.TORQUE: torque * self._shown("torque"),
-            Register.TEMPERATURE: STAGE_TEMPERATURE,
-            Register.FAULT: self.fault_code,
+            MoteusRegister.MODE: self.mode,
+            MoteusRegister.POSITION: position / TURN * self._shown("position"),
+            MoteusRegister.VELOCITY: velocity / TURN * self._shown("velocity"),
+            MoteusRegister.TORQUE: torque * self._shown("torque"),
+            MoteusRegister.TEMPERATURE: STAGE_TEMPERATURE,
+            MoteusRegister.FAULT: self.fault_code,
         }
 
     def _shown_registers(self) -> dict[int, float]:
@@ -138,19 +143,19 @@ class MoteusDrive(SimulatedDrive):
             self.command
             | self._shown_in_cycles()
             | {
-                Register.Q_CURRENT: motor.torque / TORQUE_CONSTANT,
+                MoteusRegister.Q_CURRENT: motor.torque / TORQUE_CONSTANT,
                 0x005: 0.0,
                 0x006: motor.position / TURN,
                 0x007: 0.0,
-                Register.MOTOR_TEMPERATURE: MOTOR_TEMPERATURE,
+                MoteusRegister.MOTOR_TEMPERATURE: MOTOR_TEMPERATURE,
                 0x00B: 1,
-                Register.HOME_STATE: HOME_OUTPUT,
-                Register.VOLTAGE: BUS_VOLTAGE,
-                Register.MODEL: 1,
-                Register.FIRMWARE: 0x0104,
-                Register.SERIAL1: self.serial & 0x7FFFFFFF,
-                Register.SERIAL2: 0,
-                Register.SERIAL3: 0,
+                MoteusRegister.HOME_STATE: HOME_OUTPUT,
+                MoteusRegister.VOLTAGE: BUS_VOLTAGE,
+                MoteusRegister.MODEL: 1,
+                MoteusRegister.FIRMWARE: 0x0104,
+                MoteusRegister.SERIAL1: self.serial & 0x7FFFFFFF,
+                MoteusRegister.SERIAL2: 0,
+                MoteusRegister.SERIAL3: 0,
             }
         )
 
@@ -160,48 +165,48 @@ class MoteusDrive(SimulatedDrive):
     # ---- modes
 
     def _enter(self, mode: int) -> None:
-        if mode == Mode.STOPPED:
+        if mode == MoteusMode.STOPPED:
             if "feedback.lost" not in self.faults and not self.latched:
-                self.mode, self.fault_code = Mode.STOPPED, 0
+                self.mode, self.fault_code = MoteusMode.STOPPED, 0
             self.motor.free()
-        elif self.mode in (Mode.FAULT, Mode.TIMEOUT) or "mode.refused" in self.faults:
+        elif self.mode in (MoteusMode.FAULT, MoteusMode.TIMEOUT) or "mode.refused" in self.faults:
             return
-        elif mode == Mode.POSITION:
+        elif mode == MoteusMode.POSITION:
             self.heard = self.now
-            if self.mode is not Mode.POSITION:
+            if self.mode is not MoteusMode.POSITION:
                 self._target, self._integral = self.motor.position, 0.0
-            position = self.command[Register.COMMAND_POSITION] * TURN / self._shown("position")
+            position = self.command[MoteusRegister.COMMAND_POSITION] * TURN / self._shown("position")
             if math.isfinite(position):
                 self._target = position
-            self.mode = Mode.POSITION
+            self.mode = MoteusMode.POSITION
             self._follow()
-        elif mode in (Mode.ZERO_VELOCITY, Mode.BRAKE):
-            self.mode = Mode(mode)
+        elif mode in (MoteusMode.ZERO_VELOCITY, MoteusMode.BRAKE):
+            self.mode = MoteusMode(mode)
             self._damp()
 
     def control(self, duration: float) -> None:
         """PID with a target that moves at the commanded velocity."""
-        if self.mode is not Mode.POSITION:
+        if self.mode is not MoteusMode.POSITION:
             return
         command, (_, _, integral) = self.command, self._gains
-        velocity = command[Register.COMMAND_VELOCITY] * TURN
+        velocity = command[MoteusRegister.COMMAND_VELOCITY] * TURN
         if math.isfinite(velocity):
             self._target += velocity * duration
         error, most = self._target - self.motor.position, self._torque_limit
-        share = command[Register.COMMAND_ILIMIT_SCALE] * command[Register.COMMAND_KP_SCALE]
+        share = command[MoteusRegister.COMMAND_ILIMIT_SCALE] * command[MoteusRegister.COMMAND_KP_SCALE]
         self._integral = max(-most, min(most, self._integral + integral * error * duration)) if share > 0 else 0.0
         self._follow()
 
     @property
     def _torque_limit(self) -> float:
-        asked = self.command[Register.COMMAND_MAX_TORQUE]
+        asked = self.command[MoteusRegister.COMMAND_MAX_TORQUE]
         return min(abs(asked), self._largest) if math.isfinite(asked) else self._largest
 
     def _follow(self) -> None:
         command, (stiffness, damping, _) = self.command, self._gains
-        kp = max(0.0, min(1.0, command[Register.COMMAND_KP_SCALE]))
-        kd = max(0.0, min(kp, command[Register.COMMAND_KD_SCALE]))
-        velocity, torque = command[Register.COMMAND_VELOCITY] * TURN, command[Register.COMMAND_TORQUE]
+        kp = max(0.0, min(1.0, command[MoteusRegister.COMMAND_KP_SCALE]))
+        kd = max(0.0, min(kp, command[MoteusRegister.COMMAND_KD_SCALE]))
+        velocity, torque = command[MoteusRegister.COMMAND_VELOCITY] * TURN, command[MoteusRegister.COMMAND_TORQUE]
         ahead = (torque if math.isfinite(torque) else 0.0) * self.scale("torque") + self._integral
         velocity = velocity if math.isfinite(velocity) else 0.0
         self.motor.impede(stiffness * kp, damping * kd, self._target, velocity, ahead, self._torque_limit)
@@ -211,25 +216,25 @@ class MoteusDrive(SimulatedDrive):
 
     def trip(self) -> None:
         """Position timeout: zero velocity, until a stop."""
-        if self.mode is Mode.POSITION:
-            self.mode = Mode.TIMEOUT
+        if self.mode is MoteusMode.POSITION:
+            self.mode = MoteusMode.TIMEOUT
             self._damp()
 
     def reboot(self) -> None:
         """See SimulatedDrive."""
-        self.mode, self.fault_code, self.command = Mode.STOPPED, 0, dict(COMMANDS)
+        self.mode, self.fault_code, self.command = MoteusMode.STOPPED, 0, dict(COMMANDS)
         self.motor.free()
 
     def inject(self, fault: str, value: float) -> None:
         """See SimulatedDrive."""
         super().inject(fault, value)
         if fault == "drive.mode":
-            self.mode = Mode.BRAKE
+            self.mode = MoteusMode.BRAKE
             self._damp()
 
     def lose_feedback(self) -> None:
         """Encoder fault: free."""
-        self.mode, self.fault_code = Mode.FAULT, ENCODER_FAULT
+        self.mode, self.fault_code = MoteusMode.FAULT, ENCODER_FAULT
         self.motor.free()
 
 
@@ -237,7 +242,7 @@ def _shown(asked: Subframe, shown: dict[int, float]) -> Subframe:
     value = shown.get(asked.register)
     if value is None:
         return Subframe(READ_ERROR, asked.register, NO_REGISTER)
-    whole = asked.register in (Register.MODEL, Register.FIRMWARE, Register.SERIAL1)
+    whole = asked.register in (MoteusRegister.MODEL, MoteusRegister.FIRMWARE, MoteusRegister.SERIAL1)
     return Subframe(REPLY, asked.register, value, INT32 if whole and asked.resolution == FLOAT else asked.resolution)
 
 

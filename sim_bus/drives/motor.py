@@ -11,13 +11,13 @@ from armlink.arm_file import LinkJoint
 from armlink.arrays import Array
 from sim_bus.node.position_torque_loops import Loops
 from sim_bus.physics.plant import Plant
-from sim_bus.physics.sensors import Sensors
+from sim_bus.physics.sensors import JointSensors
 
 
 class Readings:
     """Readings of all joints' motors at one time; arrays (n,), sampled once however many drives ask."""
 
-    def __init__(self, plant: Plant, sensors: Sensors) -> None:
+    def __init__(self, plant: Plant, sensors: JointSensors) -> None:
         """Nothing is sampled before the first at()."""
         self._plant, self._sensors = plant, sensors
         self._time = -1.0
@@ -48,7 +48,9 @@ class Readings:
 class Motor:
     """One joint's motor, in the units and the sense of its drive's output."""
 
-    def __init__(self, joint: int, described: LinkJoint, loops: Loops, sensors: Sensors, readings: Readings) -> None:
+    def __init__(
+        self, joint: int, described: LinkJoint, loops: Loops, sensors: JointSensors, readings: Readings
+    ) -> None:
         """Motor of joint `joint` of the arm, as the arm file describes it."""
         settings = described.settings
         self.joint, self.rated_torque = joint, described.rated_torque

@@ -7,9 +7,14 @@ from functools import partial
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import AxisError, AxisState, Message, identifier, pack, unpack
-from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import (
+    BUS_VOLTAGE,
+    MOTOR_TEMPERATURE,
+    STAGE_TEMPERATURE,
+    AddressedFront,
+    SimulatedDrive,
+)
 
 TURN = 2 * math.pi
 HEARTBEAT_PERIOD = 0.1
@@ -88,6 +93,8 @@ class ODriveAxis(SimulatedDrive):
             position, velocity, torque = values
             velocity, torque = velocity * frames.INPUT_FEED_FORWARD, torque * frames.INPUT_FEED_FORWARD
             self._take_input(position * TURN * self.scale("position"), velocity * TURN, torque * ahead)
+        elif command == Message.INPUT_VELOCITY:
+            self._take_input(self._input[0], values[0] * TURN, values[1] * self.scale("torque"))
         elif command == Message.INPUT_TORQUE:
             self._take_input(self._input[0], 0.0, values[0] * self.scale("torque"))
         elif command == Message.LIMITS and all(math.isfinite(value) and value >= 0 for value in values):
@@ -133,21 +140,22 @@ class ODriveAxis(SimulatedDrive):
         if self.control_mode == frames.TORQUE_CONTROL:
             self._integral = 0.0
             self.motor.impede(0.0, 0.0, 0.0, 0.0, torque, limit)
-        elif self.control_mode == frames.POSITION_CONTROL:
-            error = position - self.motor.position
+        else:
+            led = self.control_mode == frames.POSITION_CONTROL
+            error = position - self.motor.position if led else 0.0
             most, wanted = self._velocity_limit, velocity + self._position_gain * error
             short = max(-most, min(most, wanted)) - self.motor.velocity
             moved = self._integral + self._integral_gain * short * duration
             self._integral = max(-limit, min(limit, moved))
             gain = self._velocity_gain
-            if abs(wanted) < most:
+            if led and abs(wanted) < most:
                 kp = gain * self._position_gain
                 self.motor.impede(kp, gain, position, velocity, torque + self._integral, limit)
             else:
-                pace = math.copysign(most, wanted)
+                # so near to its speed that its torque does not saturate: a drive runs its loop many times in a step here
+                reach, speed = limit / gain / 2, self.motor.velocity
+                pace = max(speed - reach, min(speed + reach, max(-most, min(most, wanted))))
                 self.motor.impede(0.0, gain, 0.0, pace, torque + self._integral, limit)
-        else:
-            self.motor.impede(0.0, self._velocity_gain, 0.0, velocity, torque, limit)
 
     # ---- messages
 

@@ -11,8 +11,8 @@ from armlink.drives.robstride.frames import (
     RANGES,
     TIMEOUT_UNIT,
     Feedback,
-    Mode,
-    Parameter,
+    RobStrideParameter,
+    RunMode,
     Type,
     data_of,
     identifier,
@@ -22,9 +22,8 @@ from armlink.drives.robstride.frames import (
     unpack_motion,
     unpack_value,
 )
-from sim_bus.drives.front import AddressedFront
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
 
 NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 HOST = 0xFD
@@ -33,7 +32,14 @@ ENCODER_FAULT = 1 << 3
 REPORT_PERIOD = 0.01
 """Period of active reports (type 24) [s]."""
 IDENTITY_TARGET = 0xFE
-READ_ONLY = frozenset((Parameter.POSITION, Parameter.CURRENT, Parameter.VELOCITY, Parameter.BUS_VOLTAGE))
+READ_ONLY = frozenset(
+    (
+        RobStrideParameter.POSITION,
+        RobStrideParameter.CURRENT,
+        RobStrideParameter.VELOCITY,
+        RobStrideParameter.BUS_VOLTAGE,
+    )
+)
 
 
 class RobStrideDrive(SimulatedDrive):
@@ -45,25 +51,25 @@ class RobStrideDrive(SimulatedDrive):
         self.address, self.serial = drive, serial
         self._ranges = RANGES[model]
         self._stored: dict[int, float] = {
-            Parameter.RUN_MODE: MOTION_MODE,
+            RobStrideParameter.RUN_MODE: MOTION_MODE,
             0x7006: 0.0,
             0x700A: 0.0,
-            Parameter.LIMIT_TORQUE: self._ranges.torque,
+            RobStrideParameter.LIMIT_TORQUE: self._ranges.torque,
             0x7010: 0.17,
             0x7011: 0.012,
             0x7014: 0.1,
             0x7016: 0.0,
             0x7017: 2.0,
-            Parameter.LIMIT_CURRENT: 16.0,
+            RobStrideParameter.LIMIT_CURRENT: 16.0,
             0x701E: 40.0,
             0x701F: 6.0,
             0x7020: 0.02,
             0x7021: 0.1,
-            Parameter.TIMEOUT: 0,
-            Parameter.ZERO_STATE: 1,
+            RobStrideParameter.TIMEOUT: 0,
+            RobStrideParameter.ZERO_STATE: 1,
         }
         self.parameters = dict(self._stored)
-        self.mode, self.fault_bits = Mode.RESET, 0
+        self.mode, self.fault_bits = RunMode.RESET, 0
         self.command = NO_COMMAND
         self._host, self._reports_at = HOST, math.inf
 
@@ -75,7 +81,7 @@ class RobStrideDrive(SimulatedDrive):
     @property
     def patience(self) -> float:
         """See SimulatedDrive."""
-        return self.parameters[Parameter.TIMEOUT] * TIMEOUT_UNIT
+        return self.parameters[RobStrideParameter.TIMEOUT] * TIMEOUT_UNIT
 
     @property
     def due(self) -> float:
@@ -110,25 +116,25 @@ class RobStrideDrive(SimulatedDrive):
             return
         self.heard = self.now
         if kind == Type.ENABLE:
-            if not self.fault_bits and not self.latched and self.mode is not Mode.RUN:
-                self.mode, self.command = Mode.RUN, NO_COMMAND
+            if not self.fault_bits and not self.latched and self.mode is not RunMode.RUN:
+                self.mode, self.command = RunMode.RUN, NO_COMMAND
                 self._follow()
         elif kind == Type.STOP:
             self._stop()
             if data[0] == 1 and "feedback.lost" not in self.faults:
                 self.fault_bits = 0
-        elif self.parameters[Parameter.RUN_MODE] == MOTION_MODE:
+        elif self.parameters[RobStrideParameter.RUN_MODE] == MOTION_MODE:
             self.command = unpack_motion(can_id, data, self.coding)
-            if self.mode is Mode.RUN:
+            if self.mode is RunMode.RUN:
                 self._follow()
 
     def _follow(self) -> None:
         command = self.command
-        limit = min(self.coding.torque, max(self.parameters[Parameter.LIMIT_TORQUE], 0.0))
+        limit = min(self.coding.torque, max(self.parameters[RobStrideParameter.LIMIT_TORQUE], 0.0))
         self.motor.impede(command.kp, command.kd, command.position, command.velocity, command.torque, limit)
 
     def _stop(self) -> None:
-        self.mode, self.command = Mode.RESET, NO_COMMAND
+        self.mode, self.command = RunMode.RESET, NO_COMMAND
         self.motor.free()
 
     def _feed_back(self, kind: int) -> None:
@@ -144,10 +150,10 @@ class RobStrideDrive(SimulatedDrive):
 
     def _read(self, parameter: int) -> None:
         live = {
-            Parameter.POSITION: self.motor.position,
-            Parameter.VELOCITY: self.motor.velocity,
-            Parameter.CURRENT: self.motor.torque,
-            Parameter.BUS_VOLTAGE: BUS_VOLTAGE,
+            RobStrideParameter.POSITION: self.motor.position,
+            RobStrideParameter.VELOCITY: self.motor.velocity,
+            RobStrideParameter.CURRENT: self.motor.torque,
+            RobStrideParameter.BUS_VOLTAGE: BUS_VOLTAGE,
         }
         value = (live | self.parameters).get(parameter)
         unknown = NEVER_READ << 8 if value is None else 0
@@ -158,7 +164,7 @@ class RobStrideDrive(SimulatedDrive):
     def _write(self, parameter: int, content: bytes) -> None:
         if parameter not in self.parameters or parameter in READ_ONLY:
             return
-        if parameter == Parameter.RUN_MODE and (self.mode is Mode.RUN or "mode.refused" in self.faults):
+        if parameter == RobStrideParameter.RUN_MODE and (self.mode is RunMode.RUN or "mode.refused" in self.faults):
             return
         value = unpack_value(parameter, content)
         if math.isfinite(value):
@@ -185,7 +191,7 @@ class RobStrideDrive(SimulatedDrive):
         """See SimulatedDrive."""
         super().inject(fault, value)
         if fault == "drive.mode":
-            self.parameters[Parameter.RUN_MODE] = int(value)
+            self.parameters[RobStrideParameter.RUN_MODE] = int(value)
 
     def lose_feedback(self) -> None:
         """Encoder fault: free, with the bit set."""

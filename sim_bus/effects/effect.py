@@ -44,7 +44,7 @@ NOT_NEGATIVE, POSITIVE, ZERO_BY_DEFAULT = Domain(least=0.0), Domain(above=0.0), 
 
 
 @dataclass(frozen=True)
-class Parameter:
+class SimulatedParameter:
     """One parameter of an effect: its catalogue entry together with the accepted values."""
 
     name: str
@@ -71,26 +71,26 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Effect:
+class SimulatedEffect:
     """One effect on the simulated arm."""
 
     id: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[SimulatedParameter, ...]
     apply: Apply
     per_joint: bool = True
 
 
-def effect(effect_id: str, apply: Apply, **domains: Domain) -> Effect:
+def effect(effect_id: str, apply: Apply, **domains: Domain) -> SimulatedEffect:
     """The forward form of a catalogue entry; `domains` restricts the values of some of its parameters."""
     entry, free = catalogue.CATALOGUE[effect_id], Domain()
     if unknown := set(domains) - {parameter.name for parameter in entry.parameters}:
         raise ValueError(f"{effect_id}: no parameter {', '.join(sorted(unknown))} in the catalogue")
     parameters = tuple(
-        Parameter(each.name, each.unit, domain.sizes or (len(each.components),), domain)
+        SimulatedParameter(each.name, each.unit, domain.sizes or (len(each.components),), domain)
         for each in entry.parameters
         for domain in (domains.get(each.name, free),)
     )
-    return Effect(effect_id, parameters, apply, not entry.whole_arm)
+    return SimulatedEffect(effect_id, parameters, apply, not entry.whole_arm)
 
 
 def adds(array: Callable[[Imperfections], Array], parameter: str) -> Apply:

@@ -13,7 +13,7 @@ from sim_bus.effects.state import Imperfections
 
 
 @dataclass(frozen=True)
-class Level:
+class TroubleSize:
     """Size of one trouble at level 1."""
 
     size: float
@@ -22,42 +22,44 @@ class Level:
 
 
 LEVELS = {
-    "eccentricity": Level(
+    "eccentricity": TroubleSize(
         3e-4,
         "rad",
         "encoder disc of 65 mm off centre by 10 µm: 412.5 e/D arc seconds (Celera Motion, on scale eccentricity)",
     ),
-    "cubic": Level(
+    "cubic": TroubleSize(
         1e-3, "of full scale, at full scale", "0.083 % (arXiv 2603.16040) to 0.5 % of full scale (strain gauges)"
     ),
-    "hysteresis": Level(5e-4, "of rated torque", "torque sensors of accuracy class 0.05 (VDI/VDE 2646)"),
-    "crosstalk": Level(
+    "hysteresis": TroubleSize(5e-4, "of rated torque", "torque sensors of accuracy class 0.05 (VDI/VDE 2646)"),
+    "crosstalk": TroubleSize(
         2.5e-3, "1", "0.79 % of a bending moment without cross-roller bearings (SSRN 10.2139/ssrn.4216744), 0.2 % with"
     ),
-    "warm_up": Level(
+    "warm_up": TroubleSize(
         1e-3, "of rated torque", "zero of class 0.05 per 10 K (VDI/VDE 2646), a joint that warms by 20 K in an hour"
     ),
-    "cable": Level(
+    "cable": TroubleSize(
         1e-3,
         "of rated torque per rad",
         "Lin et al. 2019, gravity compensation of the dVRK's master arms: cables pull by per cents of gravity there",
     ),
-    "cable_lag": Level(5e-4, "of rated torque", "the same: half of a cable's pull depends on where it comes from"),
-    "sag": Level(
+    "cable_lag": TroubleSize(
+        5e-4, "of rated torque", "the same: half of a cable's pull depends on where it comes from"
+    ),
+    "sag": TroubleSize(
         3e-4, "rad at rated torque", "1 mrad of a gear of 3 to 6·10⁴ N·m/rad (Harmonic Drive CSG-25), encoder behind it"
     ),
-    "axis": Level(
+    "axis": TroubleSize(
         1e-3, "rad", "Nubiola and Bonev 2013: an uncalibrated ABB IRB 1600 is off by 1 mm (mean) to 2.2 mm at the tool"
     ),
-    "length": Level(1e-3, "m", "the same"),
-    "tilt": Level(2e-3, "rad", "a base set up by spirit level, 0.1°"),
-    "friction_position": Level(
+    "length": TroubleSize(1e-3, "m", "the same"),
+    "tilt": TroubleSize(2e-3, "rad", "a base set up by spirit level, 0.1°"),
+    "friction_position": TroubleSize(
         0.1, "of Coulomb friction", "Bittencourt and Gunnarsson 2012, static friction in a robot joint: joint angle"
     ),
-    "friction_load": Level(5e-3, "1", "the same: load torque"),
-    "friction_warm_up": Level(0.3, "of Coulomb friction", "the same: 30 to 80 °C"),
+    "friction_load": TroubleSize(5e-3, "1", "the same: load torque"),
+    "friction_warm_up": TroubleSize(0.3, "of Coulomb friction", "the same: 30 to 80 °C"),
 }
-"""What each trouble is at level 1, and from where."""
+"""Size of each trouble at level 1, and its source."""
 SMALLEST, LARGEST = 0.5, 1.5
 """Range of a drawn size, as a share of its level."""
 COLD = 1200.0

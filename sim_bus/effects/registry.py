@@ -6,20 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from sim_bus.effects import actuator, base, friction, link, position, timing, torque, transmission
-from sim_bus.effects.effect import Effect, EffectSetting, Parameter
+from sim_bus.effects.effect import EffectSetting, SimulatedEffect, SimulatedParameter
+from sim_bus.effects.forms import EFFECTS
 from sim_bus.effects.state import Imperfections
 
-FAMILIES = (actuator, base, friction, link, position, timing, torque, transmission)
-"""Modules with an `EFFECTS`, one a family."""
 NOT_SIMULATED = {
     "torque.nonlinearity": "the simulated sensor is linear apart from hysteresis, dead band and saturation"
 }
 """Catalogue ids without a forward form, and why."""
-_EFFECTS = {each.id: each for each in sorted((e for family in FAMILIES for e in family.EFFECTS), key=lambda e: e.id)}
+_EFFECTS = {each.id: each for each in sorted(EFFECTS, key=lambda each: each.id)}
 
 
-def effects() -> dict[str, Effect]:
+def effects() -> dict[str, SimulatedEffect]:
     """All effects by id, sorted."""
     return dict(_EFFECTS)
 
@@ -37,7 +35,7 @@ def imperfections(names: Sequence[str], settings: Iterable[EffectSetting]) -> Im
     return state
 
 
-def _value(names: Sequence[str], parameter: Parameter, value: Any) -> Any:
+def _value(names: Sequence[str], parameter: SimulatedParameter, value: Any) -> Any:
     return _index(names, value) if parameter.joint else np.asarray(value, float)
 
 
@@ -66,12 +64,12 @@ def check_entry(effect_id: str, joint: str | None, parameters: Mapping[str, Any]
             raise ValueError(f"{effect_id}: parameter {parameter.name} is missing; it has {described(effect)}")
 
 
-def described(effect: Effect) -> str:
+def described(effect: SimulatedEffect) -> str:
     """The effect's parameters with units, for messages and documentation."""
     return ", ".join(f"{parameter.name} [{parameter.unit}]" for parameter in effect.parameters)
 
 
-def _check_value(effect: Effect, parameter: Parameter, value: Any) -> None:
+def _check_value(effect: SimulatedEffect, parameter: SimulatedParameter, value: Any) -> None:
     expected = f"{effect.id}: parameter {parameter.name} [{parameter.unit}]: expected"
     if parameter.joint:
         if not isinstance(value, str):

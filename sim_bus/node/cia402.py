@@ -3,7 +3,7 @@
 from enum import IntEnum
 
 
-class State(IntEnum):
+class PowerState(IntEnum):
     """States of the power drive system (CiA 402-2, figure of the state machine)."""
 
     NOT_READY = 0
@@ -16,7 +16,7 @@ class State(IntEnum):
     FAULT = 7
 
 
-class Command(IntEnum):
+class ControlCommand(IntEnum):
     """Commands of the control word."""
 
     NONE = 0
@@ -29,51 +29,51 @@ class Command(IntEnum):
 
 
 STATUS = {
-    State.NOT_READY: 0x00,
-    State.SWITCH_ON_DISABLED: 0x40,
-    State.READY: 0x21,
-    State.SWITCHED_ON: 0x23,
-    State.ENABLED: 0x27,
-    State.QUICK_STOP: 0x07,
-    State.FAULT_REACTION: 0x0F,
-    State.FAULT: 0x08,
+    PowerState.NOT_READY: 0x00,
+    PowerState.SWITCH_ON_DISABLED: 0x40,
+    PowerState.READY: 0x21,
+    PowerState.SWITCHED_ON: 0x23,
+    PowerState.ENABLED: 0x27,
+    PowerState.QUICK_STOP: 0x07,
+    PowerState.FAULT_REACTION: 0x0F,
+    PowerState.FAULT: 0x08,
 }
 """State bits of the status word (6041h)."""
 
 TRANSITIONS = {
-    (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): State.READY,
-    (State.READY, Command.SWITCH_ON): State.SWITCHED_ON,
-    (State.READY, Command.ENABLE): State.ENABLED,
-    (State.READY, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
-    (State.READY, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,
-    (State.SWITCHED_ON, Command.ENABLE): State.ENABLED,
-    (State.SWITCHED_ON, Command.SHUTDOWN): State.READY,
-    (State.SWITCHED_ON, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
-    (State.SWITCHED_ON, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,
-    (State.ENABLED, Command.SWITCH_ON): State.SWITCHED_ON,
-    (State.ENABLED, Command.SHUTDOWN): State.READY,
-    (State.ENABLED, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
-    (State.ENABLED, Command.QUICK_STOP): State.QUICK_STOP,
-    (State.QUICK_STOP, Command.ENABLE): State.ENABLED,
-    (State.QUICK_STOP, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
-    (State.FAULT, Command.FAULT_RESET): State.SWITCH_ON_DISABLED,
+    (PowerState.SWITCH_ON_DISABLED, ControlCommand.SHUTDOWN): PowerState.READY,
+    (PowerState.READY, ControlCommand.SWITCH_ON): PowerState.SWITCHED_ON,
+    (PowerState.READY, ControlCommand.ENABLE): PowerState.ENABLED,
+    (PowerState.READY, ControlCommand.DISABLE_VOLTAGE): PowerState.SWITCH_ON_DISABLED,
+    (PowerState.READY, ControlCommand.QUICK_STOP): PowerState.SWITCH_ON_DISABLED,
+    (PowerState.SWITCHED_ON, ControlCommand.ENABLE): PowerState.ENABLED,
+    (PowerState.SWITCHED_ON, ControlCommand.SHUTDOWN): PowerState.READY,
+    (PowerState.SWITCHED_ON, ControlCommand.DISABLE_VOLTAGE): PowerState.SWITCH_ON_DISABLED,
+    (PowerState.SWITCHED_ON, ControlCommand.QUICK_STOP): PowerState.SWITCH_ON_DISABLED,
+    (PowerState.ENABLED, ControlCommand.SWITCH_ON): PowerState.SWITCHED_ON,
+    (PowerState.ENABLED, ControlCommand.SHUTDOWN): PowerState.READY,
+    (PowerState.ENABLED, ControlCommand.DISABLE_VOLTAGE): PowerState.SWITCH_ON_DISABLED,
+    (PowerState.ENABLED, ControlCommand.QUICK_STOP): PowerState.QUICK_STOP,
+    (PowerState.QUICK_STOP, ControlCommand.ENABLE): PowerState.ENABLED,
+    (PowerState.QUICK_STOP, ControlCommand.DISABLE_VOLTAGE): PowerState.SWITCH_ON_DISABLED,
+    (PowerState.FAULT, ControlCommand.FAULT_RESET): PowerState.SWITCH_ON_DISABLED,
 }
 """Transitions 2 to 12, 15 and 16; READY to ENABLED combines 3 and 4. Other commands have no effect."""
 
 
-def command(word: int, previous: int) -> Command:
+def command(word: int, previous: int) -> ControlCommand:
     """Command of a control word (6040h), given the previous one: fault reset is a rising edge of bit 7."""
     if word & 0x80:
-        return Command.NONE if previous & 0x80 else Command.FAULT_RESET
+        return ControlCommand.NONE if previous & 0x80 else ControlCommand.FAULT_RESET
     if not word & 0x02:
-        return Command.DISABLE_VOLTAGE
+        return ControlCommand.DISABLE_VOLTAGE
     if not word & 0x04:
-        return Command.QUICK_STOP
+        return ControlCommand.QUICK_STOP
     if not word & 0x01:
-        return Command.SHUTDOWN
-    return Command.ENABLE if word & 0x08 else Command.SWITCH_ON
+        return ControlCommand.SHUTDOWN
+    return ControlCommand.ENABLE if word & 0x08 else ControlCommand.SWITCH_ON
 
 
-def next_state(state: State, asked: Command) -> State:
+def next_state(state: PowerState, asked: ControlCommand) -> PowerState:
     """The state that follows `state`."""
     return TRANSITIONS.get((state, asked), state)

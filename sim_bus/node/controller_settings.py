@@ -6,7 +6,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile, LinkJoint
 from sim_bus.node.devices import Device
-from sim_bus.node.drives import SUPPORTED_MODES, UNWATCHED, Drives
+from sim_bus.node.drives import SUPPORTED_MODES, UNWATCHED, SimulatedDrives
 from sim_bus.node.node import Node
 from sim_bus.node.object_arrays import Key
 from sim_bus.node.position_torque_loops import FEED, UNIT
@@ -45,7 +45,7 @@ def _modes_shown(device: Device) -> int:
     return has & ~device.hidden_modes
 
 
-def bring_into_force(node: Node, drives: Drives) -> None:
+def bring_into_force(node: Node, drives: SimulatedDrives) -> None:
     """Apply the node's calibration record and drive settings to its drive."""
     joint, record, loops, window = node.place, node.record.active, drives.loops, node.value(0x6065)
     drives.gain[joint], drives.offset[joint] = record.gain, record.offset

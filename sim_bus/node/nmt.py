@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from sim_bus.node.cia402 import State
-from sim_bus.node.drives import Drives
+from sim_bus.node.cia402 import PowerState
+from sim_bus.node.drives import SimulatedDrives
 from sim_bus.node.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
 from sim_bus.node.supervision import Supervision
 
@@ -15,7 +15,7 @@ class NetworkManagement:
     """NMT states of all nodes; `operational[j]`: whether node j may use PDOs."""
 
     def __init__(
-        self, nodes: list[Node], drives: Drives, supervision: Supervision, apply: Callable[[Node], None]
+        self, nodes: list[Node], drives: SimulatedDrives, supervision: Supervision, apply: Callable[[Node], None]
     ) -> None:
         """`apply` applies a node's objects after a reset."""
         self._nodes, self._drives, self._supervision, self._apply = nodes, drives, supervision, apply
@@ -33,7 +33,7 @@ class NetworkManagement:
         """Bring one node into the commanded state."""
         if asked in (RESET_NODE, RESET_COMMUNICATION):
             if asked == RESET_NODE:
-                self._drives.enter(node.place, State.SWITCH_ON_DISABLED)
+                self._drives.enter(node.place, PowerState.SWITCH_ON_DISABLED)
             node.reset(communication_only=asked == RESET_COMMUNICATION)
             self._apply(node)
             self._drives.take_commands()

@@ -10,7 +10,7 @@ from canopen.sdo import SdoServer
 from canopen.sdo.exceptions import SdoAbortedError
 
 from sim_bus.node.devices import Device
-from sim_bus.node.object_arrays import DTYPES, Key, Signals, data_sheet, variable
+from sim_bus.node.object_arrays import DTYPES, Key, ObjectArrays, data_sheet, variable
 from sim_bus.node.pdo import INVALID, Frame, PdoParameters, layout
 from sim_bus.node.torque_sensor_record import TorqueRecord
 
@@ -23,14 +23,14 @@ SAVE, LOAD = b"save", b"load"
 class Node:
     """Node `place` (from 0) of the arm, with node id `node_id`."""
 
-    def __init__(self, place: int, node_id: int, signals: Signals, outbox: Callable[[Frame], None]) -> None:
+    def __init__(self, place: int, node_id: int, signals: ObjectArrays, outbox: Callable[[Frame], None]) -> None:
         """A node that has not booted yet: call reset()."""
         self.place, self.node_id = place, node_id
         self.tag = 0
         """Number of its bus, as identifiers carry it (`armlink.bus.port.BUS_SHIFT`)."""
         self.object_dictionary = data_sheet()
         self.device = Device()
-        """What it lacks, and has differently."""
+        """Its lacks and differences."""
         self.identity: dict[Key, int | str] = {}
         """Values that differ from the EDS's defaults, kept when defaults are restored."""
         self.record = TorqueRecord()

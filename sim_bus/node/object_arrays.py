@@ -48,7 +48,7 @@ def variable(index: int, sub: int) -> ODVariable | None:
         return None
 
 
-class Signals:
+class ObjectArrays:
     """`values[index, sub]` is an (n,) array of the object's type; the arrays are never replaced."""
 
     def __init__(self, n: int) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bus.node.object_arrays import DTYPES, Key, Signals, variable
+from sim_bus.node.object_arrays import DTYPES, Key, ObjectArrays, variable
 
 INVALID = 0x80000000
 Frame = tuple[int, bytes]
@@ -42,7 +42,7 @@ def layout(mapping: tuple[int, ...]) -> np.dtype[np.void]:
 class PdoGroup:
     """PDOs of one kind, number and mapping over several nodes."""
 
-    def __init__(self, members: list[PdoParameters], signals: Signals) -> None:
+    def __init__(self, members: list[PdoParameters], signals: ObjectArrays) -> None:
         """Lay out the members' data one after the other."""
         self.kind, self.number = members[0].kind, members[0].number
         self.cob_ids = [member.cob_id for member in members]
@@ -90,7 +90,7 @@ class PdoGroup:
 class PdoTable:
     """All PDOs of the arm. `receive` maps a COB-ID to (group, place)."""
 
-    def __init__(self, signals: Signals, operational: bytearray, outbox: Callable[[Frame], None]) -> None:
+    def __init__(self, signals: ObjectArrays, operational: bytearray, outbox: Callable[[Frame], None]) -> None:
         """`operational[j]`: whether node j may use PDOs; frames go to `outbox`."""
         self._signals, self._operational, self._outbox = signals, operational, outbox
         self.receive: dict[int, tuple[PdoGroup, int]] = {}
@@ -133,7 +133,7 @@ class PdoTable:
                     self._outbox((cob_id, content))
 
 
-def _grouped(pdos: list[PdoParameters], signals: Signals) -> list[PdoGroup]:
+def _grouped(pdos: list[PdoParameters], signals: ObjectArrays) -> list[PdoGroup]:
     groups: dict[tuple[int, int, tuple[int, ...]], list[PdoParameters]] = defaultdict(list)
     for pdo in sorted(pdos, key=lambda pdo: (pdo.number, pdo.node)):
         if pdo.mapping and not pdo.cob_id & INVALID:

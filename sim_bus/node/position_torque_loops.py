@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from sim_bus.node.object_arrays import Signals
+from sim_bus.node.object_arrays import ObjectArrays
 from sim_bus.physics.plant import Plant
-from sim_bus.physics.sensors import Sensors
+from sim_bus.physics.sensors import JointSensors
 from sim_bus.sim_section import sim_section
 
 FEED = 1 << 20
@@ -42,7 +42,7 @@ SPARE_ACCELERATION = 100.0
 class Loops:
     """Targets and integrators; arrays (n,)."""
 
-    def __init__(self, arm: ArmFile, plant: Plant, sensors: Sensors, signals: Signals) -> None:
+    def __init__(self, arm: ArmFile, plant: Plant, sensors: JointSensors, signals: ObjectArrays) -> None:
         """Start with all joints unpowered."""
         section, self.n = sim_section(arm).servo, plant.n
         self._plant, self._sensors = plant, sensors

@@ -3,8 +3,8 @@
 import math
 import struct
 
-from sim_bus.node.cia402 import State
-from sim_bus.node.drives import Drives
+from sim_bus.node.cia402 import PowerState
+from sim_bus.node.drives import SimulatedDrives
 from sim_bus.node.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
 
 HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST = 0x8130, 0x8250, 0x8700
@@ -18,7 +18,7 @@ ABORT_NOTHING, ABORT_FAULT, ABORT_DISABLE, ABORT_QUICK_STOP = 0, 1, 2, 3
 class Supervision:
     """Timers of all nodes. `due` is the time of the next one [s]."""
 
-    def __init__(self, nodes: list[Node], drives: Drives) -> None:
+    def __init__(self, nodes: list[Node], drives: SimulatedDrives) -> None:
         """Nothing is monitored before configure()."""
         self._nodes, self._drives = nodes, drives
         n = drives.n
@@ -118,13 +118,13 @@ class Supervision:
 
     def _abort_connection(self, node: Node, code: int = 0) -> None:
         """Act by the abort connection option (6007h): 0 nothing, 1 fault, 2 disable voltage, 3 quick stop."""
-        if self._drives.state[node.place] is not State.ENABLED:
+        if self._drives.state[node.place] is not PowerState.ENABLED:
             return
         option = node.value(0x6007)
         if option == ABORT_FAULT:
-            self._drives.enter(node.place, State.FAULT)
+            self._drives.enter(node.place, PowerState.FAULT)
         elif option == ABORT_DISABLE:
-            self._drives.enter(node.place, State.SWITCH_ON_DISABLED)
+            self._drives.enter(node.place, PowerState.SWITCH_ON_DISABLED)
         elif option == ABORT_QUICK_STOP:
             self._drives.quick_stop(node.place)
         self._drives.error_code[node.place] = code

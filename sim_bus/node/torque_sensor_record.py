@@ -24,7 +24,7 @@ WRONG_VALUE = 0x06090030
 
 
 @dataclass(frozen=True)
-class Record:
+class SensorRecord:
     """One calibration: gain, offset [N·m], id and date [s since 1970]."""
 
     gain: float = 1.0
@@ -43,7 +43,7 @@ class TorqueRecord:
 
     def __init__(self) -> None:
         """Records of a new controller."""
-        self._kept = Record()
+        self._kept = SensorRecord()
         self.reset()
 
     def reset(self) -> None:
@@ -58,7 +58,7 @@ class TorqueRecord:
 
     def forget(self) -> None:
         """Store default values; the active record stays until the next reset."""
-        self._kept = Record()
+        self._kept = SensorRecord()
 
     def read(self, sub: int) -> bytes:
         """Bytes of a sub-index, except the reading."""
@@ -83,13 +83,13 @@ class TorqueRecord:
         return b"".join(self._staged[sub] for sub in (4, 5, 7, 8))
 
     def _activate(self, data: bytes) -> None:
-        record = Record(*struct.unpack("<ffII", self._content()))
+        record = SensorRecord(*struct.unpack("<ffII", self._content()))
         usable = math.isfinite(record.gain) and record.gain != 0.0 and math.isfinite(record.offset)
         if data != b"\1" or zlib.crc32(self._content()) != self._crc or not usable:
             raise SdoAbortedError(WRONG_VALUE)
         self.active = record
 
 
-def _fields(record: Record) -> tuple[bytes, bytes, bytes, bytes]:
+def _fields(record: SensorRecord) -> tuple[bytes, bytes, bytes, bytes]:
     content = record.content
     return content[:4], content[4:8], content[8:12], content[12:]

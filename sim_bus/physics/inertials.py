@@ -1,4 +1,4 @@
-"""Inertial parameters of the links in the physics: nominal, with effects and attached masses."""
+"""Frames and inertial parameters of the links in the physics: nominal, with effects and attached masses."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from sim_bus.effects.state import Imperfections
 from sim_bus.physics.mjcf import TINY_INERTIA
 
 
-class Inertials:
+class ModelInertials:
     """Keeps the nominal values of a compiled model and writes changed ones into it."""
 
     def __init__(self, model: Any, bodies: list[int], payload_body: int) -> None:
@@ -64,3 +64,23 @@ def _principal(inertia: Array) -> tuple[Array, Array]:
 def _point_inertia(arm: Array) -> Array:
     x, y, z = arm
     return np.array([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
+
+
+class ModelFrames:
+    """Keeps the nominal frames of a compiled model and writes changed ones into it."""
+
+    def __init__(self, model: Any, bodies: list[int]) -> None:
+        """`bodies` carry the links, base to tip."""
+        self._model, self._bodies = model, bodies
+        self._place: Array = model.body_pos[bodies].copy()
+        self._turn: Array = model.body_quat[bodies].copy()
+
+    def apply(self, state: Imperfections) -> None:
+        """Set the nominal frames, changed by `frame_turn` and `frame_shift`; mj_setConst is the caller's."""
+        shift, turn = np.empty(3), np.empty(4)
+        for row, body in enumerate(self._bodies):
+            mujoco.mju_rotVecQuat(shift, state.frame_shift[row], self._turn[row])
+            self._model.body_pos[body] = self._place[row] + shift
+            angle = float(np.linalg.norm(state.frame_turn[row]))
+            mujoco.mju_axisAngle2Quat(turn, state.frame_turn[row] / angle if angle else np.array([0, 0, 1.0]), angle)
+            mujoco.mju_mulQuat(self._model.body_quat[body], self._turn[row], turn)

@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics.cables import Cables
-from sim_bus.physics.frames import Frames
-from sim_bus.physics.friction import dry_friction, unevenness
 from sim_bus.physics.gravity import gravity_torque, inertia, tilt
-from sim_bus.physics.inertials import Inertials
+from sim_bus.physics.inertials import ModelFrames, ModelInertials
+from sim_bus.physics.joint_torques import Cables, LateMotors, dry_friction, unevenness
 from sim_bus.physics.mjcf import build_model
-from sim_bus.physics.motor_lag import LateMotors
 from sim_bus.physics.transmission import HARD_GEAR_STEP, Transmissions, rotor_inertia
 from sim_bus.sim_section import sim_section
 
@@ -71,8 +68,8 @@ class Plant:
         if (self._dof == np.arange(self.n)).all():
             self._dof = slice(0, self.n)
         self.lower, self.upper = self.model.jnt_range[joints].T.copy()
-        self._inertials = Inertials(self.model, list(built.bodies), built.payload_body)
-        self._frames = Frames(self.model, list(built.bodies))
+        self._inertials = ModelInertials(self.model, list(built.bodies), built.payload_body)
+        self._frames = ModelFrames(self.model, list(built.bodies))
         self._gravity: Array = self.model.opt.gravity.copy()
         self._armature = self.model.dof_armature[self._dof].copy()
         self._damping = self.model.dof_damping[self._dof].copy()

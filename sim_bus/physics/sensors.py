@@ -5,7 +5,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics.friction import coldness
+from sim_bus.physics.joint_torques import coldness
 from sim_bus.sim_section import NOISE_SHARE, sim_section
 from sim_bus.truth import Truth
 
@@ -16,7 +16,7 @@ EXACT = 1e-13
 """Error of a position reading that is as good as none [rad]."""
 
 
-class Sensors:
+class JointSensors:
     """Readings of the joints' sensors; all arrays (n,)."""
 
     def __init__(self, arm: ArmFile, truth: Truth, imperfections: Imperfections, seed: int) -> None:

@@ -1,6 +1,8 @@
 """A simulated arm at full stretch with a mass on, whose true joint speeds are watched until its work has ended."""
 
+import itertools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -35,14 +37,17 @@ def after_each_step(plant: Plant, look: Callable[[], None]) -> None:
 class EndsBench:
     """An arm led to where gravity pulls most at its shoulder; `peak` is the largest speed of each joint since."""
 
-    def __init__(self, name: str | ArmFile) -> None:
-        """Enabled, at full stretch, holding."""
+    def __init__(self, name: str | ArmFile, enable: bool = True) -> None:
+        """Enabled, at full stretch, holding; or started, at full stretch, carried until the drives have power."""
         arm = load_arm(name) if isinstance(name, str) else name
         self.arm = arm
         self.sim = SimulatedArm(arm, Truth.of(arm), 1)
         self.bus = LockStepBus(arm=self.sim)
         self.peak = np.zeros(6)
         self.link = Link(arm, self.bus)
+        if not enable:
+            self._carry()
+            return
         self.link.start()
         self.link.enable()
         here = self.link.position_sent
@@ -51,6 +56,24 @@ class EndsBench:
         self.sim.attach_mass(MASS)
         self.hold(1.0)
         after_each_step(self.sim.plant, self._look)
+
+    def _carry(self) -> None:
+        """A hand carries the arm, and lets go of it in the second second of its enabling."""
+        plant, stretched = self.sim.plant, self.stretched()
+        weight, cycles = plant.model.opt.gravity.copy(), itertools.count()
+        plant.model.opt.gravity[:] = 0.0
+        for joint, position in enumerate(stretched):
+            self.sim.turn_by_hand(joint, float(position))
+        self.sim.advance(0.5)
+        self.link.start()
+        second, stand = self.link.rate, self.link.commander.stand
+
+        def let_go(*args: Any, **kwargs: Any) -> Any:
+            plant.model.opt.gravity[:] = weight * min(max(next(cycles) - second, 0.0) / second, 1.0)
+            return stand(*args, **kwargs)
+
+        self.link.commander.stand = let_go  # type: ignore[method-assign]
+        after_each_step(plant, self._look)
 
     def _look(self) -> None:
         self.peak = np.maximum(self.peak, np.abs(self.sim.plant.velocity))

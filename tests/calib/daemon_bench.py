@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
-from armlink.loop.messages import Answer
+from armlink.loop.messages import LoopAnswer
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.environment import Environment
 from calib.daemon.loop.loop_messages import LoopOptions, Message
@@ -68,7 +68,7 @@ class InlineLoop:
         self.loop = ArmLoop(options)
         self.controllers = LoopControllers(self.loop.handle)
 
-    def sweep(self, poses: int, seed: int) -> Answer | None:
+    def sweep(self, poses: int, seed: int) -> LoopAnswer | None:
         """Ask for a tour of poses."""
         return self.loop.handle(_tour(poses, seed))
 

@@ -22,7 +22,7 @@ from fast_daemon import FastDaemon
 from armlink.errors import BusFault
 from armlink.link.types import Calibration
 from armlink.loop.channel import Channel, Closed
-from armlink.loop.messages import Answer, Call
+from armlink.loop.messages import Call, LoopAnswer
 from armlink.recording.mcap import RecordingWriter
 from calib.daemon import main_loop, notify
 from calib.daemon.environment import Immediate
@@ -145,7 +145,7 @@ class BusProcess(LoopProcess):
             end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 22)
         self._process = SimpleNamespace(join=lambda seconds=0.0: None, is_alive=lambda: False, kill=lambda: None, pid=0)  # type: ignore[assignment]
         self._channel = Channel(FailingSocket(ours, arm.failing))  # type: ignore[arg-type]
-        self._waiting: dict[int, Future[Answer]] = {}
+        self._waiting: dict[int, Future[LoopAnswer]] = {}
         self._sending = threading.Lock()
         self._arm, self._far, self._kept = arm, Channel(theirs), list[Message]()
         self.say(Up(arm.held()))
@@ -172,17 +172,17 @@ class BusProcess(LoopProcess):
         kept, self._kept = self._kept, []
         return kept + super().pump()
 
-    def ask(self, call: Call) -> Answer:
+    def ask(self, call: Call) -> LoopAnswer:
         """As the process would, only that nobody has to wait."""
-        answer: Future[Answer] = Future()
+        answer: Future[LoopAnswer] = Future()
         self._waiting[call.id] = answer
         if self._send(call):
             self.serve()
             try:
                 self._kept += super().pump()
             except EOFError as ended:
-                return Answer(call.id, error=BusFault(str(ended)))
-        return answer.result(0) if answer.done() else Answer(call.id, error=BusFault("no answer"))
+                return LoopAnswer(call.id, error=BusFault(str(ended)))
+        return answer.result(0) if answer.done() else LoopAnswer(call.id, error=BusFault("no answer"))
 
 
 class FailingDaemon(FastDaemon):
@@ -255,13 +255,13 @@ class FailingDaemon(FastDaemon):
         patch.setattr(EventLog, "_logged", note)
         self.service.journal._db = FailingDatabase(self.service.journal._db, failing)  # type: ignore[assignment]
 
-    def answer(self, call: Call) -> Answer | None:
+    def answer(self, call: Call) -> LoopAnswer | None:
         """What the bus process answers."""
         if call.what == "sweep":
             self.touring, self.job_after, self.fast.job = call.args[0], self.fast.job, None
             return None
         act: Callable[..., Calibration] = getattr(self, str(call.what))
-        return Answer(call.id, act(*call.args))
+        return LoopAnswer(call.id, act(*call.args))
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         """Let the arm work for so long; a turn of the loop for each tenth of a second."""

@@ -12,7 +12,7 @@ from fast_arm import PERIOD, FastArm
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BusFault
 from armlink.link.types import Calibration, DriveSerial, Stats
-from armlink.loop.messages import Answer
+from armlink.loop.messages import LoopAnswer
 from calib.daemon.environment import Environment, Immediate
 from calib.daemon.loop.loop_messages import Batch, Progress, Up
 from calib.daemon.service import Service
@@ -142,7 +142,7 @@ class FastDaemon:
         self.ids[joint], self.dates[joint] = calibration.record_id, calibration.date
         return self.read_calibration(joint)
 
-    def sweep(self, poses: int, seed: int) -> Answer | None:
+    def sweep(self, poses: int, seed: int) -> LoopAnswer | None:
         self.touring, self.job_after, self.fast.job = poses, self.fast.job, None
         return None
 

@@ -11,8 +11,7 @@ from calib.observer.observer import Observer
 from gcomp.gravity.torque import gravity_regressor
 from sim_bus.effects.realism import add_realism
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics.cables import Cables
-from sim_bus.physics.friction import coldness
+from sim_bus.physics.joint_torques import Cables, coldness
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import TORQUE_RANGE
 

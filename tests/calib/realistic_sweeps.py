@@ -17,8 +17,7 @@ from calib.plan.types import SweepPlan
 from calib.sweep.dataset import Manifest, SweepData
 from calib.sweep.scout import rough_model
 from calib.sweep.thresholds import APPROACH
-from sim_bus.physics.cables import Cables
-from sim_bus.physics.friction import unevenness
+from sim_bus.physics.joint_torques import Cables, unevenness
 from sim_bus.physics.sensors import NOISE_BLOCK
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth

@@ -1,17 +1,21 @@
 """Ends of the work at drawn moments: an arm that its drives would let fall, swept or afloat, with a mass on.
 
-`ends.py [--draws 300] [--seed 1] [--family six-damiao …] [--job sweep float]`: one sweep and one float of each arm in
-simulated time; at drawn moments a copy of the process (fork) ends the job there by a drawn cause, and reports the
-largest true speed of each joint until its power has gone, less what the job's own motion had until then. Exit status 0
-where no joint was faster than 1 rad/s beyond that and every arm was parked.
+`ends.py [--draws 300] [--seed 1] [--family six-damiao …] [--job sweep float] [--cause SIGTERM …]`: one sweep and one
+float of each arm in simulated time; at drawn moments a copy of the process (fork) ends the job there by a drawn cause,
+and reports the largest true speed of each joint until its power has gone, less what the job's own motion had until
+then. A signal is sent to that process and interrupts whatever it is at. Exit status 0 where no joint was faster than
+1 rad/s beyond that and every arm was parked.
 """
 
 import argparse
 import itertools
 import json
 import os
+import signal
 import sys
 import tempfile
+import threading
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,12 +30,12 @@ from armlink.arm_file import load_arm
 from armlink.drives.orders import Mode
 from armlink.errors import BusFault, Refused, Stall
 from armlink.link.types import Command
+from armlink.termination import terminate_as_interrupt
 from calib.arm.kinematics import gcomp_arm
 from calib.motion.random_work import WorkMotion, work_pieces
 
 CAUSES: dict[str, Callable[[], BaseException | None]] = {
     "done": lambda: None,
-    "interrupted": KeyboardInterrupt,
     "exception": lambda: ZeroDivisionError("a drawn moment"),
     "disk full": lambda: OSError(28, "No space left on device"),
     "refused": lambda: Refused("a drawn moment"),
@@ -40,6 +44,8 @@ CAUSES: dict[str, Callable[[], BaseException | None]] = {
     "gate": lambda: None,
 }
 """`gate`: torque control without torque until the gate refuses, then the end."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+ALL = [*CAUSES, *(number.name for number in SIGNALS)]
 
 
 def work(bench: EndsBench, seed: int) -> Any:
@@ -70,11 +76,22 @@ def commands(bench: EndsBench, job: str, seed: int) -> Callable[[], None]:
     return step
 
 
-def ended(bench: EndsBench, cause: str) -> dict[str, Any]:
+def signalled(step: Callable[[], None], name: str, seconds: float) -> BaseException:
+    """What a signal to this process, after so much real time of its job, raises there."""
+    try:
+        with terminate_as_interrupt():
+            threading.Timer(seconds, os.kill, (os.getpid(), signal.Signals[name])).start()
+            while True:
+                step()
+    except (KeyboardInterrupt, Refused) as error:
+        return error
+
+
+def ended(bench: EndsBench, step: Callable[[], None], cause: str, seconds: float) -> dict[str, Any]:
     """End the job here; what came of the arm."""
     bench.peak[:] = np.abs(bench.sim.plant.velocity)
     own = np.array([joint.max_velocity for joint in bench.arm.require_link().joints])
-    error = CAUSES[cause]()
+    error = CAUSES[cause]() if cause in CAUSES else signalled(step, cause, seconds)
     if cause == "gate":
         try:
             bench.float_torque(5.0)
@@ -85,7 +102,7 @@ def ended(bench: EndsBench, cause: str) -> dict[str, Any]:
     return {"over": float(over.max()), "away": bench.away(), "powered": any(bench.powered)}
 
 
-def campaign(name: str, job: str, draws: int, seed: int) -> list[dict[str, Any]]:
+def campaign(name: str, job: str, causes: list[str], draws: int, seed: int) -> list[dict[str, Any]]:
     """One job of one arm, ended at drawn moments."""
     random = np.random.default_rng([seed, FALLING.index(name), job == "float"])
     bench = EndsBench(load_arm(name))
@@ -96,12 +113,12 @@ def campaign(name: str, job: str, draws: int, seed: int) -> list[dict[str, Any]]
                 step()
             except Refused:  # the push was too much
                 bench.link.recover()
-        cause = list(CAUSES)[int(random.integers(len(CAUSES)))]
+        cause, seconds = causes[int(random.integers(len(causes)))], float(random.uniform(0.0, 0.05))
         with tempfile.TemporaryFile("w+") as answer:
             child = os.fork()
             if child == 0:
                 try:
-                    json.dump(ended(bench, cause), answer)
+                    json.dump(ended(bench, step, cause, seconds), answer)
                     answer.flush()
                 finally:
                     os._exit(0)
@@ -122,16 +139,21 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--family", nargs="*", default=list(FALLING))
     parser.add_argument("--job", nargs="*", default=["sweep", "float"])
+    parser.add_argument("--cause", nargs="*", default=ALL, choices=ALL)
     asked = parser.parse_args()
+    for number in SIGNALS:  # nohup and a shell's background have a program ignore some
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     failed = 0
     for name, job in itertools.product(asked.family, asked.job):
-        found = campaign(name, job, asked.draws, asked.seed)
+        found = campaign(name, job, asked.cause, asked.draws, asked.seed)
         fast = sum(each["over"] >= EXTRA_SPEED for each in found)
         left = sum(each["away"] >= 0.1 or each["powered"] for each in found)
         worst = max(each["over"] for each in found)
         failed += fast + left
+        causes = ", ".join(f"{number} {each}" for each, number in Counter(each["cause"] for each in found).items())
         print(
-            f"{name} {job}: {len(found)} ends, {fast} too fast, {left} not parked, fastest {worst:+.2f} rad/s",
+            f"{name} {job}: {len(found)} ends ({causes}), {fast} too fast, {left} not parked, "
+            f"fastest {worst:+.2f} rad/s",
             flush=True,
         )
     return int(failed > 0)

@@ -4,8 +4,9 @@
 one joint: its position, velocity or torque frozen, forged or doubled (by a second node that sends in its name), or
 scaled by 0.2 to 5. The job is a motion under position control, or torque control of that joint with a push besides
 gravity. All is in lock-step; speeds and angles are the true ones of the simulated plant, from the end of the set-up to
-the cycle in which the host notices. As many sound draws are moved, and none of them may be refused. Exit status 0 where
-no joint turned 1.5 times as fast as max_velocity, none was 0.1 rad past a stop, and no sound arm was refused.
+the cycle in which the host notices; speeds, until a joint strikes a stop, which throws the others. As many sound draws
+are moved, and none of them may be refused. Exit status 0 where no joint turned 1.5 times as fast as max_velocity, none
+was 0.1 rad past a stop, and no sound arm was refused.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from armlink.link.link import Link
 from armlink.link.types import Command
 from sim_bus.bus.fault_kinds import Fault
 from sim_bus.bus.lock_step import LockStepBus
-from sim_bus.drives.false_readings import QUANTITIES
+from sim_bus.drives.drive_faults import QUANTITIES
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -142,9 +143,10 @@ class Run:
         self.advance(duration)
         if self.watching:
             plant = self.sim.plant
-            self.fastest = max(self.fastest, float((np.abs(plant.velocity) / self.most).max()))
             beyond = np.maximum(self.lower - plant.position, plant.position - self.upper)
             self.past = max(self.past, float(beyond.max()))
+            if self.past <= 0.0:
+                self.fastest = max(self.fastest, float((np.abs(plant.velocity) / self.most).max()))
 
     def outcome(self) -> Outcome:
         says = ""

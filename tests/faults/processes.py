@@ -14,7 +14,7 @@ import can
 from rows import ARM
 
 from armlink.arm_file import parse_arm
-from armlink.drives.canopen.cia402 import State, state_of
+from armlink.drives.canopen.cia402 import DriveState, state_of
 
 ROOT = Path(__file__).parent.parent.parent
 ARMLINK = [sys.executable, "-c", "from armlink.cli import main; main()"]
@@ -86,11 +86,11 @@ class Ear:
         interface, _, channel = bus.partition(":")
         filters = [{"can_id": base, "can_mask": 0x780, "extended": False} for base in (0x280, 0x380, 0x580)]
         self.bus = can.Bus(channel, interface=interface, can_filters=filters)
-        self.states: dict[int, State] = {}
+        self.states: dict[int, DriveState] = {}
         self.when: dict[int, float] = {}
         """When each joint came into its state, by time.monotonic() [s]."""
 
-    def listen(self, done: Callable[[dict[int, State]], bool], seconds: float) -> bool:
+    def listen(self, done: Callable[[dict[int, DriveState]], bool], seconds: float) -> bool:
         """Take frames in until `done(states)`, or the time is over."""
         end = time.monotonic() + seconds
         while not done(self.states):
@@ -122,7 +122,7 @@ class Ear:
             request = b"\x40" + STATUS_READ[1:] + bytes(4)
             self.bus.send(can.Message(arbitration_id=0x600 + node, data=request, is_extended_id=False))
 
-    def see(self, done: Callable[[dict[int, State]], bool]) -> bool:
+    def see(self, done: Callable[[dict[int, DriveState]], bool]) -> bool:
         """Ask until `done(states)`; what came so far, and may have been too much to keep, does not count."""
         self.forget()
         for _ in range(5):
@@ -138,10 +138,10 @@ class Ear:
         self.states.clear()
 
 
-def all_are(*wanted: State) -> Callable[[dict[int, State]], bool]:
+def all_are(*wanted: DriveState) -> Callable[[dict[int, DriveState]], bool]:
     """Whether every joint is in one of the states wanted."""
     return lambda states: all(states.get(node) in wanted for node in NODES)
 
 
-SAFE = all_are(State.QUICK_STOP, State.SWITCH_ON_DISABLED)
-ENABLED = all_are(State.ENABLED)
+SAFE = all_are(DriveState.QUICK_STOP, DriveState.SWITCH_ON_DISABLED)
+ENABLED = all_are(DriveState.ENABLED)

@@ -14,7 +14,7 @@ from armlink.link.link import Link
 from armlink.link.types import Command
 from sim_bus.bus.fault_kinds import Fault
 from sim_bus.bus.lock_step import LockStepBus
-from sim_bus.drives.false_readings import FALSE_READINGS
+from sim_bus.drives.drive_faults import FALSE_READINGS
 from sim_bus.drives.simulated_drive import SimulatedDrive
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth

@@ -17,7 +17,7 @@ from rows import QUICK_STOP, ROWS, Row
 from test_lock_step import pattern
 
 from armlink.arm_file import load_arm
-from armlink.drives.canopen.cia402 import State
+from armlink.drives.canopen.cia402 import DriveState
 from armlink.errors import ArmlinkError, BusFault
 from armlink.link.link import Link
 from armlink.link.types import Command
@@ -106,7 +106,7 @@ def test_a_node_without_sdo_is_named_and_nothing_is_powered(key: str, bench: Ben
     time.sleep(0.1)
     with Link.open(load_arm(str(bench.path)), BUS) as link, pytest.raises(BusFault, match=pattern(BY_KEY[key].reads)):
         link.start()
-    assert State.ENABLED not in bench.ear.states.values()
+    assert DriveState.ENABLED not in bench.ear.states.values()
 
 
 def test_an_interface_that_goes_down_is_named_and_works_again_when_it_is_up(bench: Bench) -> None:
@@ -132,7 +132,7 @@ def test_a_host_that_is_killed_or_stopped_leaves_every_joint_safe(number: int, b
         assert host.stdout.readline() == "pushing\n"
         host.send_signal(number)
         assert bench.ear.see(SAFE)
-        assert set(bench.ear.states.values()) == {State.QUICK_STOP}
+        assert set(bench.ear.states.values()) == {DriveState.QUICK_STOP}
         if number == signal.SIGSTOP:
             host.send_signal(signal.SIGCONT)
             assert re.match(r"the host was \d+ ms late \(limit 1000 ms\)", host.stdout.readline())

@@ -21,8 +21,8 @@ import numpy as np
 
 from armlink.arm_file import load_arm
 from armlink.bus.open import open_link_bus
-from sim_bus.bus.server import Server
-from sim_bus.node.cia402 import State
+from sim_bus.bus.server import ArmServer
+from sim_bus.node.cia402 import PowerState
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -78,7 +78,7 @@ def witnessed(arm: Path, bus: str, report: Path) -> Iterator[Witness]:
 def powered(arm: SimulatedArm) -> bool:
     """Whether some joint is under power."""
     states = [arm.drives.state[node.place] for node in arm.nodes]
-    return State.ENABLED in states or any(drive.motor.powered for drive in arm.drive_at.values())
+    return PowerState.ENABLED in states or any(drive.motor.powered for drive in arm.drive_at.values())
 
 
 def main(path: str, bus: str, report: str) -> int:
@@ -89,7 +89,7 @@ def main(path: str, bus: str, report: str) -> int:
     described = load_arm(path)
     arm = SimulatedArm(described, Truth.of(described), 1)
     end_of_bus = open_link_bus(bus, described.require_link())
-    server = Server(arm, end_of_bus)
+    server = ArmServer(arm, end_of_bus)
     advance, fastest, due = arm.advance, 0.0, 0.0
     with open(report, "a", buffering=1, encoding="utf-8") as out:
 

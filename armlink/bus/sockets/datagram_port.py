@@ -61,11 +61,11 @@ class _Header(ctypes.Structure):
     )
 
 
-class _Message(ctypes.Structure):
+class _MessageHeader(ctypes.Structure):
     _fields_ = (("header", _Header), ("length", ctypes.c_uint))
 
 
-class Batch:
+class DatagramBatch:
     """Preallocated datagrams and their headers for sendmmsg and recvmmsg."""
 
     def __init__(self, size: int, names: bool = False) -> None:
@@ -74,9 +74,9 @@ class Batch:
         self.content = bytearray(BATCH * size)
         self.names = bytearray(BATCH * NAME if names else 0)
         base, name = _address(self.content), _address(self.names) if names else None
-        vectors, messages = (bytearray(BATCH * ctypes.sizeof(each)) for each in (_Vector, _Message))
+        vectors, messages = (bytearray(BATCH * ctypes.sizeof(each)) for each in (_Vector, _MessageHeader))
         self._vectors, self._messages = memoryview(vectors).cast("Q"), memoryview(messages)
-        self.messages = (_Message * BATCH).from_buffer(messages)
+        self.messages = (_MessageHeader * BATCH).from_buffer(messages)
         self.address = ctypes.addressof(self.messages)
         first, step = _address(vectors), ctypes.sizeof(_Vector)
         for i, message in enumerate(self.messages):
@@ -100,7 +100,13 @@ class DatagramPort(ABC):
     """Port on sockets; counts error frames and frames lost by the receive queue."""
 
     def __init__(
-        self, name: str, receiving: socket.socket, sending: socket.socket, out: Batch, into: Batch, as_node: bool
+        self,
+        name: str,
+        receiving: socket.socket,
+        sending: socket.socket,
+        out: DatagramBatch,
+        into: DatagramBatch,
+        as_node: bool,
     ) -> None:
         """`name` of the bus for messages; both sockets may be the same; `as_node` as in CanBus.open_port."""
         self.errors = 0
@@ -152,7 +158,7 @@ class DatagramPort(ABC):
             return
         self._encode(frames)
         sent, tries, total = 0, 0, len(frames)
-        step = ctypes.sizeof(_Message)
+        step = ctypes.sizeof(_MessageHeader)
         while sent < total:
             count = self._sendmmsg(self._out_number, self._out.address + sent * step, total - sent, _DONTWAIT)
             if count > 0:

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Sequence
 
 from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame
-from armlink.bus.sockets.datagram_port import NAME, NOT_OURS, Batch, DatagramPort
+from armlink.bus.sockets.datagram_port import NAME, NOT_OURS, DatagramBatch, DatagramPort
 from armlink.bus.sockets.multicast_frames import LONGEST, Decoder, encode
 from armlink.bus.sockets.stamped_port import Stamping
 from armlink.errors import BusFault, Stall
@@ -43,7 +43,7 @@ class MulticastPort(DatagramPort):
         self._own = _address(sending)
         _hear_one_group(receiving)
         self._decoder = Decoder()
-        super().__init__(name, receiving, sending, Batch(256), Batch(LONGEST, names=True), as_node)
+        super().__init__(name, receiving, sending, DatagramBatch(256), DatagramBatch(LONGEST, names=True), as_node)
 
     def close(self) -> None:
         """Close the sending socket."""

@@ -5,7 +5,7 @@ import struct
 from collections.abc import Sequence
 
 from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame
-from armlink.bus.sockets.datagram_port import Batch, DatagramPort
+from armlink.bus.sockets.datagram_port import DatagramBatch, DatagramPort
 
 _CLASSIC, _FD = struct.Struct("=IBB2x8s"), struct.Struct("=IBB2x64s")
 _NEVER_FD, _ON_WIRE = ERROR | REMOTE | CLASSICAL, 0xFFFFFFFF
@@ -22,7 +22,7 @@ class SocketPort(DatagramPort):
         """
         self._layout = _FD if fd else _CLASSIC
         size = self._layout.size
-        super().__init__(name, raw, raw, Batch(size), Batch(size), as_node)
+        super().__init__(name, raw, raw, DatagramBatch(size), DatagramBatch(size), as_node)
         self._received = memoryview(self._in.content)
         self._fd = fd
 

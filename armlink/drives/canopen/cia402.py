@@ -7,7 +7,7 @@ from armlink.drives.orders import MODE_NAMES as MODE_NAMES
 from armlink.drives.orders import Limits, Mode
 
 
-class State(Enum):
+class DriveState(Enum):
     """States of the power drive system (CiA 402, 6041h)."""
 
     NOT_READY = "not ready to switch on"
@@ -74,49 +74,49 @@ def supports(supported: int, mode: int) -> bool:
 
 
 _BY_4F = {
-    0x00: State.NOT_READY,
-    0x40: State.SWITCH_ON_DISABLED,
-    0x0F: State.FAULT_REACTION,
-    0x08: State.FAULT,
+    0x00: DriveState.NOT_READY,
+    0x40: DriveState.SWITCH_ON_DISABLED,
+    0x0F: DriveState.FAULT_REACTION,
+    0x08: DriveState.FAULT,
 }
-_BY_6F = {0x21: State.READY, 0x23: State.SWITCHED_ON, 0x27: State.ENABLED, 0x07: State.QUICK_STOP}
+_BY_6F = {0x21: DriveState.READY, 0x23: DriveState.SWITCHED_ON, 0x27: DriveState.ENABLED, 0x07: DriveState.QUICK_STOP}
 
 # One step towards ENABLED, DISABLED (switch on disabled) or QUICK_STOP from each state; None if there is nothing to
 # command: the state is reached or the drive moves on by itself. Quick stop to enabled is transition 16: power stays on.
 _TO_ENABLED = {
-    State.SWITCH_ON_DISABLED: Control.SHUTDOWN,
-    State.READY: Control.SWITCH_ON,
-    State.SWITCHED_ON: Control.ENABLE,
-    State.ENABLED: Control.ENABLE,
-    State.QUICK_STOP: Control.ENABLE,
-    State.FAULT: Control.FAULT_RESET,
+    DriveState.SWITCH_ON_DISABLED: Control.SHUTDOWN,
+    DriveState.READY: Control.SWITCH_ON,
+    DriveState.SWITCHED_ON: Control.ENABLE,
+    DriveState.ENABLED: Control.ENABLE,
+    DriveState.QUICK_STOP: Control.ENABLE,
+    DriveState.FAULT: Control.FAULT_RESET,
 }
 _TO_DISABLED = {
-    State.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE,
-    State.READY: Control.DISABLE_VOLTAGE,
-    State.SWITCHED_ON: Control.DISABLE_VOLTAGE,
-    State.ENABLED: Control.DISABLE_VOLTAGE,
-    State.QUICK_STOP: Control.DISABLE_VOLTAGE,
-    State.FAULT: Control.FAULT_RESET,
+    DriveState.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE,
+    DriveState.READY: Control.DISABLE_VOLTAGE,
+    DriveState.SWITCHED_ON: Control.DISABLE_VOLTAGE,
+    DriveState.ENABLED: Control.DISABLE_VOLTAGE,
+    DriveState.QUICK_STOP: Control.DISABLE_VOLTAGE,
+    DriveState.FAULT: Control.FAULT_RESET,
 }
 
 
-def state_of(status_word: int) -> State:
+def state_of(status_word: int) -> DriveState:
     """State that a status word (6041h) encodes; UNKNOWN if the standard does not define the pattern."""
-    return _BY_4F.get(status_word & 0x4F) or _BY_6F.get(status_word & 0x6F, State.UNKNOWN)
+    return _BY_4F.get(status_word & 0x4F) or _BY_6F.get(status_word & 0x6F, DriveState.UNKNOWN)
 
 
-def next_control(state: State, target: State) -> int:
+def next_control(state: DriveState, target: DriveState) -> int:
     """Control word for the next step from `state` towards `target` (ENABLED, QUICK_STOP or SWITCH_ON_DISABLED).
 
     If the drive moves on by itself (not ready, fault reaction) or the state is unknown, the word is disable voltage,
     which is also the low level that the rising edge of fault reset needs.
     """
-    if target is State.ENABLED:
+    if target is DriveState.ENABLED:
         return int(_TO_ENABLED.get(state, Control.DISABLE_VOLTAGE))
-    if target is State.SWITCH_ON_DISABLED:
+    if target is DriveState.SWITCH_ON_DISABLED:
         return int(_TO_DISABLED.get(state, Control.DISABLE_VOLTAGE))
-    if target is State.QUICK_STOP:
+    if target is DriveState.QUICK_STOP:
         return int(Control.QUICK_STOP)
     raise ValueError(f"no transition to {target.value} is defined: targets are enabled, quick stop, switch on disabled")
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from armlink.arm_file import DeviceIdentity, LinkJoint, LinkSection
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
-from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, MODE_NAMES, NEEDED_MODES, State, state_of, supports
+from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, MODE_NAMES, NEEDED_MODES, DriveState, state_of, supports
 from armlink.drives.canopen.eds_file import expected_identity
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import Pdo
@@ -60,7 +60,7 @@ class Identity:
     product: int = 0
     revision: int = 0
     serial: int = 0
-    state: State = State.UNKNOWN
+    state: DriveState = DriveState.UNKNOWN
     answers: int = 1
     """How many answered one request at this node id; more than one is a duplicated id."""
     lost: tuple[str, ...] = ()

@@ -12,7 +12,7 @@ from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import faults, torque_sensor_record
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.check.guard_rules import guard_rules
-from armlink.drives.canopen.cia402 import State, state_of
+from armlink.drives.canopen.cia402 import DriveState, state_of
 from armlink.drives.canopen.cyclic.commands import SYNC, TARGETS, CommandFrames
 from armlink.drives.canopen.cyclic.readings import ReadingFrames
 from armlink.drives.canopen.cyclic.wire import Wire, check_fits
@@ -30,14 +30,14 @@ from armlink.torque_calibration import Calibration
 
 SDO_RESPONSE_ID = 0x580
 _POWERS = {
-    State.ENABLED: Power.ON,
-    State.QUICK_STOP: Power.STOPPED,
-    State.FAULT: Power.FAULT,
-    State.FAULT_REACTION: Power.FAULT,
-    State.SWITCH_ON_DISABLED: Power.OFF,
-    State.NOT_READY: Power.OFF,
-    State.READY: Power.READY,
-    State.SWITCHED_ON: Power.READY,
+    DriveState.ENABLED: Power.ON,
+    DriveState.QUICK_STOP: Power.STOPPED,
+    DriveState.FAULT: Power.FAULT,
+    DriveState.FAULT_REACTION: Power.FAULT,
+    DriveState.SWITCH_ON_DISABLED: Power.OFF,
+    DriveState.NOT_READY: Power.OFF,
+    DriveState.READY: Power.READY,
+    DriveState.SWITCHED_ON: Power.READY,
 }
 
 
@@ -55,8 +55,8 @@ class CanopenDrives:
         self._host_frames = HostFrames(self.nodes, self.protection.host)
         self._traits, self._deadline = traits, section.deadline
         self._joint_of = {node: joint for joint, node in enumerate(self.nodes)}
-        self.known = faults.Known(self.names)
-        """What the joints have shown."""
+        self.known = faults.JointStates(self.names)
+        """Newest state of the joints."""
         self._sound: tuple[list[int], list[int], list[int]] | None = None
         """Modes, mode displays and status words that were no fault when last seen, every mode being displayed."""
         self.beat_every = section.deadline / 2

@@ -10,8 +10,7 @@ from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen.cia402 import state_of
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.family import Drives, Family
-from armlink.drives.findings import Result
-from armlink.drives.found import DriveFinding, FoundDrives
+from armlink.drives.findings import DriveFinding, FoundDrives, Result
 from armlink.drives.orders import Limits
 from armlink.drives.traits import Traits
 
@@ -46,9 +45,9 @@ def self_test(
     link: Any, drives: Any, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
 ) -> list[Result]:
     """The self-test of CiA 402 controllers; see `armlink.drives.canopen.check.self_test`."""
-    from armlink.drives.canopen.check.self_test import SelfTest
+    from armlink.drives.canopen.check.self_test import CanopenSelfTest
 
-    return SelfTest(link, drives, limits, progress).run(power)
+    return CanopenSelfTest(link, drives, limits, progress).run(power)
 
 
 def state_name(code: int) -> str:
@@ -58,13 +57,13 @@ def state_name(code: int) -> str:
 
 def find(bus: CanBus) -> FoundDrives:
     """Nodes on a bus with their ratings; see `armlink.drives.canopen.check.found_drives`."""
-    from armlink.drives.canopen.check.found_drives import Drives
+    from armlink.drives.canopen.check.found_drives import FoundNodes
 
-    return Drives(bus)
+    return FoundNodes(bus)
 
 
 def examine(arm: ArmFile, bus: CanBus, name: str) -> Iterator[DriveFinding]:
-    """What the nodes say against the arm file; see `armlink.drives.canopen.check.arm_findings`."""
+    """Contradictions between nodes and arm file; see `armlink.drives.canopen.check.arm_findings`."""
     from armlink.drives.canopen.check.arm_findings import arm_findings
 
     return arm_findings(arm, bus, name)

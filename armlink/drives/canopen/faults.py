@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen import emcy
 from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, MODE_NAMES, State, state_of
+from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, MODE_NAMES, DriveState, state_of
 from armlink.drives.orders import Mode
 from armlink.errors import BusFault, Stall
 
@@ -15,7 +15,7 @@ OFF = int(Mode.OFF)
 ENABLED_BITS = 0x27
 WATCHDOGS = frozenset({0x8130, 0x8250, 0x8700})
 """Emergencies of a node that does not hear its host: heartbeat, RPDO deadline, SYNC (CiA 301)."""
-_FAULTS = (State.FAULT, State.FAULT_REACTION)
+_FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 
 
 EMERGENCIES_KEPT = 64
@@ -24,8 +24,8 @@ NO_MODE = 0
 """Stands for the mode display of a joint that has sent none: no mode is active."""
 
 
-class Known:
-    """What m joints have shown of themselves, the newest of each."""
+class JointStates:
+    """Newest states, emergencies and faults of m joints."""
 
     def __init__(self, names: Sequence[str]) -> None:
         """Nothing is known yet."""
@@ -47,7 +47,7 @@ class Known:
         """Joints whose controller has sent its boot-up message."""
 
 
-def alarm(known: Known) -> BusFault | None:
+def alarm(known: JointStates) -> BusFault | None:
     """The first event: emergency, restart, NMT state; a Stall where a joint did not hear its host."""
     told = node_fault(known)
     if told is None:
@@ -56,7 +56,7 @@ def alarm(known: Known) -> BusFault | None:
     return Stall(told) if watchdog else BusFault(told)
 
 
-def state_fault(known: Known, now: float, modes: Sequence[int], patience: float) -> BusFault | None:
+def state_fault(known: JointStates, now: float, modes: Sequence[int], patience: float) -> BusFault | None:
     """The first fault by status words and mode displays, if every joint with a mode was to be enabled in it.
 
     A mode must be displayed within `patience` [s].
@@ -73,13 +73,13 @@ def state_fault(known: Known, now: float, modes: Sequence[int], patience: float)
     return None
 
 
-def is_own_watchdog(known: Known, joint: int) -> bool:
+def is_own_watchdog(known: JointStates, joint: int) -> bool:
     """Whether a joint stopped by itself, as it must when it does not hear its host."""
     codes = {code for place, code, _ in known.emergencies if place == joint}
-    return bool(codes & WATCHDOGS) or (not codes and state_of(known.statuses[joint]) is State.QUICK_STOP)
+    return bool(codes & WATCHDOGS) or (not codes and state_of(known.statuses[joint]) is DriveState.QUICK_STOP)
 
 
-def stopped_itself(known: Known, joint: int) -> str:
+def stopped_itself(known: JointStates, joint: int) -> str:
     """That a joint's own watch of the host has stopped it, in words; empty if it has not."""
     if not is_own_watchdog(known, joint):
         return ""
@@ -88,7 +88,7 @@ def stopped_itself(known: Known, joint: int) -> str:
     return f"{known.names[joint]} stopped itself{why}"
 
 
-def node_fault(known: Known) -> str | None:
+def node_fault(known: JointStates) -> str | None:
     """The first fault of a node, whatever its drive is doing: emergency, restart, NMT state; or None."""
     for joint, code, register in known.emergencies:
         return f"{known.names[joint]}: emergency {code:04X}h, {emcy.name_of(code)} (error register {register:02X}h)"
@@ -116,7 +116,7 @@ def _name_of(mode: int) -> str:
     return "cyclic synchronous velocity" if mode == CYCLIC_VELOCITY else MODE_NAMES[Mode(mode)]
 
 
-def stuck(known: Known, joint: int, target: State, mode: int, seconds: float) -> str:
+def stuck(known: JointStates, joint: int, target: DriveState, mode: int, seconds: float) -> str:
     """Why a joint did not reach `target` in its `mode` within `seconds`."""
     name, state = known.names[joint], state_of(known.statuses[joint])
     if state is target:

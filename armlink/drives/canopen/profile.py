@@ -1,4 +1,4 @@
-"""What one device has of the objects that the link can use, and which PDOs follow from that."""
+"""Objects of one device that the link can use, and the PDOs that follow from them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -86,7 +86,7 @@ class Profile:
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """What is lost by what it lacks."""
+        """Functions lost by the lack of objects."""
         told = tuple(f"{entry}: {LOST[entry]}" for entry in LOST if entry in self.absent and LOST[entry])
         if self.by_velocity:
             told = (

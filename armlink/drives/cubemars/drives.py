@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
-from armlink.drives.cubemars.frames import NO_COMMAND, Reply, error_text, unpack_reply
+from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, error_text, unpack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.family import Ask
 from armlink.drives.mit_drives import MitDrives, MitKnown
@@ -33,8 +33,8 @@ FOLLOWS = 0.5
 
 
 @dataclass
-class _Known(MitKnown):
-    """What is known of one drive."""
+class _CubeMarsState(MitKnown):
+    """Newest state of one drive."""
 
     on: bool | None = None
     """In motor mode, by the newest switching that was answered."""
@@ -57,7 +57,7 @@ class CubeMarsDrives(MitDrives):
 
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent. Raises BadInput where one drive's replies have another's id."""
-        self._known: list[_Known] = [_Known() for _ in joints]
+        self._known: list[_CubeMarsState] = [_CubeMarsState() for _ in joints]
         super().__init__(joints, TRAITS, self._known)
         self._traits = [
             replace(traits, silence="falls") if settings.can_timeout else traits
@@ -104,12 +104,12 @@ class CubeMarsDrives(MitDrives):
         self.identify(ask)
         return [known.position for known in self._known]
 
-    def _exit(self, ask: Ask, joint: int) -> Reply | None:
+    def _exit(self, ask: Ask, joint: int) -> CubeMarsReply | None:
         """Leave motor mode; the reply, None where there is none."""
         return ask((self._settings[joint].id, special(Special.DISABLE)), self._reply_of(joint))
 
-    def _reply_of(self, joint: int) -> Callable[[int, bytes], Reply | None]:
-        def reply(can_id: int, data: bytes) -> Reply | None:
+    def _reply_of(self, joint: int) -> Callable[[int, bytes], CubeMarsReply | None]:
+        def reply(can_id: int, data: bytes) -> CubeMarsReply | None:
             known = self._known[joint]
             assert known.ranges is not None
             mine = self._replies.get((can_id, data[0])) == joint if data else False
@@ -133,7 +133,7 @@ class CubeMarsDrives(MitDrives):
                 f"{name}: no answer from {settings.address} on id {settings.reply:02X}h: is it powered, in MIT mode, "
                 "and are its CAN and master ids right?"
             )
-        self._known[joint] = known = _Known(ranges, known.grid, limit, reply.feedback.position, on=False)
+        self._known[joint] = known = _CubeMarsState(ranges, known.grid, limit, reply.feedback.position, on=False)
         self.powers[joint], self.faults[joint] = Power.OFF, error_text(reply.error)
         notes = (_watched(settings), "scales are the arm file's: the drive reports none")
         where = ("position_range", "velocity_range", "torque_range")
@@ -219,7 +219,7 @@ class CubeMarsDrives(MitDrives):
         return "makes no torque although its commands ask for some: it has left motor mode, or restarted"
 
     @staticmethod
-    def _power(known: _Known) -> Power:
+    def _power(known: _CubeMarsState) -> Power:
         if known.stopped:
             return Power.STOPPED
         if known.on:

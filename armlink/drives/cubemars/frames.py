@@ -35,7 +35,7 @@ ERRORS = {
 NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class Reply(NamedTuple):
+class CubeMarsReply(NamedTuple):
     """Reply to any frame that a drive gets."""
 
     drive: int
@@ -45,18 +45,18 @@ class Reply(NamedTuple):
     error: int | None
 
 
-def pack_reply(reply: Reply, ranges: Ranges) -> bytes:
+def pack_reply(reply: CubeMarsReply, ranges: Ranges) -> bytes:
     """The eight or six bytes of a reply."""
     tail = b"" if reply.temperature is None else bytes([max(0, min(255, reply.temperature)), reply.error or 0])
     return bytes([reply.drive]) + pack_feedback(reply.feedback, ranges) + tail
 
 
-def unpack_reply(data: bytes, ranges: Ranges) -> Reply | None:
+def unpack_reply(data: bytes, ranges: Ranges) -> CubeMarsReply | None:
     """The reply in `data`, or None for another length."""
     if len(data) not in (6, 8):
         return None
     temperature, error = (data[6], data[7]) if len(data) == 8 else (None, None)
-    return Reply(data[0], unpack_feedback(data[1:6], ranges), temperature, error)
+    return CubeMarsReply(data[0], unpack_feedback(data[1:6], ranges), temperature, error)
 
 
 def error_text(error: int | None) -> str:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.damiao import frames
-from armlink.drives.damiao.frames import READ, WRITE, Register, State
-from armlink.drives.damiao.models import delivered
+from armlink.drives.damiao.frames import READ, WRITE, DamiaoRegister, DamiaoStatus
 from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_position, read_registers
+from armlink.drives.damiao.settings import delivered
 from armlink.drives.family import Ask
 from armlink.drives.mit_drives import MitDrives, MitKnown
 from armlink.drives.mit_packing import Ranges, Special, feedback_in, special, unwrap
@@ -19,29 +19,34 @@ from armlink.drives.traits import Traits
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="11")
 OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
 """Offsets of the command ids of the modes that armlink does not use."""
-IDENTITY = (Register.HARDWARE_VERSION, Register.SOFTWARE_VERSION, Register.SERIAL_NUMBER, Register.REPLY_ID)
+IDENTITY = (
+    DamiaoRegister.HARDWARE_VERSION,
+    DamiaoRegister.SOFTWARE_VERSION,
+    DamiaoRegister.SERIAL_NUMBER,
+    DamiaoRegister.REPLY_ID,
+)
 REGISTER_KINDS = frozenset((READ, WRITE))
-ENABLED = int(State.ENABLED)
-POWERS: dict[int | None, Power] = {State.DISABLED: Power.OFF, State.LOST_COMMUNICATION: Power.STOPPED}
+ENABLED = int(DamiaoStatus.ENABLED)
+POWERS: dict[int | None, Power] = {DamiaoStatus.DISABLED: Power.OFF, DamiaoStatus.LOST_COMMUNICATION: Power.STOPPED}
 RANGE_FIELDS: dict[int, str] = {
-    Register.POSITION_RANGE: "position",
-    Register.VELOCITY_RANGE: "velocity",
-    Register.TORQUE_RANGE: "torque",
+    DamiaoRegister.POSITION_RANGE: "position",
+    DamiaoRegister.VELOCITY_RANGE: "velocity",
+    DamiaoRegister.TORQUE_RANGE: "torque",
 }
-NO_FAULTS = frozenset((int(State.DISABLED), int(State.ENABLED), int(State.LOST_COMMUNICATION)))
+NO_FAULTS = frozenset((int(DamiaoStatus.DISABLED), int(DamiaoStatus.ENABLED), int(DamiaoStatus.LOST_COMMUNICATION)))
 UNKNOWN_RANGES = Ranges(math.nan, math.nan, math.nan)
 FAULTS = {
-    State.OVERVOLTAGE: "overvoltage",
-    State.UNDERVOLTAGE: "undervoltage",
-    State.OVERCURRENT: "overcurrent",
-    State.MOSFET_HOT: "power stage too hot",
-    State.ROTOR_HOT: "motor too hot",
-    State.OVERLOAD: "overload",
+    DamiaoStatus.OVERVOLTAGE: "overvoltage",
+    DamiaoStatus.UNDERVOLTAGE: "undervoltage",
+    DamiaoStatus.OVERCURRENT: "overcurrent",
+    DamiaoStatus.MOSFET_HOT: "power stage too hot",
+    DamiaoStatus.ROTOR_HOT: "motor too hot",
+    DamiaoStatus.OVERLOAD: "overload",
 }
 
 
 @dataclass
-class _Known(MitKnown):
+class _DamiaoState(MitKnown):
     """Its ranges are those that its model is delivered with, until its registers are known."""
 
     state: int | None = None
@@ -52,7 +57,7 @@ class DamiaoDrives(MitDrives):
 
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent."""
-        self._known: list[_Known] = [_Known() for _ in joints]
+        self._known: list[_DamiaoState] = [_DamiaoState() for _ in joints]
         super().__init__(joints, TRAITS, self._known)
         for known, settings in zip(self._known, self._settings, strict=True):
             known.use(delivered(settings.model))
@@ -138,7 +143,7 @@ class DamiaoDrives(MitDrives):
         if order.power is Power.OFF and on:
             return drive, special(Special.DISABLE)
         if order.power is Power.ON and order.walk:
-            if known.state == State.DISABLED:
+            if known.state == DamiaoStatus.DISABLED:
                 return drive, special(Special.ENABLE)
             if known.state is not None:
                 return drive, special(Special.CLEAR_ERROR)
@@ -181,7 +186,7 @@ class DamiaoDrives(MitDrives):
         known.use((known.ranges or UNKNOWN_RANGES)._replace(**{field: value}))
 
     @staticmethod
-    def _power(known: _Known) -> Power:
+    def _power(known: _DamiaoState) -> Power:
         if known.state == ENABLED:
             return Power.STOPPED if known.damping else Power.ON
         return POWERS.get(known.state, Power.FAULT)
@@ -196,7 +201,7 @@ class DamiaoDrives(MitDrives):
 
     def own_stop(self, joint: int) -> str:
         """See Drives."""
-        if self._known[joint].state != State.LOST_COMMUNICATION:
+        if self._known[joint].state != DamiaoStatus.LOST_COMMUNICATION:
             return ""
         return f"{self.where(joint)}: lost communication (state Dh): its TIMEOUT ran out, the torque is off"
 
@@ -214,5 +219,5 @@ class DamiaoDrives(MitDrives):
 def _fault_text(state: int) -> str:
     if state in NO_FAULTS:
         return ""
-    words = FAULTS[State(state)] if state in FAULTS else "unknown state"
+    words = FAULTS[DamiaoStatus(state)] if state in FAULTS else "unknown state"
     return f"{words} (state {state:X}h)"

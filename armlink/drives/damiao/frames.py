@@ -14,7 +14,7 @@ REGISTERS_ID = 0x7FF
 READ, WRITE, REFRESH = 0x33, 0x55, 0xCC
 
 
-class Register(IntEnum):
+class DamiaoRegister(IntEnum):
     """Registers that armlink uses; all can be read."""
 
     UNDER_VOLTAGE = 0
@@ -45,7 +45,7 @@ MIT_MODE = 1
 VALUES = struct.Struct("<I"), struct.Struct("<f")
 
 
-class State(IntEnum):
+class DamiaoStatus(IntEnum):
     """State nibble of a reply."""
 
     DISABLED = 0x0
@@ -59,7 +59,7 @@ class State(IntEnum):
     OVERLOAD = 0xE
 
 
-class Reply(NamedTuple):
+class DamiaoReply(NamedTuple):
     """Reply to a command: state nibble, feedback, temperatures of power stage and rotor [°C]."""
 
     drive: int
@@ -107,15 +107,15 @@ def register_answer(data: bytes, drive: int) -> tuple[int, int, float] | None:
     return data[2], data[3], unpack_value(data[3], data[4:8])
 
 
-def pack_reply(reply: Reply, ranges: Ranges) -> bytes:
+def pack_reply(reply: DamiaoReply, ranges: Ranges) -> bytes:
     """The eight bytes of a reply."""
     head = reply.state << 4 | reply.drive & 0xF
     tail = (max(0, min(255, reply.stage_temperature)), max(0, min(255, reply.rotor_temperature)))
     return bytes([head]) + pack_feedback(reply.feedback, ranges) + bytes(tail)
 
 
-def unpack_reply(data: bytes, ranges: Ranges) -> Reply | None:
+def unpack_reply(data: bytes, ranges: Ranges) -> DamiaoReply | None:
     """The reply in `data`, or None for another length."""
     if len(data) != 8:
         return None
-    return Reply(data[0] & 0xF, data[0] >> 4, unpack_feedback(data[1:6], ranges), data[6], data[7])
+    return DamiaoReply(data[0] & 0xF, data[0] >> 4, unpack_feedback(data[1:6], ranges), data[6], data[7])

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable
 
 from armlink.drives.damiao import frames
-from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, Register, State
+from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, DamiaoRegister, DamiaoStatus
 from armlink.drives.damiao.settings import DamiaoSettings
 from armlink.drives.family import Ask
 from armlink.drives.mit_packing import Ranges, Special, special
@@ -12,11 +12,16 @@ from armlink.drives.mit_setup import mit_setup, require_window
 from armlink.drives.orders import Limits, Setup
 from armlink.errors import BadInput, BusFault
 
-SCALES = (Register.POSITION_RANGE, Register.VELOCITY_RANGE, Register.TORQUE_RANGE)
+SCALES = (DamiaoRegister.POSITION_RANGE, DamiaoRegister.VELOCITY_RANGE, DamiaoRegister.TORQUE_RANGE)
 RANGE_REMEDY = "write it with the maker's tool and store it"
 LARGEST_RANGE = 1e4
 """No range of a real drive is larger [rad, rad/s, N·m]."""
-NOTED = (Register.TORQUE_CONSTANT, Register.OVER_CURRENT, Register.LARGEST_CURRENT, Register.GEAR_RATIO)
+NOTED = (
+    DamiaoRegister.TORQUE_CONSTANT,
+    DamiaoRegister.OVER_CURRENT,
+    DamiaoRegister.LARGEST_CURRENT,
+    DamiaoRegister.GEAR_RATIO,
+)
 
 
 def read_registers(ask: Ask, drive: int, registers: Iterable[int]) -> dict[int, float | None]:
@@ -37,20 +42,20 @@ def prepare(ask: Ask, name: str, settings: DamiaoSettings, limits: Limits) -> tu
     """
     drive = settings.id
     ask.send(drive, special(Special.DISABLE))
-    values = read_registers(ask, drive, (*SCALES, Register.REPLY_ID, *NOTED))
+    values = read_registers(ask, drive, (*SCALES, DamiaoRegister.REPLY_ID, *NOTED))
     if None in values.values():
         raise BusFault(f"{name}: no answer from {settings.address}: is it powered, and its id right?")
     known = {register: float(value or 0.0) for register, value in values.items()}
-    if known[Register.REPLY_ID] != settings.reply:
+    if known[DamiaoRegister.REPLY_ID] != settings.reply:
         raise BadInput(
-            f"{name}: its drive replies on id {int(known[Register.REPLY_ID]):02X}h (register 7), "
+            f"{name}: its drive replies on id {int(known[DamiaoRegister.REPLY_ID]):02X}h (register 7), "
             f"the arm file says reply: {settings.reply:#04x}"
         )
     ranges = _ranges(name, known)
     require_window(name, limits, ranges, " (register 21)")
-    _set(ask, name, drive, Register.CONTROL_MODE, frames.MIT_MODE, "the drive is not in MIT mode")
+    _set(ask, name, drive, DamiaoRegister.CONTROL_MODE, frames.MIT_MODE, "the drive is not in MIT mode")
     deadman = round(limits.deadline / TIMEOUT_UNIT)
-    _set(ask, name, drive, Register.TIMEOUT, deadman, "it would keep on after its host died")
+    _set(ask, name, drive, DamiaoRegister.TIMEOUT, deadman, "it would keep on after its host died")
     return ranges, _result(ask, name, settings, ranges, known)
 
 
@@ -61,7 +66,7 @@ def _ranges(name: str, values: dict[int, float]) -> Ranges:
     return Ranges(*(values[register] for register in SCALES))
 
 
-def _set(ask: Ask, name: str, drive: int, register: Register, value: int, otherwise: str) -> None:
+def _set(ask: Ask, name: str, drive: int, register: DamiaoRegister, value: int, otherwise: str) -> None:
     """Write a register in RAM and read it back. Raises BusFault."""
     request = (frames.REGISTERS_ID, frames.write_request(drive, register, value))
     ask(request, _answer(drive, WRITE, register))
@@ -76,15 +81,15 @@ def _result(ask: Ask, name: str, settings: DamiaoSettings, ranges: Ranges, known
     reply = _state(ask, settings, ranges)
     if reply is None:
         raise BusFault(f"{name}: {settings.address} answers registers, but sends no feedback")
-    if reply.state == State.ENABLED:
+    if reply.state == DamiaoStatus.ENABLED:
         raise BusFault(f"{name}: {settings.address} stays enabled although it was commanded to disable")
-    constant = known[Register.TORQUE_CONSTANT]
+    constant = known[DamiaoRegister.TORQUE_CONSTANT]
     notes = [
         f"torque constant {constant:g} N·m/A"
         if constant
         else "torque constant register reads 0: its meaning is unknown",
-        f"gear {known[Register.GEAR_RATIO]:g}",
-        f"current limit {known[Register.OVER_CURRENT] * known[Register.LARGEST_CURRENT]:g} A",
+        f"gear {known[DamiaoRegister.GEAR_RATIO]:g}",
+        f"current limit {known[DamiaoRegister.OVER_CURRENT] * known[DamiaoRegister.LARGEST_CURRENT]:g} A",
     ]
     where = ("register 21 (PMAX)", "register 22 (VMAX)", "register 23 (TMAX)")
     return mit_setup(reply.feedback.position, settings.kp, settings.kd, ranges, notes, where, RANGE_REMEDY)
@@ -104,10 +109,10 @@ def read_position(ask: Ask, name: str, settings: DamiaoSettings) -> float:
     return math.nan if reply is None else reply.feedback.position
 
 
-def _state(ask: Ask, settings: DamiaoSettings, ranges: Ranges) -> frames.Reply | None:
+def _state(ask: Ask, settings: DamiaoSettings, ranges: Ranges) -> frames.DamiaoReply | None:
     """Feedback that is asked for; None where none comes."""
 
-    def state_of(can_id: int, data: bytes) -> frames.Reply | None:
+    def state_of(can_id: int, data: bytes) -> frames.DamiaoReply | None:
         if can_id != settings.reply or frames.register_answer(data, settings.id) is not None:
             return None
         reply = frames.unpack_reply(data, ranges)

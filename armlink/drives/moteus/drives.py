@@ -3,8 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from armlink.arm_file import ArmFile, LinkJoint
+from pydantic import Field
+
+from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import BasicDrives, no_order
 from armlink.drives.family import Ask
@@ -17,12 +20,31 @@ from armlink.drives.moteus.frames import (
     READ_ERROR,
     REPLY,
     WRITE,
-    Register,
+    MoteusRegister,
 )
-from armlink.drives.moteus.settings import MoteusSettings
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
+
+
+class MoteusSettings(DriveSettings):
+    """A moteus controller, on a bus with `fd: true`."""
+
+    family: Literal["moteus"] = "moteus"
+    id: Annotated[int, Field(ge=1, le=0x7E)]
+    """Controller id (id.id)."""
+    source: Annotated[int, Field(ge=0, le=0x7F)] = 0
+    """Our id, to which it replies."""
+    torque_constant: Positive | None = None
+    """Torque constant at its output [N·m/A], by which the scale check compares torque
+    with current; None: not compared."""
+
+    @property
+    def address(self) -> str:
+        """Its id on the bus."""
+        return f"controller {self.id}"
+
 
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("torque",), cadence="reply", frame="fd")
@@ -54,13 +76,17 @@ FAULTS = {
     50: "velocity error too large",
 }
 """Fault codes of mode 1; in other modes 96 to 105 tell what limits the torque at present."""
-STOPS = {frames.Mode.STOPPED: Power.OFF, frames.Mode.FAULT: Power.FAULT, frames.Mode.POSITION: Power.ON}
-STOPPED_MODES = (frames.Mode.TIMEOUT, frames.Mode.ZERO_VELOCITY, frames.Mode.BRAKE)
+STOPS = {
+    frames.MoteusMode.STOPPED: Power.OFF,
+    frames.MoteusMode.FAULT: Power.FAULT,
+    frames.MoteusMode.POSITION: Power.ON,
+}
+STOPPED_MODES = (frames.MoteusMode.TIMEOUT, frames.MoteusMode.ZERO_VELOCITY, frames.MoteusMode.BRAKE)
 
 
 @dataclass
-class _Known:
-    """What is known of one controller."""
+class _MoteusState:
+    """Newest state of one controller."""
 
     limits: Limits | None = None
     mode: int | None = None
@@ -75,7 +101,7 @@ class MoteusDrives(BasicDrives):
         """Nothing is sent. Raises BadInput for a bus without CAN FD."""
         super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
-        self._known = [_Known() for _ in joints]
+        self._known = [_MoteusState() for _ in joints]
         self._joint_of = {_reply_id(settings): joint for joint, settings in enumerate(self._settings)}
         section = arm.require_link()
         bus = section.buses[joints[0].bus] if joints[0].bus else section.bus
@@ -110,7 +136,13 @@ class MoteusDrives(BasicDrives):
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
         """See Drives."""
-        asked = (Register.MODEL, Register.FIRMWARE, Register.SERIAL1, Register.SERIAL2, Register.SERIAL3)
+        asked = (
+            MoteusRegister.MODEL,
+            MoteusRegister.FIRMWARE,
+            MoteusRegister.SERIAL1,
+            MoteusRegister.SERIAL2,
+            MoteusRegister.SERIAL3,
+        )
         found = []
         for joint, settings in enumerate(self._settings):
             values = self._ask(ask, joint, {}, asked)
@@ -129,27 +161,27 @@ class MoteusDrives(BasicDrives):
         """See TellsPosition: only those of the output count."""
         found = []
         for joint in range(self.m):
-            values = self._ask(ask, joint, {}, (*QUERY, Register.HOME_STATE)) or {}
-            at_output = values.get(Register.HOME_STATE) == HOMED_AT_OUTPUT
-            found.append(values.get(Register.POSITION, math.nan) * TURN if at_output else math.nan)
+            values = self._ask(ask, joint, {}, (*QUERY, MoteusRegister.HOME_STATE)) or {}
+            at_output = values.get(MoteusRegister.HOME_STATE) == HOMED_AT_OUTPUT
+            found.append(values.get(MoteusRegister.POSITION, math.nan) * TURN if at_output else math.nan)
         return found
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
         """See Drives: stopped, and referenced to its output; torque and watchdog go with every command."""
         found = []
         for joint, (known, limit) in enumerate(zip(self._known, limits, strict=True)):
-            name, asked = self.names[joint], (*QUERY, Register.HOME_STATE)
-            values = self._ask(ask, joint, {Register.MODE: frames.Mode.STOPPED}, asked)
+            name, asked = self.names[joint], (*QUERY, MoteusRegister.HOME_STATE)
+            values = self._ask(ask, joint, {MoteusRegister.MODE: frames.MoteusMode.STOPPED}, asked)
             if values is None:
                 address = self._settings[joint].address
                 raise BusFault(f"{name}: no answer from {address}: is it powered, its id right, the bus CAN FD?")
-            if values.get(Register.HOME_STATE) != HOMED_AT_OUTPUT:
+            if values.get(MoteusRegister.HOME_STATE) != HOMED_AT_OUTPUT:
                 raise BusFault(
                     f"{name}: its position is not that of the output (home state "
-                    f"{values.get(Register.HOME_STATE, math.nan):.0f}, expected 2): set it (register 130h) or use an "
-                    f"encoder at the output"
+                    f"{values.get(MoteusRegister.HOME_STATE, math.nan):.0f}, expected 2): set it (register 130h) or "
+                    "use an encoder at the output"
                 )
-            position = values.get(Register.POSITION, math.nan) * TURN
+            position = values.get(MoteusRegister.POSITION, math.nan) * TURN
             if not math.isfinite(position):
                 raise BusFault(f"{name}: reports no position")
             known.limits, known.mode = limit, None
@@ -199,17 +231,17 @@ class MoteusDrives(BasicDrives):
 
     def _writes(self, joint: int, order: Order) -> dict[int, float]:
         known = self._known[joint]
-        on = known.mode == frames.Mode.POSITION
-        if order.power is Power.STOPPED and known.mode in (frames.Mode.POSITION, *STOPPED_MODES):
-            damps = known.mode == frames.Mode.TIMEOUT
-            return {} if damps else {Register.MODE: frames.Mode.ZERO_VELOCITY}
+        on = known.mode == frames.MoteusMode.POSITION
+        if order.power is Power.STOPPED and known.mode in (frames.MoteusMode.POSITION, *STOPPED_MODES):
+            damps = known.mode == frames.MoteusMode.TIMEOUT
+            return {} if damps else {MoteusRegister.MODE: frames.MoteusMode.ZERO_VELOCITY}
         if order.power is Power.ON and on:
             return self._command(joint, order)
         if order.power is Power.ON and order.walk and known.mode is not None:
-            if known.mode == frames.Mode.STOPPED:
+            if known.mode == frames.MoteusMode.STOPPED:
                 return self._command(joint, order)
-            return {Register.MODE: frames.Mode.STOPPED}
-        return {Register.MODE: frames.Mode.STOPPED} if order.power is Power.OFF else {}
+            return {MoteusRegister.MODE: frames.MoteusMode.STOPPED}
+        return {MoteusRegister.MODE: frames.MoteusMode.STOPPED} if order.power is Power.OFF else {}
 
     def _command(self, joint: int, order: Order) -> dict[int, float]:
         limits = self._known[joint].limits
@@ -220,25 +252,27 @@ class MoteusDrives(BasicDrives):
         stiff = float(order.mode == Mode.POSITION)
         most = limits.max_torque
         return {
-            Register.MODE: frames.Mode.POSITION,
-            Register.COMMAND_POSITION: order.position / TURN if stiff else math.nan,
-            Register.COMMAND_VELOCITY: order.velocity / TURN if stiff else 0.0,
-            Register.COMMAND_TORQUE: 0.0 if stiff else _float_within(order.torque, most),
-            Register.COMMAND_KP_SCALE: stiff,
-            Register.COMMAND_KD_SCALE: stiff,
-            Register.COMMAND_MAX_TORQUE: _float_within(most, most),
-            Register.COMMAND_STOP_POSITION: math.nan,
-            Register.COMMAND_WATCHDOG: limits.deadline,
-            Register.COMMAND_ILIMIT_SCALE: stiff,
+            MoteusRegister.MODE: frames.MoteusMode.POSITION,
+            MoteusRegister.COMMAND_POSITION: order.position / TURN if stiff else math.nan,
+            MoteusRegister.COMMAND_VELOCITY: order.velocity / TURN if stiff else 0.0,
+            MoteusRegister.COMMAND_TORQUE: 0.0 if stiff else _float_within(order.torque, most),
+            MoteusRegister.COMMAND_KP_SCALE: stiff,
+            MoteusRegister.COMMAND_KD_SCALE: stiff,
+            MoteusRegister.COMMAND_MAX_TORQUE: _float_within(most, most),
+            MoteusRegister.COMMAND_STOP_POSITION: math.nan,
+            MoteusRegister.COMMAND_WATCHDOG: limits.deadline,
+            MoteusRegister.COMMAND_ILIMIT_SCALE: stiff,
         }
 
     def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
         """See TellsCurrent."""
         constant = self._settings[joint].torque_constant
-        values = None if constant is None else self._ask(ask, joint, {}, (Register.TORQUE, Register.Q_CURRENT))
+        values = (
+            None if constant is None else self._ask(ask, joint, {}, (MoteusRegister.TORQUE, MoteusRegister.Q_CURRENT))
+        )
         if values is None or constant is None:
             return None
-        return values.get(Register.TORQUE, math.nan), constant * values.get(Register.Q_CURRENT, math.nan)
+        return values.get(MoteusRegister.TORQUE, math.nan), constant * values.get(MoteusRegister.Q_CURRENT, math.nan)
 
     def sent(self, joint: int) -> Order | None:
         """See Drives."""
@@ -252,23 +286,23 @@ class MoteusDrives(BasicDrives):
         values = CYCLE_REPLY.unpack(data) or {
             each.register: each.value for each in frames.unpack(data) if each.kind == REPLY
         }
-        mode, fault = values.get(Register.MODE, math.nan), values.get(Register.FAULT, math.nan)
+        mode, fault = values.get(MoteusRegister.MODE, math.nan), values.get(MoteusRegister.FAULT, math.nan)
         if not math.isfinite(mode):
             return None
         known = self._known[joint]
         known.mode = int(mode)
         if math.isfinite(fault):
             known.fault = int(fault)
-        position = values.get(Register.POSITION, math.nan)
+        position = values.get(MoteusRegister.POSITION, math.nan)
         if not abs(position) < LARGEST_POSITION:
             position = math.nan
         return self.note(
             Reading(
                 joint,
                 position * TURN,
-                _finite(values.get(Register.VELOCITY, math.nan)) * TURN,
-                _finite(values.get(Register.TORQUE, math.nan)),
-                temperature=_finite(values.get(Register.TEMPERATURE, math.nan)),
+                _finite(values.get(MoteusRegister.VELOCITY, math.nan)) * TURN,
+                _finite(values.get(MoteusRegister.TORQUE, math.nan)),
+                temperature=_finite(values.get(MoteusRegister.TEMPERATURE, math.nan)),
                 power=_power(known),
                 fault=_fault_text(known),
             )
@@ -280,7 +314,7 @@ class MoteusDrives(BasicDrives):
 
     def own_stop(self, joint: int) -> str:
         """See Drives."""
-        if self._known[joint].mode != frames.Mode.TIMEOUT:
+        if self._known[joint].mode != frames.MoteusMode.TIMEOUT:
             return ""
         return f"{self.where(joint)}: its watchdog ran out: it damps until it is stopped (mode 11)"
 
@@ -295,14 +329,14 @@ class MoteusDrives(BasicDrives):
         return None
 
 
-def _power(known: _Known) -> Power:
+def _power(known: _MoteusState) -> Power:
     if known.mode in STOPPED_MODES:
         return Power.STOPPED
-    return STOPS[frames.Mode(known.mode)] if known.mode in STOPS else Power.READY
+    return STOPS[frames.MoteusMode(known.mode)] if known.mode in STOPS else Power.READY
 
 
-def _fault_text(known: _Known) -> str:
-    if known.mode == frames.Mode.FAULT:
+def _fault_text(known: _MoteusState) -> str:
+    if known.mode == frames.MoteusMode.FAULT:
         return f"{FAULTS.get(known.fault, 'unknown fault')} (fault {known.fault})"
     return ""
 
@@ -321,16 +355,16 @@ def _order_of(data: bytes) -> Order | None:
     values = CYCLE_COMMAND.unpack(data) or {
         each.register: each.value for each in frames.unpack(data) if each.kind == WRITE
     }
-    mode = values.get(Register.MODE)
+    mode = values.get(MoteusRegister.MODE)
     if mode is None:
         return None
-    if mode != frames.Mode.POSITION:
+    if mode != frames.MoteusMode.POSITION:
         power = {0: Power.OFF, 12: Power.STOPPED, 15: Power.STOPPED}.get(int(mode) if math.isfinite(mode) else 0)
         return no_order()._replace(power=power or Power.UNKNOWN)
-    stiff = values.get(Register.COMMAND_KP_SCALE, 1.0) > 0
-    position = values.get(Register.COMMAND_POSITION, math.nan) * TURN
-    velocity = values.get(Register.COMMAND_VELOCITY, 0.0) * TURN
-    torque = values.get(Register.COMMAND_TORQUE, 0.0)
+    stiff = values.get(MoteusRegister.COMMAND_KP_SCALE, 1.0) > 0
+    position = values.get(MoteusRegister.COMMAND_POSITION, math.nan) * TURN
+    velocity = values.get(MoteusRegister.COMMAND_VELOCITY, 0.0) * TURN
+    torque = values.get(MoteusRegister.COMMAND_TORQUE, 0.0)
     return Order(Power.ON, False, Mode.POSITION if stiff else Mode.TORQUE, position, velocity, torque, 0.0, 0.0)
 
 

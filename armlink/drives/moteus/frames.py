@@ -23,7 +23,7 @@ LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """Lengths of a CAN FD frame."""
 
 
-class Register(IntEnum):
+class MoteusRegister(IntEnum):
     """Registers that armlink uses."""
 
     MODE = 0x000
@@ -52,7 +52,7 @@ class Register(IntEnum):
     SERIAL3 = 0x122
 
 
-class Mode(IntEnum):
+class MoteusMode(IntEnum):
     """Modes that armlink uses."""
 
     STOPPED = 0
@@ -63,7 +63,7 @@ class Mode(IntEnum):
     BRAKE = 15
 
 
-SMALL = frozenset((Register.MODE, Register.HOME_STATE, Register.FAULT))
+SMALL = frozenset((MoteusRegister.MODE, MoteusRegister.HOME_STATE, MoteusRegister.FAULT))
 """Registers with whole numbers below 128."""
 SCALES: dict[int, tuple[float, float, float]] = (
     dict.fromkeys((0x001, 0x006, 0x020, 0x026, 0x038, 0x03B, 0x040, 0x041), (0.01, 0.0001, 0.00001))
@@ -282,13 +282,15 @@ def _read_varuint(data: bytes, place: int) -> tuple[int | None, int]:
 
 
 QUERY = (
-    Register.MODE, Register.POSITION, Register.VELOCITY, Register.TORQUE, Register.TEMPERATURE, Register.FAULT,
+    MoteusRegister.MODE, MoteusRegister.POSITION, MoteusRegister.VELOCITY, MoteusRegister.TORQUE,
+    MoteusRegister.TEMPERATURE, MoteusRegister.FAULT,
 )  # fmt: skip
 """Registers that are asked for in every cycle."""
 COMMAND = (
-    Register.MODE, Register.COMMAND_POSITION, Register.COMMAND_VELOCITY, Register.COMMAND_TORQUE,
-    Register.COMMAND_KP_SCALE, Register.COMMAND_KD_SCALE, Register.COMMAND_MAX_TORQUE,
-    Register.COMMAND_STOP_POSITION, Register.COMMAND_WATCHDOG, Register.COMMAND_ILIMIT_SCALE,
+    MoteusRegister.MODE, MoteusRegister.COMMAND_POSITION, MoteusRegister.COMMAND_VELOCITY,
+    MoteusRegister.COMMAND_TORQUE, MoteusRegister.COMMAND_KP_SCALE, MoteusRegister.COMMAND_KD_SCALE,
+    MoteusRegister.COMMAND_MAX_TORQUE,
+    MoteusRegister.COMMAND_STOP_POSITION, MoteusRegister.COMMAND_WATCHDOG, MoteusRegister.COMMAND_ILIMIT_SCALE,
 )  # fmt: skip
 """Registers that are written in every cycle."""
 CYCLE_COMMAND = FixedPayload([(WRITE, COMMAND), (READ, QUERY)])

@@ -4,12 +4,13 @@ The drive's cyclic messages, its watchdog and its limits are set over USB: CANSi
 """
 
 import math
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from statistics import median
+from typing import Annotated, Literal
 
-from armlink.arm_file import ArmFile, LinkJoint
+from pydantic import Field
+
+from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import REMOTE, Frame
 from armlink.drives.base import BasicDrives, no_order
@@ -20,6 +21,7 @@ from armlink.drives.odrive.frames import (
     PASSTHROUGH,
     POSITION_CONTROL,
     TORQUE_CONTROL,
+    VELOCITY_CONTROL,
     AxisError,
     AxisState,
     Message,
@@ -29,8 +31,26 @@ from armlink.drives.odrive.frames import (
     unpack,
 )
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
+
+
+class ODriveSettings(DriveSettings):
+    """One ODrive axis (Pro, S1, Micro; firmware 0.6) in CANSimple; positions and torques are the motor's."""
+
+    family: Literal["odrive"] = "odrive"
+    node: Annotated[int, Field(ge=0, le=0x3E)]
+    """Node id (axis0.config.can.node_id)."""
+    torque_constant: Positive | None = None
+    """Torque constant of the motor, 8.27 / KV [N·m/A], by which the scale check compares torque
+    with current; None: not compared."""
+
+    @property
+    def address(self) -> str:
+        """Its id on the bus."""
+        return f"node {self.node}"
+
 
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="cyclic", frame="11")
@@ -46,25 +66,20 @@ ASK_AGAIN = 0.25
 """A request that shows in no heartbeat is sent again after this time [s]."""
 PATIENCE = 0.5
 """Longest wait for heartbeat, estimates and torques at the start [s]."""
-RECENT = 3
-"""Positions of which the middle one is held: one false reading among them does not count."""
 LARGEST_POSITION = 1e5
 """No motor's position is larger [rev]; a larger one is no reading."""
 
 
 @dataclass
-class _Known:
-    """What is known of one axis."""
+class _ODriveState:
+    """Newest state of one axis."""
 
     limits: Limits | None = None
     heartbeat: frames.Heartbeat | None = None
     position: float = math.nan
     """[rad]."""
-    recent: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
-    """The newest positions [rad]."""
-    velocity: float = math.nan
-    torque: float = math.nan
-    """That came since the newest estimates [N·m]; it goes with the next ones."""
+    requested: int = 0
+    """Torques that were asked for, and come besides the cyclic ones."""
     came: set[int] = field(default_factory=set)
     """Messages that have come."""
     mode: int = 0
@@ -83,7 +98,7 @@ class ODriveDrives(BasicDrives):
         """Nothing is sent."""
         super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
-        self._known = [_Known() for _ in joints]
+        self._known = [_ODriveState() for _ in joints]
         self._joint_of = {settings.node: joint for joint, settings in enumerate(self._settings)}
 
     def routes(self) -> Mapping[int, int]:
@@ -190,19 +205,16 @@ class ODriveDrives(BasicDrives):
         known = self._known[joint]
         state = known.heartbeat.state if known.heartbeat else AxisState.UNDEFINED
         on = state == AxisState.CLOSED_LOOP
-        held, known.sent, known.stopping = known.sent, None, False
+        known.sent, known.stopping = None, False
         if order.power is Power.ON and on:
             return self._input(joint, order)
         if order.power is Power.ON and order.walk and known.heartbeat is not None:
             return self._towards_on(joint, order, now)
         if order.power is Power.STOPPED and on:
-            # no state in which it holds without its host: hold by input, where it stands now
+            # no state in which it holds without its host: no speed by input, whatever its position reads
             known.stopping = True
-            # by the middle one of its newest positions: a false one may be what it is stopped for
-            at = median(known.recent or [known.position])
-            if held is not None and held.power is Power.STOPPED:
-                at = held.position
-            return self._input(joint, Order(Power.STOPPED, False, Mode.POSITION, at, 0.0, 0.0, 0.0, 0.0))
+            known.sent = Order(Power.STOPPED, False, Mode.POSITION, known.position, 0.0, 0.0, 0.0, 0.0)
+            return self._controlled(joint, VELOCITY_CONTROL, Message.INPUT_VELOCITY, pack(Message.INPUT_VELOCITY, 0, 0))
         if (
             order.power is not Power.ON
             and (on or state == AxisState.UNDEFINED)
@@ -230,17 +242,21 @@ class ODriveDrives(BasicDrives):
         known = self._known[joint]
         if known.limits is None:
             raise BusFault(f"{self.names[joint]}: a command before the set-up")
-        control = TORQUE_CONTROL if order.mode == Mode.TORQUE else POSITION_CONTROL
-        if control == TORQUE_CONTROL:
+        if order.mode == Mode.TORQUE:
             most = known.limits.max_torque * (1 - 2.0**-23)
-            data = pack(Message.INPUT_TORQUE, max(-most, min(most, _checked(order.torque))))
-            frame = identifier(self._settings[joint].node, Message.INPUT_TORQUE), data
+            control, message = TORQUE_CONTROL, Message.INPUT_TORQUE
+            data = pack(message, max(-most, min(most, _checked(order.torque))))
         else:
+            control, message = POSITION_CONTROL, Message.INPUT_POSITION
             data = frames.input_position(_checked(order.position) / TURN, _checked(order.velocity) / TURN, 0.0)
-            frame = identifier(self._settings[joint].node, Message.INPUT_POSITION), data
-        told = _order_of(*frame)
+        told = _order_of(identifier(self._settings[joint].node, message), data)
         assert told is not None
         known.sent = told._replace(power=order.power)
+        return self._controlled(joint, control, message, data)
+
+    def _controlled(self, joint: int, control: int, message: Message, data: bytes) -> list[Frame]:
+        """An input, after its control mode where that changes."""
+        known, frame = self._known[joint], (identifier(self._settings[joint].node, message), data)
         if known.mode == control:
             return [frame]
         known.mode = control
@@ -254,6 +270,7 @@ class ODriveDrives(BasicDrives):
         constant = self._settings[joint].torque_constant
         if constant is None:
             return None
+        self._known[joint].requested += 1
         torques, currents = self._request(ask, joint, Message.TORQUES), self._request(ask, joint, Message.CURRENT)
         return None if torques is None or currents is None else (torques[1], constant * currents[1])
 
@@ -277,13 +294,12 @@ class ODriveDrives(BasicDrives):
             position, velocity = values
             if not abs(position) < LARGEST_POSITION or not math.isfinite(velocity):
                 return None
-            known.position, known.velocity = position * TURN, velocity * TURN
-            known.recent.append(known.position)
-            torque, known.torque = known.torque, math.nan
-            return Reading(joint, known.position, known.velocity, torque)
-        if message == Message.TORQUES and math.isfinite(values[1]):
-            known.torque = values[1]
-            return None
+            known.position = position * TURN
+            return Reading(joint, known.position, velocity * TURN)
+        if message == Message.TORQUES and known.requested:
+            known.requested -= 1
+        elif message == Message.TORQUES and math.isfinite(values[1]):
+            return Reading(joint, motor_torque=values[1])
         if message == Message.TEMPERATURE and all(math.isfinite(value) for value in values):
             return self.note(Reading(joint, temperature=max(values)))
         return None
@@ -317,7 +333,7 @@ class ODriveDrives(BasicDrives):
         return None if order is None else (joint, order)
 
 
-def _may_ask(known: _Known, what: int, now: float) -> bool:
+def _may_ask(known: _ODriveState, what: int, now: float) -> bool:
     """Whether something may be asked for: not again before the last request for it has had time to show."""
     if known.asked[0] == what and now - known.asked[1] < ASK_AGAIN:
         return False
@@ -325,7 +341,7 @@ def _may_ask(known: _Known, what: int, now: float) -> bool:
     return True
 
 
-def _power(known: _Known) -> Power:
+def _power(known: _ODriveState) -> Power:
     """The state counts, not the error: that can be 0 after a disarm."""
     beat = known.heartbeat
     if beat is None:
@@ -339,7 +355,7 @@ def _power(known: _Known) -> Power:
     return Power.OFF if beat.state == AxisState.IDLE else Power.READY
 
 
-def _fault_text(known: _Known) -> str:
+def _fault_text(known: _ODriveState) -> str:
     error = known.heartbeat.error & ~AxisError.WATCHDOG if known.heartbeat else 0
     return f"{error_names(error)} (axis error {error:#x})" if error else ""
 

@@ -1,8 +1,7 @@
 """The ODrive family, as the registry finds it."""
 
 from armlink.drives.family import Family
-from armlink.drives.odrive.drives import TRAITS, ODriveDrives
-from armlink.drives.odrive.settings import ODriveSettings
+from armlink.drives.odrive.drives import TRAITS, ODriveDrives, ODriveSettings
 
 FAMILY = Family(
     "odrive", TRAITS, ODriveSettings, ODriveDrives, summary="ODrive Pro, S1, Micro with firmware 0.6, CANSimple"

@@ -43,7 +43,7 @@ class AxisState(IntEnum):
     CLOSED_LOOP = 8
 
 
-TORQUE_CONTROL, POSITION_CONTROL, PASSTHROUGH = 1, 3, 1
+TORQUE_CONTROL, VELOCITY_CONTROL, POSITION_CONTROL, PASSTHROUGH = 1, 2, 3, 1
 """Control modes, and the input mode that takes inputs as they are."""
 INPUT_FEED_FORWARD = 0.001
 """Step of velocity [rev/s] and torque [N·m] feed-forward in an input position."""

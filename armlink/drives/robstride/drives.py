@@ -12,7 +12,7 @@ from armlink.drives.mit_leash import damping, order_of, round_within
 from armlink.drives.mit_packing import MitCommand, Ranges, grid_of
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.robstride import frames
-from armlink.drives.robstride.frames import RANGES, Parameter, Type, fault_names
+from armlink.drives.robstride.frames import RANGES, RobStrideParameter, Type, fault_names
 from armlink.drives.robstride.set_up import identify, prepare, read_parameter
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
@@ -23,8 +23,8 @@ HOST_TYPES = frozenset((Type.MOTION, Type.ENABLE, Type.STOP, Type.SET_ZERO, Type
 
 
 @dataclass
-class _Known:
-    """What is known of one drive."""
+class _RobStrideState:
+    """Newest state of one drive."""
 
     ranges: Ranges
     limits: Limits | None = None
@@ -45,7 +45,7 @@ class RobStrideDrives(BasicDrives):
         """Nothing is sent."""
         super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
-        self._known = [_Known(RANGES[settings.model]) for settings in self._settings]
+        self._known = [_RobStrideState(RANGES[settings.model]) for settings in self._settings]
         self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
         self._intruder = ""
 
@@ -95,7 +95,7 @@ class RobStrideDrives(BasicDrives):
 
     def positions(self, ask: Ask) -> list[float]:
         """See TellsPosition."""
-        found = [read_parameter(ask, settings, Parameter.POSITION) for settings in self._settings]
+        found = [read_parameter(ask, settings, RobStrideParameter.POSITION) for settings in self._settings]
         return [math.nan if position is None else position for position in found]
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
@@ -117,7 +117,7 @@ class RobStrideDrives(BasicDrives):
     def _frame(self, joint: int, order: Order) -> Frame:
         known, settings = self._known[joint], self._settings[joint]
         known.damping = False
-        on = known.mode == frames.Mode.RUN and not known.faults
+        on = known.mode == frames.RunMode.RUN and not known.faults
         if on and order.power is Power.ON:
             known.was_on = True
             return self._command(joint, order)
@@ -194,17 +194,17 @@ class RobStrideDrives(BasicDrives):
         if known.limits is None:
             return []
         most = min(known.limits.max_torque, known.ranges.torque)
-        can_id, data = frames.write_frame(settings.id, settings.host, frames.Parameter.LIMIT_TORQUE, most)
+        can_id, data = frames.write_frame(settings.id, settings.host, frames.RobStrideParameter.LIMIT_TORQUE, most)
         return [(can_id | EXTENDED, data)]
 
     def lets_go(self, joint: int) -> bool:
         """See Drives: in every mode but run."""
-        return self._known[joint].mode != frames.Mode.RUN
+        return self._known[joint].mode != frames.RunMode.RUN
 
     def own_stop(self, joint: int) -> str:
         """See Drives: a watchdog that ran out shows as mode reset alone."""
         known = self._known[joint]
-        if not known.was_on or known.mode != frames.Mode.RESET or known.faults:
+        if not known.was_on or known.mode != frames.RunMode.RESET or known.faults:
             return ""
         return f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off"
 
@@ -230,12 +230,12 @@ class RobStrideDrives(BasicDrives):
         return None if power is None else (joint, no_order()._replace(power=power))
 
 
-def _power(known: _Known) -> Power:
+def _power(known: _RobStrideState) -> Power:
     if known.faults:
         return Power.FAULT
-    if known.mode == frames.Mode.RUN:
+    if known.mode == frames.RunMode.RUN:
         return Power.STOPPED if known.damping else Power.ON
-    return Power.OFF if known.mode == frames.Mode.RESET else Power.READY
+    return Power.OFF if known.mode == frames.RunMode.RESET else Power.READY
 
 
 def _fault_text(bits: int) -> str:

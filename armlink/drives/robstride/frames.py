@@ -44,7 +44,7 @@ class Type(IntEnum):
     REPORT = 24
 
 
-class Parameter(IntEnum):
+class RobStrideParameter(IntEnum):
     """Parameters by index."""
 
     RUN_MODE = 0x7005
@@ -66,7 +66,7 @@ MOTION_MODE = 0
 """Value of run_mode in which motion commands are understood."""
 
 
-class Mode(IntEnum):
+class RunMode(IntEnum):
     """Mode bits of feedback."""
 
     RESET = 0

@@ -8,7 +8,7 @@ from armlink.drives.mit_packing import Ranges
 from armlink.drives.mit_setup import mit_setup, require_window
 from armlink.drives.orders import Limits, Setup
 from armlink.drives.robstride import frames
-from armlink.drives.robstride.frames import MOTION_MODE, TIMEOUT_UNIT, Feedback, Parameter, Type
+from armlink.drives.robstride.frames import MOTION_MODE, TIMEOUT_UNIT, Feedback, RobStrideParameter, Type
 from armlink.drives.robstride.settings import RobStrideSettings
 from armlink.errors import BusFault
 
@@ -44,17 +44,19 @@ def prepare(ask: Ask, name: str, settings: RobStrideSettings, limits: Limits, ra
     if feedback is None:
         raise BusFault(f"{name}: no answer from {settings.address}: is it powered, its id right, its protocol private?")
     most = min(limits.max_torque, ranges.torque)
-    _set(ask, name, settings, Parameter.RUN_MODE, MOTION_MODE, "the drive is not in motion mode")
-    _set(ask, name, settings, Parameter.LIMIT_TORQUE, most, "its own torque limit is not in force")
+    _set(ask, name, settings, RobStrideParameter.RUN_MODE, MOTION_MODE, "the drive is not in motion mode")
+    _set(ask, name, settings, RobStrideParameter.LIMIT_TORQUE, most, "its own torque limit is not in force")
     deadman = round(limits.deadline / TIMEOUT_UNIT)
-    _set(ask, name, settings, Parameter.TIMEOUT, deadman, "it would keep on after its host died")
+    _set(ask, name, settings, RobStrideParameter.TIMEOUT, deadman, "it would keep on after its host died")
     notes = (f"scales of {settings.model} by its manual: the drive has no register for them",)
     where = (f"the range of an {settings.model}",) * 3
     remedy = "the drive has no register for it: correct drive.model, or take a drive with more"
     return mit_setup(feedback.motion.position, settings.kp, settings.kd, ranges, notes, where, remedy)
 
 
-def _set(ask: Ask, name: str, settings: RobStrideSettings, parameter: Parameter, value: float, otherwise: str) -> None:
+def _set(
+    ask: Ask, name: str, settings: RobStrideSettings, parameter: RobStrideParameter, value: float, otherwise: str
+) -> None:
     ask(
         _extended(frames.write_frame(settings.id, settings.host, parameter, value)),
         _feedback(settings, frames.RANGES[settings.model]),

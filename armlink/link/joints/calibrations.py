@@ -27,7 +27,7 @@ log = logging.getLogger("armlink")
 
 
 def calibrations_by_record(arm: ArmFile) -> list[Calibration | None]:
-    """What the records of an arm say, joint by joint; None where no record is in force."""
+    """Calibrations by an arm's records, joint by joint; None where no record is in force."""
     for point in contributed("armlink.calibrations"):
         provide: Provider = point.load()
         return list(provide(arm))
@@ -62,6 +62,13 @@ class Calibrations:
                 "%s: no calibration record is in force for %s: torque is as the drives report it",
                 self.arm.name,
                 ", ".join(missing),
+            )
+        if len(missing) < len(hosted) and not self.arm.has_serial:
+            log.warning(
+                "%s: its serial is %s: the calibration in force may be that of another arm of this name: give each its "
+                "own (serial: …), then calibrate its sweeps again",
+                self.arm.name,
+                self.arm.serial,
             )
         self._apply_host()
 
@@ -100,7 +107,7 @@ class Calibrations:
         return group.drives.read_calibration(number, self._ask(group))
 
     def drive_serial(self, joint: int) -> DriveSerial:
-        """What the drive of joint 0 … n−1 is known by, if it keeps its calibration itself; raises BusFault."""
+        """Serial number of the drive of joint 0 … n−1, if it keeps its calibration itself; raises BusFault."""
         group, number = by_joint(self.groups)[joint]
         if joint in self._in_host or not isinstance(group.drives, TellsSerialNumber):
             return DriveSerial(simulated=self._simulated)

@@ -1,4 +1,4 @@
-"""What another host on the bus commands, and where its cycles begin: for listening without sending anything."""
+"""Commands of another host on the bus, and the beginnings of its cycles: for listening without sending anything."""
 
 from collections.abc import Sequence
 
@@ -91,7 +91,7 @@ class ForeignHost:
         return torque, position
 
     def orders(self, commands: Commands) -> list[Order | None]:
-        """What command frames order each joint (n,), at the joint; None for a joint without."""
+        """Orders of command frames at the joints (n,); None for a joint without."""
         ordered: list[Order | None] = [None] * self._n
         for can_id, data in commands:
             group = self._group_of.get(can_id)

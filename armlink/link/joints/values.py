@@ -155,7 +155,7 @@ class JointValues:
         )
 
     def ordered(self, joint: int, sent: Order) -> Order:
-        """What a drive was ordered, at the joint; torque as the drive makes it, not corrected."""
+        """A drive's order at the joint; torque as the drive makes it, not corrected."""
         mount = self._mounting
         if mount.plain:
             return sent

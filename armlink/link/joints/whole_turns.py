@@ -52,7 +52,7 @@ class Misplacement:
 
     @property
     def remedy(self) -> str:
-        """What is wrong with the drive, and what to do."""
+        """The drive's error, and its remedy."""
         if not self.turns:
             return (
                 "no whole turn of its drive explains it: zero, direction, gear, the stops or the scale of the reading "
@@ -167,7 +167,7 @@ class WholeTurns:
         return found
 
     def note(self, joint: int) -> str:
-        """What was corrected at a joint; empty where nothing was."""
+        """The correction of a joint, in words; empty without one."""
         stated, used = self._joints[joint].settings.zero, self._values.zero_of(joint)
         if stated == used:
             return ""

@@ -9,11 +9,11 @@ import numpy as np
 
 from armlink.bus.arm_hold import ArmHold
 from armlink.errors import ArmlinkError, BusFault, Refused
-from armlink.link.ends import Cause, cause_of
+from armlink.link.ends import EndCause, cause_of
 from armlink.link.link import Link
 from armlink.link.listener import RESOLUTION, Listener
 from armlink.link.types import Calibration, Command, Sample, Tell
-from armlink.loop.messages import Answer, Call
+from armlink.loop.messages import Call, LoopAnswer
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.loop_messages import Batch, Down, LoopOptions, Message, Progress, Up
 from calib.motion.random_work import WorkMotion, work_pieces
@@ -67,7 +67,7 @@ class ArmLoop:
         """Time to wait before the next run() [s]: 0 while the bus is open."""
         return 0.0 if self._source is not None else RETRY_SECONDS
 
-    def close(self, cause: Cause = Cause.DONE) -> None:
+    def close(self, cause: EndCause = EndCause.DONE) -> None:
         """Bring the arm to its end (`armlink.link.ends`), telling `self.tell` how far that is, and close the bus."""
         source, self._source, self._targets, self._tour = self._source, None, None, None
         try:
@@ -78,18 +78,18 @@ class ArmLoop:
         except (ArmlinkError, OSError):
             return  # the bus is gone already: the joints' own deadlines stop them
 
-    def handle(self, call: Call) -> Answer:
+    def handle(self, call: Call) -> LoopAnswer:
         """Carry out a call; every failure is in the answer."""
         source = self._source
         if source is None:
-            return Answer(call.id, error=BusFault(self._reason or "the bus is not open"))
+            return LoopAnswer(call.id, error=BusFault(self._reason or "the bus is not open"))
         try:
-            return Answer(call.id, self._do(source, call))
+            return LoopAnswer(call.id, self._do(source, call))
         except BusFault as error:
             self.close(cause_of(error))
-            return Answer(call.id, error=error)
+            return LoopAnswer(call.id, error=error)
         except ArmlinkError as error:
-            return Answer(call.id, error=error)
+            return LoopAnswer(call.id, error=error)
 
     def _do(self, source: Link | Listener, call: Call) -> Any:
         match call.what:

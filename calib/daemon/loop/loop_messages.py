@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
 from armlink.bus.can_bus import CanBus
-from armlink.drives.board import Event
+from armlink.drives.board import DriveEvent
 from armlink.link.types import Sample, Stats
-from armlink.loop.messages import Alive, Answer, Told
+from armlink.loop.messages import Alive, LoopAnswer, Told
 from armlink.loop.realtime import Realtime
 from gcomp.arrays import Array
 
@@ -45,7 +45,7 @@ class Batch:
     age: Array
     """Time since position and torque last arrived (n,) [s]."""
     stats: Stats
-    emergencies: tuple[Event, ...] = ()
+    emergencies: tuple[DriveEvent, ...] = ()
     """What drives told of themselves while only listening."""
     temperature: Array | None = None
     """Of the drives (n,) [°C]; NaN for one that does not tell it."""
@@ -55,7 +55,7 @@ class Batch:
         cls,
         rows: list[tuple[float, Sample, Array, Array]],
         stats: Stats,
-        emergencies: tuple[Event, ...] = (),
+        emergencies: tuple[DriveEvent, ...] = (),
         temperature: Array | None = None,
     ) -> "Batch":
         """From (t, sample, torque command, position command) of K > 0 cycles."""
@@ -108,4 +108,4 @@ class Progress:
     """Poses."""
 
 
-Message = Alive | Told | Started | Batch | Up | Down | Answer | Progress
+Message = Alive | Told | Started | Batch | Up | Down | LoopAnswer | Progress

@@ -10,11 +10,11 @@ from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
 from armlink.errors import BusFault
-from armlink.link.ends import Cause
+from armlink.link.ends import EndCause
 from armlink.link.types import Calibration, DriveSerial, Tell
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.ending import Ending, see_out, telling
-from armlink.loop.messages import Alive, Answer, Call, End
+from armlink.loop.messages import Alive, Call, End, LoopAnswer
 from armlink.loop.open import is_in_process
 from armlink.loop.realtime import prepare
 from calib.daemon.loop.loop_messages import Batch, LoopOptions, Message, Started
@@ -24,7 +24,7 @@ ANSWER_SECONDS = 10.0
 BATCHES = 100
 """Batches that wait for a busy service: 10 s; older ones are dropped."""
 ENDED = "the bus loop's process has ended"
-Ask = Callable[[Call], Answer]
+Ask = Callable[[Call], LoopAnswer]
 T = TypeVar("T")
 
 _numbers = itertools.count(1)
@@ -74,7 +74,7 @@ class LoopProcess:
         self._process.start()
         theirs.close()
         self._channel = Channel(ours)
-        self._waiting: dict[int, Future[Answer]] = {}
+        self._waiting: dict[int, Future[LoopAnswer]] = {}
         self._sending = threading.Lock()
 
     @property
@@ -86,7 +86,7 @@ class LoopProcess:
         """For the event loop: readable when there are messages."""
         return self._channel.fileno()
 
-    def sweep(self, poses: int, seed: int) -> Answer | None:
+    def sweep(self, poses: int, seed: int) -> LoopAnswer | None:
         """Ask for a tour of poses; the answer comes as a message."""
         self._send(_tour(poses, seed))
         return None
@@ -100,14 +100,14 @@ class LoopProcess:
             self._give_up()
             raise EOFError(ENDED) from None
         for message in received:
-            waiting = self._waiting.pop(message.id, None) if isinstance(message, Answer) else None
+            waiting = self._waiting.pop(message.id, None) if isinstance(message, LoopAnswer) else None
             if waiting is None:
                 messages.append(message)
             else:
                 waiting.set_result(message)
         return messages
 
-    def close(self, cause: Cause = Cause.DONE, tell: Tell = lambda text: None) -> None:
+    def close(self, cause: EndCause = EndCause.DONE, tell: Tell = lambda text: None) -> None:
         """End the process, which brings the arm to its end, and wait for it; one that hangs is killed.
 
         `tell` is told what it does, and may raise Dropped.
@@ -122,17 +122,17 @@ class LoopProcess:
         """End a process that hangs: the drives' own deadlines decide. `close` comes after it."""
         self._process.kill()
 
-    def ask(self, call: Call) -> Answer:
+    def ask(self, call: Call) -> LoopAnswer:
         """Send a call and wait for its answer."""
-        answer: Future[Answer] = Future()
+        answer: Future[LoopAnswer] = Future()
         self._waiting[call.id] = answer
         if not self._send(call):
-            return Answer(call.id, error=BusFault(ENDED))
+            return LoopAnswer(call.id, error=BusFault(ENDED))
         try:
             return answer.result(ANSWER_SECONDS)
         except TimeoutError:
             self._waiting.pop(call.id, None)
-            return Answer(call.id, error=BusFault(f"no answer of the bus loop within {ANSWER_SECONDS:g} s"))
+            return LoopAnswer(call.id, error=BusFault(f"no answer of the bus loop within {ANSWER_SECONDS:g} s"))
 
     def _send(self, call: Call) -> bool:
         try:
@@ -146,7 +146,7 @@ class LoopProcess:
         waiting, self._waiting = self._waiting, {}
         for number, answer in waiting.items():
             try:
-                answer.set_result(Answer(number, error=BusFault(ENDED)))
+                answer.set_result(LoopAnswer(number, error=BusFault(ENDED)))
             except InvalidStateError:
                 continue
 
@@ -159,11 +159,13 @@ def _child(end: socket.socket, options: LoopOptions, inherited: socket.socket | 
     from calib.daemon.loop.arm_loop import ArmLoop  # not loaded in the service
 
     waiting: list[Call | End] = []  # said while the arm was brought to an end
-    cause, loop = Cause.FAILED, ArmLoop(options, telling(channel, waiting.append))
+    cause, loop = EndCause.FAILED, ArmLoop(options, telling(channel, waiting.append))
     if options.open_bus is None and not is_in_process(options.arm, options.bus):
         channel.put(Started(prepare()))
     try:
         while not ending.due:
+            if ending.orphaned:
+                raise Closed
             for message in loop.run() or [Alive()]:
                 channel.put(message, isinstance(message, Batch))
             channel.flush()
@@ -177,8 +179,8 @@ def _child(end: socket.socket, options: LoopOptions, inherited: socket.socket | 
                     return
                 channel.put(loop.handle(message))
             channel.flush()
-        cause = Cause.INTERRUPTED
+        cause = EndCause.INTERRUPTED
     except Closed:
-        cause = Cause.LOST
+        cause = EndCause.LOST
     finally:
         loop.close(cause)

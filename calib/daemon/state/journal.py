@@ -122,18 +122,16 @@ class Journal:
         self._belief: tuple[str | None, str | None, str] | None = None
         self.set_aside = ""
         """Name of a damaged journal that was set aside; empty if none was."""
-        self._damaged = False
+        self._damaged = self._replaced = False
+        self._file: tuple[int, int] | None = None
+        """Device and inode of the file that is open; one of another program may take its name."""
         self._db: sqlite3.Connection = None  # type: ignore[assignment]
         try:
             self._open()
-        except UnicodeDecodeError:  # of SQLite's own message, which quotes what it could not read
-            self._begin_anew()
-        except sqlite3.DatabaseError as error:
+        except (sqlite3.DatabaseError, OSError, UnicodeDecodeError) as error:
             if not _is_damage(error):
                 raise self._not_opened(error) from None
             self._begin_anew()
-        except OSError as error:
-            raise self._not_opened(error) from None
 
     @property
     def trouble(self) -> str:
@@ -169,7 +167,6 @@ class Journal:
         """Set the damaged file aside and begin another; raises BadInput if that is not possible."""
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         aside = self.path.with_name(f"{self.path.name}.damaged-{stamp}")
-        self._damaged = False
         try:
             if self._db is not None:
                 self._db.close()
@@ -180,6 +177,20 @@ class Journal:
         except (sqlite3.Error, OSError) as error:
             raise self._not_opened(error) from None
         self.set_aside = aside.name
+        self._damaged = self._replaced = False
+
+    def _open_the_named(self) -> None:
+        """Go over to the file that has the journal's name now; raises BadInput if it cannot be opened."""
+        try:
+            # its write-ahead log, which SQLite leaves where the file was moved, would be taken for the new file's
+            with suppress(sqlite3.ProgrammingError):  # closed by an attempt before
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            self._db.close()
+            self._open()
+        except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
+            self._damaged = _is_damage(error)
+            raise self._not_opened(error) from None
+        self._replaced = False
 
     def _open(self) -> None:
         path = self.path
@@ -203,17 +214,20 @@ class Journal:
                         f"BEGIN SELECT RAISE(ABORT, '{table} is append-only'); END"
                     )
             self._db.execute(f"PRAGMA user_version={SCHEMA}")
+        self._file = _identity(path)
         self._db.execute(f"PRAGMA busy_timeout={int(LOCK_SECONDS * 1000)}")
         self._read_proposals()
-        if not self._next_event:  # ids go on where a file is begun anew under way
-            newest = "SELECT COALESCE(MAX(id), 0) FROM "
-            self._last_event, proposal = (
-                int(self._db.execute(newest + table).fetchone()[0]) for table in ("events", "proposals")
-            )
-            if max(self._last_event, proposal) > LARGEST_ROW:
-                raise sqlite3.DatabaseError("malformed: an id that nobody gave")
-            self._next_event, self._next_proposal = self._last_event + 1, proposal + 1
+        newest = "SELECT COALESCE(MAX(id), 0) FROM "
+        event, proposal = (int(self._db.execute(newest + table).fetchone()[0]) for table in ("events", "proposals"))
+        if max(event, proposal) > LARGEST_ROW:
+            raise sqlite3.DatabaseError("malformed: an id that nobody gave")
+        if not self._next_event:
             self._belief = self._db.execute("SELECT calibration, gravity, state FROM belief").fetchone()
+        # ids go on where a file is begun anew, or another one takes its place, under way
+        self._last_event = max(self._last_event, event)
+        self._next_event, self._next_proposal = (
+            max(number, one + 1) for number, one in ((self._next_event, event), (self._next_proposal, proposal))
+        )
 
     def close(self) -> None:
         """Close the file; what still waits is lost."""
@@ -258,7 +272,9 @@ class Journal:
         if self._asked:
             return
         if self._damaged:
-            self._ask(self._begin_anew, self._begun_anew)
+            self._ask(self._begin_anew, self._opened_anew)
+        elif self._replaced:
+            self._ask(self._open_the_named, self._opened_anew)
         elif self._queue:
             self._write_on()
         elif self.trouble and self._monotonic() - self._failed_at >= RETRY_SECONDS:
@@ -283,7 +299,7 @@ class Journal:
 
     def _write_on(self) -> None:
         """Write all that waits, in one go: a slow disk takes as long for one row as for a thousand."""
-        if self._asked or not self._queue or self._damaged:
+        if self._asked or not self._queue or self._damaged or self._replaced:
             return
         if self._failure and self._monotonic() - self._failed_at < RETRY_SECONDS:
             return
@@ -307,10 +323,12 @@ class Journal:
 
         Returns the number of transactions, and the error where the proposals could not be read afterwards.
         """
+        self._require_same_file()
         with self._committed():
             for transaction in batch:
                 for statement, values in transaction.statements:
                     self._db.execute(statement, values)
+        self._require_same_file()  # what was committed to another one is lost
         self._unread = self._unread or any(transaction.proposals for transaction in batch)
         try:
             if self._unread:
@@ -318,6 +336,12 @@ class Journal:
         except sqlite3.Error as error:
             return len(batch), error
         return len(batch), None
+
+    def _require_same_file(self) -> None:
+        """Raise sqlite3.OperationalError where the file that is open has lost its name."""
+        if _identity(self.path) != self._file:
+            self._replaced = True
+            raise sqlite3.OperationalError(f"{self.path} was moved, or replaced by another file")
 
     @contextmanager
     def _committed(self) -> Iterator[None]:
@@ -349,10 +373,9 @@ class Journal:
             act()
         self._write_on()
 
-    def _begun_anew(self, outcome: Exception | None) -> None:
+    def _opened_anew(self, outcome: Exception | None) -> None:
         self._failure = ""
         if isinstance(outcome, Exception):
-            self._damaged = True
             self.failed(sqlite3.OperationalError(str(outcome)))
         self._write_on()
 
@@ -479,8 +502,19 @@ def _made(take: Callable[[tuple[Any, ...]], R], rows: Iterable[tuple[Any, ...]])
         raise sqlite3.DatabaseError(f"a malformed row ({type(error).__name__})") from None
 
 
-def _is_damage(error: sqlite3.Error) -> bool:
-    return any(words in str(error) for words in ("malformed", "not a database", "decode to UTF-8"))
+def _is_damage(error: Exception) -> bool:
+    """Whether a file is none that SQLite can read; UnicodeDecodeError is of its message that quotes the file."""
+    words = ("malformed", "not a database", "decode to UTF-8")
+    return isinstance(error, UnicodeDecodeError) or any(each in str(error) for each in words)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Device and inode of the file of that name; None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _event(row: tuple[Any, ...]) -> EventRecord:

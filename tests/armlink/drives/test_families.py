@@ -210,7 +210,7 @@ def test_damiao_mode_is_written_and_read_back():
 
 def test_robstride_without_a_deadman_is_refused():
     bench = Bench("six-robstride")
-    del bench.simulated[4].parameters[robstride.Parameter.TIMEOUT]
+    del bench.simulated[4].parameters[robstride.RobStrideParameter.TIMEOUT]
     with pytest.raises(BusFault, match="wrist_2: its firmware has no parameter 7028h"):
         bench.set_up()
 

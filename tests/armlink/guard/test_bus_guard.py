@@ -35,7 +35,7 @@ from hypothesis import strategies as st
 
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.guard import bus_guard
-from armlink.guard.bus_guard import BATCH, Field, Guard, Policy, PolicyError, Port, Source
+from armlink.guard.bus_guard import BATCH, BusGuard, Field, GuardPort, Policy, PolicyError, Source
 from armlink.link.types import Calibration, Command
 
 POSITION, TORQUE = 8, 10
@@ -330,7 +330,7 @@ class Side:
 
 def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
     lines, program, wire = [], Side(), Side()
-    guard = Guard(Policy(CONTENT), program, wire, lines.append)
+    guard = BusGuard(Policy(CONTENT), program, wire, lines.append)
     guard._to_wire(0x80, b"", False)
     guard._to_wire(0x123, b"\x01", False)
     guard._to_wire(0x80, b"", False)
@@ -351,7 +351,7 @@ def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
 )
 def test_remote_error_and_extended_frames_do_not_pass(flag, said):
     wire = Side()
-    guard = Guard(Policy(CONTENT), Side(), wire, lambda text: None)
+    guard = BusGuard(Policy(CONTENT), Side(), wire, lambda text: None)
     guard._to_wire(0x80 | flag, b"", False)
     assert guard.closed == said
     assert (0x80 | flag, b"") not in wire.sent
@@ -360,7 +360,7 @@ def test_remote_error_and_extended_frames_do_not_pass(flag, said):
 def test_a_wire_that_takes_nothing_closes_it():
     wire = Side()
     wire.full = True
-    guard = Guard(Policy(CONTENT), Side(), wire, lambda text: None)
+    guard = BusGuard(Policy(CONTENT), Side(), wire, lambda text: None)
     guard._to_wire(0x80, b"", False)
     assert guard.closed.startswith("the wire takes no frames")
 
@@ -372,7 +372,7 @@ class Wire:
         own, self.other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         own.setblocking(False)
         self.other.settimeout(5)
-        self.port = Port.__new__(Port)
+        self.port = GuardPort.__new__(GuardPort)
         self.port.socket, self.port.fd = own, True
 
     def say(self, can_id, data, size=8, flags=0):
@@ -395,7 +395,7 @@ def wires():
 
 def test_frames_pass_both_ways_as_they_are(wires):
     program, wire = wires
-    guard = Guard(Policy(CONTENT), program.port, wire.port)
+    guard = BusGuard(Policy(CONTENT), program.port, wire.port)
     wire.say(0x181, b"12345678")
     wire.say(0x281, bytes(range(64)), 64, 5)
     program.say(0x80, b"")
@@ -410,7 +410,7 @@ def test_frames_pass_both_ways_as_they_are(wires):
 
 def test_error_and_remote_frames_of_the_wire_go_nowhere(wires):
     program, wire = wires
-    guard = Guard(Policy(CONTENT), program.port, wire.port)
+    guard = BusGuard(Policy(CONTENT), program.port, wire.port)
     wire.say(0x181 | socket.CAN_RTR_FLAG, b"")
     wire.say(socket.CAN_ERR_FLAG | 4, bytes(8))
     wire.say(0x181 | socket.CAN_EFF_FLAG, b"7")
@@ -420,7 +420,7 @@ def test_error_and_remote_frames_of_the_wire_go_nowhere(wires):
 
 def test_each_side_gets_its_turn(wires):
     program, wire = wires
-    guard = Guard(Policy(CONTENT), program.port, wire.port)
+    guard = BusGuard(Policy(CONTENT), program.port, wire.port)
     for _ in range(BATCH + 1):
         program.port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
         wire.say(0x181, b"12345678")
@@ -535,9 +535,9 @@ STOP = [(0x600 + node, bytes.fromhex("2b40600002000000"), 0, 16) for node in (1,
 def run_main(wires, monkeypatch, folder, steps):
     """`main` with these ports; its steps fail with these errors (None: do not), then it is told to end."""
     by_name = {"arm0": wires[0].port, "can0": wires[1].port}
-    monkeypatch.setattr(bus_guard, "Port", by_name.__getitem__)
+    monkeypatch.setattr(bus_guard, "GuardPort", by_name.__getitem__)
     monkeypatch.setattr(bus_guard.time, "sleep", lambda seconds: None)
-    step, waiting = Guard.step, list(steps)
+    step, waiting = BusGuard.step, list(steps)
 
     def next_step(guard, seconds):
         assert seconds <= 0.5  # a signal is looked at after each step
@@ -549,7 +549,7 @@ def run_main(wires, monkeypatch, folder, steps):
             raise failure
         step(guard, 0.0)
 
-    monkeypatch.setattr(Guard, "step", next_step)
+    monkeypatch.setattr(BusGuard, "step", next_step)
     (folder / "policy.json").write_text(json.dumps(CONTENT))
     before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
     try:
@@ -600,7 +600,7 @@ def test_main_closes_when_an_interface_fails_and_stays(wires, monkeypatch, tmp_p
 def opened(content=CONTENT):
     """A guard with this policy, its two sides and the lines that it says."""
     program, wire, lines = Side(), Side(), []
-    return Guard(Policy(content), program, wire, lines.append), program, wire, lines
+    return BusGuard(Policy(content), program, wire, lines.append), program, wire, lines
 
 
 def test_a_frame_that_waited_for_longer_than_the_drives_wait_for_their_host_goes_nowhere():
@@ -660,7 +660,7 @@ def test_two_guards_of_one_wire_pass_no_frame_around_for_ever():
             return True
 
     sides = [(Shared(program), Shared(wire)) for _ in range(2)]
-    guards = [Guard(Policy(CONTENT), *each, lambda text: None) for each in sides]
+    guards = [BusGuard(Policy(CONTENT), *each, lambda text: None) for each in sides]
     program.append((None, 0x80, b""))
     program.append((None, 0x601, bytes.fromhex("4064600000000000")))
     passed = 0
@@ -721,7 +721,7 @@ def test_syncs_that_no_cycle_needs_close_it():
 @pytest.mark.parametrize(("side", "name"), [("wire", "wire"), ("program", "program")])
 def test_lost_frames_close_it(wires, side, name):
     program, wire = wires
-    guard = Guard(Policy(CONTENT), program.port, wire.port, lambda text: None)
+    guard = BusGuard(Policy(CONTENT), program.port, wire.port, lambda text: None)
     (wire if side == "wire" else program).port.lost = 7
     wire.say(0x181, bytes(8))
     guard.step(1.0)
@@ -741,7 +741,7 @@ def test_a_program_that_takes_no_frames_keeps_none_to_the_wire_waiting(wires, mo
     program.port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
     for _ in range(40):
         wires[1].say(0x181, bytes(8))
-    monkeypatch.setattr(Port, "patience", math.inf)  # a wait would last for ever
+    monkeypatch.setattr(GuardPort, "patience", math.inf)  # a wait would last for ever
     assert run_main(wires, monkeypatch, tmp_path, [None, None]) == 0
     assert 0 < len(all_heard(program)) < 40
 
@@ -776,6 +776,6 @@ def test_nobody_there_to_read_what_it_says_is_no_error(monkeypatch):
             raise BrokenPipeError
 
     monkeypatch.setattr(bus_guard.sys, "stderr", Gone())
-    guard = Guard(Policy(CONTENT), Side(), Side())
+    guard = BusGuard(Policy(CONTENT), Side(), Side())
     guard.close("it was told to end")
     assert guard.closed

@@ -12,7 +12,7 @@ from ends_bench import EXTRA_SPEED, FALLING, EndsBench
 
 from armlink.arm_file import bundled_arms, parse_arm
 from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence, Stall
-from armlink.link.ends import ENDS, Cause, cause_of
+from armlink.link.ends import ENDS, EndCause, cause_of
 from armlink.link.guard import Crossed
 from armlink.termination import Presses, said
 
@@ -71,13 +71,56 @@ def test_a_command_that_the_gate_refuses_leaves_the_arm_held(name):
 def test_one_drive_that_falls_silent_does_not_let_the_others_go(name):
     bench = EndsBench(name)
     bench.bus.inject("node.silent:wrist_3")
-    with pytest.raises((BusFault, Refused)) as fault:  # what it strikes may be refused before it is missed
+    with pytest.raises(Silence, match="wrist_3: no reading for") as fault:
         bench.hold(3.0)
     bench.leave(fault.value)
     others = np.arange(6) != 5
     assert (bench.peak[others] < 3.0).all(), f"the wrist that hangs free strikes its stop: {bench.peak}"
     assert np.abs(bench.sim.plant.position - bench.arm.link.park.pose)[others].max() < 0.25
     assert not any(bench.powered[:5])
+
+
+@pytest.mark.sample(4)
+@pytest.mark.parametrize("fault", ["forged.position:wrist_3:1.0", "forged.position:wrist_3:5e4"])
+@every_family
+def test_a_joint_is_not_held_where_only_a_false_reading_has_it(name, fault):
+    """No family's frames carry 5e4 rad but those of moteus and ODrive; the others cut it off."""
+    bench = EndsBench(name)
+    bench.bus.inject(fault)
+    with pytest.raises((BusFault, Refused)) as refused:
+        bench.hold(3.0)
+    bench.leave(refused.value)
+    assert not any(bench.powered)
+    speed = np.minimum(bench.arm.link.park.speed, [joint.max_velocity for joint in bench.arm.link.joints])
+    assert (bench.peak < speed + EXTRA_SPEED).all(), bench.peak
+    assert np.abs(bench.sim.plant.position - bench.arm.link.park.pose)[:5].max() < 0.1
+
+
+@pytest.mark.sample(1)
+@pytest.mark.parametrize("name", ["six-damiao", "six-robstride", "six-odrive"])  # whose faults need a power cycle
+def test_drives_that_have_power_when_an_enable_fails_are_parked(name):
+    bench = EndsBench(name, enable=False)
+    bench.bus.inject("drive.latched:wrist_3")
+    with pytest.raises(BusFault) as fault:
+        bench.link.enable()
+    assert bench.link.held
+    bench.leave(fault.value)
+    assert (bench.peak[:5] < bench.arm.link.park.speed + EXTRA_SPEED).all(), bench.peak
+    assert np.abs(bench.sim.plant.position - bench.arm.link.park.pose)[:5].max() < 0.1
+    assert not any(bench.powered[:5])
+
+
+def test_an_error_of_the_way_to_park_lets_the_arm_down(monkeypatch, caplog):
+    def failing(*args: object) -> None:
+        raise MemoryError("a way that is too long")
+
+    bench = EndsBench("six-damiao")
+    monkeypatch.setattr("armlink.link.ends.park", failing)
+    with caplog.at_level(logging.INFO, "armlink"):
+        bench.leave(None)
+    assert "letting the arm down, 60 s at most: MemoryError: a way that is too long" in caplog.text
+    assert (bench.peak < 0.1 + EXTRA_SPEED).all(), bench.peak
+    assert not any(bench.powered)
 
 
 @pytest.mark.sample(2)
@@ -151,7 +194,7 @@ def test_only_two_presses_within_two_seconds_let_the_arm_go(monkeypatch, caplog)
     presses.press()
     bench = EndsBench("six-damiao")
     with caplog.at_level(logging.INFO, "armlink"):
-        bench.link.close(Cause.INTERRUPTED, said("arm", presses))
+        bench.link.close(EndCause.INTERRUPTED, said("arm", presses))
     assert all(bench.powered), "told to stop, which damps until the drives miss their host"
     bench.sim.advance(0.5)
     assert not any(bench.powered)
@@ -172,8 +215,8 @@ def test_a_link_that_holds_the_arm_takes_up_its_work_again():
 
 def test_the_table_of_ends_is_the_page_s():
     page = (Path(__file__).parents[3] / "docs" / "safety.md").read_text(encoding="utf-8")
-    for cause in Cause:
+    for cause in EndCause:
         holds, falls = ENDS[cause]
         row = rf"\| {re.escape(cause.value)} \| {re.escape(holds.value)} \| {re.escape(falls.value)} \|"
         assert re.search(row, page), f"docs/safety.md has no row for: {cause.value}"
-    assert {cause_of(error) for error in ERRORS.values()} < set(Cause)
+    assert {cause_of(error) for error in ERRORS.values()} < set(EndCause)

@@ -12,16 +12,25 @@ FOUND = [None, None, Calibration(1.1, 0.2, record_id=7)]
 
 
 @pytest.mark.parametrize("simulated", [False, True])
-def test_joints_that_the_host_calibrates_and_has_no_record_for_are_named(simulated, monkeypatch, caplog):
+@pytest.mark.parametrize("serial", ["SN-1", "unknown"])
+def test_joints_without_a_record_and_records_without_a_serial_are_named(simulated, serial, monkeypatch, caplog):
     traits = [SimpleNamespace(calibration=by) for by in ("host", "drive", "host")]
     monkeypatch.setattr(calibrations, "traits_of", lambda groups: traits)
     monkeypatch.setattr(calibrations, "calibrations_by_record", lambda arm: FOUND)
     joints = SimpleNamespace(
-        arm=SimpleNamespace(name="three"), n=3, groups=(), names=("a", "b", "c"), _apply_host=lambda: None
+        arm=SimpleNamespace(name="three", serial=serial, has_serial=serial != "unknown"),
+        n=3,
+        groups=(),
+        names=("a", "b", "c"),
+        _apply_host=lambda: None,
     )
     Calibrations.calibrate_host(joints, simulated)
     assert joints._in_host == {0: BLANK, 2: BLANK if simulated else FOUND[2]}
     said = [record.getMessage() for record in caplog.records]
-    assert [text.partition(": torque")[0] for text in said] == (
-        [] if simulated else ["three: no calibration record is in force for a"]
+    if simulated:
+        assert said == []
+        return
+    assert said[0].startswith("three: no calibration record is in force for a: torque")
+    assert [text.partition(": the calibration")[0] for text in said[1:]] == (
+        ["three: its serial is unknown"] if serial == "unknown" else []
     )

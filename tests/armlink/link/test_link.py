@@ -157,11 +157,12 @@ def test_torque_mode_starts_from_the_torque_now_produced(enabled, bus):
     for _ in range(5):
         enabled.cycle(command(POSITION))
     bus.nodes[1].commands.clear()
-    for _ in range(30):
+    for _ in range(80):
         enabled.cycle(command(TORQUE, torque=0.0))
     sent = [torque for _, torque, _, mode in bus.nodes[1].commands if mode == TORQUE]
-    assert sent[0] == 180  # 8 N·m less one step of 200 N·m/s · 4 ms
-    assert np.abs(np.diff(sent)).max() <= 20 + 1
+    # 8 N·m less steps of 200 N·m/s · 4 ms = 20 counts, of which each cycle within the first 0.5 s allows a share more
+    eased = np.maximum(200 - 20 * np.cumsum(np.arange(1, 81) * 0.004 / 0.5), 0.0)
+    assert sent == pytest.approx(eased, abs=1)
     assert sent[-1] == 0
 
 

@@ -157,7 +157,7 @@ def test_profile_position_goes_to_its_target():
 
 
 def test_profile_torque_is_the_torque():
-    moved, _, display, _ = run_simulated(PROFILE_TORQUE, torque=0.0, seconds=0.06)
+    moved, _, display, _ = run_simulated(PROFILE_TORQUE, torque=0.0, seconds=0.1)
     assert display == PROFILE_TORQUE
     assert 0.01 < abs(moved) < 0.3  # without torque it begins to fall, and slowly at first
 

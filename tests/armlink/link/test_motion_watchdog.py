@@ -110,6 +110,21 @@ def test_velocities_that_come_as_often_as_a_drive_sends_them_are_one_senders():
     assert bus.forged == 0
 
 
+def test_torques_that_come_apart_from_positions_are_one_senders_while_they_come_as_often():
+    bus = BusWatch(1)
+    random = np.random.default_rng(5)
+    for _ in range(20_000):
+        bus.readings[0] += random.random() > 0.002  # some are lost
+        if random.random() > 0.01:
+            bus.torque_alone(0)
+    assert bus.forged is None
+    for _ in range(EXCESS + 1):
+        bus.readings[0] += 1
+        bus.torque_alone(0)
+        bus.torque_alone(0)
+    assert bus.forged == 0
+
+
 def test_a_joint_that_strikes_its_stop_and_turns_round_is_not_contradicted() -> None:
     """Its velocity is that after the stroke, its positions still tell of the way before it."""
     watch = MotionWatch(1, PERIOD)

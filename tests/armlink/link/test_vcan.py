@@ -12,7 +12,7 @@ import can
 import pytest
 from vcan_pair import pair_text
 
-from armlink.drives.canopen.cia402 import State, state_of
+from armlink.drives.canopen.cia402 import DriveState, state_of
 from armlink.guard import bus_guard
 
 pytestmark = pytest.mark.vcan
@@ -106,10 +106,13 @@ def test_a_killed_host_leaves_every_joint_in_quick_stop(simulated, arm_file, lis
     assert process.stdout.readline() == "pushing\n"
     while listener.recv(timeout=0):
         pass
-    assert all_are(State.ENABLED)(states_of(listener, all_are(State.ENABLED), 5.0))
+    assert all_are(DriveState.ENABLED)(states_of(listener, all_are(DriveState.ENABLED), 5.0))
     process.send_signal(signal.SIGKILL)
     process.wait(timeout=30)
-    assert states_of(listener, all_are(State.QUICK_STOP), 5.0) == {11: State.QUICK_STOP, 12: State.QUICK_STOP}
+    assert states_of(listener, all_are(DriveState.QUICK_STOP), 5.0) == {
+        11: DriveState.QUICK_STOP,
+        12: DriveState.QUICK_STOP,
+    }
 
 
 def test_an_interrupted_host_quick_stops_itself(simulated, arm_file, listener):
@@ -117,7 +120,10 @@ def test_an_interrupted_host_quick_stops_itself(simulated, arm_file, listener):
     assert process.stdout.readline() == "pushing\n"
     process.send_signal(signal.SIGINT)
     process.wait(timeout=30)
-    assert states_of(listener, all_are(State.QUICK_STOP), 5.0) == {11: State.QUICK_STOP, 12: State.QUICK_STOP}
+    assert states_of(listener, all_are(DriveState.QUICK_STOP), 5.0) == {
+        11: DriveState.QUICK_STOP,
+        12: DriveState.QUICK_STOP,
+    }
 
 
 def test_the_host_keeps_no_higher_rate_than_it_should(simulated, arm_file):
@@ -184,6 +190,9 @@ def test_a_guard_passes_a_host_and_closes_at_a_torque_beyond_the_limit(guard, ar
     with can.Bus(interface="socketcan", channel="vcan1") as intruder:
         intruder.send(can.Message(arbitration_id=0x20C, data=struct.pack("<Hhi", 15, 1000, 0), is_extended_id=False))
         assert "20Ch: target torque of joint_2 1000, allowed -750 to 750" in guard.stderr.readline()
-    assert states_of(listener, all_are(State.QUICK_STOP), 5.0) == {11: State.QUICK_STOP, 12: State.QUICK_STOP}
+    assert states_of(listener, all_are(DriveState.QUICK_STOP), 5.0) == {
+        11: DriveState.QUICK_STOP,
+        12: DriveState.QUICK_STOP,
+    }
     process.communicate(timeout=30)
     assert process.returncode != 0

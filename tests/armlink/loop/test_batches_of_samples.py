@@ -46,6 +46,8 @@ def test_samples_wait_for_each_other_but_the_last_row_does_not(ticking: SimpleNa
 class After:
     """An end after so many cycles, each of which takes its period."""
 
+    orphaned = False
+
     def __init__(self, clock: SimpleNamespace, cycles: int) -> None:
         self.clock, self.cycles = clock, cycles
 

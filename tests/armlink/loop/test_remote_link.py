@@ -16,10 +16,10 @@ import yaml
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.bus.open import open_link_bus
-from armlink.drives.canopen.cia402 import State, state_of
+from armlink.drives.canopen.cia402 import DriveState, state_of
 from armlink.drives.canopen.object_dictionary import STATUS_WORD as STATUS
 from armlink.errors import BusFault, HostLate, Silence
-from armlink.link.guard import Crossed, Guard
+from armlink.link.guard import Crossed, ReadingBounds
 from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.types import Command, Sample, Setpoints
@@ -132,7 +132,7 @@ def test_a_bound_is_kept_while_the_job_is_busy(started: tuple[RemoteLink, subpro
     link, _ = started
     targets = rows(link, 1.0, 0.4)
     upper = np.array([np.inf, targets[0, 1] + 0.2])
-    guard = Guard(np.full(2, -np.inf), upper, np.full(2, np.inf))
+    guard = ReadingBounds(np.full(2, -np.inf), upper, np.full(2, np.inf))
     playing = link.play(Setpoints.follow(targets, guard))
     next(playing)
     time.sleep(1.5)
@@ -183,7 +183,7 @@ def test_a_loop_that_stands_still_says_that_the_host_was_late(
         cycles(link, hold)
     assert 1.0 < late.value.late < 10.0
     sample = link.recover()
-    assert all(state_of(int(status)) is State.ENABLED for status in sample.status)
+    assert all(state_of(int(status)) is DriveState.ENABLED for status in sample.status)
     assert np.isfinite(link.cycle(Command.hold(link.position_sent)).position).all()
 
 
@@ -199,7 +199,7 @@ def test_an_arm_that_stands_still_is_not_called_broken(
     link.recover()  # waits for it, and takes no reply of before it was stopped for an enabled joint
     for _ in range(50):
         sample = link.cycle(Command.hold(link.position_sent))
-    assert all(state_of(int(status)) is State.ENABLED for status in sample.status)
+    assert all(state_of(int(status)) is DriveState.ENABLED for status in sample.status)
 
 
 @pytest.mark.parametrize("who", ["job", "loop"])
@@ -224,7 +224,7 @@ def test_the_joints_stop_when_job_or_loop_is_killed(tmp_path: Path, who: str) ->
         with Listener(arm, open_link_bus(bus, arm.require_link())) as listener:
             joints = listener.groups[0].drives.services(listener.ask)
             states = [state_of(int(services.read(STATUS))) for services in joints]
-    assert all(state is not State.ENABLED for state in states), states
+    assert all(state is not DriveState.ENABLED for state in states), states
 
 
 def dawdle(link: Link, tell: Callable[[str], None], seconds: float) -> int:
@@ -254,7 +254,7 @@ def test_a_function_runs_in_the_loop_until_it_ends_or_ctrl_c(tmp_path: Path) -> 
         with Listener(arm, open_link_bus(bus, arm.require_link())) as listener:
             joints = listener.groups[0].drives.services(listener.ask)
             states = [state_of(int(services.read(STATUS))) for services in joints]
-    assert all(state is State.QUICK_STOP for state in states), states
+    assert all(state is DriveState.QUICK_STOP for state in states), states
 
 
 def test_sigterm_to_the_loop_is_left_to_the_job(started: tuple[RemoteLink, subprocess.Popen[bytes]]) -> None:

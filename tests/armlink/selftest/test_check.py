@@ -15,7 +15,7 @@ from armlink.link.link import Link
 from armlink.selftest.self_test import SelfTest
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.node import supervision
-from sim_bus.node.drives import Drives
+from sim_bus.node.drives import SimulatedDrives
 from sim_bus.node.supervision import Supervision
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -139,13 +139,13 @@ def test_a_device_that_leaves_operational_is_told(simulated):
 
 
 def test_a_device_that_does_not_enter_a_mode_is_found(simulated, monkeypatch):
-    select = Drives._select_mode
+    select = SimulatedDrives._select_mode
 
     def stubborn(self, joint):
         if not (joint == 1 and self._mode_in[joint] == 10):
             select(self, joint)
 
-    monkeypatch.setattr(Drives, "_select_mode", stubborn)
+    monkeypatch.setattr(SimulatedDrives, "_select_mode", stubborn)
     results = self_test(simulated)
     assert results["hinge_1", "mode display"].outcome == "passed"
     assert results["hinge_2", "mode display"].outcome == "failed"

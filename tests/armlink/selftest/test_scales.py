@@ -7,8 +7,7 @@ from moved_by_hand import ALL, arm_with, judged
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
 from armlink.link.link import Link
-from armlink.selftest.scales import against_current, between_stops, gather, integrated, judge, law
-from armlink.selftest.track import Track
+from armlink.selftest.scales import ScaleTrack, against_current, between_stops, gather, integrated, judge, law
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -27,7 +26,7 @@ def track(position=1.0, velocity=1.0, torque=1.0, noise=0.05, seed=0):
     made = 60.0 * (last[0] - q) + 2.0 * (last[1] - v) + last[2] * torque
     reported = made / torque + noise * random.standard_normal(len(t)) + 0.3
     gain = np.full(len(t), 60.0), np.full(len(t), 2.0)
-    return Track(t, read["q"], read["v"], reported, read["target"], read["rate"], ahead, *gain)
+    return ScaleTrack(t, read["q"], read["v"], reported, read["target"], read["rate"], ahead, *gain)
 
 
 @pytest.mark.parametrize("quantity", ["position", "velocity", "torque"])
@@ -50,7 +49,7 @@ def test_sound_scales_are_not_named():
 
 def test_without_more_evidence_it_says_which_ones_it_may_be():
     bare = track(velocity=1.25)
-    bare = Track(*(getattr(bare, name) for name in ("t", "position", "velocity")), *[np.full(4000, np.nan)] * 6)
+    bare = ScaleTrack(*(getattr(bare, name) for name in ("t", "position", "velocity")), *[np.full(4000, np.nan)] * 6)
     (found,) = judge(gather(bare, 9.0, stop_to_stop=False, by_current=()))
     assert found.quantities == ("position", "velocity")
     assert found.text.startswith("position or velocity reads")
@@ -58,14 +57,14 @@ def test_without_more_evidence_it_says_which_ones_it_may_be():
 
 def test_a_joint_that_hardly_moved_shows_nothing():
     still = track()
-    still = Track(still.t, 0.001 * still.position, 0.001 * still.velocity, *[np.full(4000, np.nan)] * 6)
+    still = ScaleTrack(still.t, 0.001 * still.position, 0.001 * still.velocity, *[np.full(4000, np.nan)] * 6)
     assert gather(still, 2.0, stop_to_stop=False, by_current=()) == []
 
 
 def test_a_velocity_that_is_none():
     moved = track()
     wild = moved.velocity * (3 + np.sign(np.sin(20 * moved.t)) * 4)
-    (found,) = judge([integrated(Track(moved.t, moved.position, wild, *[np.full(4000, np.nan)] * 6))])
+    (found,) = judge([integrated(ScaleTrack(moved.t, moved.position, wild, *[np.full(4000, np.nan)] * 6))])
     assert found.quantities == ("velocity",)
     assert "velocity is unsteady" in found.text
 
@@ -74,7 +73,7 @@ def test_a_velocity_that_scatters_is_known_as_well_as_its_windows_agree():
     """160 windows of 0.25 s, in each of which the velocity reads 20 % too much or too little, one in three more."""
     t = np.arange(16000) * 0.0025
     reads = 1.0 + 0.2 * np.random.default_rng(4).standard_normal(160)
-    found = integrated(Track(t, t, np.repeat(reads, 100), *[np.full(len(t), np.nan)] * 6))
+    found = integrated(ScaleTrack(t, t, np.repeat(reads, 100), *[np.full(len(t), np.nan)] * 6))
     assert found.ratio == pytest.approx(1.0, abs=0.03)
     assert found.sigma == pytest.approx(0.2 / np.sqrt(160), rel=0.25)
 
@@ -92,7 +91,7 @@ def test_current_times_torque_constant():
 
 def test_few_rows_with_gains_are_no_law():
     short = track()
-    assert law(Track(*(getattr(short, name)[:100] for name in short.__dataclass_fields__))) == []
+    assert law(ScaleTrack(*(getattr(short, name)[:100] for name in short.__dataclass_fields__))) == []
 
 
 @pytest.mark.parametrize("name", ALL[:4])  # CubeMars drives, whose evidence is Damiao's: in the campaign

@@ -11,7 +11,7 @@ from armlink.arm_file import load_arm
 from armlink.cli import run
 from armlink.content.file_content import parse_yaml
 from armlink.content.yaml_text import yaml_comment, yaml_document, yaml_entry, yaml_item
-from armlink.drives.found import FoundDrive
+from armlink.drives.findings import FoundDrive
 from armlink.errors import BadInput
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.bus_arm import _text as bus_text

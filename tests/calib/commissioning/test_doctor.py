@@ -16,6 +16,7 @@ from calib.commissioning.finding import ORDER
 MODELS = Path(__file__).parents[2] / "models"
 PLANAR = {
     "name": "planar",
+    "serial": "SN-1",
     "kinematics": {
         "gravity": [0.0, 0.0, -9.81],
         "joints": [
@@ -92,6 +93,7 @@ def test_a_sound_arm_has_no_error(tmp_path):
         (("kinematics", "gravity"), [0, 0, -9.81], "warning", ["shoulder", "vertical", "Γ/g 0.00"]),
         (("kinematics", "gravity"), [0, -1.6, 0], "warning", ["kinematics.gravity", "1.6"]),
         (("kinematics", "joints", 0, "upper"), -1.95, "error", ["shoulder", "nothing to sweep"]),
+        (("serial",), "FILL-IN", "warning", ["serial is FILL-IN", "serial: …"]),
         (("link", "joints", 0, "max_torque"), 400.0, "warning", ["shoulder", "three times"]),
         (("link", "joints", 0, "max_torque_rate"), 9000.0, "hint", ["shoulder", "usual"]),
         (("link", "bus"), {"channel": "nosuch0"}, "error", ["nosuch0", "no interface"]),

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from armlink.drives.found import FoundDrive
+from armlink.drives.findings import FoundDrive
 from armlink.errors import BadInput, BusFault
 from calib.commissioning.drive_match import match_in_order, moved_node
 

@@ -22,7 +22,7 @@ from armlink.link.link import Link
 from armlink.link.listener import Listener
 from armlink.link.types import Calibration, Command, Stats
 from armlink.loop.channel import Channel
-from armlink.loop.messages import Answer, Call
+from armlink.loop.messages import Call, LoopAnswer
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.loop.arm_loop import ArmLoop
 from calib.daemon.loop.loop_messages import CHANNELS, Batch, Down, LoopOptions, Message, Up
@@ -260,7 +260,7 @@ def test_sigterm_to_the_whole_group_is_left_to_the_service() -> None:
     host._channel.wait(60.0)
     assert host.pid is not None
     os.kill(host.pid, signal.SIGTERM)
-    answer: list[Answer] = []
+    answer: list[LoopAnswer] = []
     asking = threading.Thread(target=lambda: answer.append(host.ask(Call(1, "read_calibration", (0,)))))
     asking.start()
     end = time.monotonic() + 60.0

@@ -86,3 +86,37 @@ def test_ids_go_on_over_a_restart_and_where_a_file_is_begun_anew_under_way(tmp_p
     assert journal.add_proposal(NOW, "j1", "0a", "0b", finding) == 3
     journal.close()
     assert [row.state for row in Journal(tmp_path / "journal.db").proposals()] == ["pending"]
+
+
+@pytest.mark.parametrize("how", ["moved", "another", "older copy", "no journal"])
+def test_a_journal_whose_name_another_file_has_taken_goes_on_in_that_one(tmp_path: Path, how: str) -> None:
+    now, path = [0.0], tmp_path / "journal.db"
+
+    def keep(text: str) -> int:
+        return journal.add_event(NOW, now[0], "clock", None, text, {})
+
+    journal = Journal(path, lambda: now[0])
+    keep("of before")
+    if how == "another":
+        Journal(tmp_path / "taken.db").close()
+    if how == "older copy":
+        with sqlite3.connect(path) as source, sqlite3.connect(tmp_path / "taken.db") as copy:
+            source.backup(copy)
+    if how == "no journal":
+        (tmp_path / "taken.db").write_text("not a database, for longer than the header of one " * 9)
+    path.rename(tmp_path / "away.db")
+    if how != "moved":
+        (tmp_path / "taken.db").rename(path)
+
+    number = keep("on the way")
+    assert journal.trouble == f"the journal cannot be written: {path} was moved, or replaced by another file"
+    for now[0] in (1.0, 2.0, 3.0):
+        journal.probe()
+    assert (journal.trouble, journal.waiting) == ("", 0)
+    assert keep("of after") == number + 1
+    kept = [*{"older copy": ["of before"]}.get(how, []), "on the way", "of after"]
+    assert [event.text for event in journal.events()] == kept
+    journal.close()
+    with sqlite3.connect(tmp_path / "away.db") as away:
+        assert away.execute("SELECT text FROM events").fetchall() == [("of before",)]
+    assert bool(journal.set_aside) == (how == "no journal")

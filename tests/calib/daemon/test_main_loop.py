@@ -13,7 +13,7 @@ import yaml
 
 from armlink import cli
 from armlink.arm_file import bundled_arms, load_arm
-from armlink.link.ends import Cause
+from armlink.link.ends import EndCause
 from armlink.link.types import Tell
 from armlink.loop.messages import Alive
 from calib.daemon import main_loop
@@ -44,7 +44,7 @@ class NoProcess:
     def kill(self) -> None:
         self.killed = True
 
-    def close(self, cause: Cause = Cause.DONE, tell: Tell = lambda text: None) -> None:
+    def close(self, cause: EndCause = EndCause.DONE, tell: Tell = lambda text: None) -> None:
         self.closed = True
 
 

@@ -11,7 +11,7 @@ from armlink.link.link import Link
 from calib.sweep.dataset import load_data
 from calib.sweep.run import run_sweep
 from sim_bus.bus.lock_step import LockStepBus
-from sim_bus.node.cia402 import State
+from sim_bus.node.cia402 import PowerState
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -19,7 +19,7 @@ ARM = with_section(
     random_arm(31, 2), steps=5, poses=1, max_samples=10, settle_window=0.08, gain_std=0.5, travel_speed=0.95
 )
 TORQUE_MODE, PRESSED_CYCLES = 10, 400
-SAFE = (State.QUICK_STOP, State.SWITCH_ON_DISABLED, State.FAULT)
+SAFE = (PowerState.QUICK_STOP, PowerState.SWITCH_ON_DISABLED, PowerState.FAULT)
 
 
 class Resetting(LockStepBus):
@@ -29,7 +29,7 @@ class Resetting(LockStepBus):
 
     def put(self, can_id: int, data: bytes) -> None:
         drives = self.arm.drives
-        enabled = np.array([state is State.ENABLED for state in drives.state])
+        enabled = np.array([state is PowerState.ENABLED for state in drives.state])
         pressing = np.flatnonzero(enabled & (np.asarray(drives.loops.mode) == TORQUE_MODE))
         self.pressed += bool(pressing.size)
         if pressing.size == 1 and self.pressed > PRESSED_CYCLES and not self.reset:

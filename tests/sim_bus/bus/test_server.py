@@ -8,7 +8,7 @@ import pytest
 from rig import Hand, Rig, one_joint
 
 from armlink.bus.adapters import as_bus
-from sim_bus.bus.server import TICK, Server
+from sim_bus.bus.server import TICK, ArmServer
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -17,7 +17,7 @@ def test_only_frames_and_timers_that_need_it_advance_the_physics(ends: tuple[can
     arm_end, host_end = ends
     described, hand = one_joint(), Hand()
     arm = SimulatedArm(described, Truth.of(described))
-    server = Server(arm, as_bus(arm_end), now=hand.now)
+    server = ArmServer(arm, as_bus(arm_end), now=hand.now)
 
     def turn(can_id: int, data: bytes = b"") -> float:
         host_end.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))

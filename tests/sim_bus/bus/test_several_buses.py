@@ -14,7 +14,7 @@ from armlink.bus.open import open_link_bus
 from armlink.cli import run
 from armlink.link.link import Link
 from armlink.link.types import Command
-from sim_bus.bus.server import Server
+from sim_bus.bus.server import ArmServer
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -55,7 +55,7 @@ def served(path):
     described = load_arm(path)
     arm = SimulatedArm(described, Truth.of(described))
     group = open_link_bus(None, described.require_link())
-    server, done = Server(arm, group, lockstep=True), threading.Event()
+    server, done = ArmServer(arm, group, lockstep=True), threading.Event()
 
     def serve():
         while not done.is_set():
@@ -127,7 +127,7 @@ def test_the_joints_of_both_buses_move_as_one_arm(path, repeated):
     described = with_drives(path, None, None) if repeated else load_arm(path)
     arm = SimulatedArm(described, Truth.of(described))
     nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
-    server = Server(arm, nodes, lockstep=True, now=lambda: 0.0)
+    server = ArmServer(arm, nodes, lockstep=True, now=lambda: 0.0)
     pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], list(host.tags))
     pumped.clock = ArmTime(arm)
     with Link(described, pumped) as link:
@@ -155,7 +155,7 @@ def test_frames_on_a_bus_without_nodes_reach_no_node_of_another(path):
     described, clock = with_drives(path, None, DAMIAO), Hand()
     arm = SimulatedArm(described, Truth.of(described))
     nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
-    server = Server(arm, nodes, now=clock.now)
+    server = ArmServer(arm, nodes, now=clock.now)
     server.turn()
     [node], port = arm.nodes, host.open_port()
     before = node.nmt, node.value(0x60FF)
@@ -180,7 +180,7 @@ def serials_of_an_arm_that_moves_as_one(path, *drives):
     described, clock = with_drives(path, *drives), Hand()
     arm = SimulatedArm(described, Truth.of(described))
     nodes, host = (open_link_bus(None, described.require_link()) for _ in range(2))
-    server = Server(arm, nodes, now=clock.now)
+    server = ArmServer(arm, nodes, now=clock.now)
     pumped = BusGroup([Pumped(bus, server.turn) for bus in host.members], list(host.tags))
     pumped.clock = clock
     with Link(described, pumped) as link:

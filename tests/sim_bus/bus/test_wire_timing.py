@@ -11,7 +11,7 @@ from armlink.errors import BusFault
 from armlink.link.link import Link
 from armlink.link.types import Command
 from sim_bus.bus.lock_step import LockStepBus
-from sim_bus.bus.wire_timing import Wire
+from sim_bus.bus.wire_timing import TimedWire
 
 PERIOD = 0.004
 
@@ -33,7 +33,7 @@ class Nodes:
 
 def test_frames_go_one_after_the_other_for_as_long_as_their_bits_take() -> None:
     answers = (0x183, bytes(8)), (0x181, b"\x55" * 8)
-    wire = Wire(Nodes(*answers), 1_000_000)
+    wire = TimedWire(Nodes(*answers), 1_000_000)
     command = (0x201, b"\xaa\x01\x02\x03")
     wire.on_frame(*command)
     wire.on_frame(0x80, b"")
@@ -43,7 +43,7 @@ def test_frames_go_one_after_the_other_for_as_long_as_their_bits_take() -> None:
 
 
 def test_the_lowest_identifier_wins() -> None:
-    wire = Wire(Nodes((0x183, b"c"), (0x701, b"d"), (0x81, b"a"), (0x181, b"b")), 1_000_000)
+    wire = TimedWire(Nodes((0x183, b"c"), (0x701, b"d"), (0x81, b"a"), (0x181, b"b")), 1_000_000)
     wire.on_frame(0x80, b"")
     wire.on_frame(0x182, b"host")
     wire.advance(PERIOD)
@@ -52,7 +52,7 @@ def test_the_lowest_identifier_wins() -> None:
 
 
 def test_what_has_no_room_in_a_period_comes_in_the_next() -> None:
-    wire = Wire(Nodes(*((0x180 + node, bytes(8)) for node in range(1, 60))), 1_000_000)
+    wire = TimedWire(Nodes(*((0x180 + node, bytes(8)) for node in range(1, 60))), 1_000_000)
     wire.on_frame(0x80, b"")
     wire.advance(PERIOD)
     first = len(wire.outbox)
@@ -63,7 +63,7 @@ def test_what_has_no_room_in_a_period_comes_in_the_next() -> None:
 
 
 def test_a_full_transmit_queue_is_waited_for_and_then_given_up() -> None:
-    wire = Wire(Nodes(*((0x001, bytes(8)) for _ in range(1000))), 1_000_000)
+    wire = TimedWire(Nodes(*((0x001, bytes(8)) for _ in range(1000))), 1_000_000)
     wire.on_frame(0x80, b"")
     wire.advance(PERIOD)
     for _ in range(10):

@@ -15,9 +15,9 @@ from armlink.bus.adapters import as_bus
 from armlink.cli import run
 from armlink.errors import BadInput
 from sim_bus.bus.control_pipe import ControlPipe
-from sim_bus.bus.effect_options import Drift
-from sim_bus.bus.server import Server
-from sim_bus.node.cia402 import State
+from sim_bus.bus.effect_options import SensorDrift
+from sim_bus.bus.server import ArmServer
+from sim_bus.node.cia402 import PowerState
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -52,7 +52,7 @@ def test_physics_follows_the_clock_and_a_drift_comes_at_its_time(ends: tuple[can
     arm_end, host_end = ends
     described, hand = one_joint(), Hand()
     arm = SimulatedArm(described, Truth.of(described))
-    server = Server(arm, as_bus(arm_end), [Drift("hinge", 1.5, 0.0, 0.15)], now=hand.now)
+    server = ArmServer(arm, as_bus(arm_end), [SensorDrift("hinge", 1.5, 0.0, 0.15)], now=hand.now)
     hand.time = 0.1
     server.turn()
     assert receive(host_end) == [(0x705, b"\0")]
@@ -70,7 +70,7 @@ def test_in_lock_step_a_sync_is_a_period(ends: tuple[can.BusABC, can.BusABC]) ->
     arm_end, host_end = ends
     described, hand = one_joint(), Hand()
     arm = SimulatedArm(described, Truth.of(described))
-    server = Server(arm, as_bus(arm_end), lockstep=True, now=hand.now)
+    server = ArmServer(arm, as_bus(arm_end), lockstep=True, now=hand.now)
     for can_id, data in ((0, b"\1\0"), (0x80, b""), (0x80, b"")):
         host_end.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         hand.time += 0.05
@@ -105,7 +105,7 @@ def test_in_lock_step_a_host_that_died_is_noticed(ends: tuple[can.BusABC, can.Bu
     arm_end, host_end = ends
     described, hand = one_joint(), Hand()
     arm = SimulatedArm(described, Truth.of(described))
-    server = Server(arm, as_bus(arm_end), lockstep=True, now=hand.now)
+    server = ArmServer(arm, as_bus(arm_end), lockstep=True, now=hand.now)
 
     def send(can_id: int, data: bytes) -> None:
         host_end.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
@@ -119,21 +119,21 @@ def test_in_lock_step_a_host_that_died_is_noticed(ends: tuple[can.BusABC, can.Bu
         send(0x205, struct.pack("<Hhi", word, 0, 0))
         send(0x77E, b"\5")
         send(0x80, b"")
-    assert arm.drives.state == [State.ENABLED]
+    assert arm.drives.state == [PowerState.ENABLED]
     hand.time += 0.5  # a host that thinks: time rests
     server.turn()
-    assert arm.drives.state == [State.ENABLED]
+    assert arm.drives.state == [PowerState.ENABLED]
     for _ in range(10):
         hand.time += 0.2
         server.turn()
-    assert arm.drives.state == [State.QUICK_STOP]
+    assert arm.drives.state == [PowerState.QUICK_STOP]
 
 
 def test_orders_through_a_pipe_change_the_running_arm(ends: tuple[can.BusABC, can.BusABC], tmp_path: Path) -> None:
     described, hand, wrong = one_joint(), Hand(), []
     arm = SimulatedArm(described, Truth.of(described))
     pipe = ControlPipe(tmp_path / "arm.pipe")
-    server = Server(arm, as_bus(ends[0]), now=hand.now, control=pipe)
+    server = ArmServer(arm, as_bus(ends[0]), now=hand.now, control=pipe)
     server.on_wrong = wrong.append
 
     def order(*lines: str) -> None:

@@ -13,7 +13,7 @@ from rig import wait_for as wait_for
 
 from armlink.arm_file import ArmFile, Bus, parse_arm
 from armlink.bus.open import open_bus
-from sim_bus.bus.server import Server
+from sim_bus.bus.server import ArmServer
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -61,7 +61,7 @@ class Served:
         self.arm = SimulatedArm(arm, Truth.of(arm))
         self.drive = self.arm.device(0)
         self._bus = open_bus(None, bus or Bus(interface="virtual", channel=self.channel, fd=fd))
-        self._server = Server(self.arm, self._bus)
+        self._server = ArmServer(self.arm, self._bus)
         self._jobs: queue.Queue[Callable[[], None]] = queue.Queue()
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)

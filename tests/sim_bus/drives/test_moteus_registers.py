@@ -7,7 +7,7 @@ import moteus
 import pytest
 from moteus.protocol import scale_register
 
-from armlink.drives.moteus.frames import SCALES, Register
+from armlink.drives.moteus.frames import SCALES, MoteusRegister
 from sim_bus.drives.moteus import COMMANDS, DEFAULT_TIMEOUT, MoteusDrive
 
 
@@ -28,5 +28,5 @@ def test_a_step_of_each_register_is_that_of_the_reference(register):
     ("asked", "patience"), [(0.5, 0.5), (0.02, 0.02), (0.0, DEFAULT_TIMEOUT), (math.nan, DEFAULT_TIMEOUT)]
 )
 def test_how_long_a_command_lasts(asked, patience):
-    drive = SimpleNamespace(command={Register.COMMAND_WATCHDOG: asked})
+    drive = SimpleNamespace(command={MoteusRegister.COMMAND_WATCHDOG: asked})
     assert MoteusDrive.patience.fget(drive) == patience

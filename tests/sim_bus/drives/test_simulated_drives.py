@@ -19,7 +19,7 @@ from armlink.errors import BadInput
 from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import parse_fault
 from sim_bus.bus.lock_step import LockStepBus
-from sim_bus.drives.fault_kinds import DRIVE_KINDS
+from sim_bus.drives.drive_faults import DRIVE_KINDS
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -224,7 +224,7 @@ def test_silence_and_reboot_of_a_drive():
     injector.on_frame(2, ENABLE)
     assert [can_id for can_id, _ in injector.outbox] == [0x12]
     injector.inject(parse_fault("node.reboot:hinge", ["hinge"]))
-    assert arm.drive_at[0].state is damiao.State.DISABLED
+    assert arm.drive_at[0].state is damiao.DamiaoStatus.DISABLED
 
 
 def test_frames_of_a_drive_are_spoilt_too():

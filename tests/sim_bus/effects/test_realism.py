@@ -7,7 +7,7 @@ from armlink.arm_file import load_arm
 from armlink.errors import BadInput
 from sim_bus.effects.realism import LEVELS, add_realism
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics.cables import Cables
+from sim_bus.physics.joint_torques import Cables
 from sim_bus.sim_section import with_realism
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rig import UNIT, Rig, one_joint
 
-from sim_bus.node.cia402 import STATUS, TRANSITIONS, Command, State, command, next_state
+from sim_bus.node.cia402 import STATUS, TRANSITIONS, ControlCommand, PowerState, command, next_state
 from sim_bus.truth import Truth
 
 CSP, CST = 8, 10
@@ -20,39 +20,44 @@ def coulomb(torque: float) -> list[dict[str, object]]:
 @pytest.mark.parametrize(
     ("word", "asked"),
     [
-        (0x00, Command.DISABLE_VOLTAGE),
-        (0x02, Command.QUICK_STOP),
-        (0x06, Command.SHUTDOWN),
-        (0x07, Command.SWITCH_ON),
-        (0x0F, Command.ENABLE),
-        (0x80, Command.FAULT_RESET),
+        (0x00, ControlCommand.DISABLE_VOLTAGE),
+        (0x02, ControlCommand.QUICK_STOP),
+        (0x06, ControlCommand.SHUTDOWN),
+        (0x07, ControlCommand.SWITCH_ON),
+        (0x0F, ControlCommand.ENABLE),
+        (0x80, ControlCommand.FAULT_RESET),
     ],
 )
-def test_control_words_of_the_standard(word: int, asked: Command) -> None:
+def test_control_words_of_the_standard(word: int, asked: ControlCommand) -> None:
     assert command(word, 0) is asked
 
 
 def test_fault_reset_is_an_edge() -> None:
-    assert command(0x80, 0x80) is Command.NONE
+    assert command(0x80, 0x80) is ControlCommand.NONE
 
 
 def test_no_command_leads_out_of_a_fault_but_its_reset() -> None:
-    for state, asked in itertools.product(State, Command):
+    for state, asked in itertools.product(PowerState, ControlCommand):
         if (state, asked) not in TRANSITIONS:
             assert next_state(state, asked) is state
-    left = [asked for asked in Command if next_state(State.FAULT, asked) is not State.FAULT]
-    assert left == [Command.FAULT_RESET]
+    left = [asked for asked in ControlCommand if next_state(PowerState.FAULT, asked) is not PowerState.FAULT]
+    assert left == [ControlCommand.FAULT_RESET]
 
 
 def test_walk_through_the_states_and_back() -> None:
     rig = Rig(one_joint())
     rig.start(CSP)
-    walk = [(0x06, State.READY), (0x07, State.SWITCHED_ON), (0x0F, State.ENABLED), (0x02, State.QUICK_STOP)]
-    walk += [(0x00, State.SWITCH_ON_DISABLED), (0x0F, State.SWITCH_ON_DISABLED)]
+    walk = [
+        (0x06, PowerState.READY),
+        (0x07, PowerState.SWITCHED_ON),
+        (0x0F, PowerState.ENABLED),
+        (0x02, PowerState.QUICK_STOP),
+    ]
+    walk += [(0x00, PowerState.SWITCH_ON_DISABLED), (0x0F, PowerState.SWITCH_ON_DISABLED)]
     for word, state in walk:
         rig.word = word
         rig.cycle()
-        mask = 0x4F if state in (State.SWITCH_ON_DISABLED, State.FAULT) else 0x6F
+        mask = 0x4F if state in (PowerState.SWITCH_ON_DISABLED, PowerState.FAULT) else 0x6F
         assert rig.status(5) & mask == STATUS[state]
 
 

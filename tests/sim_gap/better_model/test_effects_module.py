@@ -12,7 +12,7 @@ from armlink.arm_file import load_arm
 from sim_bus.effects.registry import imperfections
 from sim_bus.effects.state import Imperfections
 from sim_bus.physics.plant import Plant
-from sim_bus.physics.sensors import Sensors
+from sim_bus.physics.sensors import JointSensors
 from sim_bus.truth import Truth
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.better_model.export import write_model
@@ -118,7 +118,7 @@ def test_the_module_moves_the_arm_as_the_simulated_arm_moves(name, plain):
 @pytest.mark.parametrize("name", READING)
 def test_the_module_reads_as_the_simulated_arms_sensors_read(name):
     arm = plant([])
-    sensors = Sensors(ARM, Truth.of(ARM), state(READING[name]), seed=0)
+    sensors = JointSensors(ARM, Truth.of(ARM), state(READING[name]), seed=0)
     sensors.noise = np.zeros(arm.n)
     sensors.torque_step = 1e-9
     effects = Effects(arm.model, READING[name], ARM.joint_names)

@@ -1,19 +1,19 @@
-"""What the nodes on a bus say against an arm file: absent, another controller, other ratings; they are only read."""
+"""Contradictions between the nodes on a bus and an arm file: absent, another controller, other ratings; only read."""
 
 from collections.abc import Iterator
 
 from armlink.arm_file import ArmFile
 from armlink.bus.can_bus import CanBus
-from armlink.drives.canopen.check.found_drives import Drives
+from armlink.drives.canopen.check.found_drives import FoundNodes
 from armlink.drives.canopen.controller_setup import identity_mismatches
 from armlink.drives.canopen.eds_file import expected_identity, of_joints
 from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE
-from armlink.drives.found import DriveFinding
+from armlink.drives.findings import DriveFinding
 
 
 def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[DriveFinding]:
     """Findings about the drives of an arm on an open bus of this name; raises BusFault."""
-    link, drives = arm_file.require_link(), Drives(opened)
+    link, drives = arm_file.require_link(), FoundNodes(opened)
     by_node, ours = {each.node: each for each in drives.found}, {joint.settings.node for joint in link.joints}
     spare = [each.node for each in drives.found if each.node not in ours]
     unknown = f"; nodes {', '.join(map(str, spare))} answer and are in no joint" if spare else ""

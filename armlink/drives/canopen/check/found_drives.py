@@ -8,11 +8,11 @@ from armlink.drives.canopen.controller_setup import Identity
 from armlink.drives.canopen.eds_file import bundled
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.units import units_from
-from armlink.drives.found import FoundDrive
+from armlink.drives.findings import FoundDrive
 from armlink.errors import BusFault
 
 
-class Drives:
+class FoundNodes:
     """The drives of an open bus, by node id."""
 
     def __init__(self, bus: CanBus) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from armlink.drives.canopen import emcy
 from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.cia402 import State, state_of
+from armlink.drives.canopen.cia402 import DriveState, state_of
 from armlink.drives.canopen.drives import CanopenDrives
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO2
@@ -215,7 +215,7 @@ class PowerTest:
         control = [Power.ON] * self.link.n
         control[joint] = Power.STOPPED
         state, seconds = self._reaction(joint, control, self.link.section.deadline)
-        kept = state is State.QUICK_STOP and self._stays(joint, control)
+        kept = state is DriveState.QUICK_STOP and self._stays(joint, control)
         found = "stops and holds" if kept else f"{state.value}, then {self._state(joint).value}"
         self._tell(joint, "quick stop", kept, found, seconds)
         self._again()
@@ -241,14 +241,14 @@ class PowerTest:
         self.drives.beat(self.link.ask)
         self.drives.cycle.beating = False
         start, seconds = self._last, 0.0
-        after: list[tuple[State, float] | None] = [None] * link.n
+        after: list[tuple[DriveState, float] | None] = [None] * link.n
         pairs = list(enumerate(watching))
         while any(watches and after[joint] is None for joint, watches in pairs) and seconds < PATIENCE * limit:
             seconds = self._cycle([Power.ON] * link.n).t - start + link.period
             for joint, each in enumerate(after):
                 left = self.drives.known.node_states.get(joint, objects.OPERATIONAL) != objects.OPERATIONAL
                 state = self._read(joint) if left and each is None else self._state(joint)  # it sends no status then
-                if each is None and state is not State.ENABLED:
+                if each is None and state is not DriveState.ENABLED:
                     after[joint] = (state, seconds)
         for joint, each in enumerate(after):
             if not watching[joint]:
@@ -256,21 +256,21 @@ class PowerTest:
             self._judge(joint, "heartbeat of the host", *(each or (self._read(joint), seconds)), limit)
         self._again()
 
-    def _reaction(self, joint: int, control: list[Power], patience: float) -> tuple[State, float]:
+    def _reaction(self, joint: int, control: list[Power], patience: float) -> tuple[DriveState, float]:
         """State that a joint goes to, and by the end of which cycle it shows it; its state after `patience` seconds."""
         start, seconds = self._last, 0.0
         while seconds < patience:
             seconds = self._cycle(control, tested=joint).t - start + self.link.period
-            if self._state(joint) is not State.ENABLED:
+            if self._state(joint) is not DriveState.ENABLED:
                 return self._state(joint), seconds
         return self._read(joint), seconds
 
     def _stays(self, joint: int, control: list[Power]) -> bool:
         for _ in range(self._cycles(HOLD_SECONDS)):
             self._cycle(control, tested=joint)
-        return self._state(joint) is State.QUICK_STOP
+        return self._state(joint) is DriveState.QUICK_STOP
 
-    def _judge(self, joint: int, check: str, state: State, seconds: float, limit: float) -> None:
+    def _judge(self, joint: int, check: str, state: DriveState, seconds: float, limit: float) -> None:
         """Quick stop in time passes; anything else is told as what the device does."""
         allowed = limit * (1 + LATE_SHARE) + LATE_SECONDS + 2 * self.link.period
         codes = [code for place, code, _ in self.drives.known.emergencies if place == joint]
@@ -278,20 +278,20 @@ class PowerTest:
         nmt = self.drives.known.node_states.get(joint, objects.OPERATIONAL)
         left = "" if nmt == objects.OPERATIONAL else f", NMT {objects.NMT_STATES.get(nmt, nmt)} (1029h:01)"
         timing = f"after {seconds * 1e3:.0f} ms (set to {limit * 1e3:.0f} ms){why}{left}"
-        if state is State.ENABLED:
+        if state is DriveState.ENABLED:
             self._tell(joint, check, False, f"does nothing within {seconds * 1e3:.0f} ms (set to {limit * 1e3:.0f} ms)")
-        elif state is State.QUICK_STOP:
+        elif state is DriveState.QUICK_STOP:
             in_time = seconds <= allowed
             self._tell(joint, check, in_time, f"quick stop {'' if in_time else 'too late, '}{timing}", seconds)
         else:
-            hint = ": 6007h has values 2 and 3 the other way round?" if state is State.SWITCH_ON_DISABLED else ""
+            hint = ": 6007h has values 2 and 3 the other way round?" if state is DriveState.SWITCH_ON_DISABLED else ""
             self._tell(joint, check, False, f"goes to {state.value}, expected quick stop, {timing}{hint}", seconds)
             self._harmed = f"not run: {self.link.names[joint]} lost its power in the check of its {check}"
 
-    def _state(self, joint: int) -> State:
+    def _state(self, joint: int) -> DriveState:
         return state_of(self.drives.known.statuses[joint])
 
-    def _read(self, joint: int) -> State:
+    def _read(self, joint: int) -> DriveState:
         status: Any = self.drives.services(self.link.ask)[joint].read(objects.STATUS_WORD)
         return state_of(int(status))
 

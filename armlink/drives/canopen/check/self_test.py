@@ -30,7 +30,7 @@ NEEDED = (objects.CONTROL_WORD, objects.STATUS_WORD, objects.MODE, objects.POSIT
 """Objects without which nothing goes."""
 
 
-class SelfTest:
+class CanopenSelfTest:
     """Runs the checks on an arm's controllers; the link must not be started. Results gather in `results`."""
 
     def __init__(

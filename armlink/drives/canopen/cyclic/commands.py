@@ -8,7 +8,7 @@ from armlink.bus.port import Frame
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.cia402 import (
     Control,
-    State,
+    DriveState,
     loop_gain,
     next_control,
     set_point_control,
@@ -16,14 +16,14 @@ from armlink.drives.canopen.cia402 import (
     velocity_towards,
 )
 from armlink.drives.canopen.cyclic.wire import INT32_MAX, Wire
-from armlink.drives.canopen.faults import Known
+from armlink.drives.canopen.faults import JointStates
 from armlink.drives.canopen.pdo import RPDO1, RPDO2
 from armlink.drives.orders import Mode, Order, Power
 
 OFF, PROFILE_POSITION = int(Mode.OFF), int(Mode.PROFILE_POSITION)
 ENABLE, DISABLE_VOLTAGE = int(Control.ENABLE), int(Control.DISABLE_VOLTAGE)
 FAULT_RESET, QUICK_STOP = int(Control.FAULT_RESET), int(Control.QUICK_STOP)
-TARGETS = {Power.ON: State.ENABLED, Power.OFF: State.SWITCH_ON_DISABLED, Power.STOPPED: State.QUICK_STOP}
+TARGETS = {Power.ON: DriveState.ENABLED, Power.OFF: DriveState.SWITCH_ON_DISABLED, Power.STOPPED: DriveState.QUICK_STOP}
 SYNC: Frame = (objects.SYNC_ID, b"")
 _OPERATIONAL = bytes([objects.OPERATIONAL])
 
@@ -31,7 +31,7 @@ _OPERATIONAL = bytes([objects.OPERATIONAL])
 class CommandFrames:
     """Frames of each cycle for m joints; what each joint was sent last can be decoded again."""
 
-    def __init__(self, known: Known, host: int, beat_every: float, period: float) -> None:
+    def __init__(self, known: JointStates, host: int, beat_every: float, period: float) -> None:
         """`known` is what the joints show; `host` is our own node id, whose heartbeat is due every `beat_every` [s]."""
         self._known, self._period, self._beat_every = known, period, beat_every
         self.beating = True
@@ -157,19 +157,19 @@ class CommandFrames:
         if not self._walking[joint]:
             self._walking[joint] = True
             self._select(joint, order.mode, frames, now)
-            if state is State.QUICK_STOP:
+            if state is DriveState.QUICK_STOP:
                 return QUICK_STOP
-            return next_control(state, target) if state is State.ENABLED else DISABLE_VOLTAGE
-        reset_again = state is State.FAULT and self._words[joint] == FAULT_RESET
+            return next_control(state, target) if state is DriveState.ENABLED else DISABLE_VOLTAGE
+        reset_again = state is DriveState.FAULT and self._words[joint] == FAULT_RESET
         return DISABLE_VOLTAGE if reset_again else next_control(state, target)
 
     def sent(self, joint: int) -> Order | None:
-        """What the last frame orders a joint, decoded from its bytes; None where none was sent."""
+        """A joint's order by its last frame, decoded from its bytes; None where none was sent."""
         data = self._sent[joint]
         return None if data is None else self.decoded(joint, data)
 
     def decoded(self, joint: int, data: bytes) -> Order | None:
-        """What RPDO1 with these bytes orders a joint; None where they are too few or too many."""
+        """A joint's order by RPDO1 with these bytes; None where they are too few or too many."""
         size, unpack, torque_unit, position_unit = self._readers[joint]
         if len(data) != size:
             return None

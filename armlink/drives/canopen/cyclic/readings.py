@@ -5,20 +5,20 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from armlink.bus.port import Frame
-from armlink.drives.board import Board, Event
+from armlink.drives.board import Board, DriveEvent
 from armlink.drives.canopen import emcy, faults
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.cyclic.commands import SYNC
 from armlink.drives.canopen.cyclic.wire import Wire
-from armlink.drives.canopen.faults import Known
+from armlink.drives.canopen.faults import JointStates
 from armlink.drives.canopen.pdo import TPDO1, TPDO2, TPDO3
 from armlink.drives.orders import Reading
 
 
 class ReadingFrames:
-    """What the frames of m joints say, written to what is `known` of them and to the link's board."""
+    """Readings by the frames of m joints, written to the `known` states and to the link's board."""
 
-    def __init__(self, known: Known) -> None:
+    def __init__(self, known: JointStates) -> None:
         """Nothing is decoded before `use`."""
         self._known = known
         self._wires: Sequence[Wire] = ()
@@ -35,7 +35,7 @@ class ReadingFrames:
             self._rows.append((layout.size, layout.unpack, wire.unit.position, scale, profile.torque_zero))
 
     def fill(self, board: Board, places: Sequence[int]) -> dict[int, Callable[[bytes], None]]:
-        """What takes the payload of each identifier: values go to the board, joint 0 … m−1 at its place there."""
+        """Takers of the payload of each identifier: values go to the board, joint 0 … m−1 at its place there."""
         self._board, self._places = board, places
         table: dict[int, Callable[[bytes], None]] = {}
         for joint, wire in enumerate(self._wires):
@@ -88,7 +88,7 @@ class ReadingFrames:
         self._known.emergencies.append((joint, code, register))
         if self._board is not None:
             evidence = {"code": code, "register": register}
-            self._board.events.append(Event(self._places[joint], f"{code:04X}h", emcy.name_of(code), evidence))
+            self._board.events.append(DriveEvent(self._places[joint], f"{code:04X}h", emcy.name_of(code), evidence))
 
     def reading(self, joint: int, data: bytes) -> Reading | None:
         """TPDO1: position and torque; None where the bytes are too few or too many."""

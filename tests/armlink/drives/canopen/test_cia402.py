@@ -6,8 +6,8 @@ from armlink.drives.canopen.cia402 import (
     MODE_NAMES,
     NEEDED_MODES,
     Control,
+    DriveState,
     Mode,
-    State,
     next_control,
     set_point_control,
     state_of,
@@ -16,35 +16,35 @@ from armlink.drives.canopen.cia402 import (
 
 # CiA 402, table of the status word: bits 6, 5, 3..0 as the standard prints them (x: does not matter).
 PATTERNS = {
-    State.NOT_READY: "x0xx 0000",
-    State.SWITCH_ON_DISABLED: "x1xx 0000",
-    State.READY: "x01x 0001",
-    State.SWITCHED_ON: "x01x 0011",
-    State.ENABLED: "x01x 0111",
-    State.QUICK_STOP: "x00x 0111",
-    State.FAULT_REACTION: "x0xx 1111",
-    State.FAULT: "x0xx 1000",
+    DriveState.NOT_READY: "x0xx 0000",
+    DriveState.SWITCH_ON_DISABLED: "x1xx 0000",
+    DriveState.READY: "x01x 0001",
+    DriveState.SWITCHED_ON: "x01x 0011",
+    DriveState.ENABLED: "x01x 0111",
+    DriveState.QUICK_STOP: "x00x 0111",
+    DriveState.FAULT_REACTION: "x0xx 1111",
+    DriveState.FAULT: "x0xx 1000",
 }
 
 # The drive's transitions (CiA 402 figure of the state machine): what each command does in each state.
 TRANSITIONS = {
-    (State.SWITCH_ON_DISABLED, Control.SHUTDOWN): State.READY,
-    (State.READY, Control.SWITCH_ON): State.SWITCHED_ON,
-    (State.READY, Control.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
-    (State.READY, Control.QUICK_STOP): State.SWITCH_ON_DISABLED,
-    (State.SWITCHED_ON, Control.ENABLE): State.ENABLED,
-    (State.SWITCHED_ON, Control.SHUTDOWN): State.READY,
-    (State.SWITCHED_ON, Control.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
-    (State.SWITCHED_ON, Control.QUICK_STOP): State.SWITCH_ON_DISABLED,
-    (State.ENABLED, Control.SWITCH_ON): State.SWITCHED_ON,
-    (State.ENABLED, Control.SHUTDOWN): State.READY,
-    (State.ENABLED, Control.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
-    (State.ENABLED, Control.QUICK_STOP): State.QUICK_STOP,
-    (State.QUICK_STOP, Control.ENABLE): State.ENABLED,
-    (State.QUICK_STOP, Control.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
-    (State.FAULT, Control.FAULT_RESET): State.SWITCH_ON_DISABLED,
+    (DriveState.SWITCH_ON_DISABLED, Control.SHUTDOWN): DriveState.READY,
+    (DriveState.READY, Control.SWITCH_ON): DriveState.SWITCHED_ON,
+    (DriveState.READY, Control.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.READY, Control.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.SWITCHED_ON, Control.ENABLE): DriveState.ENABLED,
+    (DriveState.SWITCHED_ON, Control.SHUTDOWN): DriveState.READY,
+    (DriveState.SWITCHED_ON, Control.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.SWITCHED_ON, Control.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.ENABLED, Control.SWITCH_ON): DriveState.SWITCHED_ON,
+    (DriveState.ENABLED, Control.SHUTDOWN): DriveState.READY,
+    (DriveState.ENABLED, Control.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.ENABLED, Control.QUICK_STOP): DriveState.QUICK_STOP,
+    (DriveState.QUICK_STOP, Control.ENABLE): DriveState.ENABLED,
+    (DriveState.QUICK_STOP, Control.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.FAULT, Control.FAULT_RESET): DriveState.SWITCH_ON_DISABLED,
 }
-BY_ITSELF = {State.NOT_READY: State.SWITCH_ON_DISABLED, State.FAULT_REACTION: State.FAULT}
+BY_ITSELF = {DriveState.NOT_READY: DriveState.SWITCH_ON_DISABLED, DriveState.FAULT_REACTION: DriveState.FAULT}
 
 
 def matches(pattern, word):
@@ -60,21 +60,21 @@ def test_every_status_word_means_what_the_standard_says():
     assert max(map(len, BY_STANDARD)) == 1
     for word in range(1 << 16):
         by_standard = BY_STANDARD[word & 0xFF]
-        assert state_of(word) is (by_standard[0] if by_standard else State.UNKNOWN)
+        assert state_of(word) is (by_standard[0] if by_standard else DriveState.UNKNOWN)
 
 
 # What the link may command from each state towards each target, written down once more by hand.
 WORDS = {
-    State.ENABLED: {
-        State.SWITCH_ON_DISABLED: 0x06,
-        State.READY: 0x07,
-        State.SWITCHED_ON: 0x0F,
-        State.ENABLED: 0x0F,
-        State.QUICK_STOP: 0x0F,
-        State.FAULT: 0x80,
+    DriveState.ENABLED: {
+        DriveState.SWITCH_ON_DISABLED: 0x06,
+        DriveState.READY: 0x07,
+        DriveState.SWITCHED_ON: 0x0F,
+        DriveState.ENABLED: 0x0F,
+        DriveState.QUICK_STOP: 0x0F,
+        DriveState.FAULT: 0x80,
     },
-    State.SWITCH_ON_DISABLED: {State.FAULT: 0x80},
-    State.QUICK_STOP: dict.fromkeys(State, 0x02),
+    DriveState.SWITCH_ON_DISABLED: {DriveState.FAULT: 0x80},
+    DriveState.QUICK_STOP: dict.fromkeys(DriveState, 0x02),
 }
 
 
@@ -82,7 +82,9 @@ WORDS = {
 def test_every_status_word_leads_to_the_one_command_of_the_table(target):
     for word in range(1 << 16):
         by_standard = BY_STANDARD[word & 0xFF]
-        expected = WORDS[target].get(by_standard[0], 0x00) if by_standard else WORDS[target].get(State.UNKNOWN, 0x00)
+        expected = (
+            WORDS[target].get(by_standard[0], 0x00) if by_standard else WORDS[target].get(DriveState.UNKNOWN, 0x00)
+        )
         assert next_control(state_of(word), target) == expected
 
 
@@ -104,8 +106,8 @@ def test_every_status_word_and_every_command_keeps_to_the_drives_own_state_machi
         state = state_of(word)
         for control in range(256):
             after = BY_ITSELF.get(state) or TRANSITIONS.get((state, command_of(control)), state)
-            assert (state is State.UNKNOWN) == (after is State.UNKNOWN)
-            if after is not State.UNKNOWN:
+            assert (state is DriveState.UNKNOWN) == (after is DriveState.UNKNOWN)
+            if after is not DriveState.UNKNOWN:
                 assert state_of(bits[after]) is after
 
 
@@ -122,8 +124,8 @@ def test_a_new_set_point_is_handed_over_by_its_handshake():
     assert set_point_control(0x1027) == 0x2F  # acknowledged: the bit falls, the target stays
 
 
-@pytest.mark.parametrize("target", [State.ENABLED, State.SWITCH_ON_DISABLED, State.QUICK_STOP])
-@pytest.mark.parametrize("start", [state for state in State if state is not State.UNKNOWN])
+@pytest.mark.parametrize("target", [DriveState.ENABLED, DriveState.SWITCH_ON_DISABLED, DriveState.QUICK_STOP])
+@pytest.mark.parametrize("start", [state for state in DriveState if state is not DriveState.UNKNOWN])
 def test_the_table_leads_from_every_state_to_its_target(start, target):
     state = start
     for _ in range(6):
@@ -133,32 +135,32 @@ def test_the_table_leads_from_every_state_to_its_target(start, target):
         assert word in list(Control)
         state = BY_ITSELF.get(state) or TRANSITIONS.get((state, Control(word)), state)
     expected = target
-    if target is State.QUICK_STOP and start is not State.ENABLED:
+    if target is DriveState.QUICK_STOP and start is not DriveState.ENABLED:
         # only an enabled drive can go to quick stop; the others have no power, or lose it
-        expected = state if state in (State.SWITCH_ON_DISABLED, State.FAULT, State.QUICK_STOP) else None
+        expected = state if state in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.QUICK_STOP) else None
     assert state is expected
 
 
-@pytest.mark.parametrize("target", [State.ENABLED, State.SWITCH_ON_DISABLED, State.QUICK_STOP])
+@pytest.mark.parametrize("target", [DriveState.ENABLED, DriveState.SWITCH_ON_DISABLED, DriveState.QUICK_STOP])
 def test_only_a_fault_gets_a_fault_reset_and_only_a_drive_without_power_a_step_up(target):
-    for state in State:
+    for state in DriveState:
         word = next_control(state, target)
-        assert (word == Control.FAULT_RESET) == (state is State.FAULT and target is not State.QUICK_STOP)
-        if target is not State.ENABLED:
+        assert (word == Control.FAULT_RESET) == (state is DriveState.FAULT and target is not DriveState.QUICK_STOP)
+        if target is not DriveState.ENABLED:
             assert word not in (Control.SHUTDOWN, Control.SWITCH_ON, Control.ENABLE)
 
 
 def test_an_unknown_state_is_commanded_nothing():
-    assert next_control(State.UNKNOWN, State.ENABLED) == Control.DISABLE_VOLTAGE
+    assert next_control(DriveState.UNKNOWN, DriveState.ENABLED) == Control.DISABLE_VOLTAGE
 
 
 def test_there_is_no_way_to_other_targets():
     with pytest.raises(ValueError, match="no transition to fault"):
-        next_control(State.READY, State.FAULT)
+        next_control(DriveState.READY, DriveState.FAULT)
 
 
 def test_states_and_modes_have_the_names_that_users_read():
-    assert [state.value for state in State] == [
+    assert [state.value for state in DriveState] == [
         "not ready to switch on",
         "switch on disabled",
         "ready to switch on",

@@ -1,6 +1,7 @@
 """Small parts: units, emergencies, PDO layouts, bus specifications, interpolation time."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
@@ -9,10 +10,11 @@ from armlink.bus.open import open_bus, parse_bus
 from armlink.drives.canopen import eds_file as data_sheet
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
-from armlink.drives.canopen.controller_setup import interpolation
+from armlink.drives.canopen.controller_setup import interpolation, reading_ranges
 from armlink.drives.canopen.emcy import name_of, parse
-from armlink.drives.canopen.units import units_from
-from armlink.errors import BadInput, BusFault
+from armlink.drives.canopen.object_dictionary import Entry
+from armlink.drives.canopen.units import Units, units_from
+from armlink.errors import BadInput, BusFault, Refused
 
 
 def test_units_of_a_geared_joint():
@@ -152,3 +154,49 @@ def test_interpolation_time_that_is_not_exact_is_within_a_percent():
     value, exponent = interpolation(1 / 333)
     assert 1 <= value <= 255
     assert value * 10.0**exponent == pytest.approx(1 / 333, rel=0.01)
+
+
+class Device:
+    """SDO access to a device that has these objects alone, by index and subindex."""
+
+    def __init__(self, objects_held: dict[tuple[int, int], int]) -> None:
+        self._held = objects_held
+
+    def has(self, entry: Entry) -> bool:
+        return (entry.index, entry.sub) in self._held
+
+    def read(self, entry: Entry) -> int:
+        return self._held[entry.index, entry.sub]
+
+
+FAST = {(0x6080, 0): 3000, (0x6091, 1): 100, (0x6091, 2): 1}
+"""3000 motor revolutions a minute behind a gear of 100: 3.14 rad/s."""
+
+
+@pytest.mark.parametrize(
+    ("held", "max_velocity", "refused"),
+    [
+        ({(0x607F, 0): 2000}, 1.9, ""),
+        ({(0x607F, 0): 2000}, 2.0, ""),
+        (
+            {(0x607F, 0): 2000},
+            2.1,
+            "607Fh:00 max profile velocity is 2000, which is 2 rad/s, .* 2.1: set it to 2100 or",
+        ),
+        ({(0x607F, 0): 0}, 2.1, ""),  # 0: no limit of its own
+        (FAST, 3.1, ""),
+        (FAST, 3.2, "6080h:00 max motor speed is 3000, which is 3.142 rad/s, .* 3.2: set it to 3056 or more, or lower"),
+        ({(0x6080, 0): 3000}, 300.0, ""),  # without a gear: 314 rad/s
+        ({}, 300.0, ""),
+    ],
+)
+def test_a_device_that_turns_no_faster_than_asked_for_is_refused(held, max_velocity, refused):
+    unit = Units(torque=0.04, position=1e-6, velocity=1e-3, encoder_step=1e-6)
+    joint = SimpleNamespace(name="elbow", settings=SimpleNamespace(address="node 5"))
+    profile = SimpleNamespace(has=lambda entry: True)
+    limits = SimpleNamespace(max_velocity=max_velocity)
+    if refused:
+        with pytest.raises(Refused, match=rf"elbow \(node 5\): {refused}"):
+            reading_ranges(Device(held), joint, unit, limits, profile)
+    else:
+        reading_ranges(Device(held), joint, unit, limits, profile)

@@ -6,8 +6,8 @@ import pytest
 
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.check.power_test import PowerTest
-from armlink.drives.canopen.check.self_test import SelfTest
-from armlink.drives.canopen.cia402 import State
+from armlink.drives.canopen.check.self_test import CanopenSelfTest
+from armlink.drives.canopen.cia402 import DriveState
 from armlink.errors import BusFault
 
 
@@ -53,9 +53,9 @@ def test_a_joint_without_a_deadline_is_not_left_without_commands():
 @pytest.mark.parametrize(
     ("state", "seconds", "outcome", "says"),
     [
-        (State.QUICK_STOP, 0.12, "passed", "quick stop after 120 ms (set to 100 ms), no emergency"),
-        (State.QUICK_STOP, 0.25, "failed", "quick stop too late, after 250 ms (set to 100 ms), no emergency"),
-        (State.ENABLED, 0.3, "failed", "does nothing within 300 ms (set to 100 ms)"),
+        (DriveState.QUICK_STOP, 0.12, "passed", "quick stop after 120 ms (set to 100 ms), no emergency"),
+        (DriveState.QUICK_STOP, 0.25, "failed", "quick stop too late, after 250 ms (set to 100 ms), no emergency"),
+        (DriveState.ENABLED, 0.3, "failed", "does nothing within 300 ms (set to 100 ms)"),
     ],
 )
 def test_a_quick_stop_in_time_passes(state, seconds, outcome, says):
@@ -68,7 +68,7 @@ def test_a_joint_that_loses_its_power_is_told_with_its_emergency():
     bench = Bench()
     bench.known.emergencies = [(0, 0x8110, b""), (1, 0x8130, b"")]
     bench.known.node_states = {1: 4}
-    bench.test._judge(1, "heartbeat of the host", State.SWITCH_ON_DISABLED, 0.1, 0.1)
+    bench.test._judge(1, "heartbeat of the host", DriveState.SWITCH_ON_DISABLED, 0.1, 0.1)
     ((name, _, outcome, says, seconds),) = bench.told
     assert (name, outcome, seconds) == ("b", "failed", 0.1)
     assert "expected quick stop, after 100 ms (set to 100 ms), emergency 8130h, NMT " in says
@@ -96,7 +96,7 @@ def test_no_joint_is_driven_unless_asked_for_and_all_before_has_passed(outcome, 
         progress=None,
         _add=lambda *each: told.append(each),
     )
-    SelfTest._with_power(test, power)
+    CanopenSelfTest._with_power(test, power)
     assert len(ran) == (says is None)
     assert {each[2:] for each in told} == ({("not run", says)} if says else set())
     assert len(told) == (2 * len(PowerTest.CHECKS) if says else 0)

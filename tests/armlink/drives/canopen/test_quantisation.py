@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from armlink.drives.canopen.cyclic.commands import CommandFrames
 from armlink.drives.canopen.cyclic.wire import Wire
-from armlink.drives.canopen.faults import Known
+from armlink.drives.canopen.faults import JointStates
 from armlink.drives.canopen.profile import OURS
 from armlink.drives.canopen.units import Units
 from armlink.drives.orders import Limits, Mode, Order, Power
@@ -18,7 +18,7 @@ UNIT = Units(0.04, 2 * math.pi / 2**20, 2 * math.pi / 2**20, 1e-6)
 
 
 def drives(lower=-2.0, upper=2.0, unit=UNIT):
-    found = CommandFrames(Known(("joint_1",)), host=127, beat_every=0.05, period=0.004)
+    found = CommandFrames(JointStates(("joint_1",)), host=127, beat_every=0.05, period=0.004)
     found.use([Wire(1, OURS, unit, Limits(30.0, 200.0, 1.0, lower, upper, 0.1, 0.004))])
     return found
 

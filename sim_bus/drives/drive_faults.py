@@ -1,8 +1,38 @@
-"""Readings of a joint that are not what its sensors say: false, or sent by a second node in its name."""
+"""Faults of drives that are no CANopen nodes: their kinds, and readings that are false or sent by a second node."""
 
+import math
+from dataclasses import dataclass
 from itertools import product
 
-from sim_bus.drives.fault_kinds import FaultKind
+
+@dataclass(frozen=True)
+class FaultKind:
+    """One kind of fault: whether it belongs to a joint, meaning of its value, and its effect."""
+
+    id: str
+    per_joint: bool
+    value: str
+    """Meaning and unit of the value; empty if there is none."""
+    default: float
+    does: str
+
+
+DRIVE_KINDS = {
+    kind.id: kind
+    for kind in (
+        FaultKind("drive.trip", True, "", 0.0, "the drive's watchdog trips although its host is there"),
+        FaultKind("drive.latched", True, "", 0.0, "the same, and nothing but a power cycle clears it"),
+        FaultKind("drive.mode", True, "mode", 2.0, "the drive finds itself in this mode of control"),
+        FaultKind("drive.classic", True, "", 0.0, "the drive answers CAN FD frames by classical ones"),
+        FaultKind("scale.position", True, "factor", 1.25, "positions are coded by a range this much larger than told"),
+        FaultKind("scale.velocity", True, "factor", 1.25, "velocities are coded by a range this much larger than told"),
+        FaultKind("scale.torque", True, "factor", 1.25, "torques are coded by a range this much larger than told"),
+        FaultKind("feedback.lost", True, "", math.inf, "the drive has lost its encoder, or sends no feedback"),
+        FaultKind("watchdog.off", True, "", 0.0, "the watchdog's setting is accepted and does nothing"),
+    )
+}
+"""By id."""
+
 
 QUANTITIES = ("position", "velocity", "torque")
 UNITS = {"position": "rad", "velocity": "rad/s", "torque": "N·m"}
@@ -29,7 +59,7 @@ FALSE_READINGS = {
 
 
 class FalseReadings:
-    """What one joint's frames tell instead of its readings."""
+    """Falsehoods of one joint's frames."""
 
     def __init__(self) -> None:
         """The truth."""
@@ -56,7 +86,7 @@ class FalseReadings:
         return any(f"{how}.{quantity}" in self._faults for how, quantity in product(SECOND_SENDER, quantities))
 
     def told(self, quantity: str, true: float, second: bool = False) -> float:
-        """What is told of a quantity, by the joint itself or by a second node."""
+        """A quantity as the joint itself, or a second node, tells it."""
         faults = self._faults
         if second:
             if (forged := faults.get(f"forged.{quantity}")) is not None:
