@@ -81,8 +81,8 @@ def refusal(
         if why == gate.VELOCITY:
             return (
                 f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, limit "
-                f"{gate.speed_limit(limit, other):.3g} (max_velocity and its margin){_by_positions(now, other)}: command "
-                "less torque, or raise max_velocity"
+                f"{gate.speed_limit(limit, other):.3g} (max_velocity and its margin){_by_positions(now, other)}: "
+                "command less torque, or raise max_velocity"
             )
         if why == gate.WINDOW:
             lower, upper = limit.lower - limit.outside, limit.upper + limit.outside
