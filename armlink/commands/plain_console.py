@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.progress import TextColumn
 from rich.segment import Segment
 from rich.status import Status
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from armlink.commands.fitted_table import fitted
@@ -91,11 +91,11 @@ class _PlainStatus(Status):
 
 
 class PlainColumn(TextColumn):
-    """A column of a progress bar whose text is no markup."""
+    """A column of a progress bar whose text is no markup, and wraps where the terminal is narrow."""
 
     def __init__(self, text_format: str) -> None:
         """`text_format` as rich has it: `{task.description}`."""
-        super().__init__(text_format, markup=False)
+        super().__init__(text_format, markup=False, table_column=Column(overflow="fold"))
 
     def render(self, task: Any) -> Text:
         """The text, measured as it is shown."""

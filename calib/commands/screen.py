@@ -29,15 +29,18 @@ class SweepScreen:
     """A progress bar with readings done, time left and what is being done; a context manager."""
 
     def __init__(self, title: str) -> None:
-        """With `title` before the bar."""
+        """With `title` before the bar, or above it on a narrow terminal."""
+        above = _CONSOLE.width < 100  # title, bar and reading do not fit in a line
+        if above:
+            _CONSOLE.print(title)
         columns = (
             PlainColumn("{task.description}"),
-            BarColumn(),
+            BarColumn(bar_width=min(40, _CONSOLE.width // 5)),
             PlainColumn("{task.completed:.0f}/{task.total:.0f}"),
             PlainColumn("{task.fields[left]} left  {task.fields[text]}"),
         )
         self._progress = Progress(*columns, console=_CONSOLE, transient=False)
-        self._task = self._progress.add_task(title, total=1, left="?", text="connecting")
+        self._task = self._progress.add_task("" if above else title, total=1, left="?", text="connecting")
 
     def update(self, done: int, total: int, seconds_left: float, text: str) -> None:
         """As run_sweep's progress."""

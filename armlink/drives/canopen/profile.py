@@ -30,7 +30,7 @@ LOST: Mapping[Entry, str] = {
     objects.VELOCITY: "no velocity reading: no torque control",
     objects.RATED_TORQUE: "rated torque as the arm file has it",
     objects.SUPPORTED_MODES: "modes as they are displayed",
-    objects.MODE_DISPLAY: "a refused mode shows by the motion alone",
+    objects.MODE_DISPLAY: "only the motion shows that a mode is refused",
     objects.TORQUE_OFFSET: "nothing latched to clear",
     objects.PROFILE_VELOCITY: "no profile position mode",
     objects.TORQUE_SLOPE: "no profile torque mode",

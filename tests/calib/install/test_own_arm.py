@@ -120,7 +120,7 @@ def test_sweeps_tell_the_drives_and_of_two_arms_are_refused() -> None:
     assert drives_of([swept(), swept()]) == ()
     assert drives_of([swept("1:1:a", "1:1:b"), swept(), swept("1:1:c", "1:1:b")]) == ("1:1:c", "1:1:b")
     assert swept("", "").manifest.drives == ()
-    with pytest.raises(Refused, match="they are of two arms"):
+    with pytest.raises(Refused, match="they come from two arms"):
         drives_of([swept("1:1:a", ""), swept("1:1:c", "")])
 
 

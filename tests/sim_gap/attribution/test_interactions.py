@@ -112,7 +112,7 @@ def test_a_payload_of_one_training_and_of_the_held_out_recording(groups):
     ]
     answer = diagnose(model(), made[:2], made[2:], labels=["a", "b", "c"], groups=groups)
     assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(1.2, rel=0.05)
-    assert "link.payload is present in b and c alone" in answer.notes
+    assert "link.payload is present only in b and c" in answer.notes
     assert np.all(answer.heldout_after < 0.1)
 
 
@@ -165,7 +165,7 @@ def test_loaded_recordings_judged_on_one_without_the_body():
     answer = diagnose(model(), made[:2], made[2:], labels=["a", "b", "c"])
     assert answer.verdict == "explained"
     assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(0.6, rel=0.03)
-    assert "link.payload is present in a and b alone" in answer.notes
+    assert "link.payload is present only in a and b" in answer.notes
     assert "second half" in answer.heldout_is
 
 

@@ -110,7 +110,7 @@ def test_joints_that_go_faster_than_in_training_are_noted() -> None:
     arm = SimpleNamespace(names=("shoulder", "elbow"))
     found = SimpleNamespace(sim=SimpleNamespace(arm=arm), search=SimpleNamespace(data=fitted), heldout=other)
     (note,) = _faster(found)
-    assert "shoulder up to 1.5 rad/s (fitted 0.2)" in note
+    assert "shoulder up to 1.5 rad/s (in training 0.2)" in note
     assert "elbow" not in note
     assert _faster(SimpleNamespace(sim=found.sim, search=found.search, heldout=fitted)) == []
 
