@@ -152,7 +152,7 @@ class ODriveAxis(SimulatedDrive):
                 kp = gain * self._position_gain
                 self.motor.impede(kp, gain, position, velocity, torque + self._integral, limit)
             else:
-                # so near to its speed that its torque does not saturate: a drive runs its loop many times in a step here
+                # so near to its speed that its torque does not saturate: a drive runs its loop many times in this step
                 reach, speed = limit / gain / 2, self.motor.velocity
                 pace = max(speed - reach, min(speed + reach, max(-most, min(most, wanted))))
                 self.motor.impede(0.0, gain, 0.0, pace, torque + self._integral, limit)
