@@ -14,9 +14,7 @@ from armlink.content.printable_text import PrintableFormatter, printable_text
 from armlink.contributed import contributed
 from armlink.termination import terminate_as_interrupt
 
-PURPOSE = (
-    "Calibrates a robot arm's joint torque sensors over CAN, learns its gravity model, explains the sim-to-real gap."
-)
+PURPOSE = "Calibrates, watches and diagnoses robot arms, with and without torque sensors in their joints."
 USAGE_STATUS = 2
 INTERRUPTED_STATUS = 130
 COLLECTIONS = ("all", "dev")
@@ -128,6 +126,8 @@ def _invoke(point: EntryPoint, arguments: list[str]) -> int:
 
     import typer
 
+    from armlink.commands.options import GroupedCommand
+
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(PrintableFormatter())
     target = point.load()
@@ -136,7 +136,7 @@ def _invoke(point: EntryPoint, arguments: list[str]) -> int:
         arguments = arguments or ["--help"]
     else:
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-        app.command(name=point.name)(target)
+        app.command(name=point.name, cls=GroupedCommand)(target)
     try:
         outcome = app(args=arguments, prog_name=f"armlink {point.name}", standalone_mode=False)
     except typer.Abort:

@@ -10,8 +10,7 @@ from side_by_side import Case
 
 from armlink.recording.files import save_recording
 from armlink.recording.recording import Recording
-from sim_gap.fleet.cluster import cluster
-from sim_gap.fleet.fleet import diagnose_fleet, find_cases
+from sim_gap.fleet import cluster, diagnose_fleet, find_cases
 
 RECORDINGS = 200
 SECONDS, RATE = 15.0, 50.0

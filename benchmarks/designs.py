@@ -8,7 +8,7 @@ from armlink.arm_file import load_arm
 from calib.arm.kinematics import gcomp_arm
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import base_parameters
-from gcomp.design.sweep_design import Sweep, choose_sweeps, readings_of, stop_combinations
+from gcomp.design.sweep_design import JointSweep, choose_sweeps, readings_of, stop_combinations
 from gcomp.gravity.torque import torque_covariance
 from gcomp.identify.global_fit import Prediction, predict_covariance
 from gcomp.identify.parameters import Parameters
@@ -55,7 +55,7 @@ def compare(
 
     def at_random() -> np.ndarray:
         sweeps = [
-            Sweep(joint, pose, np.linspace(arm.lower[joint], arm.upper[joint], STEPS))
+            JointSweep(joint, pose, np.linspace(arm.lower[joint], arm.upper[joint], STEPS))
             for joint in range(arm.n)
             for pose in rng.permutation(stop_combinations(arm, joint))[:poses]
         ]

@@ -23,12 +23,11 @@ from calib.creep.run import run_creep
 from calib.creep.verify import verify_creeping
 from calib.fit.gravity_fit import GravityFit, identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
-from calib.observer.choice import observer_of
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
+from calib.observer.observer import observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.data_sets import data_sets
-from calib.sweep.dataset import SweepData
+from calib.sweep.dataset import SweepData, data_sets
 from calib.sweep.run import Progress, run_sweep
 from calib.sweep.verify import Verification, run_verify
 from gcomp.arrays import Array
@@ -39,12 +38,12 @@ ArmLike: TypeAlias = ArmFile | str | Path
 SweepLike: TypeAlias = SweepData | str | Path
 """The data set of a pass of sweeps: loaded, or its folder."""
 Calibrated: TypeAlias = SensorFit | CreepCalibration
-"""What `calibrate` finds: in steps at rest, or in creep sweeps of drives whose torque is a motor current."""
+"""Result of `calibrate`: from steps at rest, or from creep sweeps of drives whose torque is a motor current."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What the observer found in a recording."""
+    """Findings of the observer in a recording."""
 
     names: tuple[str, ...]
     """Joints, base to tip."""
@@ -151,7 +150,9 @@ def identify(*sweeps: SweepLike, arm: ArmLike | None = None, sensors: Calibrated
     arm_file = _arm_of(data, arm)
     found = sensors or _calibrated(arm_file, data)
     if isinstance(found, CreepCalibration) != all_creep(data):
-        raise BadInput("identify: sensors: found in sweeps of the other kind (creep, steps at rest): leave them out")
+        raise BadInput(
+            "identify: sensors: these were found in sweeps of the other kind (creep or steps): leave the argument out"
+        )
     return gravity_fit(found.fit) if isinstance(found, CreepCalibration) else identify_gravity(arm_file, data, found)
 
 

@@ -10,7 +10,7 @@ from armlink.link.link import Link
 from armlink.recording.files import load_recording
 from sim_bus.bus.lock_step import LockStepBus
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.experiment.collect import collect
+from sim_gap.experiment import collect
 
 path = Path(__file__).with_name("planar3.yaml")  # its sim.effects belong to the simulated arm, not to the model
 arm, bus = load_arm(str(path)), LockStepBus(str(path))

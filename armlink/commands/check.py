@@ -30,7 +30,9 @@ def check(
     arm: Arm,
     bus: OtherBus = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the joints are enabled.")] = False,
-    passive: Annotated[bool, typer.Option("--passive", help="Only what needs no power: read, configure.")] = False,
+    passive: Annotated[
+        bool, typer.Option("--passive", help="Only the checks that need no power: they read and configure.")
+    ] = False,
     host: Annotated[
         bool, typer.Option("--host", help="Measure how well this machine keeps the cycle instead; needs no bus.")
     ] = False,
@@ -60,8 +62,9 @@ def check(
     Example: armlink check sarcos --bus socketcan:vcan0 --yes --json -
     """
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole, confirm
+    from armlink.commands.plain_console import PlainConsole, command_line, confirm, results, suggest
     from armlink.errors import BadInput, BusFault, Refused
     from armlink.link.link import Link
     from armlink.loop.open import open_arm
@@ -73,7 +76,7 @@ def check(
         return _check_host(console, described, seconds, json)
     if scales is not None:
         return _check_scales(console, described, bus, scales, seconds, yes, json)
-    with open_arm(described, bus) as link:
+    with early_end(described) as work, open_arm(described, bus) as link:
         simulated = isinstance(link, Link) and link.bus.clock is not None
         if not (passive or yes or simulated):
             deadline = described.require_link().deadline * 1e3
@@ -82,23 +85,26 @@ def check(
             if not console.is_terminal:
                 raise BadInput("check: nobody to ask: give --yes, or --passive for what needs no power")
             confirm("Go on?")
+        work.enabled = not passive
         with console.status("check") as status:
-            results, channel = link.inside(self_test, status.update, not passive)
-    console.print(_table(f"{described.name} on {channel}", link.names, results))
-    for each in results:
+            found, channel = link.inside(self_test, status.update, not passive)
+    out = results(json)
+    out.print(_table(f"{described.name} on {channel}", link.names, found))
+    for each in found:
         if each.outcome in ("failed", "absent"):
-            console.print(f"{each.joint}: {each.check}: {each.found}")
-    failed = [each for each in results if each.outcome == "failed"]
-    write_json(json, _answer(described.name, described.serial, channel, results))
+            out.print(f"{each.joint}: {each.check}: {each.found}")
+    failed = [each for each in found if each.outcome == "failed"]
+    write_json(json, _answer(described.name, described.serial, channel, found))
     if any(each.check == "answers" for each in failed):
         raise BusFault(
             f"no answer from {', '.join(each.joint for each in failed if each.check == 'answers')} on {channel}"
         )
     if failed:
         first = failed[0]
-        raise Refused(
-            f"check: {len(failed)} of {len(results)} failed, first {first.joint}: {first.check}: {first.found}"
-        )
+        raise Refused(f"check: {len(failed)} of {len(found)} failed, first {first.joint}: {first.check}: {first.found}")
+    passed = sum(each.outcome == "passed" for each in found)
+    out.print(f"all {passed} checks passed; the joints {'were not enabled' if passive else 'hold, in quick stop'}")
+    suggest(command_line("sweep", arm, "--plan", bus=bus))
     return 0
 
 
@@ -123,6 +129,7 @@ def _check_scales(
 def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path | None) -> int:
     """Lateness of this machine's cycle at the arm's rate, and the rate that it holds."""
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import results
     from armlink.errors import Refused
     from armlink.link.lateness import WARN_SHARE
     from armlink.selftest.host import measure_host
@@ -140,11 +147,12 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
         "realtime": str(report.realtime),
     }
     write_json(json, answer)
-    console.print(
+    out = results(json)
+    out.print(
         f"cycles began late by {late['p50']:.2f} ms (median), {late['p99']:.2f} (99 %), {late['p99_9']:.2f} (99.9 %),"
         f" {late['max']:.2f} (longest); {report.busy * 1e3:.2f} ms of processor time each; {report.realtime}",
     )
-    console.print(f"this machine holds {report.holds_hz:g} Hz; the arm file asks for {section.rate:g}")
+    out.print(f"this machine holds {report.holds_hz:g} Hz; the arm file asks for {section.rate:g} Hz")
     limit = WARN_SHARE * section.deadline * 1e3
     if late["p99_9"] > limit:
         raise Refused(

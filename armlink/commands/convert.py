@@ -26,7 +26,7 @@ def convert(
     Example: armlink convert run.mcap run.csv.gz
     """
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recording, save_recording
@@ -46,12 +46,11 @@ def convert(
         save_recording(recording, target)
     except OSError as error:
         raise BadInput(f"{target}: cannot write it: {error.strerror}") from None
-    console = PlainConsole()
     if recording.warning:
-        console.print(f"{source}: {recording.warning}")
+        PlainConsole().print(f"{source}: {recording.warning}", style="yellow")
     rows, seconds = int(recording.t.size), float(recording.t[-1] - recording.t[0])
     channels = list(recording.channels())
-    console.print(f"{target}: {rows} rows, {seconds:.1f} s, {recording.n} joints, {', '.join(channels)}")
+    results(json).print(f"{target}: {rows} rows, {seconds:.1f} s, {recording.n} joints, {', '.join(channels)}")
     answer = {"rows": rows, "seconds": seconds, "joints": list(recording.names), "channels": channels}
     write_json(json, {**answer, "warning": recording.warning})
     return 0

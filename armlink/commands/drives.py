@@ -14,7 +14,7 @@ def drives(
     from rich.table import Table
 
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import results
     from armlink.drives.registry import family, family_names
 
     found = [family(name) for name in family_names()]
@@ -24,6 +24,8 @@ def drives(
         traits = each.traits.as_json()
         cells = [", ".join(traits[name]) if name == "bounds" else traits[name] for name in columns]
         table.add_row(each.name, *cells, each.summary)
-    PlainConsole().print(table)
+    out = results(json)
+    out.print(table)
+    out.print(f"{len(found)} drive families are installed")
     write_json(json, [{"family": each.name, "traits": each.traits.as_json()} for each in found])
     return 0

@@ -23,7 +23,7 @@ def guard(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json, write_out
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results, suggest
     from armlink.errors import BadInput
     from armlink.guard import bus_guard
     from armlink.link.link import Link
@@ -37,8 +37,9 @@ def guard(
     with Link.open(described, bus) as link:
         rules = link.guard_rules()
     write_json(out, {"schema": bus_guard.SCHEMA, "arm": described.name, "serial": described.serial, **rules})
-    console = PlainConsole()
-    console.print(f"{len(rules['frames'])} identifiers; start the guard with")
-    console.print(f"  python3 -I {bus_guard.__file__} {out} arm0 can0")
-    console.print("where arm0 is an interface of the programs' own (ip link add arm0 type vcan) and can0 is the arm's")
+    results(out).print(f"{out}: {len(rules['frames'])} identifiers may pass")
+    suggest(f"python3 -I {bus_guard.__file__} {out} arm0 can0")
+    PlainConsole().print(
+        "It starts the guard between arm0, which programs use (ip link add arm0 type vcan), and can0, the arm's bus."
+    )
     return 0

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 REFRESH_SECONDS = 0.2
 ONCE_SECONDS = 0.5
 STREAM_SECONDS = 0.02
-COLUMNS = ("joint", "node", "position\nrad", "torque\nN·m", "motor\nN·m", "state", "NMT", "age\ns")
+COLUMNS = ("joint", "node", "position [rad]", "torque [N·m]", "motor [N·m]", "state", "NMT", "age [s]")
 
 
 def monitor(
@@ -56,7 +56,7 @@ def monitor(
     from armlink.arm_file import load_arm
     from armlink.bus.open import open_link_bus
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BusFault
     from armlink.monitor.monitor import Monitor
 
@@ -81,11 +81,17 @@ def monitor(
     finally:
         opened.shutdown()
         if answer:
-            console.print(_table(title, answer))
+            out = results(json)
+            out.print(_table(title, answer))
+            out.print(f"{sum(map(_is_heard, answer['joints']))} of {len(answer['joints'])} joints are heard")
             write_json(json, {"arm": arm_file.name, "serial": arm_file.serial, **answer})
-    if all(joint["state"] is None and joint["position"] != joint["position"] for joint in answer["joints"]):
+    if not any(map(_is_heard, answer["joints"])):
         raise BusFault(f"{title}: no joint is heard: does a host send SYNC? (--sync sends it)")
     return 0
+
+
+def _is_heard(joint: dict[str, Any]) -> bool:
+    return joint["state"] is not None or joint["position"] == joint["position"]
 
 
 @contextlib.contextmanager
@@ -163,7 +169,7 @@ def _cycle(cycle: dict[str, Any] | None) -> list[str]:
         f"{cycle['period_ms']:.3f} ms, jitter {cycle['jitter_ms']:.3f} ms, longest {cycle['longest_period_ms']:.3f} ms",
         f"SYNC to the last reading: p50 {cycle['latency_p50_ms']:.3f}, p99 {cycle['latency_p99_ms']:.3f}, "
         f"p99.9 {cycle['latency_p999_ms']:.3f}, longest {cycle['latency_max_ms']:.3f} ms",
-        f"bus {cycle['load']:.1%} busy with stuff bits: {cycle['bus_ms_per_cycle']:.3f} ms of each cycle is the wire's",
+        f"bus {cycle['load']:.1%} busy, stuff bits included: {cycle['bus_ms_per_cycle']:.3f} ms of each cycle",
     ]
     most = max((count for _, count in cycle["histogram"]), default=1)
     return lines + [

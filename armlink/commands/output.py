@@ -1,4 +1,4 @@
-"""Answers for machines and messages for people: JSON to a file or standard output, tables to standard error."""
+"""Answers for machines: JSON to a file or standard output."""
 
 import math
 from pathlib import Path

@@ -1,41 +1,77 @@
-"""Text and questions of commands, on standard error: the one way of text to a terminal.
+"""The one way of text to a terminal: results on standard output; progress, hints and questions on standard error.
 
 Names come from devices, models and recordings. No text is markup, and what is not printable is shown as its escape,
 so that nothing in a name can colour, link, move the cursor, turn the direction of reading or feign a line.
 """
 
-from collections.abc import Iterable
+import contextlib
+import os
+import shlex
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any, cast
 
 import typer
 from rich.console import Console, RenderableType
+from rich.live import Live
 from rich.progress import TextColumn
 from rich.segment import Segment
 from rich.status import Status
+from rich.table import Column, Table
 from rich.text import Text
 
+from armlink.commands.fitted_table import fitted
 from armlink.content.printable_text import printable_text
+
+PIPE_WIDTH = 10_000
+"""Columns of a pipe or file: no line is broken there, unless the environment says COLUMNS."""
+_on_screen: list[Live] = []
+"""Spinners and progress bars that are shown now, on any console."""
 
 
 class PlainConsole(Console):
-    """Sentences come as they are and unbroken, so that a command in one can be pasted; tables fit the width."""
+    """Sentences come as they are and unbroken, so that a command in one can be pasted; tables fit the width.
 
-    def __init__(self) -> None:
-        """On standard error; styles are given as `style` or as rich's `Text`."""
-        super().__init__(stderr=True, markup=False, emoji=False)
+    A console of this class never writes into a spinner or a progress bar of another one.
+    """
+
+    def __init__(self, *, stderr: bool = True) -> None:
+        """For progress, hints and warnings; for results see `results`. Styles are given as `style` or rich's `Text`."""
+        super().__init__(stderr=stderr, markup=False, emoji=False)
+        if not self.is_terminal and "COLUMNS" not in os.environ:
+            self.width = PIPE_WIDTH
+
+    def set_live(self, live: Live) -> Any:
+        """A spinner or progress bar is shown from now on."""
+        shown = super().set_live(live)
+        _on_screen.append(live)
+        return shown
+
+    def clear_live(self) -> None:
+        """The newest one is gone."""
+        super().clear_live()
+        if _on_screen:
+            _on_screen.pop()
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """As rich has it."""
+        """As rich has it; above a spinner or progress bar that is shown on the same terminal."""
         if all(isinstance(each, str) for each in objects):
             options = {"highlight": False, "soft_wrap": True} | options
-        super().print(*objects, **options)
+        shown = _on_screen[-1].console if _on_screen else self
+        if shown is not self and shown.is_terminal and self.is_terminal:
+            shown.print(*objects, **options)
+        else:
+            super().print(*objects, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Text of a string: of a sentence, a title or a cell, before it is measured."""
         return super().render_str(printable_text(text), **options | {"markup": False, "emoji": False})
 
     def render(self, renderable: RenderableType, options: Any = None) -> Iterable[Segment]:
-        """Segments of anything else, such as a `Text`; rich's own control codes pass."""
+        """Segments of anything else, such as a `Text` or a table; rich's own control codes pass."""
+        if isinstance(renderable, Table):
+            renderable = fitted(renderable, self, options or self.options)
         for segment in super().render(renderable, options):
             text, style, control = segment
             if control or text.isprintable() or text == "\n":
@@ -55,25 +91,57 @@ class _PlainStatus(Status):
 
 
 class PlainColumn(TextColumn):
-    """A column of a progress bar whose text is no markup."""
+    """A column of a progress bar whose text is no markup, and wraps where the terminal is narrow."""
 
     def __init__(self, text_format: str) -> None:
         """`text_format` as rich has it: `{task.description}`."""
-        super().__init__(text_format, markup=False)
+        super().__init__(text_format, markup=False, table_column=Column(overflow="fold"))
 
     def render(self, task: Any) -> Text:
         """The text, measured as it is shown."""
         return _plain(super().render(task).plain)
 
 
+def results(json: Path | None = None) -> PlainConsole:
+    """The console of a command's results: standard output, unless JSON is written there (`-`)."""
+    return PlainConsole(stderr=str(json) == "-")
+
+
+def command_line(*words: str, **options: object) -> str:
+    """A command ready to be pasted; an option is left out where its value is None."""
+    given = [(f"--{name.replace('_', '-')}", str(value)) for name, value in options.items() if value is not None]
+    return shlex.join(["armlink", *words, *(word for pair in given for word in pair)])
+
+
+def suggest(command: str) -> None:
+    """Name the next command."""
+    PlainConsole().print(f"next: {command}", style="bold")
+
+
 def confirm(question: str, *, abort: bool = True, default: bool = False) -> bool:
     """The answer to a question of yes or no; raises typer.Abort where it is no and `abort`."""
-    return typer.confirm(printable_text(question), abort=abort, default=default, err=True)
+    with _question():
+        return typer.confirm(printable_text(question), abort=abort, default=default, err=True)
 
 
 def ask(question: str, **options: Any) -> Any:
     """The answer to a question; `options` as of `typer.prompt`."""
-    return typer.prompt(printable_text(question), err=True, **options)
+    with _question():
+        return typer.prompt(printable_text(question), err=True, **options)
+
+
+@contextlib.contextmanager
+def _question() -> Iterator[None]:
+    """Spinners and progress bars stop while a person is asked, and nothing of the question goes to standard output."""
+    stopped = list(reversed(_on_screen))
+    for live in stopped:
+        live.stop()
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        for live in reversed(stopped):
+            live.start(refresh=True)
 
 
 def _plain(text: RenderableType) -> Text:

@@ -14,7 +14,7 @@ def record(
     arm: Arm,
     out: Annotated[
         Path | None,
-        typer.Argument(help="File to write, .mcap; convert makes others of it.", show_default=False),
+        typer.Argument(help="File to write (.mcap); convert makes other formats of it.", show_default=False),
     ] = None,
     frames: Annotated[
         Path | None, typer.Option(help="Write every frame here as it is: .asc, .blf or .log, by suffix.")
@@ -38,7 +38,7 @@ def record(
     from armlink.bus.open import open_link_bus
     from armlink.bus.taps import TappedBus
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import results
     from armlink.errors import BadInput, BusFault
     from armlink.recording.mcap import RecordingWriter
     from armlink.recording.recorder import Recorder
@@ -69,7 +69,7 @@ def record(
             out.unlink(missing_ok=True)
         raise BusFault(f"{opened.channel_info}: no SYNC was heard: does a host run {arm_file.name}?")
     written = " and ".join(str(path) for path in (out, frames) if path)
-    PlainConsole().print(f"{written}: {rows} rows, {last:.1f} s")
+    results(json).print(f"{written}: {rows} rows, {last:.1f} s")
     answer = {"file": out and str(out), "frames": frames and str(frames), "rows": rows, "seconds": last}
     write_json(json, {**answer, "joints": list(recorder.names)})
     return 0

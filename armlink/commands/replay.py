@@ -19,13 +19,15 @@ def replay(
     bus: Annotated[
         str | None, typer.Option(help="Play onto this bus instead: virtual:…, udp_multicast:… or socketcan:vcan….")
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.0, help="Times as fast as it was; 0: as fast as it goes.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="Speed relative to the recording; 0: as fast as possible.")
+    ] = 1.0,
     json: Annotated[Path | None, typer.Option(help="Write what was replayed here; - is standard output.")] = None,
 ) -> int:
     """Decode a raw log or a recording again; with neither TARGET nor --bus, show it as a live table at --speed.
 
     A raw log goes through the same decoding as live frames: its samples are those that armlink record --frames wrote,
-    bit for bit. A log or recording that was cut is read up to the cut, which is said. On a bus go only the joints' own
+    bit for bit. One that was cut off is read up to there, with a warning. On a bus go only the joints' own
     frames and SYNC, never a command, an SDO or NMT, and only on a virtual bus: for a listener such as
     armlink daemon --listen-only or armlink monitor. Nothing is ever replayed as torque or motion.
 
@@ -34,29 +36,30 @@ def replay(
     from armlink.arm_file import load_arm
     from armlink.bus.frame_log import is_log
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from armlink.recording.files import load_recording, save_recording
     from armlink.recording.replay import play_onto, recording_of_log, show
 
     arm_file = load_arm(arm)
-    console = PlainConsole()
     if bus is not None and target is not None:
         raise BadInput("replay: give a file to write or --bus, not both")
     recording = recording_of_log(arm_file, source) if is_log(source) else load_recording(source)
     if recording.warning:
-        console.print(f"{source}: {recording.warning}")
+        PlainConsole().print(f"{source}: {recording.warning}", style="yellow")
+    out = results(json)
     if bus is not None:
         sent = play_onto(arm_file, source, recording, bus, speed)
-        console.print(f"{source}: {sent} frames onto {bus}")
+        out.print(f"{source}: {sent} frames onto {bus}")
     elif target is not None:
         try:
             save_recording(recording, target)
         except OSError as error:
             raise BadInput(f"{target}: cannot write it: {error.strerror}") from None
-        console.print(f"{target}: {recording.t.size} rows")
+        out.print(f"{target}: {recording.t.size} rows")
     else:
-        show(recording, console, speed)
+        show(recording, out, speed)
+        out.print(f"{source}: {recording.t.size} rows")
     counts = {"rows": int(recording.t.size), "seconds": float(recording.t[-1] - recording.t[0])}
     content = {"joints": list(recording.names), "channels": list(recording.channels())}
     write_json(json, {**counts, **content, "warning": recording.warning})

@@ -17,15 +17,20 @@ def check_scales(
     console: "Console", arm: "ArmFile", bus: str | None, how: How, seconds: float, json: Path | None
 ) -> int:
     """Judge the scales, print and write what was found; raises Refused where one is off."""
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import results
     from armlink.errors import Refused
 
-    found, channel = _judge(console, arm, bus, how, seconds)
+    with early_end(arm) as work:
+        work.enabled = how == "move"
+        found, channel = _judge(console, arm, bus, how, seconds)
+    out = results(json)
     for each in found:
         judged = ", ".join(each.judged) or "nothing: it hardly moved"
-        console.print(f"{each.joint}: judged: {judged}")
+        out.print(f"{each.joint}: judged: {judged}")
         for finding in each.findings:
-            console.print(f"{each.joint}: {finding.text}", style="red")
+            out.print(f"{each.joint}: {finding.text}", style="red")
     write_json(
         json, {"schema": SCHEMA, "arm": arm.name, "bus": channel, "how": how, "joints": [_json(e) for e in found]}
     )
@@ -34,6 +39,7 @@ def check_scales(
         raise Refused(f"check --scales: {wrong[0][0]}: {wrong[0][1]}")
     if not any(each.evidence for each in found):
         raise Refused("check --scales: no joint moved enough to judge a scale: move every joint by a third of a radian")
+    out.print("every scale that could be judged is right")
     return 0
 
 

@@ -27,7 +27,7 @@ def scan(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import command_line, results, suggest
     from armlink.drives.registry import family
     from armlink.errors import BadInput
 
@@ -37,9 +37,13 @@ def scan(
     kinds = set() if described is None else {joint.settings.family for joint in described.require_link().joints}
     search = family(kinds.pop() if len(kinds) == 1 else SEARCHED).search if len(kinds) < 2 else None
     if search is not None:
-        return search(described, bus, json, write_json, PlainConsole().print)
-    assert described is not None
-    return _ask_all(described, bus, json)
+        status = search(described, bus, json, write_json, results(json).print)
+    else:
+        assert described is not None
+        status = _ask_all(described, bus, json)
+    if arm is not None and status == 0:
+        suggest(command_line("check", arm, bus=bus))
+    return status
 
 
 def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
@@ -49,7 +53,7 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     from rich.text import Text
 
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import results
     from armlink.errors import BusFault, Refused
     from armlink.link.joints.groups import traits_of
     from armlink.link.link import Link
@@ -75,7 +79,8 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
         table.add_row(name, kind, each.address, state, each.name, each.serial, each.firmware)
         node = {**vars(each), "joint": name, "family": kind, "power": each.power.value}
         nodes.append(node | {"traits": traits[each.joint].as_json()})
-    PlainConsole().print(table)
+    out = results(json)
+    out.print(table)
     write_json(json, {"bus": channel, "nodes": nodes})
     missing = [f"{link.names[each.joint]} ({each.address})" for each in found if not each.present]
     if missing:
@@ -83,4 +88,5 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     wrong = [f"{link.names[each.joint]} ({each.address}): {each.mismatch}" for each in found if each.mismatch]
     if wrong:
         raise Refused(f"{wrong[0]}: connect the right arm, or correct its drive under link.joints")
+    out.print(f"all {len(found)} joints answer")
     return 0

@@ -49,7 +49,7 @@ def _require_few_nodes(text: str, path: Path) -> None:
     def count(node: yaml.Node) -> int:
         known = counts.get(id(node))
         if known == 0:
-            raise BadInput(f"{path}: an alias stands for a part of the file in which it is")
+            raise BadInput(f"{path}: an alias refers to a part of the file that contains it")
         if known:
             return known
         counts[id(node)] = 0

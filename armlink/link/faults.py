@@ -55,7 +55,7 @@ def refusal(
         if why == gate.BAD_NUMBER:
             return f"{name}: target position is {command.position[joint]}, expected a finite number"
         if why == gate.VELOCITY and math.isnan(now.velocity):
-            return f"{name}: no velocity has come of late, and torque control needs to know it"
+            return f"{name}: no velocity has come lately, and torque control needs it"
         if why == gate.CONTRADICTION:
             return (
                 f"{name}: its positions and its velocity ({now.velocity:.3g} rad/s) contradict each other: one of them "
@@ -63,8 +63,8 @@ def refusal(
             )
         if why == gate.FALSE_TORQUE:
             return (
-                f"{name}: tells a torque of {now.torque:.3g} N·m where its gains and its order come to "
-                f"{other.ordered_torque:.3g}: torque control would start from a false one (docs/safety.md, Scales)"
+                f"{name}: reports a torque of {now.torque:.3g} N·m, but its gains and its command give "
+                f"{other.ordered_torque:.3g}: torque control would start from a false value (docs/safety.md, Scales)"
             )
         if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
             return (
@@ -81,8 +81,8 @@ def refusal(
         if why == gate.VELOCITY:
             return (
                 f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, limit "
-                f"{gate.speed_limit(limit, other):.3g} (max_velocity and its margin){_by_positions(now, other)}: less "
-                "torque, or a higher max_velocity"
+                f"{gate.speed_limit(limit, other):.3g} (max_velocity and its margin){_by_positions(now, other)}: "
+                "command less torque, or raise max_velocity"
             )
         if why == gate.WINDOW:
             lower, upper = limit.lower - limit.outside, limit.upper + limit.outside

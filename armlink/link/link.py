@@ -305,7 +305,9 @@ class Link(Calibrations):
         for group in self.groups:
             name, family = self.names[group.places[0]], group.family.name
             if not isinstance(group.drives, Guarded):
-                raise BadInput(f"{name}: what frames to drives of family {family} command is not in their bytes alone")
+                raise BadInput(
+                    f"{name}: a guard cannot judge frames to {family} drives: their bytes alone do not say it"
+                )
             if group.tag:
                 raise BadInput(f"{name}: a guard has one bus, this arm has several: describe each in a file of its own")
             own = [self.values.limits(place, wanted[place]) for place in group.places]

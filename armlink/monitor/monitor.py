@@ -60,7 +60,9 @@ class Monitor:
         if sync:
             silent = [group.family.name for group in self._groups if not group.drives.poll(first=False)]
             if silent:
-                raise BadInput(f"monitor --sync: drives of the family {silent[0]} send readings to commands alone")
+                raise BadInput(
+                    f"monitor --sync: drives of the family {silent[0]} send readings only in answer to commands"
+                )
             self._poll(first=True)
 
     def _poll(self, first: bool) -> None:

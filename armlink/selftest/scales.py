@@ -102,8 +102,8 @@ class ScaleFinding:
         """In a sentence."""
         what, why = " or ".join(self.quantities), "; ".join(self.evidence)
         if math.isnan(self.factor):
-            return f"{what} is no {what}: {why}"
-        return f"{what} reads {1 / self.factor:.3g} of what it is ({why})"
+            return f"the reading of {what} is unsteady: {why}"
+        return f"{what} reads {1 / self.factor:.3g} times its true value ({why})"
 
 
 def gather(

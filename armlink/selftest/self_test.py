@@ -152,7 +152,7 @@ class SelfTest:
                 continue
             held = link.read_calibration(joint)
             if name in link.uncalibrated:
-                self._add(name, "calibration", "absent", "no record in force: torque is what the drive takes it for")
+                self._add(name, "calibration", "absent", "no record in force: torque is as the drive reports it")
             else:
                 told = f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
                 self._add(name, "calibration", "passed", told)
@@ -213,7 +213,9 @@ class SelfTest:
             self._lean(joint)
             does, seconds = self._left_alone(joint)
         if does is None:
-            found = "its drive tells no state, and the joint carries no load here: repeat it where gravity pulls at it"
+            found = (
+                "its drive reports no state, and the joint carries no load here: repeat this where gravity pulls at it"
+            )
             self._add(name, "silence", "not run", found)
             return
         told = f"{does} within {seconds * 1e3:.0f} ms without a command, by its trait it {trait}"

@@ -1,6 +1,6 @@
 """The arm file's kinematics as gcomp's arm, whether given as Denavit-Hartenberg rows or as a model file."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
 from gcomp.arm.arm import Arm
 from gcomp.arm.load import ModelArm, load_model
+from gcomp.arrays import Array
 from gcomp.errors import GcompError
 
 
@@ -67,3 +68,31 @@ def _with_stops(arm_file: ArmFile, arm: Arm) -> Arm:
             raise BadInput(f"{arm_file.path}: key kinematics.stops.{name}: no joint of that name; there are {known}")
     limits = [stops.get(name, own) for name, *own in zip(arm.names, arm.lower, arm.upper, strict=True)]
     return replace(arm, lower=np.array([low for low, _ in limits]), upper=np.array([high for _, high in limits]))
+
+
+@dataclass(frozen=True, eq=False)
+class DriveLimits:
+    """Stops, and what the drives are capable of; all (n,)."""
+
+    lower: Array
+    """[rad]"""
+    upper: Array
+    """[rad]"""
+    rated: Array
+    """[N·m]"""
+    max_torque: Array
+    """[N·m]"""
+    speed: Array
+    """[rad/s]"""
+
+    @classmethod
+    def of(cls, arm_file: ArmFile) -> "DriveLimits":
+        """From the arm file's link section and joint range."""
+        kinematics, link = gcomp_arm(arm_file), arm_file.require_link()
+        return cls(
+            kinematics.lower,
+            kinematics.upper,
+            link.rated_torques,
+            np.array([joint.max_torque for joint in link.joints]),
+            np.array([joint.max_velocity for joint in link.joints]),
+        )

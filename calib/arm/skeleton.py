@@ -11,9 +11,6 @@ from gcomp.arm.arm import Arm
 from gcomp.arm.load import PlacedChain, place_chain
 from gcomp.arrays import Array
 
-STUB = 0.08
-"""Length of a last link whose end the description does not tell [m]."""
-
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
@@ -73,9 +70,9 @@ def _of_model(placed: PlacedChain, gravity: tuple[float, ...] | None) -> Skeleto
 
 
 def _with_tip(links: list[Array], axis: Array) -> tuple[Array, ...]:
-    """The links; a last one without length gets a stub along the last axis."""
+    """The links; a last one without length gets a stub of 8 cm along the last axis."""
     if len(links[-1]) < 2:
-        links[-1] = np.stack([links[-1][0], links[-1][0] + STUB * axis])
+        links[-1] = np.stack([links[-1][0], links[-1][0] + 0.08 * axis])
     return tuple(links)
 
 

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store, Sweeps, SweepsArm
+from calib.commands.options import APPLY, Bus, Check, Flash, JsonFile, Replaced, Store, Sweeps, SweepsArm
 
 if TYPE_CHECKING:
+    from armlink.commands.plain_console import PlainConsole
     from calib.fit.sensor_fit import SensorFit
     from calib.records.records import CalibrationRecord, Parameter
 
@@ -23,7 +24,10 @@ def calibrate(
     replaced: Replaced = None,
     accept: Annotated[
         list[str] | None,
-        typer.Option(help="With --apply: a joint to write although the sensor model does not hold there."),
+        typer.Option(
+            help="Joint to write although the sensor model does not hold there; may be repeated.",
+            rich_help_panel=APPLY,
+        ),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Also write a report: one self-contained HTML file.")] = None,
     store: Store = None,
@@ -33,12 +37,13 @@ def calibrate(
 
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm
-    from calib.commands.creep.fits import calibrate_creep
-    from calib.commands.screen import print_lines
-    from calib.commands.sweep_data import load_sweeps
+    from calib.commands.creep_fits import calibrate_creep
+    from calib.commands.options import load_sweeps
     from calib.creep.choice import all_creep
     from calib.fit.felt_mass import felt_mass
     from calib.fit.sensor_fit import fit_sensors
@@ -52,6 +57,7 @@ def calibrate(
         if apply:
             raise BadInput("--apply: the host keeps the calibration of these drives: the record is in force without it")
         calibrate_creep(data, arm_file, store, json_file)
+        suggest(command_line("identify", *map(str, directories), arm=arm, store=store))
         return
     drives = drives_of(data)
     fit = fit_sensors(arm_file, data)
@@ -64,7 +70,8 @@ def calibrate(
         records.add(record)
         write_json(json_file, _answer(fit, record, False))
         raise Refused(f"{felt} Record {record.id} is kept, and not made current")
-    _show(fit)
+    out = results(json_file)
+    _show(fit, out)
     if apply:
         user = getpass.getuser()
         record = record.model_copy(update={"confirmed_by": user})
@@ -76,10 +83,15 @@ def calibrate(
         how = Apply(
             by=user, bus=bus, replaced=tuple(replaced or ()), accepted=tuple(accept or ()), check=check, flash=flash
         )
-        written = apply_calibration(record, arm_file, records, data, fit, how)
-        print_lines([f"record {record.id} written to {len(written)} controllers, read back and current"])
+        again = command_line("calibrate", *map(str, directories), "--apply", arm=arm, bus=bus, store=store)
+        with early_end(arm_file, again) as work:
+            work.enabled = check
+            written = apply_calibration(record, arm_file, records, data, fit, how)
+        out.print(f"record {record.id} is current, written to {len(written)} controllers and read back")
     else:
         records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
+        out.print(f"record {record.id} is current; the controllers keep what they hold until --apply writes it to them")
+    suggest(command_line("identify", *map(str, directories), arm=arm, store=store))
     write_json(json_file, _answer(fit, record, apply))
 
 
@@ -130,23 +142,23 @@ def _attachment(fit: "SensorFit") -> dict[str, list[Any]] | None:
     }
 
 
-def _show(fit: "SensorFit") -> None:
+def _show(fit: "SensorFit", console: "PlainConsole") -> None:
     from calib.commands.screen import print_intervals, print_lines
 
     headings: dict[Parameter, str] = {"gain": "gain", "offset": "offset [N·m]", "position_gain": "position gain"}
     columns = {heading: (fit.value(name), fit.half95(name)) for name, heading in headings.items()}
     columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
-    print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns)
+    print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns, console)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
     doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
-    lines.append(f"sensors and gravity model still disagree at new poses by [N·m]: {', '.join(doubts)}")
+    lines.append(f"at new poses, sensors and gravity model still disagree by [N·m]: {', '.join(doubts)}")
     lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
     if fit.gain_ratio is not None:
         ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
         lines.append(f"gains relative to the last joint's: {ratios}")
-    print_lines(lines)
-    print_lines([finding.text for finding in fit.findings], "yellow")
+    print_lines(lines, console=console)
+    print_lines([finding.text for finding in fit.findings], "yellow", console)
     worst = max(fit.goodness.left_out, key=lambda each: each.ratio, default=None)
     if worst is not None:
         worst_sweep = f"worst sweep ({worst.sweep}) at {worst.ratio:.1f} times its expected error"
-        print_lines([f"cross-validation: {worst_sweep}"])
+        console.print(f"cross-validation: {worst_sweep}")

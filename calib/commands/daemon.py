@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from calib.commands.options import StoreUrl
+
 
 class Policies(StrEnum):
     """Treatment of a drift that was found."""
@@ -32,15 +34,25 @@ def daemon(
         ),
     ] = False,
     socket: Annotated[
-        Path | None, typer.Option(help="Unix socket of API and page; default api.sock in the state directory.")
+        Path | None,
+        typer.Option(
+            help="Unix socket of API and page; default api.sock in the state directory.", rich_help_panel="Page and API"
+        ),
     ] = None,
-    tcp: Annotated[str | None, typer.Option(help="Serve on HOST:PORT too; needs --token-file.")] = None,
-    token_file: Annotated[Path | None, typer.Option(help="File with the token that TCP clients must send.")] = None,
-    policy: Annotated[Policies | None, typer.Option(help="Instead of the arm file's daemon.policy.")] = None,
+    tcp: Annotated[
+        str | None, typer.Option(help="Serve on HOST:PORT too; needs --token-file.", rich_help_panel="Page and API")
+    ] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(help="File with the token that TCP clients must send.", rich_help_panel="Page and API"),
+    ] = None,
+    policy: Annotated[
+        Policies | None, typer.Option(help="What to do about a drift, instead of the arm file's daemon.policy.")
+    ] = None,
     state: Annotated[
         Path | None, typer.Option(help="Directory of journal and recordings; default the user's state directory.")
     ] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    store: StoreUrl = None,
     work: Annotated[
         bool, typer.Option("--work", help="Move the arm among random poses: for trying it on a simulated arm.")
     ] = False,

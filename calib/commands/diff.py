@@ -8,7 +8,8 @@ import typer
 from calib.commands.options import JsonFile, Store
 
 if TYPE_CHECKING:
-    from calib.records.compare import Change
+    from armlink.commands.plain_console import PlainConsole
+    from calib.records.compare import ParameterChange
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore
 
@@ -27,13 +28,14 @@ def diff(
     Example: armlink diff 1f0c9a2b 77e01d3c --json -
     """
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import results
     from calib.records.compare import differences
     from calib.records.store import RecordStore
 
     records = RecordStore(store)
     old, new = (_record(records, each) for each in (before, after))
     changes = differences(old, new)
-    _show(old, new, changes)
+    _show(old, new, changes, results(json_file))
     rows = [{**vars(each), "change": each.change, "deviations": each.deviations} for each in changes]
     sides = {
         side: {"id": each.id, "created": each.created.isoformat(), "sources": each.sources, "software": each.software}
@@ -50,15 +52,17 @@ def _record(records: "RecordStore", given: str) -> "CalibrationRecord | GravityR
 
 
 def _show(
-    old: "CalibrationRecord | GravityRecord", new: "CalibrationRecord | GravityRecord", changes: "list[Change]"
+    old: "CalibrationRecord | GravityRecord",
+    new: "CalibrationRecord | GravityRecord",
+    changes: "list[ParameterChange]",
+    console: "PlainConsole",
 ) -> None:
     from rich.table import Table
-
-    from armlink.commands.plain_console import PlainConsole
 
     when = [f"{each.id} of {each.created:%Y-%m-%d %H:%M}" for each in (old, new)]
     title = f"{old.arm} {old.serial}: {old.kind} {' → '.join(when)}"
     table = Table("joint", "parameter", "unit", old.id, new.id, "change", "in std", title=title)
+    count = 0
     for each in changes:
         if each.before is None and each.after is None:
             continue
@@ -67,7 +71,9 @@ def _show(
         deviations = _text(each.deviations, "+.1f")
         row = (each.joint, each.parameter.replace("_", " "), each.unit, *cells, deviations)
         table.add_row(*row, style="bold" if striking else None)
-    PlainConsole().print(table)
+        count += striking
+    console.print(table)
+    console.print(f"{count} of {table.row_count} values changed by at least {STRIKING:g} standard deviations")
 
 
 def _text(value: float | None, form: str) -> str:

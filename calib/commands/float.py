@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from armlink.commands.options import Arm, OtherBus
+from calib.commands.options import StoreUrl
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -16,13 +17,13 @@ if TYPE_CHECKING:
 def hold_afloat(
     arm: Arm,
     bus: OtherBus = None,
-    seconds: Annotated[float, typer.Option(min=0.0, help="End after so long; 0 is until Ctrl-C [s].")] = 0.0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Duration [s]; 0: until Ctrl-C.")] = 0.0,
     record: Annotated[
         str | None, typer.Option(help="Id of a gravity record; default: the current one, else the model's inertials.")
     ] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    store: StoreUrl = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write how it went here; - is standard output.")
+        Path | None, typer.Option("--json", help="Write a summary here; - is standard output.")
     ] = None,
 ) -> None:
     """Feed the gravity torque forward until Ctrl-C; then every joint holds where it is.
@@ -34,8 +35,9 @@ def hold_afloat(
     from contextlib import suppress
 
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, command_line, results
     from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
     from calib.commands.screen import warn_late
@@ -44,8 +46,10 @@ def hold_afloat(
     arm_file = load_arm(arm)
     beta, calibration, source = _model(arm_file, record, store)
     screen = PlainConsole()
-    with open_arm(arm_file, bus) as link:
+    resume = command_line("float", arm, bus=bus, record=record, store=store)
+    with early_end(arm_file, resume) as work, open_arm(arm_file, bus) as link:
         link.start()
+        work.enabled = True
         link.enable()
         screen.print(f"{arm_file.name}: floating by {source}; Ctrl-C ends it")
         try:
@@ -54,7 +58,7 @@ def hold_afloat(
             with suppress(ArmlinkError):
                 lateness = link.stats.lateness
                 warn_late(arm_file, lateness)
-    screen.print(f"floated {result.seconds:.1f} s")
+    results(json_file).print(f"floated {result.seconds:.1f} s")
     write_json(
         json_file,
         {
@@ -76,9 +80,8 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
 
     from armlink.errors import BadInput
     from calib.arm.kinematics import model_arm
-    from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
-    from calib.records.store import RecordStore
+    from calib.records.store import RecordStore, no_record
 
     records = RecordStore(store)
     calibration = records.current(CalibrationRecord, arm_file)

@@ -10,6 +10,7 @@ from armlink.commands.options import Arm
 from calib.commands.options import JsonFile, Store
 
 if TYPE_CHECKING:
+    from armlink.commands.plain_console import PlainConsole
     from calib.records.store import Activation, ControllerWrite
 
 
@@ -29,6 +30,7 @@ def history(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json, write_out
+    from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
     from calib.records.store import RecordStore
 
@@ -60,19 +62,24 @@ def history(
         for kept in records.history(arm_file)
     ]
     title = f"{arm_file.name} {arm_file.serial} in {records.url}"
-    _print(title, rows, log, writes)
+    _print(title, rows, log, writes, results(json_file))
+    if not rows:
+        suggest(command_line("sweep", arm, "--plan"))
     answer = {"arm": arm_file.name, "serial": arm_file.serial, "records": rows}
     answer["activations"] = [vars(line) for line in log]
     answer["controller_writes"] = [vars(line) for line in writes]
     write_json(json_file, answer)
 
 
-def _print(title: str, rows: list[dict[str, Any]], log: "list[Activation]", writes: "list[ControllerWrite]") -> None:
+def _print(
+    title: str,
+    rows: list[dict[str, Any]],
+    log: "list[Activation]",
+    writes: "list[ControllerWrite]",
+    console: "PlainConsole",
+) -> None:
     from rich.table import Table
 
-    from armlink.commands.plain_console import PlainConsole
-
-    console = PlainConsole()
     if not rows:
         console.print(f"{title}: no records yet")
         return
@@ -91,3 +98,5 @@ def _print(title: str, rows: list[dict[str, Any]], log: "list[Activation]", writ
     for event in sorted(happened, key=lambda each: each[0]):
         lines.add_row(*event)
     console.print(lines)
+    current = [f"{row['kind']} record {row['id']}" for row in rows if row["current"]]
+    console.print(f"current: {', '.join(current) or 'none'}")

@@ -7,6 +7,7 @@ import typer
 from calib.commands.options import JsonFile, Store, Sweeps, SweepsArm
 
 if TYPE_CHECKING:
+    from armlink.commands.plain_console import PlainConsole
     from calib.fit.gravity_fit import GravityFit
 
 
@@ -24,9 +25,10 @@ def identify(
     Example: armlink identify unloaded loaded --json gravity.json
     """
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
-    from calib.commands.creep.fits import identify_creep
-    from calib.commands.sweep_data import load_sweeps
+    from calib.commands.creep_fits import identify_creep
+    from calib.commands.options import load_sweeps
     from calib.creep.choice import all_creep
     from calib.fit.gravity_fit import identify_gravity
     from calib.fit.sensor_fit import SensorFit, fit_sensors
@@ -36,6 +38,7 @@ def identify(
     data, arm_file = load_sweeps("identify", directories, arm)
     if all_creep(data):
         identify_creep(data, arm_file, store, json_file)
+        suggest(command_line("verify", arm_file.argument, store=store))
         return
     records = RecordStore(store)
     sensors: SensorFit | CalibrationRecord
@@ -52,7 +55,10 @@ def identify(
     fit = identify_gravity(arm_file, data, sensors)
     record = fit.record(arm_file, used)
     records.put(record, arm_file, by="armlink identify", reason="sweeps")
-    _show(fit)
+    out = results(json_file)
+    _show(fit, out)
+    out.print(f"record {record.id} is current: {fit.identifiable.sum()} of {len(fit.beta)} mass moments are determined")
+    suggest(command_line("verify", arm_file.argument, store=store))
     write_json(json_file, _answer(fit, record.id))
 
 
@@ -69,7 +75,7 @@ def _answer(fit: "GravityFit", record: str) -> dict[str, Any]:
     }
 
 
-def _show(fit: "GravityFit") -> None:
+def _show(fit: "GravityFit", console: "PlainConsole") -> None:
     import numpy as np
 
     from calib.commands.screen import print_intervals
@@ -86,4 +92,5 @@ def _show(fit: "GravityFit") -> None:
             "y, recursive": (recursive[1::2], 0 * half[1::2]),
             "residual [N·m]": (fit.residual_rms, 0 * fit.residual_rms),
         },
+        console,
     )

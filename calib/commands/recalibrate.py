@@ -11,6 +11,7 @@ from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
+    from armlink.commands.plain_console import PlainConsole
     from calib.field.field_fit import FieldFit
     from calib.records.records import CalibrationRecord
     from gcomp.identify.readings import StaticReadings
@@ -40,13 +41,13 @@ def recalibrate(
     Example: armlink recalibrate sarcos slow.mcap --json -
     """
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import command_line, results, suggest
     from calib.field.field_fit import fit_field
     from calib.field.field_record import field_record
-    from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
-    from calib.records.store import RecordStore
+    from calib.records.store import RecordStore, no_record
 
     arm_file, records = load_arm(arm), RecordStore(store)
     gravity, before = records.current(GravityRecord, arm_file), records.current(CalibrationRecord, arm_file)
@@ -55,7 +56,10 @@ def recalibrate(
     rows, sources = _rows(arm_file, data, before if held == "record" else None)
     fit = fit_field(arm_file, rows, gravity, before)
     record = field_record(arm_file, fit, before, {**sources, f"gravity record {gravity.id}": gravity.id})
-    _show(fit)
+    out = results(json_file)
+    _show(fit, out)
+    given = {"held": None if held == "record" else held, "bus": bus, "store": store}
+    apply_it = command_line("recalibrate", arm, *map(str, data), "--apply", **given)
     if apply:
         import numpy as np
 
@@ -64,10 +68,14 @@ def recalibrate(
         user = getpass.getuser()
         record = record.model_copy(update={"confirmed_by": user})
         how = Apply(by=user, bus=bus, replaced=tuple(replaced or ()), check=check, flash=flash)
-        apply_field(record, arm_file, records, rows, fit, np.array(gravity.beta), how)
+        with early_end(arm_file, apply_it) as work:
+            work.enabled = check
+            written = apply_field(record, arm_file, records, rows, fit, np.array(gravity.beta), how)
+        out.print(f"record {record.id} is current, written to {len(written)} controllers and read back")
     else:
         records.add(record)
-        PlainConsole().print(f"record {record.id} is kept, not written to the controllers (--apply does that)")
+        out.print(f"record {record.id} is kept; the controllers keep what they hold until --apply writes it to them")
+        suggest(apply_it)
     write_json(json_file, _answer(fit, record, gravity.id, apply))
 
 
@@ -81,8 +89,7 @@ def _rows(
     from armlink.recording.files import load_recording
     from armlink.torque_calibration import UNCALIBRATED, per_joint
     from calib.field.rows import rows_of_recording, rows_of_sweeps
-    from calib.sweep.data_sets import labels
-    from calib.sweep.dataset import load_data
+    from calib.sweep.dataset import labels, load_data
 
     n = len(arm_file.joint_names)
     blank = per_joint([UNCALIBRATED] * n)
@@ -125,7 +132,7 @@ def _answer(fit: "FieldFit", record: "CalibrationRecord", gravity: str, applied:
     }
 
 
-def _show(fit: "FieldFit") -> None:
+def _show(fit: "FieldFit", console: "PlainConsole") -> None:
     from calib.commands.screen import print_intervals, print_lines
 
     columns = {
@@ -133,10 +140,10 @@ def _show(fit: "FieldFit") -> None:
         "offset [N·m]": (fit.offset, 1.96 * fit.std("offset")),
         "hysteresis [N·m]": (fit.hysteresis, 0 * fit.hysteresis),
     }
-    print_intervals("Sensors in the field, ± half of the 95 % interval", fit.names, columns)
+    print_intervals("Sensors in the field, ± half of the 95 % interval", fit.names, columns, console)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
     lines.append(
         f"a factor common to all gains is known to ± {1.96 * fit.common_scale_std:.2%} only (within the intervals): in"
-        " these readings it looks the same as the scale of the gravity record"
+        " these readings it cannot be separated from the scale of the gravity record"
     )
-    print_lines(lines)
+    print_lines(lines, console=console)

@@ -31,26 +31,31 @@ def rollback(
     Example: armlink rollback sarcos --to 1f0c9a2b --reason "sensor exchanged" --apply
     """
     from armlink.arm_file import load_arm
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.early_end import early_end
+    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from calib.records.store import RecordStore
 
     arm_file, records, user = load_arm(arm), RecordStore(store), getpass.getuser()
     if apply:
         from calib.install.apply import Apply
 
-        _apply(arm_file, to, records, Apply(by=user, bus=bus, check=check, replaced=tuple(replaced or ())), reason)
+        how = Apply(by=user, bus=bus, check=check, replaced=tuple(replaced or ()))
+        with early_end(arm_file, command_line("rollback", arm, "--apply", to=to, bus=bus, store=store)) as work:
+            work.enabled = check
+            _apply(arm_file, to, records, how, reason)
     else:
         records.rollback(arm_file, to, by=user, reason=reason)
     line = [each for each in records.activations(arm_file) if each.record == to][-1]
-    say = PlainConsole().print
-    say(f"{line.kind} record {to} is current on {arm_file.name} {arm_file.serial} since {line.at}")
+    results().print(f"{line.kind} record {to} is current on {arm_file.name} {arm_file.serial} since {line.at}")
     if line.kind == "calibration" and not apply:
-        keep = "the joint controllers keep what they hold: --apply writes it to them now;"
-        say(f"{keep} a daemon with policy apply writes it by itself within seconds")
+        PlainConsole().print(
+            "The controllers keep what they hold. A daemon with policy apply writes it to them within seconds."
+        )
+        suggest(command_line("rollback", arm, "--apply", to=to, bus=bus, store=store))
 
 
 def _apply(arm_file: "ArmFile", to: str, records: "RecordStore", how: "Apply", reason: str) -> None:
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import results
     from armlink.errors import BadInput
     from calib.install.apply import apply_rollback
     from calib.records.records import CalibrationRecord
@@ -61,7 +66,5 @@ def _apply(arm_file: "ArmFile", to: str, records: "RecordStore", how: "Apply", r
     if record != records.current(CalibrationRecord, arm_file):  # the current one may be written once more
         records.former(arm_file, to)
     written = apply_rollback(record, arm_file, records, how, reason)
-    PlainConsole().print(
-        f"written to {len(written)} controllers and read back; the only gate of a roll-back is the distance from what"
-        " they held"
-    )
+    gate = "a roll-back is checked for nothing but its distance from what they held"
+    results().print(f"written to {len(written)} controllers and read back; {gate}")

@@ -1,4 +1,4 @@
-"""Terminal output of the sweep commands: progress with time left, plans and results as tables on standard error."""
+"""Terminal output of the sweep commands: progress with time left, plans and results as tables."""
 
 import sys
 from collections.abc import Callable
@@ -22,21 +22,25 @@ if TYPE_CHECKING:
     from calib.sweep.preflight import Preflight
 
 _CONSOLE = PlainConsole()
+"""For progress and warnings."""
 
 
 class SweepScreen:
     """A progress bar with readings done, time left and what is being done; a context manager."""
 
     def __init__(self, title: str) -> None:
-        """With `title` before the bar."""
+        """With `title` before the bar, or above it on a narrow terminal."""
+        above = _CONSOLE.width < 100  # title, bar and reading do not fit in a line
+        if above:
+            _CONSOLE.print(title)
         columns = (
             PlainColumn("{task.description}"),
-            BarColumn(),
+            BarColumn(bar_width=min(40, _CONSOLE.width // 5)),
             PlainColumn("{task.completed:.0f}/{task.total:.0f}"),
             PlainColumn("{task.fields[left]} left  {task.fields[text]}"),
         )
         self._progress = Progress(*columns, console=_CONSOLE, transient=False)
-        self._task = self._progress.add_task(title, total=1, left="?", text="connecting")
+        self._task = self._progress.add_task("" if above else title, total=1, left="?", text="connecting")
 
     def update(self, done: int, total: int, seconds_left: float, text: str) -> None:
         """As run_sweep's progress."""
@@ -72,12 +76,10 @@ class SweepScreen:
         _CONSOLE.print(text)
 
     def __enter__(self) -> Self:
-        """Show the bar."""
         self._progress.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Leave it as it stands."""
         self._progress.stop()
 
 
@@ -87,28 +89,28 @@ def confirm(question: str) -> None:
         ask_to_confirm(question)
 
 
-def print_preflight(found: "Preflight") -> None:
+def print_preflight(found: "Preflight", console: PlainConsole) -> None:
     """Print the findings of the pre-flight, one row per joint."""
     headings = ("joint", "torque noise [N·m]", "torque at rest [N·m]", "drive [°C]", "lower stop", "upper stop [rad]")
     table = Table(*headings, title="Pre-flight")
-    for joint, name in enumerate(_without_common(found.names)):
+    for joint, name in enumerate(found.names):
         stops = [
             "not pushed" if np.isnan(at) else f"{at:.3f} (arm file {wanted:.3f})"
             for at, wanted in zip(found.stops[joint], found.expected[joint], strict=True)
         ]
         warm = "not reported" if np.isnan(found.temperature[joint]) else f"{found.temperature[joint]:.0f}"
         table.add_row(name, f"{found.noise[joint]:.3g}", f"{found.torque[joint]:.3g}", warm, *stops)
-    _CONSOLE.print(table)
+    console.print(table)
 
 
-def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
+def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
     """The sweeps of a plan as a table: where each joint rests, what presses it, range and lever of gravity."""
-    title = f"{arm.name}: {len(plan.sweeps)} sweeps"
+    title, short = f"{arm.name}: {len(plan.sweeps)} sweeps", _short(arm.joint_names)
     table = Table(
         Column("sweep", overflow="fold"),
         "from … to",
         "Γ/g",
-        *_short(arm.joint_names),
+        *short,
         title=title,
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
@@ -124,15 +126,18 @@ def print_plan(arm: ArmFile, plan: SweepPlan) -> None:
                 end = "▲" if sweep.stops[joint] > 0 else "▼"
                 cells.append(end if sweep.bias is None else f"{end}{sweep.bias[joint]:+.1f}")
         table.add_row(sweep.name, f"{sweep.steps[0]:.2f} … {sweep.steps[-1]:.2f}", f"{sweep.lever:.2f}", *cells)
-    _CONSOLE.print(table)
-    _CONSOLE.print(
-        "↔ sweeps; ▲ ▼ rests on its upper, lower stop, pressed with so many N·m; = held there by its servo [rad]",
+    console.print(table)
+    if short != list(arm.joint_names):
+        columns = (f"{number} {name}" for number, name in zip(short, arm.joint_names, strict=True))
+        console.print(f"columns: {', '.join(columns)}")
+    console.print(
+        "↔ sweeps; ▲ ▼ rests on its upper or lower stop, pressed with the torque [N·m]; = held by its servo [rad]"
     )
     for note in plan.notes:
-        _CONSOLE.print(note, style="yellow")
+        console.print(note, style="yellow")
 
 
-def unsettled_said(data: "SweepData") -> list[str]:
+def unsettled_lines(data: "SweepData") -> list[str]:
     """In one line, which readings were taken of an arm that did not stand still; nothing where there are none."""
     if not data.unsettled:
         return []
@@ -143,7 +148,7 @@ def unsettled_said(data: "SweepData") -> list[str]:
     ]
 
 
-def stalls_said(data: "SweepData") -> list[str]:
+def stall_lines(data: "SweepData") -> list[str]:
     """In one line, how often the joints had to be stopped; nothing if they never were."""
     if not data.stalls:
         return []
@@ -157,15 +162,6 @@ def warn_late(arm: ArmFile, lateness: Lateness) -> None:
     print_lines([warning] if warning else [], "yellow")
 
 
-def _without_common(names: tuple[str, ...]) -> list[str]:
-    """Names without the words that all begin with: `joint1` of openarm_right_joint1, openarm_right_joint2."""
-    words = names[0].rpartition("_")[0] + "_"
-    if len(names) < 2 or not all(name.startswith(words) for name in names):
-        return list(names)
-    short = [name.removeprefix(words) for name in names]
-    return list(names) if any(name.isdigit() for name in short) else short
-
-
 def _short(names: tuple[str, ...]) -> list[str]:
     """The numbers of names such as joint_1, joint_2; other names as they are."""
     begin = names[0].rstrip("0123456789")
@@ -173,18 +169,20 @@ def _short(names: tuple[str, ...]) -> list[str]:
     return short if all(short) else list(names)
 
 
-def print_intervals(title: str, names: tuple[str, ...], columns: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+def print_intervals(
+    title: str, names: tuple[str, ...], columns: dict[str, tuple[np.ndarray, np.ndarray]], console: PlainConsole
+) -> None:
     """Values with the half width of their 95 % interval, a row a joint; `columns` maps heading to (value, half)."""
     table = Table("joint", *columns, title=title)
-    for joint, name in enumerate(_without_common(names)):
+    for joint, name in enumerate(names):
         table.add_row(name, *(_interval(value[joint], half[joint]) for value, half in columns.values()))
-    _CONSOLE.print(table)
+    console.print(table)
 
 
-def print_lines(lines: list[str], style: str | None = None) -> None:
-    """Plain lines, or in a style of rich's such as `yellow`."""
+def print_lines(lines: list[str], style: str | None = None, console: PlainConsole = _CONSOLE) -> None:
+    """Plain lines, or in a style of rich's such as `yellow`; by default on standard error."""
     for line in lines:
-        _CONSOLE.print(line, style=style)
+        console.print(line, style=style)
 
 
 def _interval(value: float, half: float) -> str:

@@ -1,15 +1,16 @@
 """Plans, checks and runs the single-joint sweeps of an arm; continues after an interruption."""
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from armlink.commands.options import Arm, OtherBus
+from calib.commands.options import KeepGoing
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
+    from armlink.commands.plain_console import PlainConsole
     from armlink.loop.driver import ArmDriver
     from calib.commands.screen import SweepScreen
     from calib.sweep.dataset import SweepData
@@ -27,19 +28,29 @@ def sweep(
     plan: Annotated[
         bool, typer.Option("--plan", help="Print the plan from the arm file alone; nothing moves.")
     ] = False,
-    picture: Annotated[Path | None, typer.Option(help="With --plan: draw the poses into this HTML file.")] = None,
-    hold: Annotated[str | None, typer.Option(help="stops or servo: how resting joints are held.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="With --plan: draw the poses into this HTML file.", rich_help_panel="Plan")
+    ] = None,
+    hold: Annotated[
+        str | None, typer.Option(help="stops or servo: how resting joints are held.", rich_help_panel="Plan")
+    ] = None,
     check_stops: Annotated[
-        bool, typer.Option(help="Before the pass without load, push every joint slowly onto both its stops.")
+        bool,
+        typer.Option(
+            help="Before the pass without load, push every joint slowly onto both its stops.", rich_help_panel="Run"
+        ),
     ] = True,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Run the whole plan on the simulated arm of the arm file's sim section.")
+        bool,
+        typer.Option(
+            "--dry-run",
+            help="Run the whole plan on the simulated arm of the arm file's sim section.",
+            rich_help_panel="Run",
+        ),
     ] = False,
-    keep_going: Annotated[
-        int, typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle.")
-    ] = 0,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.")] = 0,
+    keep_going: KeepGoing = 0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.", rich_help_panel="Run")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.", rich_help_panel="Plan")] = 0,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write plan or outcome here; - is standard output.")
     ] = None,
@@ -51,7 +62,9 @@ def sweep(
     Example: armlink sweep sarcos --bus socketcan:vcan0 --out unloaded
     """
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
@@ -60,7 +73,8 @@ def sweep(
 
     arm_file = with_hold(load_arm(arm), hold)
     if plan:
-        write_json(json_file, _plan(arm_file, seed, picture))
+        write_json(json_file, _plan(arm_file, seed, picture, results(json_file)))
+        suggest(command_line("sweep", arm, out="unloaded", bus=bus, hold=hold))
         return
     if out is None:
         raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
@@ -68,8 +82,12 @@ def sweep(
     if not dry_run and not yes:
         confirm(f"{arm_file.name} will move through its whole range, {reference_mass:g} kg attached. Is it clear?")
     load = reference_mass if dry_run else 0.0
-    with open_link(arm_file, None if dry_run else bus, simulated=dry_run, load=load) as link:
+    words = [arm, "--resume", *["--dry-run"] * dry_run]
+    going_on = command_line("sweep", *words, out=out, reference_mass=reference_mass or None, bus=bus, hold=hold)
+    opened = open_link(arm_file, None if dry_run else bus, simulated=dry_run, load=load)
+    with early_end(arm_file, going_on) as work, opened as link:
         link.start()
+        work.enabled = True
         with SweepScreen(f"{arm_file.name}, {reference_mass:g} kg attached") as screen:
             found, data = _run(
                 link,
@@ -83,15 +101,15 @@ def sweep(
                 check_stops and not resume and not reference_mass,
             )
         lateness = link.stats.lateness
-    _show(arm_file, found, data, screen, _again(arm, bus, hold, dry_run))
+    _show(arm_file, found, data, results(json_file), _again(arm, bus, hold, dry_run))
     warn_late(arm_file, lateness)
     write_json(json_file, {**_answer(arm_file, data), "late_ms": lateness.in_ms()})
 
 
-def _plan(arm_file: "ArmFile", seed: int, picture: Path | None) -> dict[str, Any]:
+def _plan(arm_file: "ArmFile", seed: int, picture: Path | None, console: "PlainConsole") -> dict[str, Any]:
     """Print and check the plan, and draw it if asked to; the answer for machines."""
     from calib.arm.kinematics import model_arm
-    from calib.commands.screen import print_lines, print_plan
+    from calib.commands.screen import print_plan
     from calib.creep.choice import sweep_motion
     from calib.creep.plan import creep_seconds, plan_creep
     from calib.plan.collisions import check_plan
@@ -101,20 +119,20 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path | None) -> dict[str, Any
 
     if sweep_motion(arm_file) == "creep":
         planned = plan_creep(arm_file, seed=seed)
-        print_plan(arm_file, planned)
+        print_plan(arm_file, planned, console)
         took = creep_seconds(planned)
-        print_lines([f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass"])
+        console.print(f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass")
         return {**planned.model_dump(mode="json"), "seconds": took, "picture": None}
     model = None if arm_file.model_path is None else model_arm(arm_file)
     planned = plan_sweep(arm_file, None if model is None else guess_of_model(model.arm, model.beta), seed=seed)
-    print_plan(arm_file, planned)
+    print_plan(arm_file, planned, console)
     drawn = ""
     if picture is not None:
         draw_plan(arm_file, planned, picture)
         drawn = f"; drawn in {picture}"
     took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
     before = f"{_minutes(stops_seconds(arm_file))} more for its stops before the first"
-    print_lines([f"about {_minutes(took)} a pass, {before}; {checked}{drawn}"])
+    console.print(f"about {_minutes(took)} a pass, {before}; {checked}{drawn}")
     answer = {"seconds": took, "collisions": checked, "picture": None if picture is None else str(picture)}
     return {**planned.model_dump(mode="json"), **answer}
 
@@ -139,14 +157,14 @@ def _run(
     from calib.creep.run import run_creep
     from calib.sweep.preflight import find_stops, listen
     from calib.sweep.run import run_sweep
-    from calib.sweep.stalls import bridged
+    from calib.sweep.stalls import repeat_work
 
     link.enable()
     on_stall = screen.on_stall(keep_going)
-    heard = bridged(link, on_stall, lambda: listen(link, arm_file))
+    heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
     found, creeping = heard, sweep_motion(arm_file) == "creep"
     if check_stops and not creeping:
-        found = bridged(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
+        found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
     run = run_creep if creeping else run_sweep
     data = run(
         link,
@@ -165,25 +183,34 @@ def _again(arm: str, bus: str | None, hold: str | None, dry_run: bool) -> list[s
     """The command for another pass on the same arm and bus, without what differs."""
     given = {"--bus": bus, "--hold": hold}
     options = [word for option, value in given.items() if value is not None for word in (option, value)]
-    return ["armlink", "sweep", arm, *options, *["--dry-run"] * dry_run]
+    return ["sweep", arm, *options, *["--dry-run"] * dry_run]
 
 
-def _show(arm_file: "ArmFile", found: "Preflight", data: "SweepData", screen: "SweepScreen", again: list[str]) -> None:
-    from calib.commands.screen import print_lines, print_plan, print_preflight, stalls_said, unsettled_said
+def _show(
+    arm_file: "ArmFile", found: "Preflight", data: "SweepData", console: "PlainConsole", again: list[str]
+) -> None:
+    from armlink.commands.plain_console import command_line, suggest
+    from calib.commands.screen import print_lines, print_plan, print_preflight, stall_lines, unsettled_lines
 
     assert data.plan is not None
-    print_preflight(found)
-    print_plan(arm_file, data.plan)
-    print_lines([*unsettled_said(data), *stalls_said(data)], "yellow")
-    if data.manifest.reference_mass and data.plan.sweeps[0].speed is not None:
-        bare = data.path.with_name(f"{data.path.name}-again")
-        screen.say(f"{data.path} is complete. Now take the mass off and sweep once more without it:")
-        screen.say(shlex.join([*again, "--out", str(bare)]))
+    print_preflight(found, console)
+    print_plan(arm_file, data.plan, console)
+    print_lines([*unsettled_lines(data), *stall_lines(data)], "yellow", console)
+    complete = f"{data.path} is complete, {len(data.readings)} readings"
     if not data.manifest.reference_mass:
         mass = data.plan.reference_mass
         loaded = data.path.with_name(f"{data.path.name}-loaded")
-        screen.say(f"{data.path} is complete. Now attach {mass:g} kg and sweep again:")
-        screen.say(shlex.join([*again, "--reference-mass", f"{mass:g}", "--out", str(loaded)]))
+        console.print(f"{complete}; now attach {mass:g} kg and sweep again")
+        suggest(command_line(*again, reference_mass=f"{mass:g}", out=loaded))
+    elif data.plan.sweeps[0].speed is not None:
+        bare = data.path.with_name(f"{data.path.name}-again")
+        console.print(f"{complete}; now take the mass off and sweep once more without it")
+        suggest(command_line(*again, out=bare))
+    else:
+        bare = data.path.with_name(data.path.name.removesuffix("-loaded"))
+        unloaded = bare if bare != data.path else data.path.with_name("unloaded")
+        console.print(f"{complete}; now fit both passes")
+        suggest(command_line("calibrate", str(unloaded), str(data.path)))
 
 
 def _answer(arm_file: "ArmFile", data: "SweepData") -> dict[str, Any]:

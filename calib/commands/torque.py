@@ -32,10 +32,11 @@ def torque(
 
     Example: armlink torque arm.urdf --q poses.csv --json -
     """
+    import numpy as np
     from rich.table import Table
 
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import results
     from calib.commands.poses_csv import load_poses
     from gcomp.gravity.torque import gravity_torque
 
@@ -46,7 +47,11 @@ def torque(
     for number, row in enumerate(answer, start=1):
         table.add_row(str(number), *(f"{value:+.4f}" for value in row))
     if json_file is None or str(json_file) != "-":
-        PlainConsole().print(table)
+        out = results()
+        out.print(table)
+        pose, joint = divmod(int(np.argmax(np.abs(answer))), described.n)
+        largest = f"{answer[pose, joint]:+.4f} N·m at {described.names[joint]} in pose {pose + 1}"
+        out.print(f"{len(poses)} poses; largest holding torque {largest}")
     write_json(json_file, {"joints": list(described.names), "source": source, "torque": answer.tolist()})
 
 
@@ -60,9 +65,8 @@ def _model(
     from armlink.content.model_sizes import model_budget
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm, model_arm
-    from calib.records.missing import way_to
     from calib.records.records import GravityRecord
-    from calib.records.store import RecordStore
+    from calib.records.store import RecordStore, way_to
     from gcomp.arm.load import load_model
 
     if Path(arm).suffix.lower() in MODEL_SUFFIXES:

@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
+from calib.commands.options import JsonFile, KeepGoing, StoreUrl
 
 if TYPE_CHECKING:
+    from armlink.commands.plain_console import PlainConsole
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.sweep.verify import Verification
 
@@ -18,39 +20,39 @@ def verify(
     record: Annotated[
         list[str] | None, typer.Option(help="Id of a gravity or calibration record; default: the current ones.")
     ] = None,
-    store: Annotated[str | None, typer.Option(help="Record store: file or database URL.")] = None,
+    store: StoreUrl = None,
     poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
-    seed: Annotated[int, typer.Option(min=0, help="Draws other poses.")] = 0,
-    keep_going: Annotated[
-        int,
-        typer.Option(min=0, help="Enable the joints again by itself up to N times after a stall of the cycle."),
-    ] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the poses.")] = 0,
+    keep_going: KeepGoing = 0,
     report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> int:
     """Drive to random poses and compare; exit status 1 where a joint's RMS exceeds its tolerance.
 
     Example: armlink verify sarcos --bus socketcan:vcan0 --poses 40 --json -
     """
     from armlink.arm_file import load_arm
+    from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
+    from armlink.commands.plain_console import command_line, results, suggest
     from armlink.loop.open import open_arm
     from calib.commands.screen import SweepScreen
     from calib.creep.choice import sweep_motion
     from calib.creep.verify import verify_creeping
-    from calib.records.missing import no_record
-    from calib.records.store import RecordStore
+    from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify
 
     arm_file = load_arm(arm)
-    with open_arm(arm_file, bus) as link:
+    with (
+        early_end(arm_file, command_line("verify", arm, bus=bus, store=store)) as work,
+        open_arm(arm_file, bus) as link,
+    ):
         gravity, calibration = _records(RecordStore(store), arm_file, record or [])
         creeping = sweep_motion(arm_file) == "creep"
         if creeping and calibration is None:
             raise no_record(arm_file, "calibration")
         link.start()
+        work.enabled = True
         with SweepScreen(f"{arm_file.name}: verify") as screen:
             link.enable()
             watch, bridge = screen.count, screen.on_stall(keep_going)
@@ -62,7 +64,9 @@ def verify(
                 result = run_verify(
                     link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
                 )
-    _show(result)
+    _show(result, results(json_file))
+    if result.passed:
+        suggest(command_line("daemon", arm, bus=bus, store=store))
     if report is not None:
         from calib.report.verification import write_report
 
@@ -73,8 +77,8 @@ def verify(
 
 def _records(store: Any, arm_file: Any, ids: list[str]) -> "tuple[GravityRecord, CalibrationRecord | None]":
     """The records named, else the current ones; raises Refused where there is no gravity record."""
-    from calib.records.missing import no_record
     from calib.records.records import CalibrationRecord, GravityRecord
+    from calib.records.store import no_record
 
     named = [store.usable(record, arm_file) for record in ids]
     gravity = next((each for each in named if isinstance(each, GravityRecord)), None)
@@ -105,10 +109,8 @@ def _answer(
     }
 
 
-def _show(result: "Verification") -> None:
+def _show(result: "Verification", console: "PlainConsole") -> None:
     from rich.table import Table
-
-    from armlink.commands.plain_console import PlainConsole
 
     title = f"Model against sensor at {len(result.sensor)} poses [N·m]"
     table = Table("joint", "RMS", "largest", "allowed RMS", title=title)
@@ -116,4 +118,7 @@ def _show(result: "Verification") -> None:
         table.add_row(
             name, f"{result.rms[joint]:.3f}", f"{result.max_error[joint]:.3f}", f"{result.tolerance[joint]:.3f}"
         )
-    PlainConsole().print(table)
+    console.print(table)
+    beyond = [name for name, off in zip(result.names, result.rms > result.tolerance, strict=True) if off]
+    agree = "passed: model and sensor agree at every joint within its allowed RMS"
+    console.print(f"failed: RMS above the allowed one at {', '.join(beyond)}" if beyond else agree)

@@ -102,7 +102,7 @@ def another_drive(mismatch: str, where: str) -> SetupFinding:
 
 
 def _drives(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFinding]:
-    """What the drives on the open bus say against the arm file."""
+    """Differences of the drives on the open bus from the arm file."""
     groups = make_groups(arm_file, opened)
     kind = groups[0].family
     if len(groups) == 1 and kind.examine is not None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from armlink.errors import BadInput
 from calib.commissioning.model_joints import ModelJoint
-from gcomp.arm.model_tree import HAND
+from gcomp.arm.model_file import HAND
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def find_chains(
         ends = [place for place, joint in enumerate(joints) if joint.body == tip]
         if not ends:
             moving = ", ".join(dict.fromkeys(joint.body for joint in joints))
-            raise BadInput(f"{path}: --tip {tip}: no joint moves that body; moving are {moving}")
+            raise BadInput(f"{path}: --tip {tip}: no joint moves that body; the bodies that move are {moving}")
         way = _after(joints, [*joints[ends[-1]].parents, ends[-1]], base)
         if not way:
             raise BadInput(f"{path}: --base {base} --tip {tip}: no revolute joint between them")

@@ -13,13 +13,8 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.errors import GcompError
 
-SHARES = (0.8, 0.65, 0.5, 0.4, 0.3, 0.22, 0.16)
-"""Widths of the range that are tried, as shares of the model's."""
-CENTRES = 80
 SKETCH, PROOF = 40, 400
 """Poses at which a range is looked at while choosing and in the end; half of them are corners."""
-SEEDS = (0, 1)
-"""Seeds of the plans that must be clear for the model's own limits to be kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +29,7 @@ class ClearRange:
     """Why the model's limits are not kept."""
 
 
-def narrowed(arm_file: ArmFile) -> ClearRange | None:
+def find_clear_range(arm_file: ArmFile) -> ClearRange | None:
     """A clear range for an arm whose sweeps would collide within the model's limits; None where they would not.
 
     Raises BadInput or Refused as planning does where nothing narrower helps.
@@ -47,9 +42,9 @@ def narrowed(arm_file: ArmFile) -> ClearRange | None:
         raise problem
     arm = model_arm(arm_file).arm
     generator = np.random.default_rng(0)
-    centres = np.concatenate([[(arm.lower + arm.upper) / 2], generator.uniform(arm.lower, arm.upper, (CENTRES, arm.n))])
+    centres = np.concatenate([[(arm.lower + arm.upper) / 2], generator.uniform(arm.lower, arm.upper, (80, arm.n))])
     centres = centres[geometry.free(centres)]
-    for share in SHARES:
+    for share in (0.8, 0.65, 0.5, 0.4, 0.3, 0.22, 0.16):
         boxes = [_box(arm, centre, share) for centre in centres]
         clear = [box for box in boxes if geometry.free(_poses(box, SKETCH, generator)).all()]
         for low, high in clear:
@@ -59,12 +54,12 @@ def narrowed(arm_file: ArmFile) -> ClearRange | None:
 
 
 def _problem(arm_file: ArmFile) -> Exception | None:
-    """What stands against the sweeps that would be planned."""
+    """The error that planning the sweeps ends with, None if it succeeds."""
     from armlink.errors import ArmlinkError
 
     model = model_arm(arm_file)
     try:
-        for seed in SEEDS:
+        for seed in (0, 1):  # plans that must be clear for the model's own limits to be kept
             check_plan(arm_file, plan_sweep(arm_file, seed=seed))
             check_plan(arm_file, plan_sweep(arm_file, guess_of_model(model.arm, model.beta), seed=seed))
     except (ArmlinkError, GcompError) as error:

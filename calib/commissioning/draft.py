@@ -30,7 +30,6 @@ LEAST_TORQUE = 2.0
 """Least such rated torque [N·m], on a small arm that of its strongest joint; assumed."""
 FRICTION = 0.02
 """Coulomb friction of the simulated arm, as a share of rated torque; assumed."""
-POSES = 200
 
 
 @dataclass
@@ -52,7 +51,7 @@ class JointDraft:
 
 @dataclass
 class Draft:
-    """What will stand in the arm file."""
+    """Content of the arm file to be."""
 
     name: str
     model: Path
@@ -156,7 +155,7 @@ def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float]) -> 
     low = np.where(free, -np.pi, model.jnt_range[joints, 0])
     high = np.where(free, np.pi, model.jnt_range[joints, 1])
     need, column, unit = np.zeros(len(joints)), np.zeros(model.nv), np.eye(model.nv)[dof]
-    for pose in np.random.default_rng(0).uniform(low, high, (POSES, len(joints))):
+    for pose in np.random.default_rng(0).uniform(low, high, (200, len(joints))):
         data.qpos[place] = pose
         mujoco.mj_forward(model, data)
         for joint, alone in enumerate(unit):

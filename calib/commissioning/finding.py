@@ -1,4 +1,4 @@
-"""What is missing or doubtful about an arm's set-up."""
+"""Findings about an arm's set-up: what is missing or doubtful."""
 
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -8,14 +8,8 @@ from armlink.arm_file import ArmFile
 from armlink.model_file import read_model
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.finding import SetupFinding
-from calib.plan.choices import DEAD_LEVER
+from calib.plan.sweep_plan import DEAD_LEVER
 from gcomp.gravity.torque import gravity_levers
-
-POSES = 500
-SMALL_LEVER = 0.2
-"""Γ/g below which the torque gain becomes imprecise; a choice."""
-USUAL_GRAVITY = (9.7, 9.9)
-"""On Earth [m/s²]."""
 
 
 def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
@@ -44,9 +38,9 @@ def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     if model.unphysical:
         yield SetupFinding(
             "warning",
-            f"inertia with a negative principal moment, taken as none: {', '.join(model.unphysical)}",
+            f"inertia with a negative principal moment, ignored: {', '.join(model.unphysical)}",
             where,
-            "correct the inertia of these links, or know that their torque at acceleration is not modelled",
+            "correct the inertia of these links: until then their torque under acceleration is not modelled",
         )
     if model.left_out:
         remedy = "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)"
@@ -65,28 +59,28 @@ def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
 def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     arm, where = gcomp_arm(arm_file), str(arm_file.path)
     size = float(np.linalg.norm(arm.gravity))
-    if not USUAL_GRAVITY[0] < size < USUAL_GRAVITY[1]:
+    if not 9.7 < size < 9.9:  # on Earth
         remedy = "give kinematics.gravity in m/s² in the base frame, such as [0, 0, -9.81]"
         yield SetupFinding("warning", f"gravity is {size:.3g} m/s², not 9.81", f"{where}: kinematics.gravity", remedy)
         if size < 1e-6:
             return
     low = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
     high = np.where(np.isfinite(arm.upper), arm.upper, np.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
+    poses = np.random.default_rng(0).uniform(low, high, (500, arm.n))
     lever = gravity_levers(arm, poses).max(axis=0) / size
     for joint, name in enumerate(arm.names):
         if lever[joint] < DEAD_LEVER:
             axis = "its axis is vertical" if joint == 0 else "its axis is vertical in every pose"
             yield SetupFinding(
                 "warning",
-                f"gravity has no lever on it (Γ/g {lever[joint]:.2f}): {axis}, and its torque gain cannot be found",
+                f"gravity does not load it (Γ/g {lever[joint]:.2f}): {axis}, and its torque gain cannot be found",
                 name,
-                "incline the base for the sweeps, or live with its offset alone",
+                "incline the base for the sweeps, or do without its gain",
             )
-        elif lever[joint] < SMALL_LEVER:
+        elif lever[joint] < 0.2:  # a choice
             yield SetupFinding(
                 "hint",
-                f"gravity has a short lever on it (Γ/g at most {lever[joint]:.2f}): its torque gain will be imprecise",
+                f"gravity loads it little (Γ/g at most {lever[joint]:.2f}): its torque gain will be imprecise",
                 name,
                 "incline the base for the sweeps, or widen the ranges of the joints before it",
             )

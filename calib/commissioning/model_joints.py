@@ -9,8 +9,7 @@ import numpy as np
 from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
 from gcomp.arm.load import compile_model
-from gcomp.arm.model_tree import coupled_joints, upwards
-from gcomp.arm.model_xml import parse_xml
+from gcomp.arm.model_file import coupled_joints, parse_xml, upwards
 
 if TYPE_CHECKING:
     import mujoco

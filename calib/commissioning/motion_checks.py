@@ -8,27 +8,20 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.content.model_sizes import model_budget
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm, model_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import sweep_section
 from calib.commissioning.finding import SetupFinding
 from calib.creep.choice import sweep_motion
 from calib.creep.plan import plan_creep
-from calib.plan.bias_torque import pressable
+from calib.plan.bias_torque import pressable_joints
 from calib.plan.collisions import check_plan
 from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
 from calib.plan.sweep_plan import plan_sweep
-from gcomp.arm.inertia import joint_inertias
-from gcomp.arm.load import place_chain
+from gcomp.arm.load import joint_inertias, place_chain
 from gcomp.gravity.torque import gravity_torque
 
-POSES = 500
-DAMPED_POSES = 100
-"""An inertia changes little from pose to pose."""
-RESERVE = 1.2
-"""Torque that a drive should have over gravity, as a factor; a choice: friction and acceleration need the rest."""
 LEAST_DAMPING = 0.3
 """Damping ratio of a joint that its drive holds with stiffness and damping alone; below it swings after each move."""
 FASTEST_RATE = 20.0
@@ -72,18 +65,18 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
 
 def _strength(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
     """Joints whose drives cannot hold the arm everywhere in its range."""
-    arm, limits = gcomp_arm(arm_file), Limits.of(arm_file)
+    arm, limits = gcomp_arm(arm_file), DriveLimits.of(arm_file)
     low, high = np.nan_to_num(arm.lower, neginf=-np.pi), np.nan_to_num(arm.upper, posinf=np.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
+    poses = np.random.default_rng(0).uniform(low, high, (500, arm.n))
     need = np.abs(gravity_torque(arm, guess.beta, poses)).max(axis=0)
     for joint, name in enumerate(arm.names):
         most = limits.max_torque[joint]
         if need[joint] > most:
-            what = f"gravity needs up to {need[joint]:.3g} N·m by the model, max_torque is {most:g}"
+            what = f"by the model, gravity needs up to {need[joint]:.3g} N·m, but max_torque is {most:g}"
             remedy = "check the model's masses and max_torque: the arm would fall"
             yield SetupFinding("error", what, name, remedy)
-        elif RESERVE * need[joint] > most:
-            what = f"gravity needs up to {need[joint]:.3g} N·m by the model, max_torque is {most:g}: little is left"
+        elif 1.2 * need[joint] > most:  # friction and acceleration need the rest; a choice
+            what = f"by the model, gravity needs up to {need[joint]:.3g} N·m of max_torque {most:g}: little is left"
             yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
 
 
@@ -97,7 +90,8 @@ def _damping(arm_file: ArmFile, model: Path) -> Iterator[SetupFinding]:
         placed = place_chain(model, base=arm_file.kinematics.base, tip=arm_file.kinematics.tip)
     arm = placed.arm.arm
     low, high = np.nan_to_num([arm.lower, arm.upper], posinf=np.pi, neginf=-np.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (DAMPED_POSES, arm.n))
+    # few: an inertia changes little from pose to pose
+    poses = np.random.default_rng(0).uniform(low, high, (100, arm.n))
     mass = sweep_section(arm_file).reference_mass or 0.0
     largest = dict(zip(arm.names, joint_inertias(placed, poses, mass).max(axis=0).tolist(), strict=True))
     for joint in joints:
@@ -107,20 +101,20 @@ def _damping(arm_file: ArmFile, model: Path) -> Iterator[SetupFinding]:
         if ratio < LEAST_DAMPING:
             enough = 2 * LEAST_DAMPING * math.sqrt(drive.kp * inertia / square)
             softer = square * (drive.kd / (2 * LEAST_DAMPING)) ** 2 / inertia
-            what = f"kd {drive.kd:g} damps its swing by a ratio of {ratio:.2f} where it turns {inertia:.2g} kg·m²"
+            what = f"kd {drive.kd:g} gives a damping ratio of only {ratio:.2f} at an inertia of {inertia:.2g} kg·m²"
             remedy = (
-                f"kd {enough:.2g} or more, or kp {softer:.2g} or less, gives {LEAST_DAMPING:g}, at which it settles"
+                f"set kd to {enough:.2g} or more, or kp to {softer:.2g} or less: the ratio is then {LEAST_DAMPING:g}"
             )
             yield SetupFinding("warning", what, joint.name, remedy)
 
 
 def _stops(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
     """Joints that cannot be pressed on any stop within max_torque while another is swept."""
-    arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), Limits.of(arm_file)
+    arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), DriveLimits.of(arm_file)
     ever = np.zeros(arm.n, dtype=bool)
     for joint in range(arm.n):
         candidates = stop_combinations(arm, joint, sweep_range(section, limits, joint))
-        ever |= pressable(guess, section, limits, candidates).any(axis=0) & (np.arange(arm.n) != joint)
+        ever |= pressable_joints(guess, section, limits, candidates).any(axis=0) & (np.arange(arm.n) != joint)
     for name, pressed in zip(arm.names, ever, strict=True):
         if pressed or arm.n == 1:
             continue

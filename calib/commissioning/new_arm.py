@@ -13,18 +13,15 @@ from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.chain import Chain, find_chains
-from calib.commissioning.clear_range import narrowed
+from calib.commissioning.clear_range import find_clear_range
 from calib.commissioning.draft import Draft, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
 from calib.commissioning.finding import SetupFinding
 from calib.commissioning.model_joints import model_joints
 
-RATING_FACTOR = 2.5
-"""A drive whose rated torque differs from the model's effort limit by more is doubted; a choice."""
-
 
 class Questions(Protocol):
-    """What a person at a terminal is asked."""
+    """Questions to a person at a terminal."""
 
     def which(self, chains: Sequence[Chain]) -> Chain:
         """Which of several arms in a model is meant."""
@@ -45,7 +42,6 @@ class NewArm:
 
     @property
     def text(self) -> str:
-        """The file's text."""
         return arm_text(self.draft, self.out)
 
     def parsed(self) -> ArmFile:
@@ -91,7 +87,7 @@ def new_arm(
         draft.notes.append(f"tip assumed: the model has {len(chains)} arms; the others end in {others} (--tip)")
     draft.name = name or draft.name
     made = NewArm(out, draft)
-    clear = narrowed(made.parsed())
+    clear = find_clear_range(made.parsed())
     if clear is not None:
         narrow(draft, clear)
     return made
@@ -129,7 +125,7 @@ def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -
         drive = match.drive
         ratio = drive.rated_torque / joint.rated_torque
         from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
-        if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
+        if from_model and not 1 / 2.5 < ratio < 2.5:  # a choice
             made.findings.append(_doubtful_rating(match, joint.rated_torque))
         joint.node, joint.rated_torque = drive.node, drive.rated_torque
         joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
@@ -149,7 +145,7 @@ def _doubtful_rating(match: Match, effort: float) -> SetupFinding:
     return SetupFinding("warning", what, f"{match.joint} (node {drive.node})", remedy)
 
 
-def rewired(content: dict[str, Any], matches: Sequence[Match], bus: dict[str, str | int]) -> dict[str, Any]:
+def rewired_content(content: dict[str, Any], matches: Sequence[Match], bus: dict[str, str | int]) -> dict[str, Any]:
     """An arm file's content with the drives found on a bus: nodes, rated torques and the bus itself."""
     joints = []
     for row, match in zip(content["link"]["joints"], matches, strict=True):

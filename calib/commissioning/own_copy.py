@@ -25,7 +25,7 @@ class OwnCopy:
     findings: list[SetupFinding]
 
 
-def by_ids(arm: ArmFile) -> bool:
+def drives_have_ids(arm: ArmFile) -> bool:
     """Whether the drives of an arm are found by the ids of its arm file alone."""
     joints = arm.require_link().joints
     return all(family(joint.settings.family).find is None for joint in joints)

@@ -1,13 +1,18 @@
-"""Whether an arm is swept by creeping or by steps at rest."""
+"""Whether an arm is swept by creeping or by steps at rest, and what no creep of it can show by its geometry alone."""
 
 from collections.abc import Sequence
 from typing import Literal
+
+import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.drives.registry import family
 from armlink.errors import BadInput
 from calib.arm.sweep_section import sweep_section
 from calib.sweep.dataset import SweepData
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import payload_columns
+from gcomp.gravity.torque import gravity_levers, gravity_regressor
 
 Motion = Literal["creep", "steps"]
 
@@ -37,3 +42,31 @@ def all_creep(data: Sequence[SweepData]) -> bool:
         other = next(each for each in data if not is_creep(each))
         raise BadInput(f"{other.path}: steps at rest, but the other directories are creep sweeps: give one kind")
     return kinds == {True}
+
+
+VERTICAL = (
+    "its axis is vertical in every pose, so that gravity does not load it: its torque constant cannot be seen; mount"
+    " the base tilted by 10° or more and state kinematics.gravity accordingly"
+)
+NO_LEVER = (
+    "the axes of all joints that gravity loads meet in one point, or nearly, so that a mass at an unknown place has no"
+    " known lever: torque constants share one unknown factor; measure where the mass hangs (sweep.reference_point)"
+)
+SHORTEST = 0.005
+"""Lever below which the place of the mass hides it [m], root mean square over poses."""
+
+
+def is_vertical(arm: Arm, joint: int) -> bool:
+    """Whether a joint's axis is along gravity in every pose."""
+    poses = np.random.default_rng(1).uniform(-1.5, 1.5, (20, arm.n))
+    return bool(np.all(gravity_levers(arm, poses)[:, joint] < 0.02 * np.linalg.norm(arm.gravity)))
+
+
+def known_lever(arm: Arm) -> float:
+    """Lever of a mass whose place on the last link is not known [m]: what the place cannot take up, RMS over poses."""
+    poses = np.random.default_rng(1).uniform(-1.5, 1.5, (50, arm.n))
+    regressor = gravity_regressor(arm, poses)
+    at_origin, by_point = payload_columns(arm)
+    lever, moved = (regressor @ at_origin).ravel(), (regressor @ by_point).reshape(-1, 3)
+    rest = lever - moved @ np.linalg.lstsq(moved, lever, rcond=None)[0]
+    return float(np.sqrt(np.mean(rest**2)) / np.linalg.norm(arm.gravity))

@@ -13,12 +13,10 @@ from gcomp.arrays import Array
 
 BINS = 10
 """Rows per direction with which a candidate is judged."""
-SCATTER_SHARE = 0.003
-"""Scatter of a row, as a share of rated torque, that the choice assumes."""
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class CreepCandidate:
     """One creep: the other joints' poses, and both ends of the joint's way."""
 
     joint: int
@@ -37,9 +35,9 @@ class Candidate:
 
 
 def choose(
-    arm: Arm, beta: Array, rated: Array, candidates: list[list[Candidate]], count: int, speeds: tuple[float, ...],
+    arm: Arm, beta: Array, rated: Array, candidates: list[list[CreepCandidate]], count: int, speeds: tuple[float, ...],
     mass: float, doubt: Doubt,
-) -> tuple[list[list[Candidate]], Array]:  # fmt: skip
+) -> tuple[list[list[CreepCandidate]], Array]:  # fmt: skip
     """(`count` candidates of each list, tip to base; standard deviations of the gains that they promise (n,)).
 
     Greedy: each choice makes the sum of the gains' variances least, with one pass without and one with the mass [kg].
@@ -50,7 +48,7 @@ def choose(
     x[at["beta"]], x[at["coulomb"]], x[at["load"]] = beta, 0.02 * rated, 0.05
     information = np.diag(1 / std**2)
     rows = [[_information(arm, x, one, speeds[0], mass, rated) for one in each] for each in candidates]
-    chosen: list[list[Candidate]] = [[] for _ in candidates]
+    chosen: list[list[CreepCandidate]] = [[] for _ in candidates]
     gains = at["gain"]
     for _ in range(count):
         for place, each in enumerate(candidates):
@@ -61,7 +59,7 @@ def choose(
     return chosen, np.sqrt(np.diag(invert(information))[gains])
 
 
-def _information(arm: Arm, x: Array, one: Candidate, speed: float, mass: float, rated: Array) -> Array:
+def _information(arm: Arm, x: Array, one: CreepCandidate, speed: float, mass: float, rated: Array) -> Array:
     """Information of a creep both ways, without and with the mass (P, P)."""
     poses = np.tile(one.poses(BINS), (4, 1))
     side, loads = np.repeat([1.0, -1.0, 1.0, -1.0], BINS), np.repeat([0.0, 0.0, mass, mass], BINS)
@@ -78,6 +76,6 @@ def _information(arm: Arm, x: Array, one: Candidate, speed: float, mass: float, 
         warmest=np.zeros(arm.n),
     )
     _, jacobian = CreepModel(arm, rows).linearised(x)
-    jacobian /= SCATTER_SHARE * rated[one.joint]
+    jacobian /= 0.003 * rated[one.joint]  # the scatter that the choice assumes
     information: Array = jacobian.T @ jacobian
     return information

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.torque_calibration import GAIN_RANGE
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.creep.model import CreepModel
 from calib.creep.parameters import HARMONICS, Doubt, family_slices, prior
@@ -19,21 +18,16 @@ from calib.creep.pushes import WIDE_SHARE, Disturbed, Spring, disturbed_sweeps, 
 from calib.creep.ripple import ripple_cycles
 from calib.creep.rows import CreepRows
 from calib.creep.scatter import Scatter, scatter
-from calib.creep.solve import Solution, solve
-from calib.sweep.data_sets import digests
-from calib.sweep.dataset import SweepData
+from calib.creep.solve import CreepSolution, solve
+from calib.sweep.dataset import SweepData, digests
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 
-ROUNDS = 4
-"""Times that the scatter of the readings is estimated again."""
 SEEN = 0.3
 """A parameter is found if the data leave so much of what was doubted beforehand, as a share of it."""
 LOOSEST = 0.02
 """Largest standard deviation of a gain that is of use, as a share of it."""
 QUANTILE = 1.96
-LEAST_COULOMB = 1e-3
-"""Least friction that scales its unevenness, as a share of rated torque."""
 ASSUMED = 4.0
 """Harmonics for which the doubt of the friction's unevenness counts, beside those that were measured."""
 
@@ -44,7 +38,7 @@ class CreepFit:
 
     arm: Arm
     rows: CreepRows
-    solution: Solution
+    solution: CreepSolution
     prior_std: Array
     scatter: Scatter
     """Of the readings."""
@@ -59,7 +53,6 @@ class CreepFit:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Joint names."""
         return self.arm.names
 
     @cached_property
@@ -77,7 +70,6 @@ class CreepFit:
         return self.solution.x[self.slices[family]]
 
     def std(self, family: str) -> Array:
-        """Standard deviations of one family."""
         variance: Array = np.diag(self.covariance)[self.slices[family]]
         return np.sqrt(variance)
 
@@ -101,7 +93,7 @@ class CreepFit:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What disturbed the sweeps, one sentence each."""
+        """Disturbances of the sweeps, one sentence each."""
         return tuple(str(each) for each in (*self.disturbed, *self.springs))
 
     @property
@@ -128,7 +120,7 @@ def fit_creep(arm_file: ArmFile, passes: Sequence[SweepData]) -> CreepFit:
     if not len(rows):
         raise BadInput(f"{passes[0].path}: no creep sweeps: sweep with sweep.motion: creep")
     doubt, sources = Doubt.of(sweep_section(arm_file)), digests(passes)
-    return fit_rows(gcomp_arm(arm_file), rows, Limits.of(arm_file).rated, doubt, sources)
+    return fit_rows(gcomp_arm(arm_file), rows, DriveLimits.of(arm_file).rated, doubt, sources)
 
 
 def fit_rows(
@@ -137,26 +129,26 @@ def fit_rows(
     """Fit rows; rated torque (n,) [N·m] scales what is doubted beforehand. Disturbed sweeps are left out by name."""
     doubt = doubt or Doubt()
     left_out: tuple[Disturbed, ...] = ()
-    plain = _fitted(arm, rows, rated, doubt, ripple=False)  # which a contact would be taken for
+    plain = _fit(arm, rows, rated, doubt, ripple=False)  # which a contact would be taken for
     for _ in range(len(rows.sweeps)):
         found = disturbed_sweeps(arm, plain.rows, plain.solution.residual, rated)
         if not found:
             break
         left_out = (*left_out, *found)
         rows = rows.kept(~np.isin(rows.sweep, [each.sweep for each in found]))
-        plain = _fitted(arm, rows, rated, doubt, ripple=False)
-    plain = _fitted(arm, rows, rated, doubt, plain.solution.x)
+        plain = _fit(arm, rows, rated, doubt, ripple=False)
+    plain = _fit(arm, rows, rated, doubt, plain.solution.x)
     plain = replace(plain, disturbed=left_out, sources=sources or {})
     loose = replace(doubt, spring_share=WIDE_SHARE)
-    free = _fitted(arm, rows, rated, loose, plain.solution.x, ripple=False)
+    free = _fit(arm, rows, rated, loose, plain.solution.x, ripple=False)
     pulled = springs(CreepModel(arm, rows, free.ripple), free.solution, rated)
     if not pulled:
         return plain
-    free = _fitted(arm, rows, rated, loose, free.solution.x)
+    free = _fit(arm, rows, rated, loose, free.solution.x)
     return replace(free, disturbed=left_out, springs=pulled, sources=sources or {})
 
 
-def _fitted(
+def _fit(
     arm: Arm, rows: CreepRows, rated: Array, doubt: Doubt, start: Array | None = None, ripple: bool = True
 ) -> CreepFit:
     model, slices = CreepModel(arm, rows), family_slices(arm.n)
@@ -164,13 +156,13 @@ def _fitted(
     coulomb, uneven = 0.02 * rated, np.full(HARMONICS, doubt.uneven)
     mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb, uneven)
     x = mean.copy() if start is None else start
-    for _ in range(ROUNDS):
+    for _ in range(4):  # each estimates the scatter of the readings again
         found = solve(model, scattered, mean, std, x)
         x = found.x
-        coulomb = np.maximum(np.abs(x[slices["coulomb"]]), LEAST_COULOMB * rated)
+        coulomb = np.maximum(np.abs(x[slices["coulomb"]]), 1e-3 * rated)  # the least that scales the unevenness
         uneven = _unevenness(found, std, coulomb, doubt)
         mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb, uneven)
-        freedom = 1 - _used(found, std) / len(rows)
+        freedom = 1 - _determined_parameters(found, std) / len(rows)
         by_degree = _temperature_std(rows) * x[slices["warming"]][rows.joint] * rows.reading
         scattered = scatter(rows, found.residual, rated, freedom, by_degree, ripple)
         if ripple and not model.ripple.any():
@@ -178,7 +170,7 @@ def _fitted(
     return CreepFit(arm, rows, found, std, scattered, model.ripple)
 
 
-def _unevenness(found: Solution, std: Array, coulomb: Array, doubt: Doubt) -> Array:
+def _unevenness(found: CreepSolution, std: Array, coulomb: Array, doubt: Doubt) -> Array:
     """Usual size of each harmonic of the friction over position (HARMONICS,), as a share of the Coulomb friction.
 
     That of all joints' harmonics of one order, which count by what the data tell of them, and of `ASSUMED` more of the
@@ -197,6 +189,6 @@ def _temperature_std(rows: CreepRows) -> float:
     return float(steps.min(initial=1.0)) / np.sqrt(12) if steps.size else 0.0
 
 
-def _used(found: Solution, std: Array) -> float:
+def _determined_parameters(found: CreepSolution, std: Array) -> float:
     """Parameters that the data, and not the prior, determine."""
     return float(np.sum(1 - np.diag(found.covariance) / std**2))

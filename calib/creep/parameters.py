@@ -74,7 +74,7 @@ class Doubt:
 
     @classmethod
     def of(cls, section: SweepSection) -> Self:
-        """What an arm file states."""
+        """As an arm file states it."""
         return cls(zero=section.creep.zero_std, point=section.known_point)
 
 

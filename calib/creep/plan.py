@@ -7,14 +7,12 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm, model_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.arm.unseen import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
-from calib.creep.design import Candidate, choose
+from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
+from calib.creep.design import CreepCandidate, choose
 from calib.creep.parameters import Doubt
-from calib.plan.choices import POINTS
-from calib.plan.collisions import Geometry
+from calib.plan.collisions import POINTS, Geometry
 from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
 from calib.plan.poses import require_range
 from calib.plan.types import Side, Sweep, SweepPlan
@@ -31,14 +29,10 @@ MASS_SHARE = 0.3
 """Share of max_torque that the reference mass may take at the joint that it loads most."""
 BLIND_SHARE = 0.15
 """The same where no model file tells what the arm itself weighs."""
-WORST_CONSTANT = 1.6
-"""A drive may have to be asked for so many times the true torque."""
 TRAVEL_ACCELERATION = 1.5
 """Largest acceleration from one creep to the next [rad/s²]; a choice: the arm hangs in soft position loops."""
 HAND = 0.12
 """Distance of the mass from the flange that the plan allows for [m]."""
-TRAVEL_SECONDS = 6.0
-"""Rough time from one creep to the next [s]."""
 RAMP = 0.4
 """Time over which a creep reaches its speed, and comes to rest [s]."""
 SETTLE = 0.4
@@ -53,7 +47,7 @@ class CreepGround:
 
     arm: Arm
     section: SweepSection
-    limits: Limits
+    limits: DriveLimits
     beta: Array
     """Guess of the mass moments (2n,) [kg·m]."""
     geometry: Geometry | None
@@ -63,7 +57,7 @@ class CreepGround:
     @classmethod
     def of(cls, arm_file: ArmFile) -> "CreepGround":
         """Raises BadInput where a range is too short or the model cannot be used."""
-        arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), Limits.of(arm_file)
+        arm, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), DriveLimits.of(arm_file)
         require_range(section, limits, arm)
         if arm_file.model_path is None:
             share = 0.2 * limits.rated / float(np.linalg.norm(arm.gravity))
@@ -99,12 +93,13 @@ class CreepGround:
         most = share * self.limits.max_torque / np.maximum(per_kg.max(axis=0), 1e-9)
         return float(f"{float(most.min()):.2g}")
 
-    def bearable(self, one: Candidate, mass: float) -> bool:
+    def bearable(self, one: CreepCandidate, mass: float) -> bool:
         """Whether every drive can hold its joint along a creep with the mass, however wrong its constant may be."""
         at_origin, by_point = payload_columns(self.arm)
         each = gravity_regressor(self.arm, one.poses(6))
         torque = np.abs(each @ (self.beta + mass * at_origin)) + mass * HAND * np.linalg.norm(each @ by_point, axis=-1)
-        return bool((WORST_CONSTANT * torque <= self.limits.max_torque).all())
+        # a drive may have to be asked for so many times the true torque
+        return bool((1.6 * torque <= self.limits.max_torque).all())
 
 
 def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
@@ -121,7 +116,7 @@ def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
     for each in chosen:
         for number, one in enumerate(each):
             sweeps.append(_sweep(ground, one, number, creep.speeds[number % len(creep.speeds)]))
-    blind = [ground.arm.names[joint] for joint in range(n) if vertical(ground.arm, joint)]
+    blind = [ground.arm.names[joint] for joint in range(n) if is_vertical(ground.arm, joint)]
     notes = tuple(f"{name}: {VERTICAL}" for name in blind)
     if ground.section.known_point is None and known_lever(ground.arm) < SHORTEST:
         notes = (*notes, f"{arm_file.name}: {NO_LEVER}")
@@ -156,7 +151,7 @@ def _unfit(ground: CreepGround, plan: SweepPlan, ends: Array) -> Iterator[str]:
         low, high = ends[:, sweep.joint]
         if lower < low - ROUNDING or upper > high + ROUNDING:
             yield f"sweep {sweep.name}: from {lower:.4g} to {upper:.4g} rad, expected {low:.4g} to {high:.4g}"
-        if not ground.bearable(Candidate(sweep.joint, np.array(sweep.rest), lower, upper), mass):
+        if not ground.bearable(CreepCandidate(sweep.joint, np.array(sweep.rest), lower, upper), mass):
             yield f"sweep {sweep.name}: a drive cannot hold its joint there within max_torque, with {mass:g} kg"
 
 
@@ -166,14 +161,14 @@ def creep_seconds(plan: SweepPlan) -> float:
     for sweep in plan.sweeps:
         speed = creep_speed(sweep)
         way = (sweep.steps[-1] - sweep.steps[0]) * (1 + 1 / (len(sweep.steps) - 1)) + 2 * lead_way(speed)
-        total += 2 * way / speed + TRAVEL_SECONDS
+        total += 2 * way / speed + 6.0  # [s], roughly, from one creep to the next
     return total
 
 
 def creep_speed(sweep: Sweep) -> float:
     """Of a planned creep [rad/s]; raises BadInput for a sweep that has none."""
     if sweep.speed is None:
-        raise BadInput(f"sweep {sweep.name}: no speed: a plan of steps at rest is no plan of creep sweeps")
+        raise BadInput(f"sweep {sweep.name}: no speed: this is a plan of steps at rest, not of creep sweeps")
     return sweep.speed
 
 
@@ -189,7 +184,7 @@ def creep_ends(sweep: Sweep) -> tuple[float, float]:
     return middles[0] - half, middles[-1] + half
 
 
-def _sweep(ground: CreepGround, one: Candidate, number: int, speed: float) -> Sweep:
+def _sweep(ground: CreepGround, one: CreepCandidate, number: int, speed: float) -> Sweep:
     speed = min(speed, (one.upper - one.lower) / 4 / lead_way(1.0))
     lead = lead_way(speed)
     way = one.upper - one.lower - 2 * lead
@@ -224,13 +219,13 @@ def _home(ground: CreepGround, random: np.random.Generator) -> Array:
 
 def _candidates(
     ground: CreepGround, joint: int, home: Array, mass: float, random: np.random.Generator
-) -> list[Candidate]:
+) -> list[CreepCandidate]:
     ends = np.array([ground.range(each) for each in range(ground.arm.n)])
     low, high = ends[joint]
-    span, found = min(high - low, ground.section.creep.span), list[Candidate]()
+    span, found = min(high - low, ground.section.creep.span), list[CreepCandidate]()
     for _ in range(CANDIDATES * DRAWS):
         lower = random.uniform(low, high - span) if high - low > span else low
-        one = Candidate(joint, random.uniform(*ends.T), lower, lower + span)
+        one = CreepCandidate(joint, random.uniform(*ends.T), lower, lower + span)
         begin = one.poses(2)[0]
         clear = ground.free(one.poses(POINTS + 1)) and ground.way(home, begin)
         if clear and ground.bearable(one, mass):

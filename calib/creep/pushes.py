@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calib.creep.model import CreepModel
 from calib.creep.rows import CreepRows
-from calib.creep.solve import Solution
+from calib.creep.solve import CreepSolution
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 
@@ -97,7 +97,7 @@ class Spring:
         )
 
 
-def springs(model: CreepModel, found: Solution, rated: Array) -> tuple[Spring, ...]:
+def springs(model: CreepModel, found: CreepSolution, rated: Array) -> tuple[Spring, ...]:
     """Springs in a fit in which they were free."""
     place = model.slices["spring"]
     stiffness, std = found.x[place], np.sqrt(np.diag(found.covariance)[place])

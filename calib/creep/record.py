@@ -8,7 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.unseen import NO_LEVER, SHORTEST, VERTICAL, known_lever, vertical
+from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.creep.fit import QUANTILE, CreepFit
 from calib.creep.parameters import LAST_ZERO
 from calib.fit.gravity_fit import GravityFit
@@ -34,7 +34,7 @@ VALUES: dict[Value, str] = {
     "load": "load",
     "viscous": "viscous",
 }
-"""What a program asks for → family of the fit."""
+"""Value by the name that programs use → family of the fit."""
 HEADINGS = {
     "gain": "reading per N·m (1/k)",
     "offset": "offset [N·m]",
@@ -44,49 +44,47 @@ HEADINGS = {
     "viscous": "viscous [N·m·s/rad]",
 }
 """Families of the fit, as people read them."""
-ZERO_SEEN = 0.9
-"""A zero counts as found if the data leave at most so much of its doubt."""
 
 
 def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
     """(Joint, parameter) → why the data cannot determine it."""
     reasons: dict[tuple[str, Parameter], str] = {}
     found = {"gain": fit.found("gain"), "offset": fit.found("offset")}
-    zero = fit.std("zero") < ZERO_SEEN * fit.prior_std[fit.slices["zero"]]
+    zero = fit.std("zero") < 0.9 * fit.prior_std[fit.slices["zero"]]  # the data leave less than all of its doubt
     loaded = bool((fit.rows.mass > 0).any())
     for joint, name in enumerate(fit.names):
-        upright = vertical(fit.arm, joint)
+        upright = is_vertical(fit.arm, joint)
         pull = next((each for each in fit.springs if each.joint == name), None)
         if pull is not None:
             reasons[name, "gain"] = str(pull).removeprefix(f"{name}: ")
         elif not found["gain"][joint]:
             reasons[name, "gain"] = VERTICAL if upright else _no_gain(fit, joint, loaded)
         if not found["offset"][joint]:
-            reasons[name, "offset"] = "no sweep of this joint tells it"
+            reasons[name, "offset"] = "no sweep of this joint shows it"
         if joint == fit.arm.n - 1 and fit.prior_std[fit.slices["zero"]][joint] <= LAST_ZERO:
             reasons[name, "position_offset"] = "turning the last link's frame is the same as turning its centre of mass"
         elif not zero[joint]:
-            reasons[name, "position_offset"] = "the sweeps tell no more than was known before"
+            reasons[name, "position_offset"] = "the sweeps add nothing to what was known before"
     return reasons
 
 
-def told(fit: CreepFit, family: str) -> Mask:
+def determined_joints(fit: CreepFit, family: str) -> Mask:
     """Joints for which the data determine a family's value (n,); of friction every joint."""
     reasons = missing(fit)
     parameter = next((each for each, of in FAMILY.items() if of == family), None)
     return np.array([parameter is None or (name, parameter) not in reasons for name in fit.names])
 
 
-def values_told(fit: CreepFit, family: str) -> Array:
+def determined_values(fit: CreepFit, family: str) -> Array:
     """A family's estimates (n,), NaN where the data do not determine them."""
-    return np.where(told(fit, family), fit.value(family), np.nan)
+    return np.where(determined_joints(fit, family), fit.value(family), np.nan)
 
 
 def _no_gain(fit: CreepFit, joint: int, loaded: bool) -> str:
     if not (fit.rows.joint == joint).any():
         return "no sweep of this joint was free of disturbance"
     if not loaded:
-        return "without a reference mass only products of torque constant and mass are seen: sweep again with one"
+        return "without a reference mass only the product of torque constant and mass shows: sweep again with one"
     if not fit.found("gain").any() and known_lever(fit.arm) < SHORTEST:
         return NO_LEVER
     return "gravity loads this joint too little in these sweeps: attach the mass further out, or add poses"
@@ -159,13 +157,12 @@ def gravity_record(fit: CreepFit, arm_file: ArmFile, calibration: CalibrationRec
 
 @dataclass(frozen=True, eq=False)
 class CreepCalibration:
-    """What creep sweeps tell of the drives, as programs ask for it: NaN where they do not tell a value."""
+    """The drives' values by creep sweeps, as programs ask for them: NaN where the sweeps do not determine one."""
 
     fit: CreepFit
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Joint names."""
         return self.fit.names
 
     @cached_property
@@ -175,7 +172,7 @@ class CreepCalibration:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What disturbed the sweeps, one sentence each."""
+        """Disturbances of the sweeps, one sentence each."""
         return self.fit.findings
 
     @property
@@ -185,7 +182,7 @@ class CreepCalibration:
 
     def value(self, parameter: Value) -> Array:
         """Estimates (n,); the gain is what a drive reads for 1 N·m, 1/k."""
-        return values_told(self.fit, self._family(parameter))
+        return determined_values(self.fit, self._family(parameter))
 
     def std(self, parameter: Value) -> Array:
         """Standard deviations (n,)."""

@@ -14,12 +14,8 @@ from gcomp.arrays import Array
 
 LEAST_PERIODS = 2.0
 """Periods over the way of a sweep that a ripple has at least: slower ones could be gravity's."""
-FINENESS = 16
-"""Tried frequencies per reciprocal of the joint's way."""
 CLEAR = 12.0
 """Least power of a line, in twice the variance that is left without it: chance gives it once in 160,000 frequencies."""
-LEAST_BINS = 8
-"""Bins of a joint, over all its sweeps, in which a ripple is searched for."""
 
 
 def ripple_cycles(rows: CreepRows, residual: Array, n: int) -> Array:
@@ -27,12 +23,12 @@ def ripple_cycles(rows: CreepRows, residual: Array, n: int) -> Array:
     cycles = np.zeros(n)
     for joint in range(n):
         own = np.flatnonzero(rows.joint == joint)
-        if own.size >= 2 * LEAST_BINS:
-            cycles[joint] = _clearest(rows, residual, joint, own)
+        if own.size >= 16:  # eight bins both ways
+            cycles[joint] = _clearest_cycles(rows, residual, joint, own)
     return cycles
 
 
-def _clearest(rows: CreepRows, residual: Array, joint: int, own: NDArray[np.intp]) -> float:
+def _clearest_cycles(rows: CreepRows, residual: Array, joint: int, own: NDArray[np.intp]) -> float:
     position, spacing, way = rows.position[own, joint], [], []
     for sweep in np.unique(rows.sweep[own]):
         one = np.sort(position[(rows.sweep[own] == sweep) & (rows.side[own] > 0)])
@@ -42,15 +38,16 @@ def _clearest(rows: CreepRows, residual: Array, joint: int, own: NDArray[np.intp
     if not way:
         return 0.0
     lowest, highest = 2 * np.pi * LEAST_PERIODS / max(way), np.pi / float(np.median(spacing))
-    tried = np.arange(lowest, highest, 2 * np.pi / float(np.ptp(position)) / FINENESS)
+    # frequencies per reciprocal of the joint's way
+    tried = np.arange(lowest, highest, 2 * np.pi / float(np.ptp(position)) / 16)
     left = residual[own] - residual[own].mean()
-    powers = np.array([_explained(left, position, each) for each in tried])
+    powers = np.array([_explained_power(left, position, each) for each in tried])
     best = int(np.argmax(powers)) if powers.size else 0
     rest = (float(left @ left) - float(powers.max(initial=0.0))) / (own.size - 3)
     return float(tried[best]) if powers.max(initial=0.0) > 2 * CLEAR * max(rest, 1e-30) else 0.0
 
 
-def _explained(left: Array, position: Array, cycles: float) -> float:
+def _explained_power(left: Array, position: Array, cycles: float) -> float:
     """Part of the sum of squares of `left` that cosine and sine of so many periods a turn explain."""
     waves = np.stack([np.cos(cycles * position), np.sin(cycles * position)], axis=1)
     return float(left @ waves @ np.linalg.lstsq(waves, left, rcond=None)[0])

@@ -7,16 +7,64 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.motion.static_reading import StaticReading
+from armlink.link.types import Sample
+from calib.motion.static_reading import StaticReading, stack
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array, Mask
+
+
+def bin_readings(
+    samples: Sequence[Sample], joint: int, side: int, middles: Array, temperature: Array | None = None
+) -> list[StaticReading | None]:
+    """One reading per bin about `middles` (B,) [rad] of a creep of `joint` in direction `side`; None where it has none.
+
+    A bin is averaged with a Hann window over position, which suppresses ripple whose period is at most half its width.
+    Only samples count in which the joint has moved on in its direction: at a reversal friction takes a short way to
+    turn round. The reading's `speed` is that of the joint within the bin.
+    """
+    position, torque, t = stack(samples, "position"), stack(samples, "torque"), np.array([each.t for each in samples])
+    whole = np.isfinite(position).all(axis=1) & np.isfinite(torque[:, joint])
+    position, torque, t = position[whole], torque[whole], t[whole]
+    width = float(middles[1] - middles[0])
+    own = position[:, joint]
+    return [
+        _reading(position, torque, t, np.abs(own - middle) < width / 2, middle, width, joint, side, temperature)
+        for middle in middles
+    ]
+
+
+def _reading(
+    position: Array, torque: Array, t: Array, inside: Array, middle: float, width: float, joint: int, side: int,
+    temperature: Array | None,
+) -> StaticReading | None:  # fmt: skip
+    if inside.sum() < 5:  # too few for a mean
+        return None
+    q, v, when = position[inside], torque[inside], t[inside]
+    weight = 1 + np.cos(2 * np.pi * (q[:, joint] - middle) / width)
+    weight /= weight.sum()
+    centred = when - when.mean()
+    speed = float(centred @ q[:, joint]) / max(float(centred @ centred), 1e-12)
+    if speed * side <= 0:
+        return None
+    mean_q, mean_v = weight @ q, weight @ v
+    return StaticReading.of(
+        float(when.mean()),
+        mean_q,
+        mean_v,
+        count=int(inside.sum()),
+        settled=True,
+        position_std=np.sqrt(np.maximum(weight @ (q - mean_q) ** 2, 0.0)),
+        torque_std=np.sqrt(np.maximum(weight @ (v - mean_v) ** 2, 0.0)),
+        motor_torque=mean_v,
+        speed=abs(speed),
+        temperature=temperature,
+    )
+
 
 STEADY = 0.02
 """Largest difference of a bin's speed from the middle one of its creep, as a share: beyond, inertia takes torque."""
 ROUGH = 6.0
 """Where the speeds of a creep scatter more: so many times the middle size of these differences."""
-COMMON_MODE = 1.0
-"""Spread of the logged temperatures from which they, and not time, say how warm a drive is [K]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +93,6 @@ class CreepRows:
     """Temperature of each joint's drive at which warmth is 0 (n,) [°C]; NaN where it is not in kelvin."""
 
     def __len__(self) -> int:
-        """Rows."""
         return len(self.joint)
 
     @property
@@ -54,7 +101,6 @@ class CreepRows:
         return np.sign(self.velocity)
 
     def kept(self, mask: Mask) -> Self:
-        """Some of the rows."""
         names = ("joint", "position", "reading", "velocity", "mass", "warmth", "sweep")
         return replace(self, **{name: getattr(self, name)[mask] for name in names})
 
@@ -111,7 +157,7 @@ def _warmth(
     n = len(passes[0].manifest.names) if passes else 0
     temperature = np.array([each.temperature[j] for each, j in zip(readings, joint, strict=True)])
     known = bool(np.isfinite(temperature).all())
-    if known and np.ptp(temperature) >= COMMON_MODE:
+    if known and np.ptp(temperature) >= 1.0:  # [K]
         warm = np.array([temperature[joint == j].max(initial=-np.inf) for j in range(n)])
         return temperature - warm[joint], np.where(np.isfinite(warm), warm, np.nan)
     span = max(float(np.ptp(t)), 1.0) if len(t) else 1.0

@@ -9,25 +9,18 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused, Stall
 from armlink.link.guard import ReadingBounds
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
-from calib.creep.bins import bin_readings
 from calib.creep.plan import RAMP, CreepGround, check_creep_limits, creep_ends, creep_speed, plan_creep
+from calib.creep.rows import bin_readings
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.collisions import check_creeps
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, PlanLine, StallLine, SweepData, load_data
-from calib.sweep.run import Progress, new_manifest, sparkline
-from calib.sweep.stalls import OnStall, bridged, give_up, restart, stall_line
+from calib.sweep.run import Progress, SweepPass, new_manifest, sparkline
+from calib.sweep.stalls import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
-
-PAUSE = 0.5
-"""Rest before a creep [s]."""
-MOST_CONTACTS = 0.3
-"""Share of the sweeps that may end in a contact before the pass is given up."""
-CONTACT_TORQUE = 1.5
-"""Pull of a soft position loop that friction and gravity alone may ask for [N·m]."""
 
 
 def run_creep(
@@ -50,7 +43,7 @@ def run_creep(
     """
     with DataWriter(out, new_manifest(link, arm, reference_mass, on_stall), resume) as writer:
         data = load_data(out)
-        mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))
+        mover = repeat_work(link, on_stall, lambda: Mover(link, sweep_section(arm), DriveLimits.of(arm)))
         used = data.plan or plan or plan_creep(arm, seed=seed)
         ground = CreepGround.of(arm)
         check_creep_limits(ground, arm, used)
@@ -58,7 +51,7 @@ def run_creep(
             check_creeps(arm, ground.geometry, used, mover.command.position)
         if data.plan is None:
             writer.append(PlanLine(plan=used, resolution=tuple(mover.known_resolution.tolist())))
-        run = _Pass(mover, writer, ground, used, progress or (lambda *_: None), on_stall)
+        run = _CreepPass(mover, writer, progress, on_stall, ground, used)
         run.made = {reading.sweep for reading in data.readings}
         for sweep in used.sweeps:
             if sweep.name not in run.made and not any(_names(stall, sweep) for stall in data.stalls):
@@ -77,22 +70,20 @@ def _names(stall: StallLine, sweep: Sweep) -> bool:
     return stall.contact and stall.reading == sweep.name
 
 
-class _Pass:
-    """One pass under way."""
-
+class _CreepPass(SweepPass):
     def __init__(
         self,
         mover: Mover,
         writer: DataWriter,
+        progress: Progress | None,
+        on_stall: OnStall,
         ground: CreepGround,
         plan: SweepPlan,
-        progress: Progress,
-        on_stall: OnStall,
     ) -> None:
-        self._mover, self._writer, self._ground, self._plan = mover, writer, ground, plan
-        self._progress, self._on_stall = progress, on_stall
+        super().__init__(mover, writer, progress, on_stall)
+        self._ground, self._plan = ground, plan
         self._creep, self._home = ground.section.creep, np.array(plan.scout[0])
-        self._began, self._contacts = time.monotonic(), 0
+        self._contacts = 0
         self.made: set[str] = set()
 
     def sweep(self, sweep: Sweep) -> None:
@@ -102,17 +93,17 @@ class _Pass:
                 readings = self._both_ways(sweep)
                 break
             except Stall as stall:
-                self._bridge(stall, sweep)
+                self.bridge(stall, sweep.name)
             except Stalled as stalled:
                 self._note_contact(sweep, stalled)
                 return
         for reading in readings:
-            self._writer.append(reading)
+            self.writer.append(reading)
         self.made.add(sweep.name)
         self._report(sweep, readings)
 
     def _both_ways(self, sweep: Sweep) -> list[StaticReading]:
-        mover, joint = self._mover, sweep.joint
+        mover, joint = self.mover, sweep.joint
         middles, speed = np.array(sweep.steps), creep_speed(sweep)
         low, high = creep_ends(sweep)
         goal = np.array(sweep.rest)
@@ -136,7 +127,7 @@ class _Pass:
 
     def _rows(self, joint: int, end: float, speed: float) -> Array:
         """Targets of a creep at constant speed (K, n) [rad], rounded at both ends."""
-        period, start = self._mover.link.period, self._mover.command.position.copy()
+        period, start = self.mover.link.period, self.mover.command.position.copy()
         distance = end - start[joint]
         total = abs(distance) / speed + RAMP
         t = np.arange(1, int(np.ceil(total / period)) + 1) * period
@@ -148,24 +139,25 @@ class _Pass:
 
     def _guard(self, joint: int) -> ReadingBounds:
         """The creeping joint may be behind its target by `contact_lead`; the others' sag is no contact."""
-        n = self._mover.link.n
+        n = self.mover.link.n
         follow = np.full(n, np.inf)
-        stiffness = getattr(self._mover.link.arm.require_link().joints[joint].settings, "kp", None)
-        follow[joint] = max(self._creep.contact_lead, CONTACT_TORQUE / stiffness if stiffness else 0.0)
+        stiffness = getattr(self.mover.link.arm.require_link().joints[joint].settings, "kp", None)
+        # a soft loop pulls by 1.5 N·m for friction and gravity alone
+        follow[joint] = max(self._creep.contact_lead, 1.5 / stiffness if stiffness else 0.0)
         return ReadingBounds(np.full(n, -np.inf), np.full(n, np.inf), follow)
 
     def _pause(self) -> None:
-        for _ in range(round(PAUSE / self._mover.link.period)):
-            self._mover.cycle()
+        for _ in range(round(0.5 / self.mover.link.period)):
+            self.mover.cycle()
 
     def _temperature(self) -> Array | None:
         """Temperatures of the drives (n,) [°C]; None where not all report one."""
-        found = self._mover.link.read_temperatures()
+        found = self.mover.link.read_temperatures()
         return found if np.isfinite(found).all() else None
 
     def _note_contact(self, sweep: Sweep, stalled: Stalled) -> None:
         """Lead the joint back, and note the sweep as not made."""
-        mover = self._mover
+        mover = self.mover
         self._contacts += 1
         mover.come_to_rest()
         text = (
@@ -173,26 +165,18 @@ class _Pass:
             " itself or a cable"
         )
         line = StallLine(t=mover.seen_at, late_ms=None, reading=sweep.name, reason=text, contact=True)
-        self._writer.append(line)
-        self._progress(len(self.made), len(self._plan.sweeps), 0.0, text)
-        if self._contacts > MOST_CONTACTS * len(self._plan.sweeps):
-            raise Refused(f"{text}; {self._contacts} sweeps ended so: clear the workspace, or narrow lower and upper")
+        self.writer.append(line)
+        self.progress(len(self.made), len(self._plan.sweeps), 0.0, text)
+        if self._contacts > 0.3 * len(self._plan.sweeps):  # then the pass is given up
+            raise Refused(
+                f"{text}; {self._contacts} sweeps ended like this: clear the workspace, or narrow lower and upper"
+            )
         goal = mover.command.position.copy()
         goal[sweep.joint] = sweep.rest[sweep.joint]
         mover.travel(goal, self._plan.travel_acceleration)
 
-    def _bridge(self, stall: Stall, sweep: Sweep) -> None:
-        mover = self._mover
-        restart(
-            mover.link,
-            self._on_stall,
-            stall,
-            lambda each: self._writer.append(stall_line(each, mover.seen_at, sweep.name)),
-        )
-        bridged(mover.link, self._on_stall, mover.resume)
-
     def _report(self, sweep: Sweep, readings: list[StaticReading]) -> None:
         done, total = len(self.made), len(self._plan.sweeps)
-        left = (time.monotonic() - self._began) / max(done, 1) * (total - done)
+        left = (time.monotonic() - self.began) / max(done, 1) * (total - done)
         up = [float(each.torque[sweep.joint]) for each in readings if each.direction.sum() > 0]
-        self._progress(done, total, left, f"{sweep.name} {sparkline(up) if up else ''}")
+        self.progress(done, total, left, f"{sweep.name} {sparkline(up) if up else ''}")

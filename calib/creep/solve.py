@@ -9,13 +9,9 @@ from calib.creep.model import CreepModel
 from calib.creep.scatter import Scatter
 from gcomp.arrays import Array
 
-STEPS = 60
-SMALL = 1e-9
-"""A step that improves the cost by a smaller share of it ends the search."""
-
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class CreepSolution:
     """Maximum of the posterior."""
 
     x: Array
@@ -30,7 +26,7 @@ class Solution:
         return invert(self.information)
 
 
-def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: Array) -> Solution:
+def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: Array) -> CreepSolution:
     """The parameters for rows that scatter so, with the prior's mean and std (P,), from `start`."""
     x, damping = start.copy(), 1e-6
     reading = model.rows.reading
@@ -39,7 +35,7 @@ def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: A
         return float((scatter.whitened(reading - model.predict(at)) ** 2).sum() + (((at - mean) / std) ** 2).sum())
 
     now = cost(x)
-    for _ in range(STEPS):
+    for _ in range(60):
         predicted, jacobian = model.linearised(x)
         weighted = scatter.whitened(jacobian)
         information = weighted.T @ weighted + np.diag(1 / std**2)
@@ -53,11 +49,11 @@ def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: A
                 x, now, damping = tried, value, max(damping / 5, 1e-9)
                 break
             damping *= 8
-        if before - now <= SMALL * now:
+        if before - now <= 1e-9 * now:  # too little to go on
             break
     predicted, jacobian = model.linearised(x)
     weighted = scatter.whitened(jacobian)
-    return Solution(x, reading - predicted, weighted.T @ weighted + np.diag(1 / std**2))
+    return CreepSolution(x, reading - predicted, weighted.T @ weighted + np.diag(1 / std**2))
 
 
 def invert(information: Array) -> Array:

@@ -10,14 +10,13 @@ from armlink.errors import Refused
 from armlink.link.guard import ReadingBounds
 from armlink.link.types import Sample
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.creep.plan import CreepGround
-from calib.motion.mover import Mover, Stalled
+from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
-from calib.motion.thresholds import STALL
 from calib.plan.poses import nearest_first
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.stalls import OnStall, give_up, repeated
+from calib.sweep.stalls import OnStall, give_up, repeat_motion
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
@@ -50,7 +49,7 @@ def verify_creeping(
     The link must have been enabled. A pose that a Stall interrupts is repeated where `on_stall` accepts it. Raises
     Refused on records of another arm or where no pose can be reached, BusFault.
     """
-    ground, limits = CreepGround.of(arm_file), Limits.of(arm_file)
+    ground, limits = CreepGround.of(arm_file), DriveLimits.of(arm_file)
     calibration.require(arm_file)
     beta = np.array(gravity.require(arm_file).beta)
     mover = Mover(link, ground.section, limits)
@@ -60,7 +59,7 @@ def verify_creeping(
     angles, torques, skipped = list[Array](), list[Array](), 0
     held_out = _poses(ground, poses, seed, mover.position)
     for number, pose in enumerate(held_out, start=1):
-        ways = repeated(mover, on_stall, partial(_both_ways, mover, pose))
+        ways = repeat_motion(mover, on_stall, partial(_both_ways, mover, pose))
         if ways is None:
             skipped += 1
             continue

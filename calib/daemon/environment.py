@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Protocol, TypeVar
 
+from armlink.errors import ArmlinkError
 from armlink.loop.messages import LoopAnswer
 from calib.install.journaled_write import Controllers
 
@@ -42,7 +43,7 @@ class Immediate:
         return True
 
 
-class Port(Protocol):
+class BusAccess(Protocol):
     """Access to the bus loop."""
 
     @property
@@ -65,5 +66,34 @@ class Environment:
     """With time zone."""
     run: RunAside
     """For bus and record store."""
-    port: Port
+    port: BusAccess
     disk: Disk = field(default_factory=Immediate)
+
+
+class BusJobs:
+    """`busy` while a job is under way; the calibration in the controllers may change during that time."""
+
+    def __init__(self, run: RunAside) -> None:
+        self.busy = False
+        self._run = run
+
+    def start(self, work: Callable[[], T], done: Callable[[T | ArmlinkError], None]) -> None:
+        """Run `work` aside, then call `done` with its value or its ArmlinkError; any other error is raised."""
+
+        def back(outcome: T | Exception) -> None:
+            self.busy = False
+            _finish(outcome, done)
+
+        assert not self.busy
+        self.busy = True
+        self._run(work, back)
+
+    def aside(self, work: Callable[[], T], done: Callable[[T | ArmlinkError], None]) -> None:
+        """As `start`, for work that leaves the controllers alone: `busy` stays what it is."""
+        self._run(work, lambda outcome: _finish(outcome, done))
+
+
+def _finish(outcome: T | Exception, done: Callable[[T | ArmlinkError], None]) -> None:
+    if isinstance(outcome, Exception) and not isinstance(outcome, ArmlinkError):
+        raise outcome
+    done(outcome)

@@ -12,8 +12,6 @@ from armlink.content.printable_text import printable_json
 
 MOST_LINES = 10_000
 """Lines that wait for a reader of stderr that takes none; further ones are dropped."""
-LAST_SECONDS = 2.0
-"""Time at the end for the lines that wait [s]."""
 _KNOWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 
 
@@ -41,7 +39,7 @@ class LineQueue:
         self._to = to
         self._lines = queue.Queue[str](MOST_LINES)
         threading.Thread(target=self._run, name="log", daemon=True).start()
-        atexit.register(self.drain, LAST_SECONDS)
+        atexit.register(self.drain, 2.0)
 
     def write(self, text: str) -> None:
         """Returns at once."""
@@ -90,16 +88,16 @@ class LineLimit(logging.Filter):
         return True
 
 
-def log_as_json(level: int = logging.INFO) -> None:
+def log_as_json() -> None:
     """Send everything that is logged to stderr as JSON."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
     handler.addFilter(LineLimit())
     root = logging.getLogger()
     root.handlers[:] = [handler]
-    root.setLevel(level)
+    root.setLevel(logging.INFO)
     for chatty in ("can", "canopen"):  # they log every socket that they open, and every SDO
-        logging.getLogger(chatty).setLevel(max(level, logging.WARNING))
+        logging.getLogger(chatty).setLevel(logging.WARNING)
 
 
 def log_in_thread() -> None:

@@ -25,7 +25,6 @@ class Notifier:
         self.flush()
 
     def flush(self) -> None:
-        """Send what waits."""
         if not self._address:
             self._waiting.clear()
         if not self._waiting:

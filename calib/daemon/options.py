@@ -33,7 +33,6 @@ class Options:
         return daemon_section(arm).model_copy(update=given)
 
     def loop(self, arm: ArmFile) -> LoopOptions:
-        """Options of the bus loop."""
         return LoopOptions(arm, self.bus, self.listen_only, work=self.settings(arm).work, seed=int(time.time()))
 
 

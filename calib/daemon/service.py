@@ -20,18 +20,17 @@ from pathlib import Path
 
 from armlink.arm_file import ArmFile
 from armlink.loop.messages import LoopAnswer
-from calib.daemon.environment import Environment
+from calib.daemon.environment import BusJobs, Environment
 from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
-from calib.daemon.observing.active_records import ActiveRecords
-from calib.daemon.observing.daily_diagnosis import DailyDiagnosis
-from calib.daemon.observing.observation import Observation
-from calib.daemon.observing.observer_feed import ObserverFeed
-from calib.daemon.observing.observer_storage import ObserverStorage
-from calib.daemon.observing.pose_tours import PoseTours
-from calib.daemon.observing.recalibration_workflow import RecalibrationWorkflow
+from calib.daemon.observation.active_observation import ActiveObservation
+from calib.daemon.observation.active_records import ActiveRecords
+from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
+from calib.daemon.observation.observer_feed import ObserverFeed
+from calib.daemon.observation.observer_storage import ObserverStorage
+from calib.daemon.observation.pose_tours import PoseTours
+from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration, DaemonSection
 from calib.daemon.state.arm_state import ArmState
-from calib.daemon.state.bus_jobs import BusJobs
 from calib.daemon.state.busiest_minute import BusiestMinute
 from calib.daemon.state.event_log import EventLog
 from calib.daemon.state.journal import Journal
@@ -39,7 +38,7 @@ from calib.daemon.state.live_window import LiveWindow
 from calib.daemon.state.recordings import Recordings
 from calib.daemon.view.api_models import State
 from calib.daemon.view.fan_out import Hub
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.observer.recalibrator import Recalibrator
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
@@ -99,7 +98,6 @@ class Service:
 
     @property
     def state(self) -> State:
-        """Activity of the daemon."""
         connected = self.arm_state.connected
         if self.jobs.busy:
             return State.RECALIBRATING
@@ -111,7 +109,7 @@ class Service:
 
     @property
     def trouble(self) -> str:
-        """What the service lacks itself, the arm apart: its journal or its record store; empty if nothing."""
+        """Fault of the service itself, the arm apart: of its journal or its record store; empty if there is none."""
         return self.journal.trouble or self.records.store_fault
 
     def take(self, message: Message) -> None:
@@ -137,7 +135,6 @@ class Service:
             self.tours.refused(str(message.error))
 
     def tick(self) -> None:
-        """Do what is due."""
         self.journal.probe()
         self._say_set_aside()
         for part in (self.events, self.arm_state, self.records, self.recalibrations, self.tours, self.diagnosis):
@@ -201,19 +198,19 @@ class Service:
         self.save()
         self.records.renew()
 
-    def _observe(self, calibration: CalibrationRecord, gravity: GravityRecord) -> Observation:
+    def _observe(self, calibration: CalibrationRecord, gravity: GravityRecord) -> ActiveObservation:
         """An observation against these records, continued from the saved state if that fits; raises Refused."""
         configuration, before = self.configuration, self.records.observation
         arm = configuration.arm
         feed = ObserverFeed(arm, calibration, gravity, configuration.settings.observer_config())
         recalibrator = Recalibrator(arm, self.environment.port.controllers, self._store, "propose", calibration)
 
-        def installed(record: CalibrationRecord, finding: Finding) -> None:
+        def installed(record: CalibrationRecord, finding: DriftFinding) -> None:
             feed.install(record, finding)
             self.storage.save(feed, history=True)
 
         self.storage.restore(feed, self.recalibrations.begin(recalibrator, installed))
-        observation = Observation(
+        observation = ActiveObservation(
             feed, self.recalibrations, self.storage, self.journal, self.events, self.jobs, self.tours.wish
         )
         if before is not None:

@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
-from calib.daemon.observing.observation import Observation
+from calib.arm.skeleton import skeleton
+from calib.daemon.observation.active_observation import ActiveObservation
 from calib.daemon.service import Service
 from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.view import api_models
-from calib.daemon.view.drawn_arm import drawn_arm
+from calib.daemon.view.api_models import DrawnArm, DrawnJoint
 from calib.daemon.view.fan_out import Client
-from calib.daemon.view.view import Decisions, NoSuch
-from calib.daemon.view.window import Window
+from calib.daemon.view.view import Decisions, NoSuch, Window
 from gcomp.arrays import Array
 
 
@@ -31,11 +32,10 @@ class ServiceView:
         self.decisions: Decisions = service.recalibrations
 
     @property
-    def _observation(self) -> Observation | None:
+    def _observation(self) -> ActiveObservation | None:
         return self._service.records.observation
 
     def status(self) -> api_models.Status:
-        """State, bus and records."""
         service, observation = self._service, self._observation
         arm_state, configuration, now = service.arm_state, service.configuration, service.environment.monotonic()
         return api_models.Status(
@@ -65,7 +65,6 @@ class ServiceView:
         )
 
     def joints(self) -> tuple[api_models.JointNow, ...]:
-        """Every joint as of the newest samples, base to tip."""
         names, arm_state = self._service.configuration.names, self._service.arm_state
         batch = arm_state.batch
         if batch is None:
@@ -114,7 +113,6 @@ class ServiceView:
         return torque, model
 
     def estimates(self) -> tuple[api_models.JointEstimate, ...]:
-        """Every joint's gain and offset, base to tip; empty while there is no gravity record."""
         if self._observation is None:
             return ()
         feed, last_accepted = self._observation.feed, self._observation.last_accepted
@@ -139,19 +137,16 @@ class ServiceView:
         )
 
     def events(self, after: int = 0, limit: int = 500) -> tuple[api_models.EventRecord, ...]:
-        """Events with a larger id, oldest first; raises sqlite3.Error."""
         return tuple(self._service.journal.events(after, limit))
 
     def history(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
     ) -> tuple[api_models.HistoryPoint, ...]:
-        """Estimates over time, oldest first; raises NoSuch."""
         return tuple(point for page in self.history_pages(joint, since, until, most) for point in page)
 
     def history_pages(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
     ) -> Iterator[tuple[api_models.HistoryPoint, ...]]:
-        """Likewise in pieces; raises NoSuch at the first."""
         names, reader = self._service.configuration.names, self._history
         if joint is not None and joint not in names:
             raise NoSuch(f"no joint {joint!r}; there are {', '.join(names)}")
@@ -162,11 +157,9 @@ class ServiceView:
                 yield tuple(point for point in points if point is not None)
 
     def proposals(self, limit: int = 200) -> tuple[api_models.Proposal, ...]:
-        """Newest first."""
         return tuple(row.answer() for row in self._service.journal.proposals(limit))
 
     def subscribe(self) -> Client:
-        """A new client of the stream; it begins with the present joints."""
         client = self._service.hub.subscribe()
         client.put(self.snapshot())
         return client
@@ -228,3 +221,19 @@ def _point(
         return api_models.HistoryPoint(time=time, t=t, joint=joint, record=record, **values)
     except (LookupError, TypeError, ValueError):
         return None
+
+
+def drawn_arm(arm: ArmFile) -> DrawnArm:
+    """The arm of an arm file; reads its model file, if it has one, and raises BadInput or OSError if it cannot."""
+    drawn = skeleton(arm)
+    columns = zip(
+        arm.joint_names,
+        drawn.axes.tolist(),
+        drawn.points.tolist(),
+        drawn.reference.tolist(),
+        (link.tolist() for link in drawn.links),
+        strict=True,
+    )
+    keys = ("joint", "axis", "point", "reference", "link")
+    joints = tuple(DrawnJoint.model_validate(dict(zip(keys, column, strict=True))) for column in columns)
+    return DrawnArm.model_validate({"up": drawn.up.tolist(), "joints": joints})

@@ -12,13 +12,24 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
-from calib.field.linear_model import Belief, Solution, belief_of, field_columns, solve
-from calib.field.thresholds import DRIFT, GAIN_STD, OFFSET_STD, PAYLOAD_EVIDENCE, ROUNDS, UNKNOWN_MOMENT
+from calib.field.linear_model import UNKNOWN_MOMENT, Belief, Solution, belief_of, field_columns, solve
+from calib.fit.heldout import FEWEST
 from calib.records.records import CalibrationRecord, GravityRecord, Parameter
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.readings import StaticReadings
+
+GAIN_STD = 0.02
+"""Relative standard deviation above which a gain counts as not separable from the offset."""
+OFFSET_STD = 0.005
+"""Likewise of an offset, as a share of rated torque."""
+DRIFT = 0.05
+"""Standard deviation allowed for the drift of a gain that these rows do not show, as a ratio."""
+PAYLOAD_EVIDENCE = 10.0
+"""BIC difference up to which a payload that explains the rows worse than new gains and offsets is not excluded."""
+BLOCK = 24
+"""Rows that are held out together, since neighbours are correlated: six seconds of a recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +76,11 @@ def fit_field(
     belief = belief_of(arm, gravity, calibration)
     n, q = belief.arm.n, rows.position * belief.position_gain + belief.position_offset
     if not np.isfinite(rows.torque).any():
-        raise BadInput("no torque reading counts")
+        raise BadInput("no torque reading can be used")
     belief = belief.over(rows, q)
     gain, sigma = belief.installed.gain, rows.sigma
     noise, prior = sigma, belief.prior(np.ones(n))
-    for _ in range(ROUNDS):
+    for _ in range(4):  # Gauss-Newton steps, each with the noise scaled to the residuals' scatter
         columns = field_columns(belief, rows, q, gain)
         solved = solve(columns, rows.torque, noise, prior)
         residual: Array = rows.torque - columns @ solved.value
@@ -143,13 +154,13 @@ def _report(belief: Belief, rows: StaticReadings, columns: Array, solved: Soluti
         here = model[counted[:, j], j]
         sides = set(np.sign(rows.direction[counted[:, j], j])) - {0.0}
         if len(here) == 0:
-            reasons[name, "gain"] = reasons[name, "offset"] = "its sensor counts in none of these rows"
+            reasons[name, "gain"] = reasons[name, "offset"] = "none of these rows has a usable reading of its sensor"
         elif unseen[j]:
             reasons[name, "gain"] = _no_gain(here)
         if len(here) and len(sides) < 2:
             hysteresis[j] = np.nan
             reasons[name, "offset"] = (
-                "it was approached from one side only, where friction or hysteresis looks the same: move it both ways"
+                "it was approached from one side only, so friction and hysteresis look the same: move it both ways"
             )
         elif len(here) and np.sqrt(pairs[j, 1, 1]) > OFFSET_STD * belief.rated[j]:
             reasons[name, "offset"] = (
@@ -186,3 +197,23 @@ def _no_gain(torque: Array) -> str:
         f"it cannot be separated from the offset: gravity torque varies by only {spread:.2g} N·m (standard deviation)"
         " in these poses: move it, or the joints beyond it, further"
     )
+
+
+def heldout_errors(rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:
+    """Errors (K, n) [N·m] of held-out rows with a new calibration and with the one before; NaN if they do not count.
+
+    For every joint a line of readings over model torque is fitted to every second block of rows and predicts the
+    others.
+    """
+    block = np.arange(len(rows.torque)) // min(BLOCK, max(len(rows.torque) // 6, 1)) % 2
+    old = rows.torque - before.torque_calibration().apply(fit.torque)
+    new = np.full_like(old, np.nan)
+    counted = np.isfinite(old) & np.isfinite(fit.gain)
+    for j in range(old.shape[1]):
+        for held in (0, 1):
+            train, test = counted[:, j] & (block != held), counted[:, j] & (block == held)
+            if train.sum() < FEWEST:
+                continue
+            line = np.polyfit(fit.torque[train, j], rows.torque[train, j], 1)
+            new[test, j] = rows.torque[test, j] - np.polyval(line, fit.torque[test, j])
+    return new, old

@@ -8,13 +8,17 @@ from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.field.thresholds import HYSTERESIS, UNKNOWN_MOMENT
 from calib.fit.position_field import PositionField
 from calib.records.records import CalibrationRecord, Discrepancy, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 from gcomp.identify.readings import StaticReadings
+
+HYSTERESIS = 0.01
+"""Prior standard deviation of f_i, as a share of rated torque (docs/theory.md, section 4.3)."""
+UNKNOWN_MOMENT = 10.0
+"""Prior standard deviation of a mass moment that is not identifiable in the gravity record [kg·m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +38,7 @@ class Belief:
     spread: tuple[Array, Array] | None
     """Its standard deviations of gain and offset (n,), NaN if unknown; None without a record."""
     discrepancy: tuple[Discrepancy | None, ...]
-    """What that record's calibrated torque and the gravity model disagree by, joint by joint."""
+    """Disagreement of that record's calibrated torque with the gravity model, joint by joint."""
     local: Array
     """Columns of the discrepancy, each of unit standard deviation, at the rows (K, n, F) [N·m]; see `over`."""
 

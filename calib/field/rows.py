@@ -7,11 +7,23 @@ import numpy as np
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from armlink.torque_calibration import TorqueCalibration
-from calib.field.thresholds import FEWEST_ROWS, FEWEST_SAMPLES, MOVED, SLOW, STEADY, WINDOW
 from calib.fit.sweep_readings import sweep_readings
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.identify.readings import StaticReadings
+
+WINDOW = 0.25
+"""Length of a window, which is averaged to one row [s]."""
+FEWEST_SAMPLES = 3
+"""Samples of a window; its slope and scatter need as many."""
+SLOW = 0.1
+"""Largest speed of any joint in a window that counts: centrifugal torque is then below 0.1 N·m at 10 kg·m² [rad/s]."""
+STEADY = 0.05
+"""Largest change of any joint's speed [rad/s²] (docs/theory.md, section 6.1)."""
+MOVED = 0.004
+"""Motion of a joint after which its direction counts as changed [rad]."""
+FEWEST_ROWS = 12
+"""Rows that a recording must have: three unknowns a joint, and some more for the scatter."""
 
 
 def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], number: int, source: str) -> StaticReadings:

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from calib.fit.findings import Finding, effect_finding, encoder_findings, outlier_findings, scatter_findings
+from calib.fit.findings import FitFinding, effect_finding, encoder_findings, outlier_findings, scatter_findings
 from calib.fit.lags import Lags
 from calib.fit.position_field import PositionField
-from calib.fit.refinement import Extra, Refined, refine
+from calib.fit.refinement import FEWEST, Extra, Refined, refine
 from calib.fit.remaining_doubt import remaining_doubt
 from calib.fit.small_troubles import Setting
 from calib.fit.sweep_readings import SweepReadings
-from calib.fit.unmodelled_effects import Effect, size_of, strongest_effect
+from calib.fit.unmodelled_effects import UnmodelledEffect, size_of, strongest_effect
 from calib.records.records import Discrepancy
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
@@ -21,12 +21,8 @@ from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.parameters import Parameters, Prior
 from gcomp.identify.sensor_model import predict
 
-MOST_EFFECTS = 6
-"""Largest number of effects added one after the other; a choice."""
 OUTLIER = 6.0
 """Robust standard deviations of the deleted residual from which a reading is an outlier (docs/theory.md, 5.4)."""
-FEWEST = 8
-"""Smallest number of a joint's readings for a robust standard deviation; a choice."""
 MOST_OUTLIERS = 0.15
 """Largest share of a joint's readings that are left out as outliers; beyond it the model is at fault; a choice."""
 PLATEAU, PLATEAU_POSES = 4.0, 4
@@ -39,7 +35,7 @@ BLURRED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
+class LeftOutSweep:
     """Cross-validation of one sweep: its readings against a fit of all others."""
 
     sweep: str
@@ -56,12 +52,10 @@ class Goodness:
     """The final fit, and whether the sensor model holds."""
 
     refined: Refined
-    findings: tuple[Finding, ...]
-    outliers: Mask
-    """Readings left out as outliers (K, n)."""
-    left_out: tuple[LeftOut, ...]
+    findings: tuple[FitFinding, ...]
+    left_out: tuple[LeftOutSweep, ...]
     discrepancy: tuple[Discrepancy, ...]
-    """What the fit still doubts at a new pose, joint by joint."""
+    """Remaining doubt at a new pose, joint by joint."""
 
 
 def examine(
@@ -74,7 +68,7 @@ def examine(
     rows, findings = _without_plateaus(kinematics.names, rows)
     encoders = encoder_findings(kinematics.names, rows)
     setting = _setting(kinematics, rows, rated, fit.complete)
-    effects, sound = list[Effect](), rows.readings.sigma
+    effects, sound = list[UnmodelledEffect](), rows.readings.sigma
     outliers = np.zeros(sound.shape, dtype=bool)
 
     def fitted() -> Refined:
@@ -83,7 +77,7 @@ def examine(
         return refine(replace(rows, readings=kept), setting, fit, priors, extras)
 
     refined = fitted()
-    for _ in range(MOST_EFFECTS):
+    for _ in range(6):  # effects at most, one after the other
         strange = _outliers(kinematics, refined, rows, [extra for effect in effects for extra in effect.extras])
         if (strange != outliers).any():
             outliers = strange
@@ -102,7 +96,7 @@ def examine(
     findings += scatter_findings(kinematics.names, refined, rated, {finding.joint for finding in findings})
     final = encoders or findings  # a wrong position causes the others
     doubt = remaining_doubt(setting, rows, refined)
-    return Goodness(refined, tuple(final), outliers, leave_out(refined, rows), doubt)
+    return Goodness(refined, tuple(final), leave_out(refined, rows), doubt)
 
 
 def _setting(kinematics: Arm, rows: SweepReadings, rated: Array, parameters: Parameters) -> Setting:
@@ -112,7 +106,7 @@ def _setting(kinematics: Arm, rows: SweepReadings, rated: Array, parameters: Par
     return Setting(kinematics, rated, fields, (float(rows.time.min()), float(rows.time.max())), lags)
 
 
-def _sized(effects: list[Effect], refined: Refined) -> Iterator[tuple[Effect, Array]]:
+def _sized(effects: list[UnmodelledEffect], refined: Refined) -> Iterator[tuple[UnmodelledEffect, Array]]:
     """Each effect with its coefficients."""
     place = 0
     for effect in effects:
@@ -120,7 +114,7 @@ def _sized(effects: list[Effect], refined: Refined) -> Iterator[tuple[Effect, Ar
         place += len(effect.extras)
 
 
-def _doubted(sigma: Array, effects: list[Effect], refined: Refined) -> Array:
+def _doubted(sigma: Array, effects: list[UnmodelledEffect], refined: Refined) -> Array:
     """Standard deviations (K, n) [N·m] that include the uncertainty of the effects at each reading."""
     square = sigma**2
     for effect, coefficient in _sized(effects, refined):
@@ -129,7 +123,7 @@ def _doubted(sigma: Array, effects: list[Effect], refined: Refined) -> Array:
     return np.sqrt(square)
 
 
-def _without_plateaus(names: tuple[str, ...], rows: SweepReadings) -> tuple[SweepReadings, list[Finding]]:
+def _without_plateaus(names: tuple[str, ...], rows: SweepReadings) -> tuple[SweepReadings, list[FitFinding]]:
     """(Rows without readings at a sensor's limit, findings of sensors that saturate)."""
     torque, flat, found = rows.readings.torque, np.zeros(rows.readings.torque.shape, dtype=bool), []
     for joint, name in enumerate(names):
@@ -145,7 +139,7 @@ def _without_plateaus(names: tuple[str, ...], rows: SweepReadings) -> tuple[Swee
                 flat[near, joint] = True
                 limit = float(side * np.max(side * value))
                 text = f"{name}: {len(near)} readings at different poses are at {limit:.4g} N·m: the sensor saturates"
-                found.append(Finding(name, "saturation", limit, "N·m", text))
+                found.append(FitFinding(name, "saturation", limit, "N·m", text))
     readings = replace(rows.readings, torque=np.where(flat, np.nan, torque))
     return (replace(rows, readings=readings) if found else rows), found
 
@@ -157,7 +151,7 @@ def _sharp(rows: SweepReadings, joint: int) -> npt.NDArray[np.intp]:
     return counted[sigma <= BLURRED * np.median(sigma)] if len(counted) else counted
 
 
-def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOut, ...]:
+def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOutSweep, ...]:
     """Cross-validation of each sweep, by the block form of the leave-one-out residual (docs/theory.md, section 5.4)."""
     linear, found = refined.linear, []
     series = rows.readings.series[linear.row]
@@ -173,7 +167,7 @@ def leave_out(refined: Refined, rows: SweepReadings) -> tuple[LeftOut, ...]:
         outside = turn[:, kept] @ ((turn[:, kept].T @ residual) / size[kept])
         expected = float(residual @ outside) / max(int(kept.sum()), 1)
         rms = float(np.sqrt(np.mean((outside * linear.sigma[here]) ** 2)))
-        found.append(LeftOut(name, int(linear.joint[here[0]]), rms, float(np.sqrt(max(expected, 0.0)))))
+        found.append(LeftOutSweep(name, int(linear.joint[here[0]]), rms, float(np.sqrt(max(expected, 0.0)))))
     return tuple(found)
 
 

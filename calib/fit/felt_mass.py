@@ -12,8 +12,6 @@ from gcomp.identify.readings import StaticReadings
 
 LEAST, MOST = 0.4, 2.5
 """A mass that is felt as this share of the stated one is another mass: no sensor gain is so far from 1."""
-SURE = 0.15
-"""A joint counts if it tells the share to this standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +22,6 @@ class FeltMass:
     """[kg]."""
     felt: float
     """[kg]."""
-    std: float
-    """Standard deviation of `felt` [kg]; the spread of the gains is not in it."""
 
     @property
     def contradicts(self) -> bool:
@@ -58,14 +54,12 @@ def felt_mass(arm: Arm, readings: StaticReadings) -> FeltMass | None:
         loaded = np.hstack([load * (rows @ at_origin[2 * joint :, None]), load * (rows @ by_point[2 * joint :])])
         columns = np.hstack([loaded * stated, rows, np.ones((len(rows), 1))])
         found = _first(columns, readings.torque[counts, joint], readings.sigma[counts, joint])
-        if found is not None and found[1] < SURE:
+        if found is not None and found[1] < 0.15:  # else the joint does not tell the share
             shares.append(abs(found[0]))
             spreads.append(found[1])
     if not shares:
         return None
-    weights = 1 / np.square(spreads)
-    share = float(np.average(shares, weights=weights))
-    return FeltMass(stated, stated * share, stated * float(1 / np.sqrt(weights.sum())))
+    return FeltMass(stated, stated * float(np.average(shares, weights=1 / np.square(spreads))))
 
 
 def _first(columns: Array, values: Array, sigma: Array) -> tuple[float, float] | None:

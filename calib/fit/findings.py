@@ -7,8 +7,8 @@ import numpy as np
 
 from calib.fit.refinement import Refined
 from calib.fit.sweep_readings import SweepReadings
-from calib.fit.unmodelled_effects import Effect, size_of
-from calib.motion.encoder_bits import stuck_bits
+from calib.fit.unmodelled_effects import UnmodelledEffect, size_of
+from calib.motion.encoder_check import stuck_bits
 from gcomp.arrays import Array, Mask
 
 Kind = Literal[
@@ -31,7 +31,7 @@ HOLDING: tuple[Kind, ...] = ("direction", "hysteresis", "outliers")
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class FitFinding:
     """An effect in the readings that the sensor model does not have."""
 
     joint: str
@@ -49,8 +49,8 @@ class Finding:
 
 
 def effect_finding(
-    names: tuple[str, ...], effect: Effect, coefficient: Array, refined: Refined, rated: Array
-) -> Finding:
+    names: tuple[str, ...], effect: UnmodelledEffect, coefficient: Array, refined: Refined, rated: Array
+) -> FitFinding:
     """One effect in words."""
     name, gain = names[effect.joint], float(refined.fit.complete.gain[effect.joint]) or 1.0
     value = float(coefficient[0])
@@ -59,43 +59,43 @@ def effect_finding(
             f"{name}: torque linear in position that gravity does not explain, {value / gain:+.3g} N·m/rad: a cable or"
             " spring over the joint? It is taken out; its pull at 0 rad is part of the offset"
         )
-        return Finding(name, "spring", value / gain, "N·m/rad", text)
+        return FitFinding(name, "spring", value / gain, "N·m/rad", text)
     if effect.each_sweep:
         size = size_of(coefficient)
         text = f"{name}: readings differ by {2 * size:.3g} N·m with the side of approach; taken out"
-        return Finding(name, "direction", size, "N·m", text)
+        return FitFinding(name, "direction", size, "N·m", text)
     if effect.id == "torque.hysteresis":
         text = (
             f"{name}: the torque sensor lags by {abs(value):.3g} N·m behind changes of torque (hysteresis); taken out"
         )
-        return Finding(name, "hysteresis", abs(value), "N·m", text)
+        return FitFinding(name, "hysteresis", abs(value), "N·m", text)
     if effect.id == "torque.saturation":
         text = f"{name}: the torque sensor flattens beyond {effect.knee:.3g} N·m: does it saturate?"
-        return Finding(name, "saturation", effect.knee, "N·m", text)
+        return FitFinding(name, "saturation", effect.knee, "N·m", text)
     if effect.id == "torque.drift":
         text = f"{name}: the torque reading drifts by {value * 3600:+.3g} N·m an hour: warm up, then sweep again"
-        return Finding(name, "drift", value * 3600, "N·m/h", text)
+        return FitFinding(name, "drift", value * 3600, "N·m/h", text)
     if effect.id == "position.eccentricity":
         size = float(np.hypot(*coefficient))
         text = f"{name}: the position reading is wrong by {size:.3g} rad once a turn: an eccentric encoder disc?"
-        return Finding(name, "eccentricity", size, "rad", text)
+        return FitFinding(name, "eccentricity", size, "rad", text)
     text = f"{name}: the torque sensor's gain changes with the load (by {2 * value / gain:+.2%} at the largest)"
-    return Finding(name, "nonlinear", value / gain, "1", text)
+    return FitFinding(name, "nonlinear", value / gain, "1", text)
 
 
-def encoder_findings(names: tuple[str, ...], rows: SweepReadings) -> list[Finding]:
+def encoder_findings(names: tuple[str, ...], rows: SweepReadings) -> list[FitFinding]:
     """Findings of position sensors with a bit that never changes."""
     found = []
     for joint, bit, step in stuck_bits(rows.readings.position, rows.resolution, rows.target):
         text = (
             f"{names[joint]}: bit {bit} of the position reading ({step:.3g} rad) never changes: the encoder or its"
-            " transmission is faulty; nothing found with this joint's positions holds"
+            " transmission is faulty; no result that uses this joint's position is valid"
         )
-        found.append(Finding(names[joint], "encoder", step, "rad", text))
+        found.append(FitFinding(names[joint], "encoder", step, "rad", text))
     return found
 
 
-def outlier_findings(names: tuple[str, ...], rows: SweepReadings, outliers: Mask) -> list[Finding]:
+def outlier_findings(names: tuple[str, ...], rows: SweepReadings, outliers: Mask) -> list[FitFinding]:
     """Findings of outliers, by joint, with a likely cause."""
     found = []
     for joint in np.flatnonzero(outliers.any(axis=0)):
@@ -106,11 +106,11 @@ def outlier_findings(names: tuple[str, ...], rows: SweepReadings, outliers: Mask
         run = len(at) >= 2 and len(set(series.tolist())) == 1
         cause = "it touched something there, or a resting joint slipped" if run else "a knock or a bad contact"
         text = f"{names[joint]}: {len(at)} readings left out, {places}{more}: {cause}?"
-        found.append(Finding(names[joint], "outliers", float(len(at)), "readings", text))
+        found.append(FitFinding(names[joint], "outliers", float(len(at)), "readings", text))
     return found
 
 
-def scatter_findings(names: tuple[str, ...], refined: Refined, rated: Array, named: set[str]) -> list[Finding]:
+def scatter_findings(names: tuple[str, ...], refined: Refined, rated: Array, named: set[str]) -> list[FitFinding]:
     """Findings of joints whose readings scatter far more than their samples' noise, without a known cause."""
     linear, found = refined.linear, []
     rest = linear.residual * linear.sigma
@@ -124,5 +124,5 @@ def scatter_findings(names: tuple[str, ...], refined: Refined, rated: Array, nam
                 f"{name}: readings scatter by {rms:.3g} N·m, {refined.factor[joint]:.0f} times what their noise"
                 " explains, and no known effect accounts for it: the model does not hold here"
             )
-            found.append(Finding(name, "scatter", rms, "N·m", text))
+            found.append(FitFinding(name, "scatter", rms, "N·m", text))
     return found

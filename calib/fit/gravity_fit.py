@@ -12,8 +12,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.fit.sensor_fit import SensorFit
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
-from calib.sweep.data_sets import digests
-from calib.sweep.dataset import SweepData
+from calib.sweep.dataset import SweepData, digests
 from gcomp.arrays import Array, Mask
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import GlobalFit, identify_global
@@ -88,7 +87,7 @@ def identify_gravity(
     )
 
 
-def calibrated(rows: SweepReadings, calibration: Parameters, which: Mask) -> StaticReadings:
+def calibrated_readings(rows: SweepReadings, calibration: Parameters, which: Mask) -> StaticReadings:
     """Readings of the swept joints' own sensors, calibrated to true angles [rad] and torques [N·m]."""
     readings = rows.readings
     own = rows.own
@@ -103,7 +102,7 @@ def calibrated(rows: SweepReadings, calibration: Parameters, which: Mask) -> Sta
 
 
 def _recursion(arm_file: ArmFile, rows: SweepReadings, calibration: Parameters) -> RecursiveFit | None:
-    readings = calibrated(rows, calibration, rows.readings.load == 0)
+    readings = calibrated_readings(rows, calibration, rows.readings.load == 0)
     if len(readings) == 0 or not readings.counted.any(axis=0).all():
         return None
     try:

@@ -22,7 +22,7 @@ LEAST = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Effects:
+class RandomEffects:
     """Normal equations of m random effects, what parameters and nuisances can explain taken out."""
 
     square: Array
@@ -35,7 +35,9 @@ class Effects:
     families: int
 
     @classmethod
-    def of(cls, fixed: Array, effects: Array, target: Array, family: npt.NDArray[np.int64], families: int) -> "Effects":
+    def of(
+        cls, fixed: Array, effects: Array, target: Array, family: npt.NDArray[np.int64], families: int
+    ) -> "RandomEffects":
         """From weighted rows: fixed columns (P, f) and priors below (P + priors, f), effects (P, m), target likewise.
 
         The fixed columns are in units in which a standard deviation of 1 is no knowledge.
@@ -67,7 +69,7 @@ class Levels:
     """Of the levels' logarithms (F, F)."""
 
 
-def learn(effects: Effects, start: Array, largest: Array) -> Levels:
+def learn(effects: RandomEffects, start: Array, largest: Array) -> Levels:
     """Levels of all families (F,), at most `largest`, by Fisher scoring in their logarithms, with a common level.
 
     A family has the inverse χ² prior of WEIGHT coefficients at the common level, which is unknown within the range.
@@ -85,7 +87,7 @@ def learn(effects: Effects, start: Array, largest: Array) -> Levels:
     return Levels(np.exp(theta[:count]), told, covariance[:count, :count])
 
 
-def _scored(effects: Effects, theta: Array) -> tuple[Array, Array, Array]:
+def _scored(effects: RandomEffects, theta: Array) -> tuple[Array, Array, Array]:
     """Of (M) and the prior at log levels (F + 1,), the common one last: gradient, freedom (F,), expected Hessian."""
     count, family = effects.families, effects.family
     level = np.exp(theta[:count])

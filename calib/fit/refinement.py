@@ -13,14 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg
 
-from calib.fit.levels import Effects, Levels, learn
+from calib.fit.levels import Levels, RandomEffects, learn
 from calib.fit.small_troubles import FAMILIES, LARGEST, UNITS, Setting, Troubles, troubles
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.identifiability import analyse, describe_null_space
-from gcomp.identify.natural_units import natural_units
-from gcomp.identify.parameters import Parameters, Prior, parameter_names, prior_vectors
+from gcomp.identify.parameters import Parameters, Prior, natural_units, parameter_names, prior_vectors
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict_and_jacobian
 
@@ -30,8 +29,6 @@ ROUGHLY, a choice."""
 LEAST_FACTOR = 0.5
 """Least scatter over the samples' noise; it only bounds the search. Less than 1 is by chance, but so is as much more:
 cut off at 1, the intervals of perfect arms were 5 % too wide."""
-ROUNDS = 4
-"""Gauss-Newton steps, each followed by an update of the noise; the start is the global fit's minimum; a choice."""
 NEGLIGIBLE = 0.1
 """Share of a reading's noise below which rounding is neglected: it adds 0.5 % to the standard deviation."""
 FEWEST = 8.0
@@ -89,8 +86,6 @@ class Refined:
     linear: Linear
     coefficients: Array
     """Of the extras, in their units (m,)."""
-    freedom: Array
-    """Free readings of each joint (n,)."""
     levels: Levels
     """Of the small troubles."""
     troubles: Troubles
@@ -110,7 +105,7 @@ def refine(
     problem = _Problem(rows, setting, fit, priors, extras)
     vector, factor = fit.complete.vector.copy(), np.ones(kinematics.n)
     level = np.ones(len(FAMILIES))
-    for _ in range(ROUNDS):
+    for _ in range(4):  # Gauss-Newton steps, each followed by an update of the noise; a choice
         step = problem.step(vector, factor, level)
         level = step.levels.level
         vector[problem.free] += step.solution[: step.parameters]
@@ -144,14 +139,13 @@ def refine(
         factor,
         step.linear,
         step.solution[behind],
-        freedom,
         step.levels,
         step.troubles,
         Parameters.from_vector(certainty, kinematics.n),
     )
 
 
-def _certainty(step: "_Step", covariance: Array, free: Array) -> Array:
+def _certainty(step: "_RefinementStep", covariance: Array, free: Array) -> Array:
     """Degrees of freedom (p,) of the parameters' variances, by Satterthwaite: 2 v² over the variance of v.
 
     v consists of each joint's noise, known from its `free` (n,) readings, and one part a family, in proportion to its
@@ -169,9 +163,7 @@ def _certainty(step: "_Step", covariance: Array, free: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
-    """One Gauss-Newton step."""
-
+class _RefinementStep:
     solution: Array
     """Change of the free parameters, then the extras' coefficients."""
     parameters: int
@@ -206,7 +198,7 @@ class _Problem:
         self.scale = np.concatenate([natural_units(kinematics, readings, fit.complete)[self.free], sizes])
         self.resolution = rows.resolution
 
-    def step(self, vector: Array, factor: Array, level: Array) -> _Step:
+    def step(self, vector: Array, factor: Array, level: Array) -> _RefinementStep:
         """Solve the problem linearised at a parameter vector (6n + 3,), noise times factor (n,)."""
         readings, free = self.readings, int(self.free.sum())
         modelled, jacobian, slope = predict_and_jacobian(self.arm, Parameters.from_vector(vector, self.arm.n), readings)
@@ -226,7 +218,7 @@ class _Problem:
         weighted = found.columns / sigma[:, None]
         nuisance = np.vstack([rounding, np.zeros((known, rounding.shape[1]))])
         fixed = np.hstack([design * self.scale, nuisance])
-        effects = Effects.of(fixed, weighted, target, found.family, len(FAMILIES))
+        effects = RandomEffects.of(fixed, weighted, target, found.family, len(FAMILIES))
         levels = learn(effects, level, LARGEST)
         random = np.hstack([rounding, weighted * levels.level[found.family]])
         root = np.linalg.cholesky(np.eye(count) + random @ random.T)
@@ -251,7 +243,7 @@ class _Problem:
             random[:, rounding.shape[1] :],
         )
         triangle: Array = np.asarray(np.linalg.qr(rest, mode="r"), dtype=np.float64)
-        return _Step(solution, free, triangle, self.scale, linear, levels, found)
+        return _RefinementStep(solution, free, triangle, self.scale, linear, levels, found)
 
 
 def _scatter(linear: Linear, n: int) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""What a fit still doubts about the torque at a new pose, beyond the covariance of its parameters, joint by joint."""
+"""Doubt of a fit about the torque at a new pose, beyond the covariance of its parameters, joint by joint."""
 
 from dataclasses import replace
 

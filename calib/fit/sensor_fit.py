@@ -12,12 +12,10 @@ from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.fit.examination import Goodness, examine
-from calib.fit.findings import Finding
-from calib.fit.missing_values import missing_values
+from calib.fit.findings import FitFinding
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
-from calib.sweep.data_sets import digests
-from calib.sweep.dataset import SweepData
+from calib.sweep.dataset import SweepData, digests
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Parameters, Prior
@@ -81,7 +79,7 @@ class SensorFit:
         return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[FitFinding, ...]:
         """Effects in the readings that the sensor model does not have."""
         return self.goodness.findings
 
@@ -110,7 +108,7 @@ class SensorFit:
         point, half = self.attachment
         if np.isnan(point).all():
             return "where the reference mass hung is not observable"
-        place = ", ".join(_said(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
+        place = ", ".join(_value_text(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
         moments = [f"{mass:g} kg: {_triple(mass * point)} kg·m" for mass in self.rows.masses if mass]
         return (
             f"the reference mass hung at ({place}) m of the last joint's frame; its mass moment, {'; '.join(moments)}"
@@ -135,7 +133,6 @@ class SensorFit:
         return rms
 
     def record(self, arm_file: ArmFile) -> CalibrationRecord:
-        """The calibration record of this fit."""
         residual = self.residual_rms
         joints = tuple(
             JointCalibration(
@@ -183,7 +180,7 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
         fit=fit,
         rows=rows,
         noise_factor=good.refined.factor,
-        hysteresis=_half_difference(rows.readings.torque - _modelled(arm_file, fit, rows), rows),
+        hysteresis=_half_difference(rows.readings.torque - _model_readings(arm_file, fit, rows), rows),
         friction=_friction(fit, rows),
         goodness=good,
         quantile=_quantiles(good.refined.certainty),
@@ -214,7 +211,7 @@ def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
     return examine(kinematics, rows, fit, priors, arm_file.require_link().rated_torques)
 
 
-def _modelled(arm_file: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:
+def _model_readings(arm_file: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:
     """Torque readings (K, n) by the fitted sensors and moments alone [N·m]."""
     return predict(gcomp_arm(arm_file), fit.complete, rows.readings)
 
@@ -248,12 +245,43 @@ def _gain_ratio(arm_file: ArmFile, rows: SweepReadings) -> Array:
 
 
 def _triple(values: Array) -> str:
-    return f"({', '.join(map(_said, values))})"
+    return f"({', '.join(map(_value_text, values))})"
 
 
-def _said(value: float, interval: str = "") -> str:
+def _value_text(value: float, interval: str = "") -> str:
     return "not observable" if np.isnan(value) else f"{value:.4f}{interval}"
 
 
 def _number(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
+
+
+WHERE_IT_HANGS = ": measure where the reference mass hangs (sweep.reference_point in the arm file)"
+"""Remedy for a gain that the readings with a mass leave open, as those of a single joint do."""
+
+
+def missing_values(fit: GlobalFit, rows: SweepReadings) -> dict[tuple[str, Parameter], str]:
+    """(joint, parameter) → reason, for each parameter without a value."""
+    reasons: dict[tuple[str, Parameter], str] = {}
+    lost = {name: found for name, found in zip(fit.names, fit.identifiable, strict=True) if not found}
+    for name in (*lost, *fit.hopeless):
+        family, _, joint = name.rstrip("]").partition("[")
+        for parameter in PARAMETERS:
+            if parameter == family:
+                reasons[joint, parameter] = _reason(name, fit, rows)
+    return reasons
+
+
+def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
+    if name in fit.hopeless:
+        spread = float(np.sqrt(fit.covariance_of(name)[0, 0]))
+        return f"these sweeps determine it to ± {2 * spread:.2g} only: gravity hardly acts on it in these poses"
+    for sentence in fit.null_space:
+        if name in sentence:
+            if "common factor" in sentence and not any(rows.masses):
+                return "no readings with a reference mass: only ratios of gains are determined"
+            remedy = WHERE_IT_HANGS if "load_point" in sentence and name.startswith("gain") else ""
+            if sentence.count(",") > 6:  # too many parameters to name
+                return f"not identifiable: the data fit equally well with other values{remedy}"
+            return f"{sentence}{remedy}"
+    return "the readings do not determine it"

@@ -65,15 +65,13 @@ class Troubles:
     """Index in FAMILIES of each coefficient (m,)."""
     joint: npt.NDArray[np.int64]
     """Joint that each coefficient belongs to (m,)."""
-    label: tuple[str, ...]
-    """Neighbouring joint, axis or term of each coefficient (m,); for people."""
     kept: Mask
     """Which of all columns these are: those that change some reading."""
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What the columns need beside the readings."""
+    """Inputs of the columns beside the readings."""
 
     arm: Arm
     rated: Array
@@ -97,25 +95,24 @@ def troubles(setting: Setting, rows: SweepReadings, parameters: Parameters, keep
         here = counted[:, joint]
         values = np.zeros((*counted.shape, field.root.shape[0]))
         values[here, joint] = setting.rated[joint] * field.columns(rows.readings.position[here])
-        found += [("field", joint, f"{k}", column) for k, column in enumerate(values[counted].T * UNITS["field"][0])]
+        found += [("field", joint, column) for column in values[counted].T * UNITS["field"][0]]
     if keep is None:
-        keep = np.array([np.abs(each[3]).max(initial=0.0) > 0 for each in found])
+        keep = np.array([np.abs(each[2]).max(initial=0.0) > 0 for each in found])
     kept = [each for each, wanted in zip(found, keep, strict=True) if wanted]
     return Troubles(
-        np.column_stack([np.zeros((int(counted.sum()), 0)), *(each[3] for each in kept)]),
+        np.column_stack([np.zeros((int(counted.sum()), 0)), *(each[2] for each in kept)]),
         np.array([FAMILIES.index(each[0]) for each in kept], dtype=np.int64),
         np.array([each[1] for each in kept], dtype=np.int64),
-        tuple(each[2] for each in kept),
         keep,
     )
 
 
-def _one_column(counted: Mask, family: str, joint: int, label: str, values: Array) -> tuple[str, int, str, Array]:
-    return family, joint, label, values[counted] * UNITS[family][0]
+def _one_column(counted: Mask, family: str, joint: int, values: Array) -> tuple[str, int, Array]:
+    return family, joint, values[counted] * UNITS[family][0]
 
 
-def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Iterator[tuple[str, int, str, Array]]:
-    """(Family, joint, label, change of all readings (K, n) per unit) of every named trouble."""
+def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Iterator[tuple[str, int, Array]]:
+    """(Family, joint, change of all readings (K, n) per unit) of every named trouble."""
     arm, readings, rated = setting.arm, rows.readings, setting.rated
     n, gain = arm.n, parameters.gain
     frames = bar_frames(arm, joint_positions(parameters, readings))
@@ -144,54 +141,54 @@ def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Ite
 
     for joint in range(n):
         base = BASE if joint == 0 else 1.0
-        for label, axis in zip("xy", _crossing(arm, frames.rotation, joint), strict=True):
-            yield "axes", joint, label, gain * turn(joint, axis) * base
+        for axis in _crossing(arm, frames.rotation, joint):
+            yield "axes", joint, gain * turn(joint, axis) * base
             for link, across in product(range(joint, upright), range(2)):
                 moment = unseen * frames.rotation[:, link, :, across]
                 change = gain * swung(joint, axis, moment, link) * base
-                yield "upright", joint, f"{label} of link {link} {'xy'[across]}", change
+                yield "upright", joint, change
         stiffness = gain * turn(joint, frames.rotation[:, joint, :, 2])
         angle = readings.position[:, joint]
-        yield "eccentricity", joint, "sin", stiffness * np.sin(angle)[:, None]
-        yield "eccentricity", joint, "cos", stiffness * np.cos(angle)[:, None]
-        yield "sag", joint, "", stiffness * felt[:, joint, None] / rated[joint]
+        yield "eccentricity", joint, stiffness * np.sin(angle)[:, None]
+        yield "eccentricity", joint, stiffness * np.cos(angle)[:, None]
+        yield "sag", joint, stiffness * felt[:, joint, None] / rated[joint]
         if joint < n - 1:
             for across in range(3):  # a length: where the load hangs beyond this link
                 shift = np.einsum("kid,kd->ki", frames.lever, frames.rotation[:, joint, :, across])
                 reach = np.where(np.arange(n) <= joint, shift, 0.0) * readings.load[:, None]
-                yield "axes", joint, f"length {'xyz'[across]}", gain * reach
+                yield "axes", joint, gain * reach
     own, bare = np.eye(n), np.ones((len(torque), 1))
     middle = (arm.lower + arm.upper) / 2
     since = _waves(rows.time, setting.span)
     for joint, here in enumerate(own):
         for other in {joint - 1, joint + 1} & set(range(n)):
-            yield "crosstalk", joint, arm.names[other], here * gain[joint] * felt[:, other, None]
+            yield "crosstalk", joint, here * gain[joint] * felt[:, other, None]
         share = torque[:, joint, None] / rated[joint]
-        yield "nonlinear", joint, "", here * gain[joint] * rated[joint] * share**3
+        yield "nonlinear", joint, here * gain[joint] * rated[joint] * share**3
         for other in {joint - 1, joint, joint + 1} & set(range(n)):
             bent = readings.position[:, other, None] - middle[other]
-            yield "spring", joint, arm.names[other], here * gain[joint] * rated[joint] * bent
-        yield "spring", joint, "rest", here * gain[joint] * rated[joint] * REST * bare
+            yield "spring", joint, here * gain[joint] * rated[joint] * bent
+        yield "spring", joint, here * gain[joint] * rated[joint] * REST * bare
         side = np.where(rows.swept == joint, readings.direction[:, joint], 0.0)[:, None]
-        yield "direction", joint, "side", here * rated[joint] * side
-        yield "direction", joint, "sensor", here * rated[joint] * setting.lags.sensor[:, joint, None]
-        for number, lag in enumerate(setting.lags.cable):
-            yield "direction", joint, f"cable {number}", here * rated[joint] * lag[:, joint, None]
+        yield "direction", joint, here * rated[joint] * side
+        yield "direction", joint, here * rated[joint] * setting.lags.sensor[:, joint, None]
+        for lag in setting.lags.cable:
+            yield "direction", joint, here * rated[joint] * lag[:, joint, None]
             for other in {joint - 1, joint + 1} & set(range(n)):
                 beside = BESIDE * lag[:, other, None]
-                yield "direction", joint, f"cable {number} {arm.names[other]}", here * rated[joint] * beside
+                yield "direction", joint, here * rated[joint] * beside
         share = (readings.position[:, joint] - middle[joint])[:, None] / ((arm.upper - arm.lower)[joint] / 2)
         for bend in (share, 1.5 * share**2 - 0.5, 2.5 * share**3 - 1.5 * share):
-            yield "direction", joint, "bend", here * rated[joint] * side * bend
-        for number, sweep in enumerate(rows.sweeps):
+            yield "direction", joint, here * rated[joint] * side * bend
+        for number in range(len(rows.sweeps)):
             during = (readings.series == number) & (rows.swept >= 0)
             moved = (during & (rows.swept == joint))[:, None]
             scale = here * rated[joint]
-            yield "direction", joint, f"held in {sweep}", scale * ROUGHLY * (during[:, None] & ~moved)
-            yield "direction", joint, f"moved in {sweep}", scale * ROUGHLY * moved
-            yield "direction", joint, f"side in {sweep}", scale * ROUGHLY * side * moved
-        for number, wave in enumerate(since):
-            yield "drift", joint, f"{number}", here * gain[joint] * rated[joint] * wave[:, None]
+            yield "direction", joint, scale * ROUGHLY * (during[:, None] & ~moved)
+            yield "direction", joint, scale * ROUGHLY * moved
+            yield "direction", joint, scale * ROUGHLY * side * moved
+        for wave in since:
+            yield "drift", joint, here * gain[joint] * rated[joint] * wave[:, None]
 
 
 def _along_axes(arm: Arm, rho: Array) -> Array:

@@ -9,8 +9,7 @@ import numpy.typing as npt
 from armlink.errors import BadInput
 from armlink.torque_calibration import TorqueCalibration
 from calib.motion.static_reading import StaticReading, batch, stack
-from calib.sweep.data_sets import labels
-from calib.sweep.dataset import SweepData
+from calib.sweep.dataset import SweepData, labels
 from gcomp.arrays import Array, Mask
 from gcomp.identify.readings import StaticReadings
 
@@ -40,8 +39,6 @@ class SweepReadings:
     """The drives' own estimates (K, n) [N·m]; NaN if missing."""
     target: Array
     """Where the plan wanted the joints under position control (K, n) [rad]; NaN for the others."""
-    noise: Array
-    """Standard deviation of one torque sample (n,) [N·m]."""
     position_sigma: Array
     """Standard deviation of a position reading from its resolution (n,) [rad]."""
     resolution: Array
@@ -67,7 +64,7 @@ def sweep_readings(data: Sequence[SweepData]) -> SweepReadings:
     names = [f"{folder}/{reading.sweep}" for folder, one in zip(folders, data, strict=True) for reading in one.readings]
     source = np.repeat(np.arange(len(data)), [len(each.readings) for each in data])
     sweeps = tuple(dict.fromkeys(names))
-    noise, sigma = _noise(taken, np.array(data[0].manifest.rated_torque))
+    sigma = _sigma(taken, np.array(data[0].manifest.rated_torque))
     resolution = np.max([each.resolution for each in data], axis=0)
     sent = batch(taken, sigma)
     gain = np.array([each.manifest.installed_gain for each in data])[source]
@@ -86,7 +83,6 @@ def sweep_readings(data: Sequence[SweepData]) -> SweepReadings:
         felt=TorqueCalibration(gain, offset).apply(stack(taken, "torque")),
         motor_torque=stack(taken, "motor_torque"),
         target=np.concatenate([_targets(each) for each in data if each.readings]),
-        noise=noise,
         position_sigma=_rounding(readings.position, resolution),
         resolution=resolution,
     )
@@ -101,16 +97,16 @@ def _require_one_arm(data: Sequence[SweepData]) -> None:
             raise BadInput(f"{each.path}: swept on another arm or description than {data[0].path}")
 
 
-def _noise(taken: Sequence[StaticReading], rated: Array) -> tuple[Array, Array]:
-    """Standard deviations [N·m] of one torque sample (n,) and of each reading (K, n)."""
+def _sigma(taken: Sequence[StaticReading], rated: Array) -> Array:
+    """Standard deviations of the readings (K, n) [N·m]."""
     std, count = stack(taken, "torque_std"), stack(taken, "count")
     noise = np.sqrt(np.nanmedian(np.where(stack(taken, "counted"), std, np.nan) ** 2, axis=0))
     noise = np.maximum(np.nan_to_num(noise), 0.0)
     unsettled = ~np.array([reading.settled for reading in taken])
-    sigma = np.hypot(noise / np.sqrt(count)[:, None], FLOOR * rated)
+    sigma: Array = np.hypot(noise / np.sqrt(count)[:, None], FLOOR * rated)
     swing = np.sqrt(np.maximum(np.nan_to_num(std[unsettled]) ** 2 - noise**2, 0.0))  # NaN: a sensor that was silent
     sigma[unsettled] = np.hypot(UNSETTLED * sigma[unsettled], swing)
-    return noise, sigma
+    return sigma
 
 
 def _time(data: Sequence[SweepData]) -> Array:

@@ -18,12 +18,8 @@ CHANCE = 1e-7
 (docs/theory.md, section 5.4)."""
 MATERIAL = 0.0005
 """RMS of an effect, as a share of rated torque, below which it is not material (docs/theory.md, section 5.4)."""
-KNEES = (0.6, 0.7, 0.8, 0.9, 0.95)
-"""Shares of the largest torque tried as the onset of saturation."""
 FEWEST = 6
 """Smallest number of a joint's readings for a search of effects; a choice."""
-TURN = 2.0
-"""Range of a joint from which an error once a turn can be separated from a gain [rad] (docs/theory.md, section 5.2)."""
 OWN_DOUBT, HELD_DOUBT = 0.1, 0.75
 """Standard deviation of a sensor's lag, as a share of its size: along the joint's own sweep; while it holds, with the
 lag anywhere between both ends (0.58 if uniform). Held by the hysteresis case of tests/campaigns/hard_cases.py."""
@@ -32,7 +28,7 @@ PATH = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Effect:
+class UnmodelledEffect:
     """An effect found: its columns, in the effect's own units."""
 
     joint: int
@@ -52,7 +48,9 @@ def size_of(coefficients: Array) -> float:
     return float(np.sqrt(np.mean(coefficients**2)))
 
 
-def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array) -> Effect | None:
+def strongest_effect(
+    kinematics: Arm, rows: SweepReadings, kept: Mask, refined: Refined, rated: Array
+) -> UnmodelledEffect | None:
     """The effect that explains most of the residuals of `refined` beyond chance; None if none is material.
 
     rated (n,) [N·m]; kept (K, n) are the readings that `refined` used, without outliers.
@@ -85,7 +83,7 @@ def strongest_effect(kinematics: Arm, rows: SweepReadings, kept: Mask, refined: 
     return best
 
 
-def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Iterator[Effect]:
+def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Iterator[UnmodelledEffect]:
     """Every effect that is tried, a joint at a time."""
     complete, readings = refined.fit.complete, rows.readings
     counted = readings.counted
@@ -103,13 +101,13 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
         sides = [here * side for side in _sides(rows, joint)]
         if sides:
             columns = tuple(_one(kinematics.n, joint, "torque.hysteresis", side).extras[0] for side in sides)
-            yield Effect(joint, "torque.hysteresis", columns, doubt=doubt, each_sweep=True)
+            yield UnmodelledEffect(joint, "torque.hysteresis", columns, doubt=doubt, each_sweep=True)
         yield replace(
             _one(kinematics.n, joint, "torque.hysteresis", here * lag(kinematics, rows, refined, joint)), doubt=doubt
         )
         largest = float(np.abs(own[here]).max())
         yield _one(kinematics.n, joint, "torque.nonlinearity", here * own * np.abs(own) / max(largest, 1e-9))
-        for share in KNEES:
+        for share in (0.6, 0.7, 0.8, 0.9, 0.95):  # of the largest torque: the onset of saturation
             bent = np.where(here, np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0), 0.0)
             if np.count_nonzero(bent) >= FEWEST // 2:
                 yield _one(
@@ -120,17 +118,17 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
                     share * largest / max(abs(complete.gain[joint]), 1e-9),
                 )
         yield _one(kinematics.n, joint, "torque.drift", here * (rows.time - rows.time.mean()))
-        if float(np.ptp(angle[here])) > TURN:
+        if float(np.ptp(angle[here])) > 2.0:  # [rad]: else it looks like a gain (docs/theory.md, section 5.2)
             turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
             extras = tuple(Extra(joint, "position.eccentricity", each) for each in turn)
-            yield Effect(joint, "position.eccentricity", extras)
+            yield UnmodelledEffect(joint, "position.eccentricity", extras)
 
 
-def _one(n: int, joint: int, effect_id: str, values: Array, knee: float = np.nan) -> Effect:
+def _one(n: int, joint: int, effect_id: str, values: Array, knee: float = np.nan) -> UnmodelledEffect:
     """An effect that shows in one joint's sensor alone, `values` (K,)."""
     column = np.zeros((len(values), n))
     column[:, joint] = values
-    return Effect(joint, effect_id, (Extra(joint, effect_id, column),), knee)
+    return UnmodelledEffect(joint, effect_id, (Extra(joint, effect_id, column),), knee)
 
 
 def _sides(rows: SweepReadings, joint: int) -> Iterator[Array]:

@@ -87,7 +87,6 @@ class FloatControl:
 
     @property
     def speed(self) -> Array:
-        """Filtered speed (n,) [rad/s]."""
         return self._speed
 
     def _damping(self) -> Array:

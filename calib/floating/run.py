@@ -12,9 +12,8 @@ from armlink.drives.orders import Mode
 from armlink.errors import ArmlinkError, Refused
 from armlink.link.types import Command, Sample
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
-from calib.floating.controller import FloatConfig, FloatControl
+from calib.arm.kinematics import DriveLimits, gcomp_arm
+from calib.floating.controller import FloatControl
 from calib.records.records import CalibrationRecord
 from gcomp.arrays import Array
 
@@ -27,8 +26,6 @@ as it is now. A calibration leaves well below a hundredth (`ObserverConfig.initi
 
 @dataclass(frozen=True)
 class Floated:
-    """Summary of one float."""
-
     seconds: float
     """Of the link's clock [s]."""
     cycles: int
@@ -47,7 +44,6 @@ def run_float(
     calibration: CalibrationRecord | None = None,
     *,
     seconds: float = float("inf"),
-    config: FloatConfig | None = None,
     reflect: Callable[[Sample], Array] | None = None,
     on_sample: Callable[[Sample, Array], None] | None = None,
 ) -> Floated:
@@ -57,14 +53,14 @@ def run_float(
     arm; `on_sample` sees every sample and the torque commanded (n,) [N·m]. Raises BusFault, and Refused if sensors and
     model disagree.
     """
-    described, limits = gcomp_arm(arm), Limits.of(arm)
+    described, limits = gcomp_arm(arm), DriveLimits.of(arm)
     given = (
         ()
         if calibration is None
         else (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
     )
-    control = FloatControl(described, beta, limits.rated, limits.speed, link.period, config, *given)
-    run = _Run(link, control, on_sample)
+    control = FloatControl(described, beta, limits.rated, limits.speed, link.period, None, *given)
+    run = _Float(link, control, on_sample)
     run.compare(limits.rated)
     try:
         run.follow(Floating(control, run.position, reflect), seconds)
@@ -97,9 +93,7 @@ class Floating:
         return Command(np.full(len(torque), Mode.TORQUE, np.int8), torque, self._position.copy())
 
 
-class _Run:
-    """One float under way."""
-
+class _Float:
     def __init__(
         self, link: ArmDriver, control: FloatControl, on_sample: Callable[[Sample, Array], None] | None
     ) -> None:
@@ -125,9 +119,9 @@ class _Run:
         worst = int(np.nanargmax(away / rated))
         if not away[worst] <= AGREEMENT * rated[worst]:
             raise Refused(
-                f"{self._link.names[worst]}: its sensor reads {sensor[worst]:.2f} N·m, the gravity model says"
-                f" {model[worst]:.2f}; at most {AGREEMENT * rated[worst]:.2f} apart is safe to float with: is a load"
-                " on the arm, a joint on its stop, or the calibration not written to the controllers?"
+                f"{self._link.names[worst]}: its sensor reads {sensor[worst]:.2f} N·m, but the gravity model says"
+                f" {model[worst]:.2f}; floating is safe only within {AGREEMENT * rated[worst]:.2f} of it: is a load on"
+                " the arm, a joint on its stop, or the calibration not written to the controllers?"
             )
 
     def follow(self, floating: Floating, seconds: float) -> None:
@@ -153,5 +147,4 @@ class _Run:
             self._link.cycle(here)
 
     def result(self) -> Floated:
-        """Summary."""
         return Floated(self._seconds, self._cycles, self._largest, self._fastest, self._high - self._low)

@@ -9,16 +9,15 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from armlink.loop.driver import ArmDriver
 from armlink.loop.open import open_arm
-from calib.field.field_fit import FieldFit
-from calib.field.heldout import heldout_errors
-from calib.fit.findings import Finding
+from calib.field.field_fit import FieldFit, heldout_errors
+from calib.fit.findings import FitFinding
 from calib.fit.heldout import heldout_scores, worse_joint
 from calib.fit.sensor_fit import SensorFit
 from calib.fit.sweep_readings import sweep_readings
 from calib.install.check_motion import CheckMotion
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, GateRefused, Refusal, admit, admit_rollback
-from calib.records.records import CalibrationRecord, GravityRecord, Record
+from calib.records.records import ArmRecord, CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
@@ -103,7 +102,7 @@ def admit_sweeps(
     arm: ArmFile,
     store: RecordStore,
     data: Sequence[SweepData],
-    findings: Sequence[Finding],
+    findings: Sequence[FitFinding],
     how: Apply,
 ) -> Admitted:
     """The gates of a record from sweeps: the model holds, bounds, change, held-out data; raises GateRefused."""
@@ -114,7 +113,7 @@ def admit_sweeps(
     return admitted
 
 
-def check_holds(findings: Sequence[Finding], accepted: Sequence[str] = ()) -> None:
+def check_holds(findings: Sequence[FitFinding], accepted: Sequence[str] = ()) -> None:
     """Raise GateRefused if the fit found that the sensor model does not hold on a joint that was not `accepted` so."""
     broken = next((each for each in findings if each.breaks_model and each.joint not in accepted), None)
     if broken is not None:
@@ -145,12 +144,12 @@ def check_heldout(
     _refuse_worse(arm, old, fresh, heldout_scores(old, arm, rows, refit=False, beta=beta))
 
 
-def fitted_to(record: Record, digests: Set[str]) -> bool:
+def fitted_to(record: ArmRecord, digests: Set[str]) -> bool:
     """Whether a record comes from some of these data sets: for it they are not held out."""
     return not digests.isdisjoint(record.sources.values())
 
 
-def data_of(record: Record) -> set[str]:
+def data_of(record: ArmRecord) -> set[str]:
     """Digests of the data that a record comes from; other records, such as gravity's, are named by their ids."""
     return {digest for name, digest in record.sources.items() if not name.endswith(digest)}
 

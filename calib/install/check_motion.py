@@ -11,8 +11,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.types import Calibration
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading, stack
@@ -45,7 +44,7 @@ class CheckMotion:
     def __init__(self, link: ArmDriver, arm: ArmFile, record: CalibrationRecord, beta: Array | None) -> None:
         """The motion is around the arm's present pose; `beta` (2n,) [kg·m] is None if no gravity model is known."""
         self._link, self._arm, self._record, self._beta = link, arm, record, beta
-        self._limits, self._names = Limits.of(arm), arm.joint_names
+        self._limits, self._names = DriveLimits.of(arm), arm.joint_names
         self._floor = np.maximum(FLOOR * self._limits.rated, DOUBT * record.discrepancy("level"))
         self._installed: list[Calibration] = []
         self._before: list[StaticReading] = []
@@ -114,7 +113,7 @@ class CheckMotion:
         return rms
 
 
-def check_poses(begin: Array, limits: Limits) -> Array:
+def check_poses(begin: Array, limits: DriveLimits) -> Array:
     """Poses (P, n) [rad] around `begin` (n,), each joint once to either side in a pattern of its own, off the stops."""
     joints = np.arange(len(begin))
     signs = np.array([np.where((joints >> bit) & 1, 1.0, -1.0) for bit in range(POSES // 2)])

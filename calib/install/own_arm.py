@@ -27,17 +27,19 @@ def require_own_arm(
             f" to its drives: give it one in {arm.path.name} (serial: …), then calibrate its sweeps again"
         )
     drives = tuple(drive.number for drive in found)
-    _require_shared(arm, drives, record.drives, f"record {record.id} was measured on")
+    _require_shared(arm, drives, record.drives, f"on which record {record.id} was measured")
     last = store.last_write(arm)
     if last is not None:
-        _require_shared(arm, drives, drives_written(last), f"record {last.record} was written to on {last.at[:10]}")
+        _require_shared(
+            arm, drives, drives_written(last), f"to which record {last.record} was written on {last.at[:10]}"
+        )
     return drives
 
 
 def require_drives_of(line: ControllerWrite, arm: ArmFile, found: Sequence[DriveSerial]) -> None:
     """Raise Refused where a write that is to be undone was begun on the drives of another arm."""
     drives = [drive.number for drive in found]
-    _require_shared(arm, drives, drives_written(line), f"a write was begun to on {line.at[:10]}")
+    _require_shared(arm, drives, drives_written(line), f"of the unfinished write of {line.at[:10]}")
 
 
 def drives_written(line: ControllerWrite) -> tuple[str, ...]:
@@ -50,7 +52,7 @@ def _require_shared(arm: ArmFile, drives: Sequence[str], known: Sequence[str], w
     here, there = sorted({*drives} - {""}), sorted({*known} - {""})
     if here and there and not {*here} & {*there}:
         raise Refused(
-            f"{arm.name} {arm.serial}: none of its drives ({here[0]} …) is one of those that {what} ({there[0]} …):"
+            f"{arm.name} {arm.serial}: none of its drives ({here[0]} …) is one of the drives {what} ({there[0]} …):"
             f" another arm has this name and serial: give each its own serial in its arm file ({arm.path.name}) and"
             " calibrate it; nothing was written"
         )

@@ -40,12 +40,12 @@ class Refusal(Enum):
     GAIN = "gain {value:.4f} is not between {lower:g} and {upper:g}: check the sensor's wiring and the arm file"
     OFFSET = "offset {value:.3f} N·m is beyond ± {limit:.3f}, half of rated torque: check the sensor"
     CHANGE = (
-        "{parameter} {value:.4f} is {change:+.1%}{of} from record {record}, covariance and history allow {limit:.1%}:"
-        " check the sensor; if it was exchanged: --replaced {joint}"
+        "{parameter} {value:.4f} differs by {change:+.1%}{of} from record {record}, and covariance and history allow"
+        " {limit:.1%}: check the sensor; if it was exchanged: --replaced {joint}"
     )
-    DRIFT = "{difference} from record {record}, at most {limit} is drift: check the sensor, then sweep"
+    DRIFT = "{difference} from record {record}, but a drift is at most {limit}: check the sensor, then sweep"
     FAR = (
-        "{difference} from what its controller holds, at most {limit} passes in a roll-back: check the record;"
+        "{difference} from what its controller holds, but a roll-back may change at most {limit}: check the record;"
         " if the sensor was exchanged: --replaced {joint}"
     )
     HELD_OUT = (

@@ -11,32 +11,35 @@ from armlink.link.guard import Crossed, ReadingBounds
 from armlink.link.integral import slowest_time
 from armlink.link.types import Command, Sample, Samples, Setpoints
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import SweepSection
 from calib.motion.encoder_check import EncoderCheck
 from calib.motion.settle_rule import SettleRule
 from calib.motion.static_reading import StaticReading, average, stack
-from calib.motion.thresholds import (
-    BOUNCE,
-    BOUNCE_LOOK,
-    BOUNCE_SECONDS,
-    BOUNCE_STILL,
-    CHECK_EVERY,
-    COAST,
-    COAST_LOOK,
-    COAST_STILL,
-    CONTACT_LEAD,
-    CONTACT_STILL,
-    CREEP_AHEAD,
-    LOST,
-    PRESS_SECONDS,
-    SLIP,
-    STALL,
-    STOP_TOLERANCE,
-)
 from calib.motion.trajectory import trajectory
 from gcomp.arrays import Array, Mask
 
+STALL = 0.2
+"""Following error at which a joint counts as blocked [rad]."""
+LOST = 0.05
+"""Following error at which a joint is no longer asked to go where it was asked to [rad]."""
+CREEP_AHEAD = 10
+"""Rows that creeping is ahead of its samples: a job that is held up stops the creep after this many."""
+CONTACT_LEAD = 0.015
+"""A joint that its target leads by so much, and that does not move, stands at its stop [rad]."""
+CONTACT_STILL = 0.15
+"""Share of the approach speed below which a joint does not move."""
+STOP_TOLERANCE = 0.06
+"""How far from the arm file's place a stop may be found, beyond the position sensor's own error [rad]."""
+SLIP = 0.01
+"""How far a pressed joint may leave its stop [rad]."""
+BOUNCE = 0.05
+"""How far it may while all are being pressed: one that lands throws the others [rad]."""
+BOUNCE_SECONDS, BOUNCE_LOOK, BOUNCE_STILL = 2.0, 0.15, 0.003
+"""Longest time that joints may take to stand on their stops [s]; how long one looks [s]; way in that time of one that
+stands [rad]."""
+COAST, COAST_LOOK, COAST_STILL = 5.0, 0.1, 0.002
+"""Longest time that joints may take to stop [s]; how often one looks [s]; way in that time of one that stands [rad]."""
 POSITION, TORQUE = 8, 10
 
 
@@ -56,7 +59,6 @@ class Slipped(Refused):
     """A pressed joint left its stop."""
 
     def __init__(self, name: str, joint: int) -> None:
-        """Joint's name and index."""
         super().__init__(f"{name}: slipped off its stop")
         self.joint = joint
 
@@ -64,7 +66,7 @@ class Slipped(Refused):
 class Mover:
     """Holds the arm's command and changes it in small, safe ways. The link must be enabled."""
 
-    def __init__(self, link: ArmDriver, section: SweepSection, limits: Limits) -> None:
+    def __init__(self, link: ArmDriver, section: SweepSection, limits: DriveLimits) -> None:
         """Take over an enabled link: every joint is held at its last target."""
         self.link, self.section, self.limits = link, section, limits
         self.average_to(section.standard_error)
@@ -201,7 +203,7 @@ class Mover:
         self.pressed = joints.copy()
         self._guard_stops(BOUNCE)
         self.command.mode[joints] = TORQUE
-        cycles = max(int(PRESS_SECONDS / self.link.period), 1)
+        cycles = max(int(0.3 / self.link.period), 1)  # [s] in which the torque rises to its bias
         start = np.where(joints, self._produced, 0.0)
         shares = np.linspace(1 / cycles, 1.0, cycles)[:, None]
         ramp = np.where(joints, start + shares * (bias - start), self.command.torque)
@@ -250,7 +252,9 @@ class Mover:
         while True:
             samples.append(self.cycle())
             count = len(samples)
-            if not self._lasted(samples, window) or (count - rule.window) % CHECK_EVERY:
+            if (
+                not self._lasted(samples, window) or (count - rule.window) % 5
+            ):  # the rule is looked at every fifth cycle
                 continue
             if begin is None:
                 if self._lasted(samples, timeout):

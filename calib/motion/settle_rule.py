@@ -5,8 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.arm.sweep_section import SweepSection
-from calib.motion.thresholds import DRIFT, QUIET, WINDOW_TIMES
 from gcomp.arrays import Array, Mask
+
+DRIFT = 2.5
+"""Standard errors by which the means of the window's halves may differ."""
+WINDOW_TIMES = 3.0
+"""Time constants of the slowest position loop in a window: what drifts more slowly is what one would call creep."""
+QUIET = 1.0
+"""Torque scatter that is this many times the standard error asked for has settled whatever its shape."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,7 +43,7 @@ def may_adapt(tracking: Tracking, window: list[StaticReading], config: ObserverC
     return not tracking.belief.learnt or len(window) >= DOUBTED * config.window
 
 
-def confirmed(
+def is_confirmed(
     tracking: Tracking, state: Investigation, test: CauseTest, verdict: Verdict, config: ObserverConfig
 ) -> bool:
     """Whether fresh rows twice find what an audit or a suspicion was about; nothing is told before."""

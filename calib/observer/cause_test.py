@@ -8,7 +8,7 @@ from itertools import combinations, pairwise, product
 import numpy as np
 
 from calib.observer.config import ObserverConfig
-from calib.observer.effect_dictionary import DRIFT, Entry, class_of, dictionary, kin
+from calib.observer.effect_dictionary import DRIFT, DictionaryEffect, class_of, dictionary, kin
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_levers
@@ -57,8 +57,8 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class _Fit:
-    entry: Entry
+class _CauseFit:
+    entry: DictionaryEffect
     bic: float
     chi2: float
     values: Array
@@ -79,7 +79,7 @@ class Solved:
     """Number of independent parameters that the rows show."""
 
 
-def solved(columns: Array, target: Array) -> Solved:
+def solve_whitened(columns: Array, target: Array) -> Solved:
     """The fit of whitened columns (K, p) to a whitened target (K,)."""
     u, s, vt, size = _decomposed(columns)
     kept = s > 0
@@ -106,7 +106,7 @@ def _decomposed(columns: Array) -> tuple[Array, Array, Array, Array]:
     return u, np.where(s > max(1e-6 * s[0], 1e-12), s, 0.0), vt, size
 
 
-def smallest_noticed(own: Array, rivals: Iterable[tuple[Array, int]], evidence: float) -> float:
+def smallest_noticed_change(own: Array, rivals: Iterable[tuple[Array, int]], evidence: float) -> float:
     """Size of a change with whitened column (K,) that wins in one case of two: over "none", and over every rival.
 
     Of each rival an orthonormal basis (K, p) and the parameters charged in its BIC.
@@ -161,7 +161,7 @@ class CauseTest:
             name: round(float(bic - top), 1) for name, bic in sorted(classes.items(), key=lambda item: item[1])[:6]
         }
 
-        def answer(cause: str, fit: _Fit | None, of: str, rivals: tuple[str, ...] = ()) -> Verdict:
+        def answer(cause: str, fit: _CauseFit | None, of: str, rivals: tuple[str, ...] = ()) -> Verdict:
             known = (fit.values, fit.covariance) if fit else (np.empty(0), np.empty((0, 0)))
             joint = fit.entry.joint if fit else None
             return Verdict(cause, joint, float(weights[of] / total), *known, evidence, rivals)
@@ -184,12 +184,12 @@ class CauseTest:
             return answer("ambiguous", best, name, rivals)
         return answer(winner.cause, best, name)
 
-    def _is_small(self, fit: _Fit) -> bool:
+    def _is_small(self, fit: _CauseFit) -> bool:
         """Whether an effect is no larger than the arm's discrepancy anyway: twice its level at each joint."""
         size = (fit.entry.columns @ fit.values).reshape(-1, self.belief.arm.n)
         return bool((np.sqrt((size**2).mean(axis=0)) <= 2 * self.belief.level.total).all())
 
-    def _fit(self, *indices: int) -> _Fit:
+    def _fit(self, *indices: int) -> _CauseFit:
         """Generalised least squares of entries together; columns that are collinear at these poses never win.
 
         But for a payload: of an arm with parallel axes no lever may show its mass, or where it is along them. These
@@ -198,8 +198,8 @@ class CauseTest:
         columns = np.hstack([self._columns[index] for index in indices])
         entries = [self.entries[index] for index in indices]
         count = columns.shape[1]
-        nothing = _Fit(entries[0], np.inf, np.inf, np.full(count, np.nan), np.full((count, count), np.nan))
-        found = solved(columns, self._white)
+        nothing = _CauseFit(entries[0], np.inf, np.inf, np.full(count, np.nan), np.full((count, count), np.nan))
+        found = solve_whitened(columns, self._white)
         hidden_by_arm = [entry.cause for entry in entries] == [
             "payload"
         ] and found.shown == self.belief.kernel.payload_rank
@@ -208,7 +208,7 @@ class CauseTest:
         price = sum(entry.columns.shape[1] if entry.price is None else entry.price for entry in entries)
         price -= count - found.shown
         bic = found.chi2 + price * np.log(len(self._white))
-        return _Fit(entries[0], bic, found.chi2, found.values, found.covariance)
+        return _CauseFit(entries[0], bic, found.chi2, found.values, found.covariance)
 
     def _two_drifts(self) -> Verdict | None:
         """Two joints that drift at once, if that alone explains the window; else None.
@@ -232,7 +232,7 @@ class CauseTest:
         first, second = (self.entries[index].joint for index in best)
         return Verdict("drift", first, confidence, fit.values, fit.covariance, evidence, beside=second)
 
-    def _weighs(self, payload: _Fit) -> bool:
+    def _weighs(self, payload: _CauseFit) -> bool:
         """Whether a payload's mass is possible: positive, or no more taken off than the model carries as a tool; or no
         lever shows it."""
         return bool(payload.values[0] > min(0.0, -1.2 * self.belief.mass)) or payload.covariance[0, 0] == 0
@@ -268,7 +268,7 @@ class CauseTest:
             for entry, basis in zip(self.entries, self._bases, strict=True)
             if basis.size and not kin(entry, winner)
         )
-        return smallest_noticed(own, rivals, self._config.evidence)
+        return smallest_noticed_change(own, rivals, self._config.evidence)
 
     @cached_property
     def _bases(self) -> list[Array]:
@@ -297,3 +297,28 @@ class CauseTest:
         dof, level = len(self._white) - parameters, self.belief.level
         known = np.inf if not level.total.any() else level.rows + LEVEL_ROWS
         return round(float((chi2 - dof) / np.sqrt(2 * dof * (1 + len(self.window.position) / known))), 2)
+
+
+@dataclass(frozen=True)
+class DetectionLimits:
+    """Smallest changes that are noticed, in one case of two; 1.5 times as large ones almost always."""
+
+    gain: Array
+    """Relative (n,); NaN if gravity does not load the joint."""
+    offset: Array
+    """(n,) [N·m]."""
+    rests: int
+    """Rests at other poses after which they are noticed."""
+
+
+def limits(test: CauseTest, config: ObserverConfig, wait: int) -> DetectionLimits:
+    """Limits in work at poses like those of a test.
+
+    A change is noticed if it stands out of a window of the longest kind, by the rule of the cause test, and rows after
+    it confirm it. `wait` is the number of rests until the first test.
+    """
+    count, n = test.window.position.shape
+    longer = np.sqrt(config.longest_window / count)
+    gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) / longer for cause in ("gain", "offset"))
+    gain[~(gain <= 1.0)] = np.nan  # gravity hardly loads the joint
+    return DetectionLimits(gain, offset, wait + config.longest_window + 2 * config.window)

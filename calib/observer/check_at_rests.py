@@ -9,6 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
+from calib.install.check_motion import WORSE
 from calib.observer.config import ObserverConfig
 from calib.observer.rest_detector import RestDetector
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -18,16 +19,12 @@ from gcomp.gravity.torque import gravity_torque
 ROWS = 12
 """Rests at other poses after which the check decides. An RMS of so few is known to ± 20 % (1/√(2 · 12)), but both RMS
 are of the same rests."""
-WORSE = 1.1
-"""RMS with the new calibration over RMS with the old one from which on it is worse, beside the floor."""
 FLOOR = 0.0005
 """Difference in RMS that does not count, as a share of rated torque: half of the scatter of one rest's average."""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """Outcome of the check."""
-
     verdict: Literal["kept", "worse"]
     joint: int
     """Joint with the largest increase of RMS, or the smallest decrease."""

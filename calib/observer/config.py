@@ -7,11 +7,6 @@ payloads recognised, no write in quiet work.
 
 from dataclasses import dataclass
 
-CHI2_1_AT_1E_3 = 10.8
-"""χ² with 1 degree of freedom that noise exceeds once in 1000 (§6)."""
-CHI2_2_AT_1E_3 = 13.8
-"""χ² with 2 degrees of freedom that noise exceeds once in 1000 (§6)."""
-
 
 @dataclass(frozen=True)
 class ObserverConfig:
@@ -48,8 +43,9 @@ class ObserverConfig:
     """Standard deviation of a gain just installed: the accuracy asked of a calibration."""
     initial_offset_std: float = 0.05
     """Standard deviation of an offset just installed [N·m]: likewise."""
-    outlier: float = CHI2_1_AT_1E_3
-    """A row is rejected by the filter if its squared innovation over the variance is larger (§6)."""
+    outlier: float = 10.8
+    """A row is rejected by the filter if its squared innovation over the variance is larger: noise exceeds this χ² once
+    in 1000 (§6)."""
     outliers_in_a_row: int = 3
     """This many rejected rows in succession are an event, not outliers (§6)."""
     excitation_std: float = 3e-3
@@ -110,8 +106,9 @@ class ObserverConfig:
     """An offset is written only if its standard deviation is smaller [N·m] (§6)."""
     significance: float = 5.0
     """A change is written only if it is this many standard deviations (§6)."""
-    agreement: float = CHI2_2_AT_1E_3
-    """Two disjoint windows agree if the χ² of their difference (gain, offset) is smaller (§6)."""
+    agreement: float = 13.8
+    """Two disjoint windows agree if the χ² of their difference (gain, offset) is smaller: noise exceeds it once in 1000
+    (§6)."""
     lever_share: float = 0.3
     """A gain is written only if gravity's lever Γ on the joint reached this share of g in the window (§6)."""
     common_joints: int = 3

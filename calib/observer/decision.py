@@ -17,7 +17,7 @@ discrepancy are estimates. Without it the errors of 30 findings on arms of `sim.
 
 
 @dataclass(frozen=True)
-class Finding:
+class DriftFinding:
     """Change of one joint's sensor against the installed calibration, and the reasons against writing it, if any."""
 
     joint: int
@@ -71,7 +71,7 @@ class Agreeing:
     joints: frozenset[int]
 
 
-def agreed(first: CauseTest, second: CauseTest, joint: int, beside: int | None, limit: float) -> bool:
+def windows_agree(first: CauseTest, second: CauseTest, joint: int, beside: int | None, limit: float) -> bool:
     """Whether two disjoint windows find the same gain and offset change of a joint: χ²₂ of the difference.
 
     If gravity does not load the joint, only the offset is compared. `beside`: a joint that drifts at the same time.
@@ -83,7 +83,7 @@ def agreed(first: CauseTest, second: CauseTest, joint: int, beside: int | None, 
     return float((a - b) @ np.linalg.solve(cov_a + cov_b, a - b)) < limit
 
 
-def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig) -> Finding:
+def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig) -> DriftFinding:
     """The finding for one joint of a drift verdict on all rows that agree, with every rule that forbids a write."""
     cause, refused = verdict.cause, []
     beside = verdict.other(joint)
@@ -106,14 +106,14 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
         refused.append(f"change is less than {config.significance:g} standard deviations")
     if len(set(np.sign(test.window.direction[:, joint])) - {0.0}) < 2:
         refused.append("joint approached from one side only: friction looks like an offset")
-    alike = _alike(test, joint, config.significance)
+    alike = _joints_alike(test, joint, config.significance)
     if alike >= config.common_joints:
         refused.append(f"{alike} joints changed by the same factor: gravity, payload or supply voltage")
-    moved = _zeros(test, verdict, joint, config.significance)
+    moved = _moved_zeros(test, verdict, joint, config.significance)
     if cause != "gain" and moved >= config.common_joints - 1:
         refused.append(f"the zeros of {moved} other joints moved as well: temperature")
     rows = len(test.window.position)
-    return Finding(
+    return DriftFinding(
         joint,
         cause,
         1.0 + float(change[0]),
@@ -125,7 +125,7 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     )
 
 
-def _zeros(test: CauseTest, verdict: Verdict, joint: int, significance: float) -> int:
+def _moved_zeros(test: CauseTest, verdict: Verdict, joint: int, significance: float) -> int:
     """Number of joints beside those that drift whose offset has changed too."""
     changes = [test.drift(j, "offset", joint) for j in range(test.belief.arm.n) if j not in verdict.joints]
     return sum(bool(abs(change[1]) >= significance * np.sqrt(covariance[1, 1])) for change, covariance in changes)
@@ -138,7 +138,7 @@ def _distance(change: Array, covariance: Array) -> float:
     return float(np.sqrt(part @ np.linalg.solve(covariance[np.ix_(estimated, estimated)], part)))
 
 
-def _alike(test: CauseTest, joint: int, significance: float) -> int:
+def _joints_alike(test: CauseTest, joint: int, significance: float) -> int:
     """Number of joints that, each fitted alone, changed their gain by the same factor as this joint within noise."""
     fits = [test.drift(j, "gain") for j in range(test.belief.arm.n)]
     changes = np.array([change[0] for change, _ in fits])

@@ -27,9 +27,7 @@ DRIFT = ("gain", "offset", "drift")
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One effect of the dictionary."""
-
+class DictionaryEffect:
     cause: str
     """A key of CAUSES."""
     joint: int | None
@@ -39,12 +37,12 @@ class Entry:
     price: int | None = None
     """Parameters charged in the BIC; by default the number of columns."""
 
-    def contains(self, other: "Entry") -> bool:
+    def contains(self, other: "DictionaryEffect") -> bool:
         """Whether the other is a special case of this one: fewer of its effects, at the same joint."""
         return self.joint == other.joint and set(CAUSES[other.cause]) < set(CAUSES[self.cause])
 
 
-def dictionary(arm: Arm, beta: Array, window: StaticReadings) -> Iterator[Entry]:
+def dictionary(arm: Arm, beta: Array, window: StaticReadings) -> Iterator[DictionaryEffect]:
     """Every entry of the dictionary for the true angles of a window; beta (2n,) [kg·m] is the present gravity model."""
     q, n = window.position, arm.n
     regressor = gravity_regressor(arm, q)
@@ -58,29 +56,29 @@ def dictionary(arm: Arm, beta: Array, window: StaticReadings) -> Iterator[Entry]
         return full.reshape(len(q) * n, len(columns))
 
     for j in range(n):
-        yield Entry("gain", j, row_of(j, torque[:, j]))
-        yield Entry("offset", j, row_of(j, one))
-        yield Entry("drift", j, row_of(j, torque[:, j], one))
-        yield Entry("friction", j, row_of(j, window.direction[:, j]))
-        yield Entry("spring", j, row_of(j, q[:, j] - middle[j], one))
+        yield DictionaryEffect("gain", j, row_of(j, torque[:, j]))
+        yield DictionaryEffect("offset", j, row_of(j, one))
+        yield DictionaryEffect("drift", j, row_of(j, torque[:, j], one))
+        yield DictionaryEffect("friction", j, row_of(j, window.direction[:, j]))
+        yield DictionaryEffect("spring", j, row_of(j, q[:, j] - middle[j], one))
     stiffness = gravity_stiffness(arm, beta, q)
     for j in range(n):
-        yield Entry("slip", j, stiffness[:, :, j].reshape(-1, 1))
+        yield DictionaryEffect("slip", j, stiffness[:, :, j].reshape(-1, 1))
     at_origin, by_point = payload_columns(arm)
-    yield Entry("payload", None, (regressor @ np.column_stack([at_origin, by_point])).reshape(-1, 4))
+    yield DictionaryEffect("payload", None, (regressor @ np.column_stack([at_origin, by_point])).reshape(-1, 4))
     across = np.linalg.svd(arm.gravity[None])[2][1:] * np.linalg.norm(arm.gravity)
     tilted = [gravity_regressor(replace(arm, gravity=direction), q) @ beta for direction in across]
-    yield Entry("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))
+    yield DictionaryEffect("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))
     # a payload explains nine tenths of a common scale and is far more frequent: at the same price it wins
-    yield Entry("scale", None, torque.reshape(-1, 1), price=4)
+    yield DictionaryEffect("scale", None, torque.reshape(-1, 1), price=4)
 
 
-def class_of(entry: Entry) -> str:
+def class_of(entry: DictionaryEffect) -> str:
     """Class of an entry in the comparison of verdicts: gain, offset and both of one joint are one class."""
     cause = "drift" if entry.cause in DRIFT else entry.cause
     return cause if entry.joint is None else f"{cause}_{entry.joint + 1}"
 
 
-def kin(entry: Entry, winner: Entry) -> bool:
+def kin(entry: DictionaryEffect, winner: DictionaryEffect) -> bool:
     """Whether an entry is not a rival: it is of the same class, or the winner is a special case of it."""
     return class_of(entry) == class_of(winner) or entry.contains(winner)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from calib.observer.cause_test import Verdict
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Event:
     kind: str
     joint: str | None
     evidence: dict[str, Any] = field(default_factory=dict)
-    finding: Finding | None = None
+    finding: DriftFinding | None = None
     """The change to write, for a proposal."""
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.observer.discrepancy.kernel import Kernel
-from calib.observer.discrepancy.level import Level
+from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.discrepancy.posterior import Data, Posterior
 from calib.observer.discrepancy.reference import Reference, Rows
 from calib.observer.saved_values import UNREADABLE
@@ -17,8 +17,6 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, as_array
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 
-LEVEL_ROWS = 120
-"""Most rows that the level is fitted to, evenly chosen: known to 7 % then, in 50 ms."""
 WANDER = 0.5
 """How far a zero may have moved with temperature since the reference, as a share of the discrepancy's level: a sensor
 of class 0.05 moves by 0.1 % of rated torque in 20 K, and an arm of such sensors has a discrepancy of 0.2 to 0.4 %."""
@@ -26,8 +24,6 @@ THERMAL, TOLD = 1.0, 0.3
 """Where drives tell their temperature: how far a zero follows a rise of 20 K, as a share of the level, and the share of
 WANDER that is left, since the sensor's own temperature is another."""
 LEVEL_ARRAYS = ("smooth", "rough", "before", "spread")
-FIRST_ROWS = 120
-"""Rows of the first epoch unless told otherwise."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +76,8 @@ class GravityBelief:
         beta: Array,
         covariance: Array,
         position_std: float = 0.0,
-        level: Level | None = None,
-        first_rows: int = FIRST_ROWS,
+        level: DiscrepancyLevel | None = None,
+        first_rows: int = 120,
         wander: Array | float = np.inf,
     ) -> None:
         """beta (2n,) [kg·m], covariance (2n, 2n) [kg²·m²], with zero rows for what gravity does not determine.
@@ -98,7 +94,7 @@ class GravityBelief:
         self._position_std, self._wander = position_std, wander
         self.mass = 0.0
         """Mass of the loads that the model has taken over as tools [kg]."""
-        self.level = Level.none(arm.n) if level is None else level
+        self.level = DiscrepancyLevel.none(arm.n) if level is None else level
         self._noise: Array = np.zeros(arm.n)
         self._reference = Reference(arm.n, first_rows)
         self._posterior: Posterior | None = None
@@ -113,7 +109,6 @@ class GravityBelief:
 
     @property
     def learnt(self) -> int:
-        """Reference rows."""
         return len(self._reference.rows)
 
     @property
@@ -127,7 +122,7 @@ class GravityBelief:
         return torque
 
     def expected(self, q: Array, side: Array, temperature: Array | None = None) -> Expected:
-        """What residuals to expect at poses q [rad], sides of approach and temperatures [°C], (K, n) each."""
+        """Residuals to expect at poses q [rad], sides of approach and temperatures [°C], (K, n) each."""
         if self._posterior is None:
             self._posterior = self._learn(self._reference.rows)
         warmer = np.full(q.shape, np.nan) if temperature is None else temperature - self._reference.temperature
@@ -188,7 +183,8 @@ class GravityBelief:
     def _fit_level(self, rows: Rows) -> None:
         if not self.level.before.any():
             return
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(LEVEL_ROWS, len(rows))).astype(int))]
+        # rows at most, evenly chosen: the level is known to 7 % then, in 50 ms
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(120, len(rows))).astype(int))]
         points, n = self.kernel.points(rows.position, rows.side), self.arm.n
         at_origin, by_point = payload_columns(self.arm)
         regressor = gravity_regressor(self.arm, rows.position)
@@ -244,7 +240,7 @@ class GravityBelief:
             mass, level, saved = float(values["mass"]), self.level, values.get("level")
             if saved is not None:
                 stds = {name: as_array(name, saved[name], np.shape(getattr(level, name))) for name in LEVEL_ARRAYS}
-                level = Level(**stds, rows=int(saved["rows"]))
+                level = DiscrepancyLevel(**stds, rows=int(saved["rows"]))
         except UNREADABLE:
             return False
         if not reference.restore(values):

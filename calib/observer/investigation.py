@@ -16,7 +16,6 @@ class Investigation:
     """Progress from an alarm to a decision; with no alarm, the rows of the next audit."""
 
     def __init__(self, n: int, config: ObserverConfig) -> None:
-        """n joints."""
         self._n, self._config = n, config
         self.held = False
         """Whether an alarm is open: estimates are held until a verdict."""
@@ -25,7 +24,6 @@ class Investigation:
         self.clear()
 
     def clear(self) -> None:
-        """Forget every row and result."""
         self.window: list[StaticReading] = []
         self.fresh = self.repeated = self.carrying = 0
         """New rows since the last test; repeated poses; consecutive windows that found the same payload."""

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.audit import DOUBTED, audit, confirmed, may_adapt
-from calib.observer.cause_test import CauseTest, Verdict
+from calib.observer.audit import DOUBTED, audit, is_confirmed, may_adapt
+from calib.observer.cause_test import CauseTest, DetectionLimits, Verdict
 from calib.observer.config import ObserverConfig
-from calib.observer.decision import Agreeing, Finding, agreed, decide
-from calib.observer.discrepancy.level import Level
+from calib.observer.decision import Agreeing, DriftFinding, decide, windows_agree
+from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
+from calib.observer.motion.observer import MovingObserver
 from calib.observer.rest_detector import RestDetector
-from calib.observer.tracking.limits import Limits
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.observer.tracking.tracking import Tracking
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -43,7 +43,7 @@ class Observer:
         config: ObserverConfig | None = None,
         position_gain: Array | None = None,
         position_offset: Array | None = None,
-        level: Level | None = None,
+        level: DiscrepancyLevel | None = None,
     ) -> None:
         """Watch an arm.
 
@@ -56,7 +56,7 @@ class Observer:
         self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
         self._rest = RestDetector(arm.n, self.config)
         rated, settings = np.asarray(sigma, dtype=float) / self.config.noise_share, self.config
-        expected = level or Level.expected(settings.discrepancy_share * rated)
+        expected = level or DiscrepancyLevel.expected(settings.discrepancy_share * rated)
         wander = settings.zero_wander * rated
         belief = GravityBelief(
             arm, beta, beta_covariance, settings.position_std, expected, settings.baseline_rows, wander
@@ -64,7 +64,7 @@ class Observer:
         self._tracking = Tracking(belief, sigma, self.config)
         self._investigation = Investigation(arm.n, self.config)
         self._proposed = np.full(arm.n, -np.inf)
-        self._limits: tuple[tuple[int, ...], Limits] | None = None
+        self._limits: tuple[tuple[int, ...], DetectionLimits] | None = None
 
     @property
     def rows(self) -> int:
@@ -94,7 +94,9 @@ class Observer:
         config = config or ObserverConfig()
         sigma = config.noise_share * np.asarray(rated_torque, dtype=float)
         position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
-        level = Level.of_record(calibration, config.discrepancy_share * np.asarray(rated_torque, dtype=float))
+        level = DiscrepancyLevel.of_record(
+            calibration, config.discrepancy_share * np.asarray(rated_torque, dtype=float)
+        )
         return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position, level)
 
     def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Event]:
@@ -130,7 +132,7 @@ class Observer:
         """Current gain and offset of every joint against the installed calibration."""
         return self._tracking.filter.estimate()
 
-    def limits(self) -> Limits:
+    def limits(self) -> DetectionLimits:
         """The changes of each joint that would be noticed now, at poses like the latest ones."""
         key = (
             self._tracking.rows // self.config.audit_rows,
@@ -146,7 +148,7 @@ class Observer:
         torque: Array = self._tracking.belief.torque(np.atleast_2d(self._angle(position)))
         return torque.reshape(position.shape)
 
-    def install(self, finding: Finding) -> None:
+    def install(self, finding: DriftFinding) -> None:
         """The finding was written to the controller: readings are correct again within the finding's uncertainty."""
         self._tracking.install(finding)
         self._resume()
@@ -181,7 +183,7 @@ class Observer:
         verdict = test.verdict()
         if verdict.cause == "ambiguous" and len(state.window) < self.config.longest_window:
             return []  # more rows may decide
-        if state.silent and not confirmed(self._tracking, state, test, verdict, self.config):
+        if state.silent and not is_confirmed(self._tracking, state, test, verdict, self.config):
             return []
         found, state.silent = state.silent and verdict.is_drift, False
         window, state.window = state.window, []
@@ -226,14 +228,14 @@ class Observer:
         if first is None or first.joints != agreeing.joints:
             return []
         for joint in verdict.joints:
-            if not agreed(first.test, test, joint, verdict.other(joint), self.config.agreement):
+            if not windows_agree(first.test, test, joint, verdict.other(joint), self.config.agreement):
                 return self._undecided(t, joint, "two windows disagree: still drifting")
         rows = (first.rows + window)[-self.config.longest_window :]
         together = self._tracking.cause_test(rows)
         self._investigation.first = Agreeing(rows, together, first.joints)
         verdict = together.verdict()
         if not verdict.is_drift or frozenset(verdict.joints) != first.joints:
-            return self._undecided(t, None, "all windows together say something else")
+            return self._undecided(t, None, "all windows together point to another cause")
         return [event for joint in verdict.joints for event in self._decide(t, together, verdict, joint)]
 
     def _decide(self, t: float, test: CauseTest, verdict: Verdict, joint: int) -> list[Event]:
@@ -278,3 +280,19 @@ class Observer:
 
     def _event(self, t: float, kind: str, joint: int | None, **evidence: Any) -> Event:
         return Event(t, kind, None if joint is None else self.arm.names[joint], evidence)
+
+
+def observer_of(
+    arm: Arm,
+    calibration: CalibrationRecord,
+    gravity: GravityRecord,
+    rated_torque: Array,
+    config: ObserverConfig | None = None,
+) -> Observer | MovingObserver:
+    """The observer that suits the arm of these records: of rests, or, where torque is a motor current, of motion.
+
+    rated_torque (n,) [N·m]. Records of drives whose torque is a current have their friction.
+    """
+    if any(joint.motor is not None for joint in calibration.joints):
+        return MovingObserver(arm, calibration, gravity, rated_torque, config)
+    return Observer.of_records(arm, calibration, gravity, rated_torque, config)

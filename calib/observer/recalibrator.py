@@ -13,10 +13,9 @@ from armlink.torque_calibration import TorqueCalibration, same_real32
 from calib.install.journaled_write import Controllers, install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
 from calib.observer.check_at_rests import AfterWrite, Checked
-from calib.observer.decision import Finding
-from calib.records.missing import no_record
+from calib.observer.decision import DriftFinding
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
-from calib.records.store import RecordStore
+from calib.records.store import RecordStore, no_record
 from gcomp.arrays import Array
 
 Policy = Literal["observe", "propose", "apply"]
@@ -36,12 +35,12 @@ class Recalibration:
     offset: float
     """New offset [N·m]."""
     applied: bool
-    undo: Finding | None = None
+    undo: DriftFinding | None = None
     """After a roll-back of one joint: the change of its sensor, for `Observer.install`; None for a whole record."""
 
 
-def recalibrated(
-    record: CalibrationRecord, arm: ArmFile, finding: Finding, installed_gain: float, by: str | None
+def recalibrated_record(
+    record: CalibrationRecord, arm: ArmFile, finding: DriftFinding, installed_gain: float, by: str | None
 ) -> CalibrationRecord:
     """The record that follows from `record`, installed, and a finding; its covariance is that of both.
 
@@ -92,7 +91,7 @@ class Recalibrator:
         """Joints of the last write."""
         self._check: AfterWrite | None = None
 
-    def handle(self, finding: Finding) -> Recalibration | None:
+    def handle(self, finding: DriftFinding) -> Recalibration | None:
         """Treat a finding as the policy demands; None under observe. Raises Refused, as propose and apply do."""
         if self._policy == "observe":
             return None
@@ -103,7 +102,7 @@ class Recalibrator:
         self.apply(proposed.record, finding.joint, by=APPLIED_BY)
         return replace(proposed, applied=True)
 
-    def propose(self, finding: Finding, by: str | None = None, ask: bool = True) -> Recalibration:
+    def propose(self, finding: DriftFinding, by: str | None = None, ask: bool = True) -> Recalibration:
         """Keep the record that a finding leads to, without making it current; `by` is who confirms it, if anybody does.
 
         With `ask` the controller's calibration is read; without, it is taken to be the current record's. Raises Refused
@@ -111,7 +110,7 @@ class Recalibrator:
         """
         j = finding.joint
         held = require_installed(self.record, self._controllers, j) if ask else Calibration(1.0, 0.0)
-        new = recalibrated(self.record, self._arm, finding, held.gain, by)
+        new = recalibrated_record(self.record, self._arm, finding, held.gain, by)
         admit_drift(new, self._reference, j, self._arm)
         self._store.add(new)
         pair = new.joints[j].torque_calibration(held)
@@ -173,7 +172,7 @@ class Recalibrator:
         self._install(admitted, CHECKED_BY, checked.why, joints)
         now = parent.joints[j].torque_calibration(held[j])
         change = now.relative_to(held[j])
-        undo = Finding(j, "drift", change.gain, change.offset, np.zeros((2, 2)), 0, 1.0)
+        undo = DriftFinding(j, "drift", change.gain, change.offset, np.zeros((2, 2)), 0, 1.0)
         self.record, self._before, self._written, self._check = parent, parent.parent, (), None
         whole = len(joints) > 1
         name = parent.joints[j].name
@@ -234,7 +233,7 @@ def require_installed(record: CalibrationRecord, controllers: Controllers, j: in
     return held
 
 
-def _propagated(record: CalibrationRecord, finding: Finding, installed_gain: float) -> Array:
+def _propagated(record: CalibrationRecord, finding: DriftFinding, installed_gain: float) -> Array:
     """Covariance of K = k g, O = o + k b, the old pair (k, o) and the finding (g, b) being independent."""
     joint = record.joints[finding.joint]
     names = [f"{joint.name}.gain", f"{joint.name}.offset"]

@@ -17,7 +17,6 @@ class RestDetector:
     """
 
     def __init__(self, n: int, config: ObserverConfig) -> None:
-        """n joints."""
         self._config = config
         self._anchor = np.full(n, np.nan)
         self._since, self._last = -np.inf, -np.inf

@@ -18,12 +18,12 @@ UNREADABLE = (LookupError, TypeError, ValueError, OverflowError)
 def save_rows(rows: list[StaticReading]) -> list[list[Any]]:
     """Rows as JSON values: time, position, torque, side of approach, and temperature if a drive tells it."""
     return [
-        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *_told(row.temperature)]
+        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *_known_values(row.temperature)]
         for row in rows
     ]
 
 
-def _told(temperature: Array) -> list[Any]:
+def _known_values(temperature: Array) -> list[Any]:
     return [known(temperature)] if np.isfinite(temperature).any() else []
 
 

@@ -3,15 +3,21 @@
 import numpy as np
 import numpy.typing as npt
 
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import SweepSection
-from calib.plan.choices import FASTEST, SLOWEST
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates
 from gcomp.arrays import Array, Mask
 
+SLOWEST = 0.3
+"""Acceleration that every planned sweep must allow [rad/s²]: a step of 0.5 rad then takes 2.6 s; a choice."""
+FASTEST = 2.0
+"""Largest acceleration between sweeps [rad/s²]; a choice, swept in tests/campaigns/random_arms.py."""
 
-def hold_torque(guess: GravityGuess, section: SweepSection, limits: Limits, poses: Array) -> tuple[Array, Array, Array]:
+
+def hold_torque(
+    guess: GravityGuess, section: SweepSection, limits: DriveLimits, poses: Array
+) -> tuple[Array, Array, Array]:
     """(Least, largest, allowance) holding torque (C, n) [N·m] along candidate sweeps with poses (C, S, n).
 
     The allowance covers the rough model's error, the torque scale and friction, but not the margin.
@@ -22,7 +28,7 @@ def hold_torque(guess: GravityGuess, section: SweepSection, limits: Limits, pose
 
 
 def required_bias(
-    guess: GravityGuess, section: SweepSection, limits: Limits, stops: npt.NDArray[np.int8], poses: Array
+    guess: GravityGuess, section: SweepSection, limits: DriveLimits, stops: npt.NDArray[np.int8], poses: Array
 ) -> Array:
     """Size of the torque (C, n) [N·m] that keeps each resting joint pressed along candidate sweeps; 0 if swept."""
     least, largest, allowance = hold_torque(guess, section, limits, poses)
@@ -32,7 +38,7 @@ def required_bias(
     return np.where(stops == 0, 0.0, needed)
 
 
-def pressable(guess: GravityGuess, section: SweepSection, limits: Limits, candidates: Candidates) -> Mask:
+def pressable_joints(guess: GravityGuess, section: SweepSection, limits: DriveLimits, candidates: Candidates) -> Mask:
     """Resting joints (C, n) that can be pressed on their stop within max_torque; True for the swept joint."""
     needed = required_bias(guess, section, limits, candidates.stops, candidates.poses)
     needed = needed + SLOWEST * reaction_bound(guess, candidates.joint)
@@ -49,7 +55,7 @@ def reaction_bound(guess: GravityGuess, joint: int) -> Array:
 
 
 def bias_and_acceleration(
-    needed: Array, spare: Array, reaction: Array, pressed: Mask, section: SweepSection, limits: Limits, joint: int
+    needed: Array, spare: Array, reaction: Array, pressed: Mask, section: SweepSection, limits: DriveLimits, joint: int
 ) -> tuple[Array, float]:
     """(Bias size (n,) [N·m], acceleration [rad/s²]), the largest acceleration that every joint's torque allows.
 
@@ -66,7 +72,7 @@ def bias_and_acceleration(
     return np.minimum(needed + acceleration * reaction, limits.max_torque), acceleration
 
 
-def travel_acceleration(limits: Limits, options: list[Candidates], guess: GravityGuess | None) -> float:
+def travel_acceleration(limits: DriveLimits, options: list[Candidates], guess: GravityGuess | None) -> float:
     """Acceleration [rad/s²] that the drives have beyond gravity at the poses between which they travel."""
     if guess is None:
         return 1.0

@@ -9,12 +9,15 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from armlink.model_file import Beside, compile_model, read_model
 from calib.arm.sweep_section import ParkedArm, sweep_section
-from calib.plan.choices import DEPTH, POINTS
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array, Mask
 
+POINTS = 15
+"""Poses checked between two poses of a plan: 0.1 rad apart if a joint moves 1.5 rad; a choice."""
+DEPTH = 0.0005
+"""Overlap from which bodies count as touching [m]; a choice, below the accuracy of collision meshes."""
 PARKED = "parked "
-"""What the names of bodies of an arm that is parked beside this one begin with, where it has a model of its own."""
+"""Prefix of the body names of an arm that is parked beside this one, where it has a model of its own."""
 Pair = tuple[str, str]
 
 

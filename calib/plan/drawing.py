@@ -9,8 +9,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.content.atomic_file import write_whole
 from armlink.content.printable_text import printable_text
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.trajectory import trajectory
 from calib.plan.collisions import sweep_ends
@@ -24,8 +23,6 @@ SPEED_UP, STOP_CREEP = 0.3, 0.8
 """Seconds lost to speeding up and slowing down on a way, and for creeping onto a stop and off it again: estimates."""
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b")
 """One per joint."""
-GHOSTS = 4
-"""Poses drawn per sweep."""
 
 
 def frame_origins(kinematics: Arm, q: Array) -> Array:
@@ -40,7 +37,7 @@ def frame_origins(kinematics: Arm, q: Array) -> Array:
 
 def pass_seconds(arm_file: ArmFile, plan: SweepPlan) -> float:
     """Rough duration of one pass of a plan [s]."""
-    section, limits = sweep_section(arm_file), Limits.of(arm_file)
+    section, limits = sweep_section(arm_file), DriveLimits.of(arm_file)
     period, speed = 0.02, section.travel_speed * limits.speed
 
     def travel(start: Array, goal: Array, acceleration: float) -> float:
@@ -63,7 +60,7 @@ def pass_seconds(arm_file: ArmFile, plan: SweepPlan) -> float:
 
 def stops_seconds(arm_file: ArmFile) -> float:
     """Rough time in which each joint looks for both its stops, the others mid-range, before the first pass [s]."""
-    section, limits = sweep_section(arm_file), Limits.of(arm_file)
+    section, limits = sweep_section(arm_file), DriveLimits.of(arm_file)
     way = limits.upper - limits.lower  # half of it, all of it, half of it
     return float(np.sum(2 * way / (section.travel_speed * limits.speed) + 6 * SPEED_UP + 2 * (PRESS + STOP_CREEP)))
 
@@ -75,7 +72,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
     kinematics, figure = gcomp_arm(arm_file), graph.Figure()
     for sweep in plan.sweeps:
         begin, end = sweep_ends(sweep)
-        poses = begin + np.linspace(0, 1, GHOSTS)[:, None] * (end - begin)
+        poses = begin + np.linspace(0, 1, 4)[:, None] * (end - begin)
         points = np.concatenate(
             [np.vstack([places, np.full((1, 3), np.nan)]) for places in frame_origins(kinematics, poses)]
         )

@@ -10,13 +10,15 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.plan.choices import FASTEST, SERVO_GAP, SLOWEST
+from calib.plan.bias_torque import FASTEST, SLOWEST
 from calib.plan.poses import sweep_range
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array
 
+SERVO_GAP = 0.05
+"""Distance from the stop at which a servo-held joint rests [rad]; a choice."""
 ROUNDING = 1e-6
 """Share of a value, or [rad], by which arithmetic in another order may differ: far above that of 64-bit numbers."""
 
@@ -35,7 +37,7 @@ class PoseBounds:
 
 def check_limits(arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused, naming sweep, joint and value, where a plan of static readings leaves the arm file's limits."""
-    section, limits = sweep_section(arm_file), Limits.of(arm_file)
+    section, limits = sweep_section(arm_file), DriveLimits.of(arm_file)
     ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))]).T
     stops = (limits.lower, limits.upper)
     held = (limits.lower + SERVO_GAP, limits.upper - SERVO_GAP)
@@ -107,7 +109,7 @@ def _beyond(where: str, pose: Array, lower: Array, upper: Array, names: Sequence
         yield f"{where}: {names[k]} at {pose[k]:.4g} rad, expected {lower[k]:.4g} to {upper[k]:.4g}"
 
 
-def _of_drives(plan: SweepPlan, section: SweepSection, limits: Limits, names: Sequence[str]) -> Iterator[str]:
+def _of_drives(plan: SweepPlan, section: SweepSection, limits: DriveLimits, names: Sequence[str]) -> Iterator[str]:
     if not 0 < plan.travel_acceleration <= FASTEST * (1 + ROUNDING):
         yield f"travel_acceleration is {plan.travel_acceleration:g} rad/s², expected at most {FASTEST:g}"
     fastest = max(section.acceleration, SLOWEST)
@@ -119,7 +121,7 @@ def _of_drives(plan: SweepPlan, section: SweepSection, limits: Limits, names: Se
         yield from _of_bias(sweep, limits, names)
 
 
-def _of_bias(sweep: Sweep, limits: Limits, names: Sequence[str]) -> Iterator[str]:
+def _of_bias(sweep: Sweep, limits: DriveLimits, names: Sequence[str]) -> Iterator[str]:
     for k, bias in enumerate(sweep.bias or ()):
         pressed = k != sweep.joint and not sweep.servo[k]
         most, side = limits.max_torque[k] * (1 + ROUNDING), sweep.stops[k]

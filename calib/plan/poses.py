@@ -3,9 +3,8 @@
 import numpy as np
 
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import SweepSection
-from calib.plan.choices import SCOUT_CANDIDATES
 from calib.plan.collisions import Geometry
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
@@ -18,7 +17,7 @@ Poses = tuple[tuple[float, ...], ...]
 """(P, n) [rad]"""
 
 
-def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[float, float]:
+def sweep_range(section: SweepSection, limits: DriveLimits, joint: int) -> tuple[float, float]:
     """First and last step [rad] of a joint; the margin grows with the angle, since the position gain is unknown."""
     low, high = float(limits.lower[joint]), float(limits.upper[joint])
     margin = section.range_margin
@@ -28,7 +27,7 @@ def sweep_range(section: SweepSection, limits: Limits, joint: int) -> tuple[floa
 def scout_poses(
     kinematics: Arm,
     section: SweepSection,
-    limits: Limits,
+    limits: DriveLimits,
     seed: int,
     geometry: Geometry | None = None,
 ) -> Poses:
@@ -39,7 +38,7 @@ def scout_poses(
     n = kinematics.n
     ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
     generator = np.random.default_rng(seed)
-    poses = ends[:, 0] + generator.random((SCOUT_CANDIDATES, n)) * (ends[:, 1] - ends[:, 0])
+    poses = ends[:, 0] + generator.random((300, n)) * (ends[:, 1] - ends[:, 0])
     if geometry is not None:
         poses = poses[geometry.free(poses)]
         if len(poses) < 2 * (n + 3):
@@ -64,7 +63,7 @@ def nearest_first(poses: Array, begin: Array) -> Array:
     return poses[way]
 
 
-def require_range(section: SweepSection, limits: Limits, kinematics: Arm) -> None:
+def require_range(section: SweepSection, limits: DriveLimits, kinematics: Arm) -> None:
     """Raise BadInput, naming the joint, if a range leaves nothing to sweep."""
     for joint, name in enumerate(kinematics.names):
         first, last = sweep_range(section, limits, joint)

@@ -4,13 +4,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.plan.choices import HOPELESS, SCATTER, SIDE
 from calib.plan.rough_gravity import GravityGuess
+from calib.plan.stop_selection import PRIOR_GAIN
 from calib.plan.types import Sweep
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import predict_covariance
 from gcomp.identify.parameters import Parameters, Prior
 from gcomp.identify.readings import StaticReadings
+
+SIDE = 0.05
+"""Lateral offset at which the reference mass is assumed to hang [m]; a choice."""
+SCATTER = 1.3
+"""Scatter of readings over the noise of their samples, since joints never rest completely: as the fits of
+tests/campaigns/random_arms.py find it."""
 
 
 def predicted_gain_std(
@@ -63,5 +69,5 @@ def predicted_gain_std(
 
 def worst_gain_std(std: Array) -> float:
     """Largest standard deviation among the gains that averaging can improve; 0 if there is none."""
-    known = std[std < HOPELESS]
+    known = std[std < PRIOR_GAIN]  # beyond it more averaging cannot help
     return float(known.max()) if len(known) else 0.0

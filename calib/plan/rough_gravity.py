@@ -4,10 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.plan.choices import GAIN_STD, MODEL_ERROR, SIGMAS
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor
+
+GAIN_STD = 0.3
+"""Standard deviation of an uncalibrated torque gain; tests/calib/drawn_arms.py draws 0.7 to 1.3."""
+MODEL_ERROR = 0.1
+"""Standard deviation of a model file's mass moments, as a share of each; a choice."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +33,7 @@ class GravityGuess:
         """Bound of the model's error (…, n) [N·m] at poses q (…, n) [rad]."""
         regressor = gravity_regressor(self.kinematics, q)
         variance = np.einsum("...ip,pq,...iq->...i", regressor, self.covariance, regressor, optimize=True)
-        bound: Array = SIGMAS * np.sqrt(np.maximum(variance, 0.0))
+        bound: Array = 3.0 * np.sqrt(np.maximum(variance, 0.0))  # 99.7 %
         return bound
 
     def inertia(self) -> Array:

@@ -5,15 +5,21 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calib.plan.choices import PRIOR_GAIN, PRIOR_POINT, PRIOR_POSITION_GAIN, SKETCH_STEPS, TRAVEL_COST
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.design.selection import select, sweep_information, sweep_jacobian
 from gcomp.design.sweep_design import stop_combinations as limit_poses
-from gcomp.design.sweep_design import well_felt
+from gcomp.design.sweep_design import sufficient_levers
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.parameters import Parameters, free_mask
 
+SKETCH_STEPS = 5
+"""Steps by which a candidate sweep is judged: more than a sinusoid's three unknowns (docs/theory.md, section 5.3)."""
+TRAVEL_COST = 0.6
+"""Price of a second of travel between two sweeps, as log determinant (docs/theory.md, section 7.4)."""
+PRIOR_GAIN, PRIOR_POSITION_GAIN, PRIOR_POINT = 0.15, 0.02, 0.2
+"""Standard deviations before any reading of torque gain, position gain and place of the mass [m]
+(docs/theory.md, section 7.4)."""
 UNKNOWN = ("gain", "offset", "position_gain", "beta", "rho")
 """Parameter families for which the stops are chosen."""
 
@@ -53,7 +59,7 @@ def stop_combinations(kinematics: Arm, joint: int, swept: tuple[float, float]) -
 
 def with_lever(candidates: Candidates) -> Candidates:
     """Those with a sufficient lever of gravity on the swept joint; if there are none, the better half."""
-    return candidates.kept(well_felt(candidates.lever))
+    return candidates.kept(sufficient_levers(candidates.lever))
 
 
 def choose_stops(
@@ -84,12 +90,12 @@ def choose_stops(
     return select(information, prior, counts, cost=travel)
 
 
-def guessed_moments(kinematics: Arm, seed: int, draws: int = 3) -> list[Array]:
-    """Mass moments (2n,) of plausible arms of these dimensions, for planning before anything was measured."""
+def guessed_moments(kinematics: Arm, seed: int) -> list[Array]:
+    """Mass moments (2n,) of three plausible arms of these dimensions, for planning before anything was measured."""
     generator = np.random.default_rng(seed)
     length = np.hypot(kinematics.a, kinematics.d)
     beyond = np.cumsum((length + 0.1)[::-1])[::-1]
-    return [(generator.normal(size=(kinematics.n, 2)) * beyond[:, None]).ravel() for _ in range(draws)]
+    return [(generator.normal(size=(kinematics.n, 2)) * beyond[:, None]).ravel() for _ in range(3)]
 
 
 def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, slot: int, speed: Array) -> Array:

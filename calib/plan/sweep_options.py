@@ -7,12 +7,10 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.plan.bias_torque import hold_torque, pressable
-from calib.plan.choices import POINTS
-from calib.plan.collisions import Collided, Geometry
+from calib.plan.bias_torque import hold_torque, pressable_joints
+from calib.plan.collisions import POINTS, Collided, Geometry
 from calib.plan.poses import require_range, sweep_range
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates, stop_combinations, with_lever
@@ -26,7 +24,7 @@ class PlannedArm:
 
     kinematics: Arm
     section: SweepSection
-    limits: Limits
+    limits: DriveLimits
     guess: GravityGuess | None
     """Rough gravity model; None if nothing is known of the masses."""
     geometry: Geometry | None
@@ -35,7 +33,7 @@ class PlannedArm:
     @classmethod
     def of(cls, arm_file: ArmFile, guess: GravityGuess | None) -> Self:
         """Raises BadInput if a joint's range is too short to sweep or the model cannot be used."""
-        kinematics, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), Limits.of(arm_file)
+        kinematics, section, limits = gcomp_arm(arm_file), sweep_section(arm_file), DriveLimits.of(arm_file)
         require_range(section, limits, kinematics)
         return cls(kinematics, section, limits, guess, None if arm_file.model_path is None else Geometry(arm_file))
 
@@ -63,7 +61,9 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
     if not drivable.any():
         drivable = strongest[:, joint] <= limits.max_torque[joint]
     holdable = (strongest + section.friction * limits.rated <= limits.max_torque).all(axis=1) & drivable
-    pressed = pressable(guess, section, limits, everything).all(axis=1) & holdable  # it must leave its stop again
+    pressed = (
+        pressable_joints(guess, section, limits, everything).all(axis=1) & holdable
+    )  # it must leave its stop again
     if pressed.sum() >= min(section.poses, everything.count):
         return with_lever(everything.kept(pressed)), []
     if not (pressed | holdable).any():
@@ -85,8 +85,8 @@ def _without_collision(candidates: Candidates, geometry: Geometry, name: str) ->
         return candidates.kept(free)
     first, second = next(found for pose in flat for found in geometry.contacts(pose)).bodies
     raise Collided(
-        f"joint {name}: in every combination of stops something touches, as {first} does {second}: narrow lower and"
-        " upper in the arm file"
+        f"joint {name}: in every combination of stops something touches, for example {first} and {second}:"
+        " narrow lower and upper in the arm file"
     )
 
 

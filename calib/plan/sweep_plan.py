@@ -5,23 +5,42 @@ from collections.abc import Sequence
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from calib.arm.kinematics import DriveLimits
 from calib.plan.bias_torque import (
     bias_and_acceleration,
     hold_torque,
-    pressable,
+    pressable_joints,
     reaction_bound,
     required_bias,
     travel_acceleration,
 )
-from calib.plan.choices import DEAD_LEVER, ENOUGH, FINEST, MORE_POSES, SERVO_GAP
+from calib.plan.plan_limits import SERVO_GAP
 from calib.plan.poses import Poses, scout_poses, sweep_range
 from calib.plan.predicted_precision import predicted_gain_std, worst_gain_std
-from calib.plan.reference_mass import reference_masses
-from calib.plan.rough_gravity import GravityGuess
+from calib.plan.rough_gravity import GravityGuess, reach
 from calib.plan.stop_selection import Candidates, choose_stops, guessed_moments
 from calib.plan.sweep_options import PlannedArm, sweep_options
 from calib.plan.types import Sweep, SweepPlan
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
+from gcomp.gravity.torque import gravity_regressor
+
+MASS_SHARES = (0.3, 0.5, 0.7)
+"""Shares of the torque beyond gravity that the reference mass may take, tried from the smallest; a choice."""
+ASSUMED_GRAVITY = 0.6
+"""Share of max_torque that gravity is assumed to take before any measurement: drives have 1.5 to 2.2 times gravity in
+tests/calib/drawn_arms.py."""
+HAND = 0.15
+"""Largest distance of the reference mass from the flange [m], as in tests/calib/drawn_arms.py."""
+DEAD_LEVER = 0.005
+"""Γ/g below which a joint is swept at one combination, for its offset alone (docs/theory.md, section 4.4)."""
+MORE_POSES = 2
+"""Stop combinations per joint that may be added to reach the gains' precision; a choice: each takes minutes."""
+FINEST = 3.0
+"""Largest factor of precision by averaging longer: nine times the samples; a choice."""
+ENOUGH = 1.2
+"""Factor by which the gains may be less precise than asked without a note; a choice."""
 
 
 def plan_sweep(
@@ -56,7 +75,7 @@ def plan_sweep(
     finer = 1.0 if gain_std is None else float(np.clip(gain_std / goal, 1.0, FINEST))
     if gain_std is not None and gain_std > ENOUGH * FINEST * goal:
         notes.append(
-            f"gains will be known to ± {2 * gain_std / finer:.1%} only, not ± {2 * goal:.1%}, however long one"
+            f"gains will be known to ± {2 * gain_std / finer:.1%} only, not ± {2 * goal:.1%}, even with long"
             " averages: use a heavier reference mass, or measure where it hangs (sweep.reference_point)"
         )
     return SweepPlan(
@@ -142,7 +161,7 @@ def _hold(planned: PlannedArm, one: Candidates) -> tuple[Mask, Array | None, flo
     servo = resting & (section.hold == "servo")
     if guess is None:
         return servo, None, section.acceleration
-    servo = servo | (resting & ~pressable(guess, section, limits, one)[0])
+    servo = servo | (resting & ~pressable_joints(guess, section, limits, one)[0])
     needed = required_bias(guess, section, limits, one.stops, one.poses)[0]
     least, largest, _ = hold_torque(guess, section, limits, one.poses)
     spare = limits.max_torque - np.maximum(np.abs(least), np.abs(largest))[0]
@@ -150,3 +169,20 @@ def _hold(planned: PlannedArm, one: Candidates) -> tuple[Mask, Array | None, flo
     reaction = reaction_bound(guess, joint)
     size, acceleration = bias_and_acceleration(needed, spare, reaction, pressed, section, limits, joint)
     return servo, stops * np.where(pressed, size, 0.0), acceleration
+
+
+def reference_masses(
+    kinematics: Arm, limits: DriveLimits, options: list[Candidates], guess: GravityGuess | None
+) -> list[float]:
+    """Masses [kg] that take `MASS_SHARES` of the torque left at the joint that they load most, to two digits."""
+    poses = np.concatenate([each.poses.reshape(-1, kinematics.n) for each in options])
+    regressor = gravity_regressor(kinematics, poses)
+    at_origin, by_point = payload_columns(kinematics)
+    flange = np.array([kinematics.a[-1], 0.0, kinematics.d[-1]])
+    per_kg = np.abs(regressor @ (at_origin + by_point @ flange))
+    per_kg += HAND * np.linalg.norm(regressor @ by_point, axis=-1)
+    gravity = ASSUMED_GRAVITY * limits.max_torque if guess is None else np.abs(guess.torque(poses)).max(axis=0)
+    room = np.maximum(limits.max_torque - gravity, 0.05 * limits.max_torque)
+    most = float(np.min(room / np.maximum(per_kg.max(axis=0), 1e-9)))
+    most = min(most, 2 * float(limits.rated.max()) / (9.81 * float(reach(kinematics)[0])))
+    return [float(f"{share * most:.2g}") for share in MASS_SHARES]

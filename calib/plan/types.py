@@ -7,11 +7,11 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 Side = Literal[-1, 0, 1]
 
 
-class _Model(BaseModel):
+class _PlanPart(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Sweep(_Model):
+class Sweep(_PlanPart):
     """One sweep: a joint steps through its range while the others rest."""
 
     name: str
@@ -46,7 +46,7 @@ class Sweep(_Model):
         return (self.steps[reading], 1) if reading < count else (self.steps[2 * count - 1 - reading], -1)
 
 
-class SweepPlan(_Model):
+class SweepPlan(_PlanPart):
     """All sweeps of one pass, tip to base, and the poses that the scout takes first."""
 
     sweeps: Annotated[tuple[Sweep, ...], Field(min_length=1)]
@@ -67,11 +67,3 @@ class SweepPlan(_Model):
     def readings(self) -> int:
         """Static readings of one pass, scout included."""
         return len(self.scout) + sum(sweep.readings for sweep in self.sweeps)
-
-    @property
-    def levers(self) -> dict[int, float]:
-        """Best Γ/g of each swept joint over its sweeps."""
-        best: dict[int, float] = {}
-        for sweep in self.sweeps:
-            best[sweep.joint] = max(sweep.lever, best.get(sweep.joint, 0.0))
-        return best

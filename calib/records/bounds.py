@@ -89,7 +89,9 @@ def require_sound(record: R, arm: ArmFile, now: datetime | None = None) -> R:
 
 
 def _unsound(record: R, why: str) -> Refused:
-    return Refused(f"record {record.id}: {why}: it is of no working arm: calibrate again, or go back to another record")
+    return Refused(
+        f"record {record.id}: {why}: no working arm has such values: calibrate again, or go back to another record"
+    )
 
 
 def _require_date(record: R, now: datetime | None) -> None:

@@ -12,7 +12,7 @@ UNITS = {"gain": "1", "offset": "N·m", "position_gain": "1", "position_offset":
 
 
 @dataclass(frozen=True)
-class Change:
+class ParameterChange:
     """One parameter of one joint in two records; None for a missing value."""
 
     joint: str
@@ -36,7 +36,9 @@ class Change:
         return None if change is None or not self.std else change / self.std
 
 
-def differences(before: CalibrationRecord | GravityRecord, after: CalibrationRecord | GravityRecord) -> list[Change]:
+def differences(
+    before: CalibrationRecord | GravityRecord, after: CalibrationRecord | GravityRecord
+) -> list[ParameterChange]:
     """Every parameter of both records, joints base to tip; raises Refused, BadInput if they are not comparable."""
     for what in ("arm", "serial", "description_hash"):
         ours, theirs = getattr(before, what), getattr(after, what)
@@ -54,7 +56,7 @@ def differences(before: CalibrationRecord | GravityRecord, after: CalibrationRec
     )
 
 
-def _of_calibration(before: CalibrationRecord, after: CalibrationRecord) -> list[Change]:
+def _of_calibration(before: CalibrationRecord, after: CalibrationRecord) -> list[ParameterChange]:
     stds = {name: (before.std(name), after.std(name)) for name in PARAMETERS}
     values = {name: (before.values(name), after.values(name)) for name in PARAMETERS}
     return [
@@ -64,7 +66,7 @@ def _of_calibration(before: CalibrationRecord, after: CalibrationRecord) -> list
     ]
 
 
-def _of_gravity(before: GravityRecord, after: GravityRecord) -> list[Change]:
+def _of_gravity(before: GravityRecord, after: GravityRecord) -> list[ParameterChange]:
     (old, old_std), (new, new_std) = (_moments(record) for record in (before, after))
     return [
         _change(name, axis, old[2 * j + k], new[2 * j + k], old_std[2 * j + k], new_std[2 * j + k])
@@ -79,9 +81,9 @@ def _moments(record: GravityRecord) -> tuple[Array, Array]:
     return np.where(known, np.array(record.beta), np.nan), np.where(known, spread, np.nan)
 
 
-def _change(joint: str, name: str, before: float, after: float, std_before: float, std_after: float) -> Change:
+def _change(joint: str, name: str, before: float, after: float, std_before: float, std_after: float) -> ParameterChange:
     spread = float(np.sqrt(np.nansum([std_before**2, std_after**2])))
-    return Change(joint, name, UNITS[name], _number(before), _number(after), spread or None)
+    return ParameterChange(joint, name, UNITS[name], _number(before), _number(after), spread or None)
 
 
 def _number(value: float) -> float | None:

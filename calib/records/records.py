@@ -35,7 +35,7 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Record(_Frozen):
+class ArmRecord(_Frozen):
     """Common part of all records: arm, date, software, sources. Records never change."""
 
     kind: str
@@ -88,7 +88,7 @@ class Record(_Frozen):
 
 
 class Discrepancy(_Frozen):
-    """What one joint's calibrated torque and the gravity model still disagree by, as a field over position.
+    """Remaining disagreement of one joint's calibrated torque with the gravity model, as a field over position.
 
     Calibrated torque (v - offset)/gain minus model torque, without noise, is at poses q, q' a Gaussian field of mean 0
     and covariance level² exp(-|q - q'|²/(2 length²)), where |q - q'| is the root of the sum over all joints of
@@ -105,7 +105,7 @@ class Discrepancy(_Frozen):
 
 
 class MotorTorque(_Frozen):
-    """What else is known of a joint whose torque is a motor current: friction, and what temperature does to the gain.
+    """Friction of a joint whose torque is a motor current, and what temperature does to the gain.
 
     v = gain (τ + s (coulomb + load |τ|)(1 + s·asymmetry) + viscous q̇) + offset, with s the direction of motion.
     """
@@ -141,7 +141,7 @@ class JointCalibration(_Frozen):
     residual_std: FiniteFloat | None = None
     """Standard deviation of the fit's torque residual at one stop [N·m]."""
     discrepancy: Annotated[Discrepancy | None, Field(exclude_if=lambda value: value is None)] = None
-    """What the fit doubts beyond its covariance; None, and not written, in records made without an estimate of it, so
+    """Doubt of the fit beyond its covariance; None, and not written, in records made without an estimate of it, so
     that these keep their content and with it their id."""
     motor: Annotated[MotorTorque | None, Field(exclude_if=lambda value: value is None)] = None
     """Friction of a joint whose torque is a motor current; None, and not written, for the others."""
@@ -165,7 +165,7 @@ class JointCalibration(_Frozen):
         )
 
 
-class CalibrationRecord(Record):
+class CalibrationRecord(ArmRecord):
     """Sensor gains and offsets of all joints, base to tip."""
 
     kind: Literal["calibration"] = "calibration"
@@ -222,7 +222,7 @@ class CalibrationRecord(Record):
         return np.array([self.covariance[place[n]][place[n]] ** 0.5 if n in place else np.nan for n in names])
 
 
-class GravityRecord(Record):
+class GravityRecord(ArmRecord):
     """Gravity parameters β = (n_1x, n_1y, …, n_nx, n_ny) [kg·m] (docs/theory.md, section 2) and their covariance."""
 
     kind: Literal["gravity"] = "gravity"

@@ -54,7 +54,6 @@ class RecordStore:
         self.url = self._engine.url.render_as_string(hide_password=True)
 
     def close(self) -> None:
-        """Close the database."""
         self._engine.dispose()
 
     def add(self, record: AnyRecord) -> str:
@@ -221,7 +220,7 @@ class RecordStore:
             return [ControllerWrite(*row[:5], self._parsed(row[5])) for row in connection.execute(wanted)]
 
     def import_yaml(self, path: Path, arm: ArmFile) -> str:
-        """Append the record of a YAML file (as `Record.to_yaml` wrote it), not making it current; returns its id.
+        """Append the record of a YAML file (as `ArmRecord.to_yaml` wrote it), not making it current; returns its id.
 
         Raises BadInput if the file is no record or was changed, Refused if it is of another arm or not sound.
         """
@@ -229,7 +228,7 @@ class RecordStore:
 
 
 def load_yaml(path: Path) -> AnyRecord:
-    """The record of a YAML file (as `Record.to_yaml` wrote it); raises BadInput if it is none or was changed."""
+    """The record of a YAML file (as `ArmRecord.to_yaml` wrote it); raises BadInput if it is none or was changed."""
     try:
         content = read_yaml(path)
     except OSError as error:
@@ -251,3 +250,18 @@ def _activate(connection: sa.Connection, record: AnyRecord, arm: ArmFile, by: st
 def _write_row(line: ControllerWrite, arm: ArmFile, record: str, stage: str, body: dict[str, Any]) -> dict[str, Any]:
     row = {"record": record, "arm": arm.name, "serial": arm.serial, "at": _now(), "by": line.by, "stage": stage}
     return row | {"body": json.dumps(body)}
+
+
+MAKERS = {"calibration": "calibrate", "gravity": "identify"}
+"""Kind of record → the command that makes it from sweeps."""
+
+
+def no_record(arm: ArmFile, kind: str) -> Refused:
+    """The refusal of work that needs a record of the `kind`, with the commands that lead to one."""
+    return Refused(f"{arm.name} {arm.serial}: no {kind} record yet: {way_to(arm, kind)}")
+
+
+def way_to(arm: ArmFile, *kinds: str) -> str:
+    """The commands that make records of these kinds, from the first."""
+    made = " and ".join(MAKERS[kind] for kind in kinds)
+    return f"sweep the arm, then {made}: armlink sweep {arm.argument} --out unloaded"

@@ -16,7 +16,7 @@ from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, Parameter
 from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
-from calib.report.page import ReportTable, Section, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.page import ReportSection, ReportTable, html_of, paragraph, paragraphs, render, verdict_line
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
@@ -48,7 +48,7 @@ def write_report(done: Calibrated, path: Path) -> None:
     render(path, title, sections, f"{record.created:%Y-%m-%d %H:%M} UTC, {record.software}")
 
 
-def _identity(done: Calibrated) -> Section:
+def _identity(done: Calibrated) -> ReportSection:
     record, findings = done.record, done.fit.goodness.findings
     broken = sorted({each.joint for each in findings if each.breaks_model})
     verdict = f"the model does not hold: {', '.join(broken)}" if broken else "the model holds"
@@ -70,11 +70,11 @@ def _identity(done: Calibrated) -> Section:
         rows.append(
             [f"sweeps {data.path.name}", html_of("{}<br><small>SHA-256 {}</small>", f"{load}, {when}", data.digest)]
         )
-    return Section("Calibration", html, (), [ReportTable((), rows, texts=2)])
+    return ReportSection("Calibration", html, (), [ReportTable((), rows, texts=2)])
 
 
 def _advice(done: Calibrated, broken: list[str]) -> Markup:
-    """What a person does with this calibration, in a few sentences and a command, as HTML."""
+    """Advice on what to do with this calibration, in a few sentences and a command, as HTML."""
     fit = done.fit
     half = fit.half95("gain")
     known, unknown = (
@@ -97,7 +97,7 @@ def _advice(done: Calibrated, broken: list[str]) -> Markup:
     return paragraph(f"{exactly}{without}. {next_step}") + html_of("<p><code>{}</code></p>", command)
 
 
-def _sensors(done: Calibrated) -> Section:
+def _sensors(done: Calibrated) -> ReportSection:
     fit = done.fit
     header = [
         "joint",
@@ -114,10 +114,10 @@ def _sensors(done: Calibrated) -> Section:
     reasons += [f"{why}." for why in fit.imprecise.values()]
     if fit.attachment is not None:
         reasons.append(f"{fit.attachment_text[0].upper()}{fit.attachment_text[1:]}.")
-    return Section("Sensors", paragraphs(reasons), (), [table])
+    return ReportSection("Sensors", paragraphs(reasons), (), [table])
 
 
-def _comparison(done: Calibrated) -> Section:
+def _comparison(done: Calibrated) -> ReportSection:
     """The calibration in use until now against the new one, on the same readings."""
     before, record, names = done.before, done.record, done.fit.names
     n = len(names)
@@ -142,7 +142,7 @@ def _comparison(done: Calibrated) -> Section:
         tables.append(_changes(before, record))
     else:
         text += " This arm had no record before."
-    return Section("Before and after", paragraph(text), figures, tables)
+    return ReportSection("Before and after", paragraph(text), figures, tables)
 
 
 def _changes(before: CalibrationRecord, record: CalibrationRecord) -> ReportTable:
@@ -175,7 +175,7 @@ def _rms_of_pair(done: Calibrated, pair: TorqueCalibration[Array]) -> Array:
     return np.where(counted.any(axis=0), rms, np.nan)
 
 
-def _sweeps(done: Calibrated) -> list[Section]:
+def _sweeps(done: Calibrated) -> list[ReportSection]:
     arm, fit = gcomp_arm(done.arm), done.fit
     text = (
         "Upward (▸) and downward (◂) readings, one colour per sweep. Lines: the fit to all sweeps of all joints. Bars:"
@@ -213,13 +213,15 @@ def _sweeps(done: Calibrated) -> list[Section]:
         caption = "Cross-validation: RMS of this sweep minus a fit without it, and its ratio to the expected error."
         figures = [joint_figure(arm, fit, joint)] if rows else []
         sections.append(
-            Section(f"Sweeps of {fit.names[joint]}", paragraph(text), figures, [ReportTable(header, rows, caption)])
+            ReportSection(
+                f"Sweeps of {fit.names[joint]}", paragraph(text), figures, [ReportTable(header, rows, caption)]
+            )
         )
         text = ""
     return sections
 
 
-def _left_out(done: Calibrated) -> Section:
+def _left_out(done: Calibrated) -> ReportSection:
     """The paper's Figure 6 on held-out steps."""
     rows, fit = done.fit.rows, done.fit
     score = heldout_scores(done.record, done.arm, rows, refit=True)
@@ -233,7 +235,7 @@ def _left_out(done: Calibrated) -> Section:
         " solid, and the sensor, dashed. For poses that are in no sweep: "
         f"armlink verify {done.arm.argument} --report verify.html"
     )
-    return Section(
+    return ReportSection(
         "Model against sensor (the paper's Figure 6)", paragraph(text), [left_out_figure(fit.names, sensor, model)]
     )
 

@@ -22,7 +22,7 @@ GRID = {"gridcolor": "#e8ecf0", "zerolinecolor": "#c6ced6", "automargin": True}
 
 
 @dataclass(frozen=True)
-class Section:
+class ReportSection:
     """One part of a report. Text is escaped by the template, all but what is Markup."""
 
     title: str
@@ -71,7 +71,7 @@ def _shown(value: Any) -> Any:
     return printable_text(value, keep="\n") if type(value) is str else value
 
 
-def render(path: Path, title: str, sections: Sequence[Section], subtitle: str = "") -> None:
+def render(path: Path, title: str, sections: Sequence[ReportSection], subtitle: str = "") -> None:
     """Write the page with plotly's script inside, so that it opens without a network. Raises OSError."""
     from jinja2 import Environment, PackageLoader
     from plotly.offline import get_plotlyjs
@@ -90,10 +90,12 @@ def render(path: Path, title: str, sections: Sequence[Section], subtitle: str = 
 def _figure(figure: Any) -> Markup:
     from plotly.io import to_html
 
-    return Markup(to_html(styled(figure), full_html=False, include_plotlyjs=False, config=SCREEN, validate=False))
+    return Markup(
+        to_html(styled_figure(figure), full_html=False, include_plotlyjs=False, config=SCREEN, validate=False)
+    )
 
 
-def styled(figure: Any) -> dict[str, Any]:
+def styled_figure(figure: Any) -> dict[str, Any]:
     """A plotly figure as its dictionary, with grid, typeface and margins those of the page.
 
     Merged by hand: plotly looks through a template and every axis anew in each figure.

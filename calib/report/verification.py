@@ -5,7 +5,7 @@ from pathlib import Path
 from armlink.arm_file import ArmFile
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.report.figures import verify_figure
-from calib.report.page import ReportTable, Section, paragraph, render, verdict_line
+from calib.report.page import ReportSection, ReportTable, paragraph, render, verdict_line
 from calib.sweep.verify import Verification
 
 
@@ -29,7 +29,7 @@ def write_report(
         abs(result.model).max(axis=0),
     )
     rows = [[name, *(f"{column[joint]:.4f}" for column in numbers)] for joint, name in enumerate(result.names)]
-    section = Section(
+    section = ReportSection(
         "Model against sensor (the paper's Figure 6)", html, [verify_figure(result)], [ReportTable(header, rows)]
     )
     title = f"Verification: {arm.name} {arm.serial}"

@@ -3,7 +3,9 @@
 import errno
 import hashlib
 import json
+import logging
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -122,13 +124,11 @@ def drives_of(data: Sequence["SweepData"]) -> tuple[str, ...]:
     told = [each for each in data if each.manifest.drives]
     for each in told[1:]:
         if not {*each.manifest.drives} & {*told[0].manifest.drives} - {""}:
-            raise Refused(
-                f"{told[0].path} and {each.path}: no drive of one is a drive of the other: they are of two arms"
-            )
+            raise Refused(f"{told[0].path} and {each.path}: they have no drive in common: they come from two arms")
     return told[-1].manifest.drives if told else ()
 
 
-def encoded(line: Line) -> bytes:
+def encode(line: Line) -> bytes:
     """A line of a data set as in the file."""
     return _LINE.dump_json(line) + b"\n"
 
@@ -244,7 +244,7 @@ class DataWriter:
 
     def append(self, line: Line) -> None:
         """Write one line and wait until it is on disk; raises BadInput if the disk is full or fails."""
-        content = encoded(line)
+        content = encode(line)
         try:
             if self._file.write(content) < len(content):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -256,11 +256,9 @@ class DataWriter:
             ) from None
 
     def __enter__(self) -> Self:
-        """The writer itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file."""
         self._file.close()
 
     def _drop_torn_line(self) -> None:
@@ -311,3 +309,47 @@ def _require_same(found: Manifest, wanted: Manifest, path: Path) -> None:
     }
     for key, (ours, theirs) in differing.items():
         raise Refused(f"{path}: {key} is {ours} there, but {theirs} is asked for: resume with the same arm and mass")
+
+
+log = logging.getLogger(__name__)
+
+
+def data_sets(given: Sequence[Path | SweepData]) -> list[SweepData]:
+    """Each data set, read from its folder where it is given as one; a warning for each that was ended early.
+
+    Raises BadInput where one cannot be read, or where two hold the same readings, which would count twice.
+    """
+    found = [each if isinstance(each, SweepData) else load_data(each) for each in given]
+    for number, each in enumerate(found):
+        twin = next((other for other in found[:number] if other.readings and other.digest == each.digest), None)
+        if twin is not None:
+            raise BadInput(f"{each.path}: the same readings as {twin.path}, which would count twice: give one of them")
+        if each.readings and (missing := _missing(each)):
+            log.warning(
+                "%s: ended before %s: fitted to what is there; to go on: armlink sweep %s --out %s --resume",
+                *(each.path, missing, each.manifest.arm_file, each.path),
+            )
+    return found
+
+
+def labels(paths: Sequence[Path]) -> list[str]:
+    """Names of the data of these paths in records and findings: last names, or the paths where two have the same."""
+    names = [path.resolve().name for path in paths]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+
+
+def digests(data: Sequence[SweepData]) -> dict[str, str]:
+    """Label → SHA-256 of each data set, as records name their sources."""
+    return dict(zip(labels([each.path for each in data]), [each.digest for each in data], strict=True))
+
+
+def _missing(data: SweepData) -> str:
+    """The first part that the sweep of a data set did not reach, in words; empty if it is whole."""
+    if data.plan is None:
+        return "its first sweep"
+    made = Counter(reading.sweep for reading in data.readings)
+    met = {stall.reading for stall in data.stalls if stall.contact}  # of creeping joints: not repeated
+    for sweep in data.plan.sweeps:
+        if sweep.name not in met and made[sweep.name] < (1 if sweep.speed else sweep.readings):
+            return f"the end of sweep {sweep.name}"
+    return ""

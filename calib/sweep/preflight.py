@@ -12,11 +12,19 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.types import Stats
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
-from calib.sweep.thresholds import HOT, LATE, LISTEN, LOUD, MISSING, NEAR_LIMIT, STOP_APPROACH
 from gcomp.arrays import Array
+
+LISTEN = 0.5
+"""Seconds for which the sensors are listened to at rest, after as long again in which switching on dies down."""
+MISSING, LATE = 0.1, 0.5
+"""Shares of readings from which on they are said to be missing, and to be late."""
+LOUD = 0.05
+"""Noise of a torque sensor, as a share of rated torque, from which it is not fit for a calibration."""
+HOT = 70.0
+"""Temperature of a drive from which no sweep is begun: it would fall or rise while the sensors are read [°C]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +50,7 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     Raises Refused naming the joint whose sensor is silent, loud or at the end of its range, or whose drive is hot.
     """
     temperature = read_temperatures(link)
-    limits, mover = Limits.of(arm), Mover(link, sweep_section(arm), Limits.of(arm))
+    limits, mover = DriveLimits.of(arm), Mover(link, sweep_section(arm), DriveLimits.of(arm))
     cycles = max(int(LISTEN / link.period), 20)
     for _ in range(cycles):
         mover.cycle()
@@ -52,7 +60,7 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     position = np.array([sample.position for sample in samples])
     _check_readings(link.names, before, link.stats, torque, position)
     for joint, name in enumerate(link.names):
-        if np.nanmax(np.abs(torque[:, joint])) > NEAR_LIMIT * limits.rated[joint]:
+        if np.nanmax(np.abs(torque[:, joint])) > 1.9 * limits.rated[joint]:  # about to saturate
             raise Refused(
                 f"{name}: its torque sensor reads {torque[-1, joint]:.3g} N·m at rest, near the end of its range:"
                 " unload the joint, or check the sensor"
@@ -110,7 +118,7 @@ def find_stops(
     Raises Refused naming the joint and the place where a stop is not where the arm file has it. A stop that a joint
     does not get to is left out.
     """
-    limits, section = Limits.of(arm), sweep_section(arm)
+    limits, section = DriveLimits.of(arm), sweep_section(arm)
     mover = Mover(link, section, limits)
     mover.hold_all()
     middle = (limits.lower + limits.upper) / 2
@@ -118,7 +126,7 @@ def find_stops(
     for count, joint in enumerate(reversed(range(link.n))):
         for end, side in enumerate((-1, 1)):
             goal = middle.copy()
-            goal[joint] = mover.before_stop(joint, side, STOP_APPROACH)
+            goal[joint] = mover.before_stop(joint, side, 0.08)  # from there it creeps
             try:
                 mover.travel(goal, 1.0)
                 push = np.zeros(link.n, dtype=np.int64)

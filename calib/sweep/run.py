@@ -9,8 +9,8 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused, Stall
 from armlink.loop.driver import ArmDriver
-from calib.arm.drive_limits import Limits
-from calib.arm.sweep_section import SweepSection, sweep_section
+from calib.arm.kinematics import DriveLimits
+from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Slipped, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.collisions import check_plan
@@ -18,10 +18,15 @@ from calib.plan.plan_limits import check_bias, check_limits
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.dataset import DataWriter, Manifest, PlanLine, SweepData, load_data
-from calib.sweep.scout import SCOUT, rough_model, run_scout
-from calib.sweep.stalls import OnStall, bridged, give_up, restart, stall_line
-from calib.sweep.thresholds import APPROACH, GAP, RETRIES, SLOWER
+from calib.sweep.scout import SCOUT, SLOWER, rough_model, run_scout
+from calib.sweep.stalls import OnStall, give_up, repeat_work, resume_after, stall_line
 from gcomp.arrays import Array
+
+APPROACH = 0.03
+"""Each step is approached over at least this way [rad]."""
+RETRIES = 3
+"""How often a joint that slipped or stalled is tried again before the sweep gives up."""
+
 
 Progress = Callable[[int, int, float, str], None]
 """Called after each reading with (readings done, readings in all, seconds left, what is being done)."""
@@ -49,8 +54,8 @@ def run_sweep(
     """
     with DataWriter(out, new_manifest(link, arm, reference_mass, on_stall), resume) as writer:
         data = load_data(out)
-        mover = bridged(link, on_stall, lambda: Mover(link, sweep_section(arm), Limits.of(arm)))
-        run = _Pass(mover, writer, list(data.readings), progress or (lambda *_: None), on_stall)
+        mover = repeat_work(link, on_stall, lambda: Mover(link, sweep_section(arm), DriveLimits.of(arm)))
+        run = _StepPass(mover, writer, progress, on_stall, list(data.readings))
         if data.plan is None:
             first = plan_sweep(arm, seed=seed, reference_mass=reference_mass)
             check_limits(arm, first)
@@ -78,8 +83,8 @@ def run_sweep(
 
 def new_manifest(link: ArmDriver, arm: ArmFile, reference_mass: float, on_stall: OnStall) -> Manifest:
     """The manifest of a pass that begins, with what the controllers hold and the drives' numbers; raises BusFault."""
-    installed = bridged(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
-    drives = bridged(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
+    installed = repeat_work(link, on_stall, lambda: [link.read_calibration(joint) for joint in range(link.n)])
+    drives = repeat_work(link, on_stall, lambda: [link.drive_serial(joint).number for joint in range(link.n)])
     return Manifest.of(arm, reference_mass, installed, drives)
 
 
@@ -99,31 +104,45 @@ def sparkline(values: Sequence[float]) -> str:
     return "".join(BARS[round((value - low) * steps)] for value in values)
 
 
-class _Pass:
-    """One pass under way."""
+class SweepPass:
+    """A pass under way, of steps or of creeps."""
 
+    def __init__(self, mover: Mover, writer: DataWriter, progress: Progress | None, on_stall: OnStall) -> None:
+        self.mover, self.writer = mover, writer
+        self.progress: Progress = progress or (lambda *_: None)
+        self.began = time.monotonic()
+        self._on_stall = on_stall
+
+    def bridge(self, stall: Stall, reading: str) -> None:
+        """Note a stall, enable the joints again and hold them where they stand; raises it if that is not wanted."""
+
+        def note(stall: Stall) -> None:
+            self.writer.append(stall_line(stall, self.mover.seen_at, reading))
+
+        resume_after(self.mover, self._on_stall, stall, note)
+
+
+class _StepPass(SweepPass):
     def __init__(
         self,
         mover: Mover,
         writer: DataWriter,
+        progress: Progress | None,
+        on_stall: OnStall,
         readings: list[StaticReading],
-        progress: Progress,
-        on_stall: OnStall = give_up,
     ) -> None:
-        self._on_stall = on_stall
-        self.mover, self.writer, self.readings = mover, writer, readings
-        self.section: SweepSection = mover.section
+        super().__init__(mover, writer, progress, on_stall)
+        self.readings, self._at_start = readings, len(readings)
         self.total, self.acceleration = 0, 1.0
         self.refuge = mover.position.copy()
-        self._progress, self._began, self._at_start = progress, time.monotonic(), len(readings)
 
     def save(self, reading: StaticReading) -> None:
         """Put a reading on disk and report."""
         self.writer.append(reading)
         self.readings.append(reading)
         made = len(self.readings) - self._at_start
-        left = (time.monotonic() - self._began) / made * max(self.total - len(self.readings), 0)
-        self._progress(len(self.readings), self.total, left, self._text(reading))
+        left = (time.monotonic() - self.began) / made * max(self.total - len(self.readings), 0)
+        self.progress(len(self.readings), self.total, left, self._text(reading))
 
     def _text(self, reading: StaticReading) -> str:
         """Current step, with a plot of the swept joint's torque in this sweep."""
@@ -131,16 +150,6 @@ class _Pass:
             return f"{reading.sweep} {reading.index + 1}"
         curve = [each.torque[reading.joint] for each in self.readings if each.sweep == reading.sweep]
         return f"{reading.sweep} {reading.index + 1} {sparkline(curve)}"
-
-    def bridge(self, stall: Stall, reading: str) -> None:
-        """Note a stall, enable the joints again and hold them where they stand; raises it if that is not wanted."""
-        link = self.mover.link
-
-        def note(stall: Stall) -> None:
-            self.writer.append(stall_line(stall, self.mover.seen_at, reading))
-
-        restart(link, self._on_stall, stall, note)
-        bridged(link, self._on_stall, self.mover.resume)
 
     def rest(self) -> None:
         """Every joint under position control, holding."""
@@ -201,7 +210,7 @@ class _Pass:
         goal = np.array(sweep.rest)
         stops = np.array(sweep.stops, dtype=np.int64) * ~np.array(sweep.servo)
         for joint in np.flatnonzero(stops):
-            goal[joint] = mover.before_stop(int(joint), int(stops[joint]), GAP)
+            goal[joint] = mover.before_stop(int(joint), int(stops[joint]), 0.02)  # from there it creeps
         goal[sweep.joint] = target - direction * APPROACH
         mover.travel(goal, self.acceleration)
         if stops.any():

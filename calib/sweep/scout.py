@@ -5,15 +5,15 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading, stack
 from calib.plan.rough_gravity import GravityGuess, guess_gravity
 from calib.plan.types import SweepPlan
-from calib.sweep.thresholds import SCOUT_ACCELERATION, SLOWER, SLOWEST
 
+SLOWER, SLOWEST = 0.4, 0.15
+"""Factor on the acceleration after a joint did not follow, and where that ends [rad/s²]."""
 SCOUT = "scout"
 
 
@@ -24,7 +24,8 @@ def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callab
     """
     n = mover.link.n
     everything = np.ones(n, dtype=bool)
-    acceleration, last, unreached = SCOUT_ACCELERATION, mover.position.copy(), list[Stalled]()
+    # [rad/s²]: nothing is known of the arm's weight yet
+    acceleration, last, unreached = 1.0, mover.position.copy(), list[Stalled]()
     for index, pose in enumerate(plan.scout):
         if index in done:
             continue
@@ -49,7 +50,7 @@ def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callab
 def rough_model(arm: ArmFile, readings: Sequence[StaticReading]) -> GravityGuess:
     """The rough gravity model from the scout's readings among `readings`."""
     scouted = [reading for reading in readings if reading.sweep == SCOUT]
-    limits, section = Limits.of(arm), sweep_section(arm)
+    limits, section = DriveLimits.of(arm), sweep_section(arm)
     return guess_gravity(
         gcomp_arm(arm),
         stack(scouted, "position"),

@@ -34,7 +34,7 @@ def restart(
             return
 
 
-def bridged(link: ArmDriver, on_stall: OnStall, work: Callable[[], T]) -> T:
+def repeat_work(link: ArmDriver, on_stall: OnStall, work: Callable[[], T]) -> T:
     """Return the result of `work`; it is repeated from its beginning after each Stall that `on_stall` accepts."""
     while True:
         try:
@@ -43,14 +43,21 @@ def bridged(link: ArmDriver, on_stall: OnStall, work: Callable[[], T]) -> T:
             restart(link, on_stall, stall)
 
 
-def repeated(mover: Mover, on_stall: OnStall, work: Callable[[], T]) -> T:
-    """As `bridged`, for work that moves the arm: after a Stall it holds where it stands before the work is repeated."""
+def resume_after(
+    mover: Mover, on_stall: OnStall, stall: Stall, note: Callable[[Stall], None] = lambda stall: None
+) -> None:
+    """As `restart`; then the arm holds where it stands."""
+    restart(mover.link, on_stall, stall, note)
+    repeat_work(mover.link, on_stall, mover.resume)
+
+
+def repeat_motion(mover: Mover, on_stall: OnStall, work: Callable[[], T]) -> T:
+    """As `repeat_work`, for work that moves the arm: after a Stall it holds where it stands first."""
     while True:
         try:
             return work()
         except Stall as stall:
-            restart(mover.link, on_stall, stall)
-            bridged(mover.link, on_stall, mover.resume)
+            resume_after(mover, on_stall, stall)
 
 
 def stall_line(stall: Stall, t: float, reading: str) -> StallLine:

@@ -10,17 +10,26 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.loop.driver import ArmDriver
 from armlink.torque_calibration import TorqueCalibration, per_joint
-from calib.arm.drive_limits import Limits
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.motion.mover import Mover, Stalled
 from calib.motion.static_reading import StaticReading
 from calib.plan.poses import nearest_first, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.stalls import OnStall, give_up, repeated
-from calib.sweep.thresholds import ACCELERATION, EXPECTED, NOISE_FLOOR, TOLERANCE
+from calib.sweep.stalls import OnStall, give_up, repeat_motion
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_torque, torque_covariance
+
+ACCELERATION = 2.0
+"""Of travel between poses [rad/s²]; a choice."""
+TOLERANCE = 0.01
+"""RMS that passes, as a share of the joint's largest model torque: twice the error of gravity torque that
+tests/calib/drawn_arms.py allows."""
+EXPECTED = 2.5
+"""RMS that passes, as a multiple of what the records expect: a field that is alike over much of the range is drawn anew
+only a few times by the poses, and a mean of two squares exceeds this one time in five hundred."""
+NOISE_FLOOR = 0.003
+"""RMS that always passes, as a share of rated torque: the error of an offset that tests/calib/drawn_arms.py allows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,15 +85,15 @@ def run_verify(
     reading a Stall interrupts is repeated where `on_stall` accepts it. Raises Refused on records of another arm, or if
     no pose can be reached; BusFault.
     """
-    n, section, limits = link.n, sweep_section(arm_file), Limits.of(arm_file)
+    n, section, limits = link.n, sweep_section(arm_file), DriveLimits.of(arm_file)
     kinematics = gcomp_arm(arm_file)
-    sensors = _Sensors.of(link, None if calibration is None else calibration.require(arm_file))
+    sensors = _SensorConversion.of(link, None if calibration is None else calibration.require(arm_file))
     beta = np.array(gravity.require(arm_file).beta)
     mover = Mover(link, section, limits)
     mover.hold_all()
     everything, angles, torques, skipped = np.ones(n, dtype=bool), [], [], 0
     for number, pose in enumerate(verify_poses(limits, section, poses, seed, mover.position), start=1):
-        rest = repeated(mover, on_stall, partial(_rest_at, mover, pose, everything))
+        rest = repeat_motion(mover, on_stall, partial(_rest_at, mover, pose, everything))
         if rest is None:
             skipped += 1
             continue
@@ -127,7 +136,7 @@ def _tolerance(calibration: CalibrationRecord | None, model: Array, variance: Ar
     return passes
 
 
-def verify_poses(limits: Limits, section: SweepSection, count: int, seed: int, begin: Array) -> Array:
+def verify_poses(limits: DriveLimits, section: SweepSection, count: int, seed: int, begin: Array) -> Array:
     """Random poses (count, n) [rad] within the joint range, in an order with little travel from `begin` (n,)."""
     ends = np.array([sweep_range(section, limits, joint) for joint in range(len(limits.lower))])
     generator = np.random.default_rng([seed, 6])
@@ -135,7 +144,7 @@ def verify_poses(limits: Limits, section: SweepSection, count: int, seed: int, b
 
 
 @dataclass(frozen=True, eq=False)
-class _Sensors:
+class _SensorConversion:
     """Conversion of what the controllers send to angles and torques."""
 
     installed: TorqueCalibration[Array]
@@ -143,7 +152,7 @@ class _Sensors:
     record: CalibrationRecord | None
 
     @classmethod
-    def of(cls, link: ArmDriver, record: CalibrationRecord | None) -> "_Sensors":
+    def of(cls, link: ArmDriver, record: CalibrationRecord | None) -> "_SensorConversion":
         installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
         return cls(installed, installed if record is None else record.torque_calibration(installed), record)
 

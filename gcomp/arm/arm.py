@@ -51,7 +51,7 @@ class Arm:
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
+class BarFrames:
     """Bar frames of K poses in the base frame: frame i is fixed to link i and turns with joint i about its z axis."""
 
     rotation: Array
@@ -60,7 +60,7 @@ class Frames:
     """w_i = z_{i-1} × g (K, n, 3) [m/s²]; its length is Γ_i."""
 
 
-def bar_frames(arm: Arm, q: Array) -> Frames:
+def bar_frames(arm: Arm, q: Array) -> BarFrames:
     """Bar frames at poses q (K, n) [rad]: B_1 = Rz(θ_1), B_{i+1} = B_i Rx(α_i) Rz(θ_{i+1})."""
     cos, sin = np.cos(q + arm.theta_offset), np.sin(q + arm.theta_offset)
     rotation = np.empty((len(q), arm.n, 3, 3))
@@ -76,4 +76,4 @@ def bar_frames(arm: Arm, q: Array) -> Frames:
             ca * rotation[:, i, :, 1] + sa * rotation[:, i, :, 2],
             ca * rotation[:, i, :, 2] - sa * rotation[:, i, :, 1],
         )
-    return Frames(rotation, np.cross(rotation[..., 2], arm.gravity))
+    return BarFrames(rotation, np.cross(rotation[..., 2], arm.gravity))

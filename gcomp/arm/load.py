@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arm.dh_rows import ArmGeometry, axes_to_arm
-from gcomp.arm.model_tree import upwards
-from gcomp.arm.model_xml import NotXml, parse_xml
+from gcomp.arm.model_file import NotXml, parse_xml, upwards
 from gcomp.arrays import Array, as_array
 from gcomp.errors import BadModel
 
@@ -35,12 +34,6 @@ class ModelArm:
     arm: Arm
     beta: Array
     """Mass moments (2n,) of the model's inertials [kg·m]."""
-    mass: Array
-    """Link masses (n,), bodies welded to a link included [kg]."""
-    first_moment: Array
-    """Link first moments (n, 3) in bar frames, from the joint's anchor [kg·m]."""
-    bodies: tuple[tuple[str, ...], ...]
-    """Names of the bodies that each link consists of, the one with the joint first."""
 
 
 def load_model(
@@ -58,7 +51,7 @@ def load_model(
 
 @dataclass(frozen=True, eq=False)
 class PlacedChain:
-    """The chain in MuJoCo's reference configuration, with all that is needed to write inertials back into the file."""
+    """The chain in MuJoCo's reference configuration."""
 
     model: "mujoco.MjModel"
     data: "mujoco.MjData"
@@ -69,7 +62,7 @@ class PlacedChain:
     reference: Array
     """Joint positions (n,) of this configuration [rad]."""
     bodies: tuple[tuple[int, ...], ...]
-    """Ids of the bodies that each link consists of."""
+    """Ids of the bodies that each link consists of, the one with the joint first."""
 
 
 def place_chain(
@@ -217,8 +210,7 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None,
         limits=limits,
     )
     moments = np.einsum("ndk,nd->nk", geometry.bar, first_moment)
-    names = tuple(tuple(model.body(body).name for body in of_link) for of_link in bodies)
-    arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments), mass, moments, names)
+    arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments))
     return PlacedChain(model, data, arm, geometry, data.xanchor[chain], reference, tuple(map(tuple, bodies)))
 
 
@@ -238,3 +230,27 @@ def _links(model: "mujoco.MjModel", chain: list[int]) -> dict[int, int]:
         if link is not None:
             link_of[body] = link
     return link_of
+
+
+def joint_inertias(placed: PlacedChain, poses: Array, mass: float = 0.0) -> Array:
+    """Inertia about each joint's axis [kg·m²] (K, n) of all beyond it, the other joints held, at `poses` (K, n) [rad].
+
+    Rotors are as the model has them; `mass` [kg] is a point on the origin of the last joint.
+    """
+    import mujoco
+
+    model, data = placed.model, placed.data
+    chain = [model.joint(name).id for name in placed.arm.arm.names]
+    places, rates = model.jnt_qposadr[chain], model.jnt_dofadr[chain]
+    column, found = np.zeros(model.nv), np.empty(poses.shape)
+    before = data.qpos.copy()
+    for row, pose in enumerate(poses):
+        data.qpos[places] = pose
+        mujoco.mj_fwdPosition(model, data)
+        levers = np.cross(data.xanchor[chain[-1]] - data.xanchor[chain], data.xaxis[chain])
+        for joint, rate in enumerate(rates):
+            mujoco.mj_mulM(model, data, column, np.eye(model.nv)[rate])
+            found[row, joint] = column[rate] + mass * (levers[joint] ** 2).sum()
+    data.qpos[:] = before
+    mujoco.mj_fwdPosition(model, data)
+    return found

@@ -39,12 +39,12 @@ def payload_columns(arm: Arm) -> tuple[Array, Array]:
     return at_origin, by_point
 
 
-def base_parameter_names(arm: Arm, tolerance: float = 1e-6) -> tuple[str, ...]:
+def base_parameter_names(arm: Arm) -> tuple[str, ...]:
     """Names of the 2(n − p) mass moments that act on a torque in some pose (docs/theory.md, section 2.4).
 
-    p leading joints have their axis along gravity in every pose, to within `tolerance` [rad]; they carry no torque.
+    p leading joints have their axis along gravity in every pose, to within 1e-6 rad; they carry no torque.
     """
-    vertical = 0
+    vertical, tolerance = 0, 1e-6
     strength = float(np.linalg.norm(arm.gravity))
     if np.hypot(arm.gravity[0], arm.gravity[1]) <= tolerance * strength:
         bends = np.abs(np.sin(arm.alpha)) > tolerance

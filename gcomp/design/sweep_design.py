@@ -9,19 +9,22 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask, as_array
-from gcomp.design.choices import MINIMUM_LEVER, SKETCH_STEPS
 from gcomp.design.selection import Criterion, select, sweep_information, sweep_jacobian
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.global_fit import Prediction, predict_covariance
-from gcomp.identify.natural_units import natural_units
-from gcomp.identify.parameters import Parameters, free_mask
+from gcomp.identify.parameters import Parameters, free_mask, natural_units
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import expected_readings
 
+MINIMUM_LEVER = 0.3
+"""Γ/g of the swept joint below which a combination is used only if none is better (docs/theory.md, section 2.5)."""
+SKETCH_STEPS = 7
+"""Steps by which a candidate sweep is judged: more than a sinusoid's three unknowns (docs/theory.md, section 5.3)."""
+
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class JointSweep:
     """Joint `joint` moves through `angles` (K,) [rad] while the others rest as in `pose` (n,) [rad]."""
 
     joint: int
@@ -43,7 +46,7 @@ class Sweep:
 class Design:
     """Chosen sweeps, and the precision that they would give."""
 
-    sweeps: tuple[Sweep, ...]
+    sweeps: tuple[JointSweep, ...]
     prediction: Prediction
 
 
@@ -62,24 +65,26 @@ def stop_combinations(arm: Arm, joint: int) -> Array:
     return np.array(list(product(*choices)))
 
 
-def candidate_sweeps(arm: Arm, joint: int, steps: int, margin: float = 0.0) -> list[Sweep]:
+def candidate_sweeps(arm: Arm, joint: int, steps: int, margin: float = 0.0) -> list[JointSweep]:
     """A sweep of `joint`, `margin` [rad] off its limits, for each stop combination with a sufficient lever of gravity.
 
     Sufficient is Γ ≥ 0.3 g; if no combination has that, the better half is taken.
     """
     poses = stop_combinations(arm, joint)
-    good = well_felt(gravity_levers(arm, poses)[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9))
+    good = sufficient_levers(gravity_levers(arm, poses)[:, joint] / max(float(np.linalg.norm(arm.gravity)), 1e-9))
     angles = np.linspace(arm.lower[joint] + margin, arm.upper[joint] - margin, steps)
-    return [Sweep(joint, pose, angles) for pose in poses[good]]
+    return [JointSweep(joint, pose, angles) for pose in poses[good]]
 
 
-def well_felt(lever: Array) -> Mask:
+def sufficient_levers(lever: Array) -> Mask:
     """Levers Γ/g (C,) of at least `MINIMUM_LEVER`; if there is none, the better half."""
     good: Mask = lever >= MINIMUM_LEVER
     return good if good.any() else lever >= np.median(lever)
 
 
-def readings_of(arm: Arm, sweeps: Sequence[Sweep], sigma: ArrayLike, loads: Sequence[float] = (0.0,)) -> StaticReadings:
+def readings_of(
+    arm: Arm, sweeps: Sequence[JointSweep], sigma: ArrayLike, loads: Sequence[float] = (0.0,)
+) -> StaticReadings:
     """Readings of these sweeps, repeated with each load [kg]; only the swept joint's torque counts and is 0."""
     positions = np.concatenate([sweep.positions() for sweep in sweeps])
     torque = np.full(positions.shape, np.nan)
@@ -115,7 +120,7 @@ def choose_sweeps(
     information = [sweep_information(judge.jacobian(each)) * (steps / SKETCH_STEPS) for each in candidates]
     picks = judge.select(information, [poses] * arm.n, criterion)
     chosen = [each[pick] for each, of_joint in zip(candidates, picks, strict=True) for pick in of_joint]
-    sweeps = [Sweep(each.joint, each.pose, each.stepped(steps)) for each in chosen]
+    sweeps = [JointSweep(each.joint, each.pose, each.stepped(steps)) for each in chosen]
     return judge.design(sorted(sweeps, key=lambda sweep: sweep.joint))
 
 
@@ -137,7 +142,7 @@ class _Judge:
         cls,
         arm: Arm,
         guess: Parameters,
-        sweeps: Sequence[Sweep],
+        sweeps: Sequence[JointSweep],
         sigma: ArrayLike,
         unknown: Collection[str],
         loads: Sequence[float],
@@ -146,7 +151,7 @@ class _Judge:
         unit = natural_units(arm, expected_readings(arm, guess, readings_of(arm, sweeps, sigma)), guess)[free]
         return cls(arm, guess, _per_joint(arm, sigma), unknown, loads, free, unit)
 
-    def jacobian(self, sweeps: Sequence[Sweep]) -> Array:
+    def jacobian(self, sweeps: Sequence[JointSweep]) -> Array:
         """Weighted Jacobian (C, L·S, p) of sweeps of one joint with equally many steps."""
         poses = np.stack([sweep.positions() for sweep in sweeps])
         return sweep_jacobian(self.arm, self.guess, sweeps[0].joint, poses, self.sigma, self.free, self.loads)
@@ -156,7 +161,7 @@ class _Judge:
         prior = np.diag(self.unit**-2.0)[None]
         return select([each[None] for each in information], prior, counts, criterion=criterion, unit=self.unit)
 
-    def design(self, sweeps: Sequence[Sweep]) -> Design:
+    def design(self, sweeps: Sequence[JointSweep]) -> Design:
         """The sweeps with their predicted precision."""
         readings = readings_of(self.arm, sweeps, self.sigma, self.loads)
         return Design(tuple(sweeps), predict_covariance(self.arm, readings, self.guess, unknown=self.unknown))

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, as_array, as_batch, as_poses
-from gcomp.gravity.half_angle import half_angles
-from gcomp.gravity.single_pose import compile_single_pose, without_rounding
+from gcomp.gravity.single_pose import compile_single_pose, exact_cosine_and_sine
 
 BLOCK = 5000
 """Poses per block: about two megabytes of work space for seven joints, best in benchmarks/bench_gravity.py. Not a power
@@ -32,7 +31,7 @@ class GravityModel:
         self.arm = arm
         self.beta = as_array("beta", beta, (2 * arm.n,), finite=False)
         self._moments = self.beta[::2] + 1j * self.beta[1::2]
-        self._twists = [without_rounding(alpha) for alpha in arm.alpha]
+        self._twists = [exact_cosine_and_sine(alpha) for alpha in arm.alpha]
 
     def __reduce__(self) -> "tuple[Callable[[Arm, Array], GravityModel], tuple[Arm, Array]]":
         """Pickled without the function of `one`, which is compiled again where it is unpickled."""
@@ -56,7 +55,7 @@ class GravityModel:
             np.copyto(torque[block], space.moment.imag.T)
         return as_batch(torque, leading)
 
-    def _moments_inwards(self, space: "_Space") -> None:
+    def _moments_inwards(self, space: "_TorqueBuffers") -> None:
         """Composite mass moments N_i = n_i + Rx(α_i) Rz(θ_{i+1}) N_{i+1} into space.moment."""
         z, next_z = space.along
         last = self.arm.n - 1
@@ -68,7 +67,7 @@ class GravityModel:
             np.add(moment, self._moments[i - 1], out=moment)
             z, next_z = next_z, z
 
-    def _gravity_outwards(self, space: "_Space") -> None:
+    def _gravity_outwards(self, space: "_TorqueBuffers") -> None:
         """Gravity's conjugate ḡ_x − i ḡ_y into each bar frame; its product with N_i has τ_i as imaginary part."""
         gravity, (z, next_z) = space.gravity, space.along
         gravity.fill(complex(self.arm.gravity[0], -self.arm.gravity[1]))
@@ -87,7 +86,7 @@ def _ready(arm: Arm, beta: Array) -> GravityModel:
     return model
 
 
-class _Space:
+class _TorqueBuffers:
     """Work space for `size` poses of n joints, one row a joint."""
 
     def __init__(self, n: int, size: int) -> None:
@@ -100,12 +99,26 @@ class _Space:
 _kept = threading.local()
 
 
-def _space_for(n: int, size: int) -> _Space:
+def _space_for(n: int, size: int) -> _TorqueBuffers:
     """Work space for a block, reused by each thread: new memory costs as much as the computation."""
-    space: _Space | None = getattr(_kept, "space", None)
+    space: _TorqueBuffers | None = getattr(_kept, "space", None)
     if space is None or space.turn.shape != (n, size):
-        space = _kept.space = _Space(n, size)
+        space = _kept.space = _TorqueBuffers(n, size)
     return space
+
+
+def half_angles(arm: Arm, q: Array, tangent: Array, double: Array) -> None:
+    """At poses q (K, n) [rad]: t = tan(θ/2) into `tangent` (n, K), 2/(1 + t²) into `double` (n, K).
+
+    numpy's tan is vectorised, its sin is not. Then cos θ = double − 1 and sin θ = tangent · double.
+    """
+    np.multiply(q.T, 0.5, out=tangent)
+    if arm.theta_offset.any():
+        np.add(tangent, 0.5 * arm.theta_offset[:, None], out=tangent)
+    np.tan(tangent, out=tangent)
+    np.multiply(tangent, tangent, out=double)
+    np.add(double, 1.0, out=double)
+    np.divide(2.0, double, out=double)
 
 
 def _turn(arm: Arm, q: Array, tangent: Array, double: Array, turn: ComplexArray) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
-from gcomp.gravity.half_angle import half_angles
-from gcomp.gravity.single_pose import without_rounding
+from gcomp.gravity.batch import half_angles
+from gcomp.gravity.single_pose import exact_cosine_and_sine
 
 BLOCK = 10_000
 """Poses per block: about four megabytes of work space for seven joints, best in benchmarks/bench_gravity.py."""
@@ -35,17 +35,17 @@ def regressor(arm: Arm, q: Array) -> Array:
     columns[:, 0] = 0.0
     for j in range(n - 1):
         columns[2 * j : 2 * j + 2, j + 1 :] = 0.0
-    space = _Space(n, min(size, BLOCK))
+    space = _RegressorBuffers(n, min(size, BLOCK))
     for begin in range(0, size, BLOCK):
         poses = q[begin : begin + BLOCK]
         if len(poses) < space.size:
-            space = _Space(n, len(poses))
+            space = _RegressorBuffers(n, len(poses))
         space.turn_by(arm, poses)
         _levers_outwards(arm, columns[..., begin : begin + BLOCK], space)
     return columns.transpose(2, 1, 0)
 
 
-def _levers_outwards(arm: Arm, columns: Array, space: "_Space") -> None:
+def _levers_outwards(arm: Arm, columns: Array, space: "_RegressorBuffers") -> None:
     """Levers w_i in bar frame j into columns[2j : 2j + 2, i], i ≤ j; gravity is turned along and gives w_j.
 
     Rows from j + 1 on are zero, so that a new lever has no component along its axis.
@@ -63,7 +63,7 @@ def _levers_outwards(arm: Arm, columns: Array, space: "_Space") -> None:
             np.negative(into_x[j], out=into_x[j])  # w_j = (−g_y, g_x, 0)
         if j + 1 == arm.n:
             return
-        twist = without_rounding(alpha)
+        twist = exact_cosine_and_sine(alpha)
         x, gx = into_x, into_y[j]
         g_y, g_z = _about_x(twist, Signed(into_x[j], -1.0), g_z, (space.g_y, space.g_z, space.spare[j]))
         y, z = _about_x(twist, Signed(into_y, 1.0), z, (space.y, space.z, space.spare))
@@ -88,7 +88,7 @@ def _about_x(
     return Signed(to_y, 1.0), Signed(to_z, 1.0)
 
 
-class _Space:
+class _RegressorBuffers:
     """Work space for `size` poses of n joints, and the turns about each joint's axis."""
 
     def __init__(self, n: int, size: int) -> None:

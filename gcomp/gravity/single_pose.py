@@ -17,7 +17,7 @@ EXACT = 1e-15
 """Cosine or sine of a twist below which it counts as zero: the rounding of a right angle is below 1e-16."""
 
 
-def without_rounding(alpha: float) -> tuple[float, float]:
+def exact_cosine_and_sine(alpha: float) -> tuple[float, float]:
     """(cos α, sin α), exact if α is a multiple of 90° up to rounding."""
     ca, sa = float(np.cos(alpha)), float(np.sin(alpha))
     if abs(ca) < EXACT:
@@ -44,7 +44,7 @@ def _outwards(arm: Arm) -> list[str]:
     gx, gy, gz = (_number(component) for component in arm.gravity)
     for i, alpha in enumerate(arm.alpha):
         angle = f"q{i}" if arm.theta_offset[i] == 0 else f"q{i} + {_number(arm.theta_offset[i])}"
-        ca, sa = without_rounding(alpha)
+        ca, sa = exact_cosine_and_sine(alpha)
         lines += [
             f"    a = {angle}",
             f"    c{i} = cos(a); s{i} = sin(a)",
@@ -65,7 +65,7 @@ def _inwards(arm: Arm, beta: Array) -> list[str]:
         lines.append(f"    t{i} = {_sum((f'x{i}', y), (f'-y{i}', x))}")
         if i == 0:
             break
-        ca, sa = without_rounding(arm.alpha[i - 1])
+        ca, sa = exact_cosine_and_sine(arm.alpha[i - 1])
         lines += [
             f"    b = {_sum((f's{i}', x), (f'c{i}', y))}",
             f"    u{i} = {_sum((f'c{i}', x), (f'-s{i}', y), ('1.0', _number(beta[2 * i - 2])))}",

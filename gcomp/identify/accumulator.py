@@ -9,9 +9,8 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, as_array
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_regressor
-from gcomp.identify.identifiability import analyse, describe_null_space
+from gcomp.identify.identifiability import NULL_RATIO, analyse, describe_null_space
 from gcomp.identify.parameters import free_mask, parameter_names
-from gcomp.identify.thresholds import NULL_RATIO
 
 BLOCK = 4096
 """Samples per block: a few megabytes of regressor for seven joints."""

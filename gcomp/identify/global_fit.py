@@ -9,13 +9,17 @@ from numpy.typing import ArrayLike
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.identify.identifiability import Information, analyse, describe_null_space
-from gcomp.identify.least_squares import Outcome, Problem, solve
+from gcomp.identify.least_squares import LeastSquaresProblem, Outcome, solve
 from gcomp.identify.linear_start import linear_start
-from gcomp.identify.natural_units import natural_units
-from gcomp.identify.parameters import Parameters, Prior, family_slices, parameter_names, prior_vectors
+from gcomp.identify.parameters import Parameters, Prior, family_slices, natural_units, parameter_names, prior_vectors
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import expected_readings, predict
-from gcomp.identify.thresholds import DOUBT, MAX_STD
+
+MAX_STD = {"gain": 0.2, "offset": 0.5, "position_gain": 0.1, "position_offset": 0.35, "beta": 0.5, "rho": 0.2}
+"""Standard deviation beyond which a value is of no use, per family: as a share of the gain, of the readings' RMS for
+offsets, of that over g for mass moments; rad; m (docs/theory.md, section 7.3)."""
+DOUBT = 2.0
+"""Weighted squares per degree of freedom above which another start is tried (docs/theory.md, section 7.2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +41,13 @@ class GlobalFit:
     null_space: tuple[str, ...]
     """Parameters that the readings cannot separate, one sentence per null direction."""
     hopeless: tuple[str, ...]
-    """Parameters that are determined, but with a standard deviation beyond `max_std`."""
+    """Parameters that are determined, but with a standard deviation beyond MAX_STD."""
     residual: Array
     """Reading minus model (K, n) [N·m]; NaN for readings that do not count."""
     chi2: float
     """Sum of squared residuals over their variance."""
     dof: int
     """Counted readings minus the rank."""
-    iterations: int
     converged: bool
 
     @property
@@ -77,7 +80,6 @@ def identify_global(
     priors: Mapping[str, Prior] | None = None,
     loss: str = "linear",
     position_sigma: ArrayLike = 0.0,
-    max_std: Mapping[str, float] | None = None,
 ) -> GlobalFit:
     """Estimate the families `unknown` by weighted least squares on the readings that count.
 
@@ -89,7 +91,7 @@ def identify_global(
     """
     readings.require_arm(arm)
     begin = start or _start_of(arm.n, priors or {})
-    problem = Problem.of(
+    problem = LeastSquaresProblem.of(
         arm, readings, unknown, priors or {}, loss, position_sigma, natural_units(arm, readings, begin)
     )
     starts = _starts(problem, begin)
@@ -99,10 +101,10 @@ def identify_global(
             break
         other = solve(problem, first)
         outcome = other if other.cost < outcome.cost else outcome
-    return _report(problem, outcome, {**MAX_STD, **(max_std or {})})
+    return _report(problem, outcome)
 
 
-def _starts(problem: Problem, begin: Parameters) -> Iterator[Parameters]:
+def _starts(problem: LeastSquaresProblem, begin: Parameters) -> Iterator[Parameters]:
     """Starts in the order in which they are tried (docs/theory.md, section 7.2).
 
     Position errors bias the linear solution. Hence first everything but the scale from the readings without a reference
@@ -148,7 +150,7 @@ def predict_covariance(
     """
     design.require_arm(arm)
     expected = expected_readings(arm, guess, design)
-    problem = Problem.of(
+    problem = LeastSquaresProblem.of(
         arm, expected, unknown, priors or {}, "linear", position_sigma, natural_units(arm, expected, guess)
     )
     weight = problem.weights(guess.vector)
@@ -169,7 +171,7 @@ def _start_of(n: int, priors: Mapping[str, Prior]) -> Parameters:
     return Parameters.from_vector(np.where(np.isfinite(std), mean, Parameters.nominal(n).vector), n)
 
 
-def _names_and_std(problem: Problem, information: Information) -> tuple[tuple[str, ...], Array]:
+def _names_and_std(problem: LeastSquaresProblem, information: Information) -> tuple[tuple[str, ...], Array]:
     """(Names of the estimated parameters, standard deviations (6n + 3,): 0 if known, inf if not determined)."""
     names = tuple(name for name, free in zip(parameter_names(problem.arm), problem.free, strict=True) if free)
     std = np.zeros(len(problem.free))
@@ -178,11 +180,11 @@ def _names_and_std(problem: Problem, information: Information) -> tuple[tuple[st
     return names, std
 
 
-def _report(problem: Problem, outcome: Outcome, max_std: Mapping[str, float]) -> GlobalFit:
+def _report(problem: LeastSquaresProblem, outcome: Outcome) -> GlobalFit:
     n, information = problem.arm.n, outcome.information
     names, std = _names_and_std(problem, information)
     values = np.where(np.isinf(std), np.nan, outcome.vector)
-    limit = np.concatenate([np.full(place.stop - place.start, max_std[f]) for f, place in family_slices(n).items()])
+    limit = np.concatenate([np.full(place.stop - place.start, MAX_STD[f]) for f, place in family_slices(n).items()])
     beyond = (std > limit * problem.unit)[problem.free] & information.determined
     complete = Parameters.from_vector(outcome.vector, n)
     return GlobalFit(
@@ -197,6 +199,5 @@ def _report(problem: Problem, outcome: Outcome, max_std: Mapping[str, float]) ->
         residual=problem.readings.torque - predict(problem.arm, complete, problem.readings),
         chi2=outcome.chi2,
         dof=outcome.dof,
-        iterations=outcome.iterations,
         converged=outcome.converged,
     )

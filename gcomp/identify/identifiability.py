@@ -5,7 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array, Mask
-from gcomp.identify.thresholds import NULL_RATIO, NULL_STD, PARTICIPATION
+
+NULL_RATIO = 1e-7
+"""Share of the largest singular value below which one counts as zero. Structural zeros are below 1e-8, since angles are
+written with eight digits; the smallest true ones seen are above 1e-4 (docs/theory.md, section 7.3)."""
+NULL_STD = 1.0
+"""A direction with a larger standard deviation, in natural units, is held: a linearisation over it means nothing."""
+PARTICIPATION = 1e-4
+"""Smallest share in a null direction with which a parameter counts as taking part in it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Weighted nonlinear least squares of the sensor model: Levenberg-Marquardt on a QR factor built block by block."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,14 +9,14 @@ from numpy.typing import ArrayLike
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask, as_array
 from gcomp.errors import BadArray
-from gcomp.identify.block_qr import fold
 from gcomp.identify.identifiability import Information, Spectrum, analyse
 from gcomp.identify.parameters import Parameters, Prior, free_mask, prior_vectors
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict, predict_and_jacobian
 
-MAX_ITERATIONS = 60
-"""Fits of sweeps take 3 or 4, hardly determined ones some 20."""
+BLOCK_ROWS = 192
+"""Rows per update. A factorisation this small stays in the cache and on one thread; from 384 rows LAPACK uses threads,
+which on a busy machine is ten to a hundred times slower."""
 SETTLED, STALLED, EXACT = 1e-7, 1e-5, 1e-16
 """Converged if a step can lower the cost by less than the first share of it (a hundredth of that with fixed weights, as
 convergence is then quadratic), or if no step lowers it and the gain expected is below the second share. The third is
@@ -26,7 +26,7 @@ TUNING = {"huber": 1.345, "cauchy": 2.385}
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class LeastSquaresProblem:
     """A least-squares problem; vectors have the length of the whole parameter vector (6n + 3,)."""
 
     arm: Arm
@@ -49,7 +49,7 @@ class Problem:
         loss: str,
         position_sigma: ArrayLike,
         unit: Array,
-    ) -> "Problem":
+    ) -> "LeastSquaresProblem":
         """Check and convert to vectors; raises BadArray on an unknown loss or family and on wrong shapes."""
         if loss != "linear" and loss not in TUNING:
             raise BadArray(f"loss is {loss!r}, expected linear, {' or '.join(TUNING)}")
@@ -57,8 +57,7 @@ class Problem:
         mean, std = prior_vectors(arm.n, priors)
         return cls(arm, readings, free_mask(arm.n, unknown), mean, std, loss, noise, unit)
 
-    def on(self, readings: StaticReadings) -> "Problem":
-        """The same problem with other readings."""
+    def on(self, readings: StaticReadings) -> "LeastSquaresProblem":
         return replace(self, readings=readings)
 
     @property
@@ -118,25 +117,22 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """End of the iteration."""
-
     vector: Array
     information: Information
     cost: float
     chi2: float
     dof: int
-    iterations: int
     converged: bool
 
 
-def solve(problem: Problem, first: Parameters) -> Outcome:
+def solve(problem: LeastSquaresProblem, first: Parameters) -> Outcome:
     """Minimise from `first`; no step goes along directions that the readings do not determine."""
     vector, damping, converged = first.vector, 0.0, False
     weight = problem.weights(vector)
     cost = problem.cost(vector, weight)
-    iterations = 0
-    while iterations < MAX_ITERATIONS and not converged:
-        iterations += 1
+    for _ in range(60):  # fits of sweeps take 3 or 4, hardly determined ones some 20
+        if converged:
+            break
         triangle, target = problem.factor(vector, weight)
         spectrum = Spectrum.of(triangle, problem.unit[problem.free])
         along = spectrum.left.T @ target
@@ -152,11 +148,17 @@ def solve(problem: Problem, first: Parameters) -> Outcome:
         if problem.reweighted:
             weight = problem.weights(vector)
             cost = problem.cost(vector, weight)
-    return _finish(problem, vector, cost, iterations, converged)
+    return _finish(problem, vector, cost, converged)
 
 
 def _step(
-    problem: Problem, vector: Array, weight: list[Array], cost: float, spectrum: Spectrum, along: Array, damping: float
+    problem: LeastSquaresProblem,
+    vector: Array,
+    weight: list[Array],
+    cost: float,
+    spectrum: Spectrum,
+    along: Array,
+    damping: float,
 ) -> tuple[Array | None, float, float]:
     """(Vector with a lower cost or None, its cost, damping for the next step)."""
     weakest = float(spectrum.values.min(initial=np.inf)) ** 2
@@ -171,7 +173,7 @@ def _step(
     return None, cost, damping
 
 
-def _finish(problem: Problem, vector: Array, cost: float, iterations: int, converged: bool) -> Outcome:
+def _finish(problem: LeastSquaresProblem, vector: Array, cost: float, converged: bool) -> Outcome:
     """Covariance and goodness of fit at the end, from the weights without the loss."""
     weight = problem.weights(vector, robust=False)
     information = analyse(problem.factor(vector, weight)[0], problem.unit[problem.free])
@@ -184,10 +186,10 @@ def _finish(problem: Problem, vector: Array, cost: float, iterations: int, conve
     if problem.loss != "linear":
         factor = _robust_factor(problem, np.abs(scaled), information.rank)
         information = replace(information, covariance=information.covariance * factor)
-    return Outcome(vector, information, cost, float(scaled @ scaled), dof, iterations, converged)
+    return Outcome(vector, information, cost, float(scaled @ scaled), dof, converged)
 
 
-def _robust_factor(problem: Problem, size: Array, rank: int) -> float:
+def _robust_factor(problem: LeastSquaresProblem, size: Array, rank: int) -> float:
     """Factor of a robust loss on the covariance: Huber's E[ψ²]/E[ψ']² at the residuals found."""
     influence = size * problem._loss_weight(size)
     bound = TUNING[problem.loss]
@@ -197,3 +199,23 @@ def _robust_factor(problem: Problem, size: Array, rank: int) -> float:
         scaled = (size / bound) ** 2
         slope = (1 - scaled) / (1 + scaled) ** 2
     return float(np.sum(influence**2) / max(1, len(size) - rank) / np.mean(slope) ** 2)
+
+
+def fold(triangle: Array, rows: Array) -> Array:
+    """Triangular factor (p, p) of all rows folded in before and of the rows (K, p), in little memory."""
+    for begin in range(0, len(rows), BLOCK_ROWS):
+        stacked = np.vstack([triangle, rows[begin : begin + BLOCK_ROWS]])
+        triangle = np.asarray(np.linalg.qr(stacked, mode="r"), dtype=np.float64)
+    return triangle
+
+
+def linear_least_squares(blocks: Iterable[Array], unit: Array, rcond: float) -> tuple[Array, float]:
+    """(x (p,) that solves A x = b, norm of A x − b); x is of least norm in units (p,), rows [A | b] come in blocks.
+
+    A direction with less than `rcond` of the largest singular value in those units is left at zero.
+    """
+    triangle = np.zeros((0, len(unit) + 1))
+    for rows in blocks:
+        triangle = fold(triangle, rows)
+    solution: Array = unit * np.linalg.lstsq(triangle[:, :-1] * unit, triangle[:, -1], rcond=rcond)[0]
+    return solution, float(np.linalg.norm(triangle[:, :-1] @ solution - triangle[:, -1]))

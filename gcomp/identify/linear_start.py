@@ -6,12 +6,16 @@ from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_regressor
-from gcomp.identify.block_qr import least_squares
-from gcomp.identify.natural_units import natural_units
-from gcomp.identify.parameters import Parameters, family_slices
+from gcomp.identify.identifiability import NULL_RATIO
+from gcomp.identify.least_squares import linear_least_squares
+from gcomp.identify.parameters import Parameters, family_slices, natural_units
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import joint_positions
-from gcomp.identify.thresholds import FACTORS, NULL_RATIO, SANE_GAIN_RATIO, SMALLEST_RATIO
+
+SANE_GAIN_RATIO = 5.0
+"""Factor to the start beyond which a gain counts as not determined by its readings (docs/theory.md, section 7.2)."""
+FACTORS = (1.0, 0.7, 1.4, 0.5, 2.0, -1.0, -0.7, -1.4, -0.5, -2.0)
+"""Common factors tried for such gains: position errors make (L) shrink κ towards zero but keep sign and ratios."""
 
 
 def linear_start(
@@ -35,7 +39,7 @@ def linear_start(
         if not lost.any():
             break
         free_gain &= ~lost
-        signed = np.where(ratio < -SMALLEST_RATIO, -1.0, 1.0)
+        signed = np.where(ratio < -1e-2, -1.0, 1.0)  # of a smaller one the sign is not determined either
         tried = [_with_gain(start, np.where(lost, start.gain * signed * factor, start.gain)) for factor in FACTORS]
         costs = [_solve(arm, readings, each, free, free_gain, keep_ratios)[1] for each in tried]
         start = tried[int(np.argmin(costs))]
@@ -64,14 +68,13 @@ def _solve(
 
     unit, places = natural_units(arm, readings, start), family_slices(n)
     unit = np.concatenate([1 / unit[places["gain"]], unit[places["offset"]], unit[places["beta"].start :]])
-    solution, residual = least_squares(map(rows, readings.blocks()), unit, rcond=NULL_RATIO)
+    solution, residual = linear_least_squares(map(rows, readings.blocks()), unit, rcond=NULL_RATIO)
     if keep_ratios:
         solution[:n] = np.where(free_gain, solution[0] / start.gain, 0.0)
     return np.split(solution, [n, 2 * n, 4 * n]), residual
 
 
 def _with_gain(parameters: Parameters, gain: Array) -> Parameters:
-    """The parameters with other gains (n,)."""
     vector = parameters.vector
     vector[family_slices(len(gain))["gain"]] = gain
     return Parameters.from_vector(vector, len(gain))

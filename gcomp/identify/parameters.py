@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask, as_array, frozen
 from gcomp.errors import BadArray
+from gcomp.identify.readings import StaticReadings
 
 FAMILIES = ("gain", "offset", "position_gain", "position_offset", "beta", "rho")
 """In the order of the parameter vector (6n + 3,)."""
@@ -69,7 +70,6 @@ class Parameters:
 
     @property
     def vector(self) -> Array:
-        """The parameter vector (6n + 3,)."""
         return np.concatenate([getattr(self, family) for family in FAMILIES])
 
     def __post_init__(self) -> None:
@@ -113,3 +113,17 @@ def prior_vectors(n: int, priors: Mapping[str, Prior]) -> tuple[Array, Array]:
         if not np.all(std[slices[family]] > 0):
             raise BadArray(f"std of the prior on {family} is {np.min(prior.std)}, expected above zero")
     return mean, std
+
+
+def natural_units(arm: Arm, readings: StaticReadings, start: Parameters) -> Array:
+    """Natural units of the parameter vector (6n + 3,): the size of a change that matters (docs/theory.md, section 7.3).
+
+    The gain of the start, 1 rad and 1 m; the RMS reading of the most loaded joint for offsets, that over g for mass
+    moments.
+    """
+    with np.errstate(invalid="ignore"):
+        per_joint = np.sqrt(np.nansum(readings.torque**2, axis=0) / np.maximum(readings.counted.sum(axis=0), 1))
+    torque = float(per_joint.max()) or 1.0
+    n, ones = arm.n, np.ones(arm.n)
+    moment = torque / (float(np.linalg.norm(arm.gravity)) or 1.0)
+    return Parameters(np.abs(start.gain), torque * ones, ones, ones, moment * np.ones(2 * n), np.ones(3)).vector

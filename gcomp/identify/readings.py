@@ -90,7 +90,7 @@ class StaticReadings:
         if self.position.shape[1] != arm.n:
             raise BadArray(f"readings of {self.position.shape[1]} joints, but the arm has {arm.n}")
         if not self.counted.any():
-            raise BadArray("no torque reading counts: all are NaN")
+            raise BadArray("no torque reading can be used: all are NaN")
 
 
 def _spread(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:

@@ -9,7 +9,9 @@ from gcomp.arrays import Array, Mask
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.readings import StaticReadings
-from gcomp.identify.thresholds import DEAD_COLUMN
+
+DEAD_COLUMN = 1e-6
+"""Share of g·√K below which a column's norm counts as zero: the axis was along gravity in every row (section 2.3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,7 @@ def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool =
         own = slice(2 * i, 2 * i + 2)
         target = readings.torque[rows, i] * weight - regressor[:, 2 * i + 2 :] @ beta[2 * i + 2 :]
         columns, places = regressor[:, own], [2 * i, 2 * i + 1]
-        felt = _felt(arm, regressor, weight)
+        felt = _acting_moments(arm, regressor, weight)
         if not felt[own].all():
             found[own] = False
             columns, places = columns[:, :0], []
@@ -76,7 +78,7 @@ def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool =
     return RecursiveFit(beta, offset, covariance, found)
 
 
-def _felt(arm: Arm, weighted: Array, weight: Array) -> Mask:
+def _acting_moments(arm: Arm, weighted: Array, weight: Array) -> Mask:
     """Moments that act on this joint's torque in these rows."""
     floor = DEAD_COLUMN * float(np.linalg.norm(arm.gravity)) * float(np.linalg.norm(weight))
     felt: Mask = np.linalg.norm(weighted, axis=0) > floor

@@ -35,7 +35,9 @@ def sim(
     ] = None,
     realism: Annotated[
         float | None,
-        typer.Option(min=0, help="All small troubles of a real arm: 1 a good one's, 3 a bad one's; --seed draws them."),
+        typer.Option(
+            min=0, help="Small imperfections of a real arm: 1 for a good one, 3 for a bad one; --seed draws them."
+        ),
     ] = None,
     lockstep: Annotated[
         bool, typer.Option(help="Each SYNC advances the physics by one period, independent of real time.")

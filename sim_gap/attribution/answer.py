@@ -7,17 +7,17 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.attribution.causes import left_over
+from sim_gap.attribution.causes import remainder
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout
-from sim_gap.attribution.notes import besides_notes, law_notes, notes
+from sim_gap.attribution.notes import aside_notes, law_notes, notes
 from sim_gap.attribution.residual_laws import ResidualLaw, as_effects, residual_laws
 from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
 from sim_gap.model.load import SimModel
-from sim_gap.residuals.besides import fast, left_out, slides, slow
+from sim_gap.residuals.disregarded_rows import fast_gaps, share_left_out, slides, slow_gaps
+from sim_gap.residuals.location import Location, by_joint, combine_by_joint, locate
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.where import Location, by_joint, combined, locate
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +27,11 @@ class Internals:
     model: SimModel
     train: ResidualSet
     heldout: ResidualSet
-    estimate: Estimate | None
+    estimate: EffectEstimate | None
     """None if there is no gap."""
     recordings: tuple[Recording, ...] = ()
     """Held-out recordings."""
-    nominal: Estimate | None = None
+    nominal: EffectEstimate | None = None
     """The fit even if there is no gap."""
 
 
@@ -39,7 +39,7 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
     """The diagnosis from its causes, the minor ones, and a description of the held-out data."""
     fit, judge, estimate = made.train, made.heldout, made.estimate
     left, left_fit = (
-        left_over(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
+        remainder(data, estimate.predict(data)) if estimate is not None else data.values for data in (judge, fit)
     )
     stuck = [each for s in (*fit.signals, *judge.signals) for each in s.stuck]
     sets = [(judge, left), *([(fit, left_fit)] if found else [])]
@@ -52,29 +52,29 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
         verdict=result,
         names=made.model.arm.names,
         where=(*locate(judge), *aside),
-        left_out=left_out(judge),
+        left_out=share_left_out(judge),
         causes=tuple(_hints(found) if result == "unexplained" else found),
         minor=tuple(minor),
-        noise_floor=combined(judge, judge.floor),
+        noise_floor=combine_by_joint(judge, judge.floor),
         train_before=by_joint(fit),
         train_after=by_joint(fit, left_fit),
         heldout_before=by_joint(judge),
         heldout_after=by_joint(judge, left),
         unexplained=share_left(judge, left),
-        margin=combined(judge, judge.margin),
+        margin=combine_by_joint(judge, judge.margin),
         heldout_is=heldout_is,
         rollout=_rolled(made, found, laws),
         laws=tuple(laws),
         notes=(
             *notes(found, stuck, estimate, fit, judge, left),
-            *besides_notes(aside),
+            *aside_notes(aside),
             *law_notes(laws, made.model.arm.names),
         ),
         internals=made,
     )
 
 
-def _dry_friction(nominal: Array, estimate: Estimate | None) -> Array:
+def _dry_friction(nominal: Array, estimate: EffectEstimate | None) -> Array:
     """Dry friction of the joints as far as it is known: the model's, and what was found beside it [N·m], (n,)."""
     friction = nominal.copy()
     for term in estimate.terms if estimate is not None else ():
@@ -83,13 +83,13 @@ def _dry_friction(nominal: Array, estimate: Estimate | None) -> Array:
     return np.maximum(friction, 0.0)
 
 
-def _aside(made: Internals, estimate: Estimate | None, friction: Array) -> list[Location]:
+def _aside(made: Internals, estimate: EffectEstimate | None, friction: Array) -> list[Location]:
     """Gaps at rest, in creep and above the band on held-out data."""
     judge = made.heldout
     zero = {row: np.zeros(len(values)) for row, values in judge.values.items()}
     explained = zero if estimate is None else estimate.predict(judge)
     known = [row for row in made.train.rows if slides(made.train, row)]
-    return [*slow(judge, explained, friction, known), *fast(judge, made.recordings)]
+    return [*slow_gaps(judge, explained, friction, known), *fast_gaps(judge, made.recordings)]
 
 
 def _rolled(made: Internals, found: list[Cause], laws: Sequence[ResidualLaw]) -> Rollout | None:

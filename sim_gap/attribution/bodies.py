@@ -7,12 +7,12 @@ import numpy as np
 
 from armlink.errors import BadInput
 from gcomp.arrays import Array
-from sim_gap.residuals.layout import Layout
-from sim_gap.residuals.preprocess import ABSENT, Signals
+from sim_gap.residuals.layout import ChannelLayout
+from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import Estimate
-from sim_gap.search.model_selection import golden
+from sim_gap.search.estimate import EffectEstimate
+from sim_gap.search.model_selection import golden_section
 from sim_gap.search.term import Term
 
 
@@ -41,12 +41,12 @@ def _names(label: str) -> tuple[str, ...]:
     return label, file, file.split(".", 1)[0]
 
 
-def body_of(estimate: Estimate) -> Term | None:
+def body_of(estimate: EffectEstimate) -> Term | None:
     """The body that recordings differ in, if one was found."""
     return next((term for term in estimate.terms if term.effect == "link.payload"), None)
 
 
-def placed(estimate: Estimate, heldout: ResidualSet) -> ResidualSet:
+def numbered_by_body(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
     """The held-out recordings, each numbered by whether it was made with the body that training recordings have.
 
     By its groups if there are any; else by the sum of squares that remains with and without the body. If it is mounted
@@ -79,8 +79,6 @@ def placed(estimate: Estimate, heldout: ResidualSet) -> ResidualSet:
 
 TURNED = 0.25
 """Least angle by which a body counts as mounted in another way [rad]."""
-ANGLES = 12
-"""Number of angles that are tried first."""
 CLEARLY = 0.5
 """Fall of Σ ½ log(R² + floor²) over the rows from which it does."""
 ALIKE = 0.5
@@ -92,26 +90,26 @@ OPPOSITE = 0.9
 """Cosine from which two moments are opposite."""
 
 
-def _has_alike(estimate: Estimate, data: ResidualSet, body: Term) -> bool:
+def _has_alike(estimate: EffectEstimate, data: ResidualSet, body: Term) -> bool:
     """Whether a body of about the same mass, elsewhere, would explain a recording far better than the one found."""
     own, mass = _own(estimate, estimate.on(data), body, 0), float(estimate.of(body)[0])
     return own.fall > CLEARLY and abs(own.values[0] - mass) < ALIKE * abs(mass)
 
 
-def _mounted(estimate: Estimate, s: Signals, layout: Layout) -> tuple[float, Signals]:
+def _mounted(estimate: EffectEstimate, s: PreparedSignals, layout: ChannelLayout) -> tuple[float, PreparedSignals]:
     """The recording with the body turned by the angle that leaves least, and what is left then."""
 
     def left(angle: float) -> float:
         return _left(estimate, ResidualSet((replace(s, mount=angle),), layout))
 
-    step = 2.0 * np.pi / ANGLES
-    start = min((step * k for k in range(ANGLES)), key=left)
-    angle = golden(left, start - step, start + step)
+    step = 2.0 * np.pi / 12
+    start = min((step * k for k in range(12)), key=left)
+    angle = golden_section(left, start - step, start + step)
     angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
     return left(angle), replace(s, mount=angle)
 
 
-def mounts(estimate: Estimate) -> tuple[float, ...]:
+def mounts(estimate: EffectEstimate) -> tuple[float, ...]:
     """Angle by which the body is turned in each training recording against the first that has it [rad].
 
     Without a body found, one that is turned by half a turn between recordings may have been missed, as its moment
@@ -147,7 +145,7 @@ class _Own:
     """Share of the squares of the rows with a gap that it leaves; one without a gap."""
 
 
-def _own(estimate: Estimate, store: ColumnStore, body: Term, recording: int) -> _Own:
+def _own(estimate: EffectEstimate, store: ColumnStore, body: Term, recording: int) -> _Own:
     """The body in one recording of a set, all else as in the estimate."""
     data = store.data
     explained = estimate.predict(data, store)
@@ -171,20 +169,20 @@ def _own(estimate: Estimate, store: ColumnStore, body: Term, recording: int) -> 
     return _Own(found + change, float(fall), float(np.mean(gaps)) if gaps else 1.0)
 
 
-def _across(s: Signals, body: Array) -> Array:
+def _across(s: PreparedSignals, body: Array) -> Array:
     """Moment of a body across the last joint's axis, (3,)."""
     axis = s.arm.axis[-1]
     return np.asarray(body[1:] - (body[1:] @ axis) * axis)
 
 
-def _opposite(s: Signals, one: Array, other: Array) -> bool:
+def _opposite(s: PreparedSignals, one: Array, other: Array) -> bool:
     """Whether two moments across the last joint's axis are opposite."""
     first, second = _across(s, one), _across(s, other)
     sizes = sorted((float(np.linalg.norm(first)), float(np.linalg.norm(second))))
     return sizes[0] > ALIKE * sizes[1] and float(first @ second) < -OPPOSITE * sizes[0] * sizes[1]
 
 
-def _turn(s: Signals, one: Array, other: Array) -> float:
+def _turn(s: PreparedSignals, one: Array, other: Array) -> float:
     """Angle about the last joint's axis from a body (mass, moment) to another one; zero if they are different bodies.
 
     They are alike if their masses are, and the sizes of their moments across the axis.
@@ -197,7 +195,7 @@ def _turn(s: Signals, one: Array, other: Array) -> float:
     return float(np.arctan2(np.cross(across[0], across[1]) @ s.arm.axis[-1], across[0] @ across[1]))
 
 
-def lacking(estimate: Estimate, heldout: ResidualSet) -> list[int]:
+def recordings_with_another_body(estimate: EffectEstimate, heldout: ResidualSet) -> list[int]:
     """Indices of held-out recordings that differ from all training recordings by a body.
 
     Nothing in the training data then separates the body from errors of the arm's own masses: all of them have one that
@@ -214,7 +212,7 @@ def lacking(estimate: Estimate, heldout: ResidualSet) -> list[int]:
     return [k for k, s in enumerate(heldout.signals) if s.number == ABSENT]
 
 
-def _left(estimate: Estimate, data: ResidualSet) -> float:
+def _left(estimate: EffectEstimate, data: ResidualSet) -> float:
     """Σ ½ log(R² + floor²) over the rows that remains of one recording."""
     explained = estimate.predict(data)
     total = 0.0

@@ -8,21 +8,48 @@ from functools import cached_property
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.attribution.confidence import FOUNDED, confidence
 from sim_gap.attribution.diagnosis import HINT, Cause, Signs
 from sim_gap.attribution.law_test import LawTest
 from sim_gap.attribution.rivals import Rivals
-from sim_gap.attribution.steadiness import STEADY, steadiness
+from sim_gap.attribution.verdict import FOUNDED, confidence
 from sim_gap.effects.registry import effects
-from sim_gap.residuals.layout import Layout, Row
+from sim_gap.residuals.layout import ChannelLayout, Row
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.estimate import Estimate, Value
+from sim_gap.search.estimate import EffectEstimate, Value
 from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.term import Term
 
+STEADY = 2.0
+"""Least mean decrease of a row's sum of squares over the blocks, in standard errors."""
+
+
+def steadiness(estimate: EffectEstimate, heldout: ResidualSet, terms: Sequence[Term]) -> float:
+    """Decrease of some held-out row's sum of squares by these terms, all others fitted, in standard errors.
+
+    The mean over blocks of time of the decrease per block, divided by the standard error of that mean; the largest of
+    the rows.
+    """
+    store = estimate.on(heldout)
+    with_them = estimate.subset(list(estimate.terms))
+    without = estimate.subset([term for term in estimate.terms if term not in terms])
+    best = 0.0
+    for row in heldout.rows:
+        valid = heldout.valid[row]
+        touching = [term for term in estimate.terms if row in store.columns(term)]
+        if not valid.any() or not any(row in store.columns(term) for term in terms):
+            continue
+        columns = store.wide(touching, row, estimate.normal.fixed)[valid]
+        index = estimate.normal.index(touching)
+        left, more = (heldout.values[row][valid] - columns @ c[index] for c in (with_them, without))
+        falls = np.bincount(heldout.blocks[valid], more**2 - left**2)
+        falls = falls[np.unique(heldout.blocks[valid])]
+        if len(falls) > 2:
+            best = max(best, float(falls.mean() / (falls.std(ddof=1) / np.sqrt(len(falls)) + 1e-300)))
+    return best
+
 
 @dataclass(frozen=True)
-class Step:
+class CauseStep:
     """One effect added to the earlier ones: RMS per joint before and after, (n,)."""
 
     effect: str
@@ -43,7 +70,7 @@ FLOOR_KNOWN = 1.05
 
 
 class _Scorer:
-    def __init__(self, estimate: Estimate, heldout: ResidualSet) -> None:
+    def __init__(self, estimate: EffectEstimate, heldout: ResidualSet) -> None:
         self.estimate, self.heldout = estimate, heldout
         self.normal = NormalEquations(estimate.on(heldout), estimate.terms, estimate.normal)
         self.joint = np.array([row[1] for row in self.normal.rows])
@@ -111,7 +138,7 @@ class _Scorer:
         return np.asarray(np.sqrt(out))
 
 
-def ordered(estimate: Estimate, scorer: _Scorer) -> list[Step]:
+def order_of_effects(estimate: EffectEstimate, scorer: _Scorer) -> list[CauseStep]:
     """Effects in the order in which each, added to the earlier ones, lowers the held-out RMS of some joint most."""
     groups: dict[str, list[Term]] = defaultdict(list)
     for term in estimate.terms:
@@ -121,7 +148,7 @@ def ordered(estimate: Estimate, scorer: _Scorer) -> list[Step]:
     while groups:
         outcomes = {effect: scorer.rms([*chosen, *terms]) for effect, terms in groups.items()}
         effect = max(outcomes, key=lambda name: float(np.max(before - outcomes[name])))
-        steps.append(Step(effect, tuple(groups.pop(effect)), tuple(chosen), before, outcomes[effect]))
+        steps.append(CauseStep(effect, tuple(groups.pop(effect)), tuple(chosen), before, outcomes[effect]))
         chosen += steps[-1].terms
         before = outcomes[effect]
     return steps
@@ -143,7 +170,7 @@ could explain them."""
 
 
 def relevant_terms(
-    step: Step, estimate: Estimate, heldout: ResidualSet, scorer: _Scorer, quiet: bool
+    step: CauseStep, estimate: EffectEstimate, heldout: ResidualSet, scorer: _Scorer, quiet: bool
 ) -> tuple[Term, ...]:
     """Those of a step's terms that matter: without the others together, no joint's RMS rises by a relevant amount.
 
@@ -170,7 +197,7 @@ def relevant_terms(
     small = set[int]()
 
     def rise(gone: set[int]) -> Array:
-        """What is lost without the effect there; or what it takes in its place, if a later cause takes that too."""
+        """RMS lost without the effect there; or that it takes in its place, if a later cause takes that too."""
         lost = [term for term in step.terms if term.place in gone]
         kept = [[term for term in terms if term not in lost] for terms in (estimate.terms, [*step.below, *step.terms])]
         last, first = (scorer.falls(terms, lost, by_row) for terms in kept)
@@ -182,7 +209,7 @@ def relevant_terms(
     return tuple(term for term in step.terms if term.place not in small) or step.terms
 
 
-def _minor(shows: set[Row], layout: Layout) -> Array:
+def _minor(shows: set[Row], layout: ChannelLayout) -> Array:
     """Share of each joint's torque below which a cause that shows in these rows is minor, (n,)."""
     if any(channel == layout.against_model for channel, _ in shows):
         return np.full(layout.n, MINOR)
@@ -192,7 +219,7 @@ def _minor(shows: set[Row], layout: Layout) -> Array:
 
 
 def causes(
-    estimate: Estimate,
+    estimate: EffectEstimate,
     heldout: ResidualSet,
     rivals: Rivals,
     names: tuple[str, ...],
@@ -210,7 +237,7 @@ def causes(
     fitted = _Scorer(estimate, estimate.store.data)
     law_test = LawTest(estimate.store, estimate.terms)
     hints: list[Term] = []
-    for step in ordered(estimate, scorer):
+    for step in order_of_effects(estimate, scorer):
         main = relevant_terms(step, estimate, heldout, scorer, quiet)
         if quiet and main and steadiness(estimate, heldout, main) < STEADY:
             main = ()
@@ -226,7 +253,7 @@ def causes(
     return [replace(each, fall=min(each.fall, missed)) if each.confidence < HINT else each for each in found], minor
 
 
-def founded_ones(found: Sequence[Cause], minor: Sequence[Cause]) -> tuple[list[Cause], list[Cause]]:
+def founded_causes(found: Sequence[Cause], minor: Sequence[Cause]) -> tuple[list[Cause], list[Cause]]:
     """The causes that say more than that noise is uneven, for a gap within its margins; the others are minor.
 
     They are more than a guess, even where a general law would do as well, or rivals share their evidence.
@@ -242,11 +269,7 @@ def _is_held_out(term: Term, heldout: ResidualSet) -> bool:
 
 
 def _cause(
-    step: Step,
-    terms: tuple[Term, ...],
-    scorer: _Scorer,
-    against: tuple[Rivals, LawTest],
-    names: tuple[str, ...],
+    step: CauseStep, terms: tuple[Term, ...], scorer: _Scorer, against: tuple[Rivals, LawTest], names: tuple[str, ...]
 ) -> Cause:
     """One cause from terms of a step, compared with the rest of the library and with the general laws."""
     rivals, law_test = against
@@ -274,6 +297,6 @@ def _cause(
     )
 
 
-def left_over(data: ResidualSet, explained: dict[Row, Array]) -> dict[Row, Array]:
+def remainder(data: ResidualSet, explained: dict[Row, Array]) -> dict[Row, Array]:
     """Residual less the sum of the terms, (K,) per row."""
     return {row: values - explained[row] for row, values in data.values.items()}

@@ -15,35 +15,39 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
 from sim_gap.attribution.answer import Internals, answer
-from sim_gap.attribution.bodies import CLEARLY, body_of, groups_of, lacking, mounts, placed
-from sim_gap.attribution.causes import causes, founded_ones
+from sim_gap.attribution.bodies import (
+    CLEARLY,
+    body_of,
+    groups_of,
+    mounts,
+    numbered_by_body,
+    recordings_with_another_body,
+)
+from sim_gap.attribution.causes import causes, founded_causes
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.attribution.friction_compensation import held_in_commands, missing_in_readings
-from sim_gap.attribution.positions.answer import diagnose_positions
+from sim_gap.attribution.friction_compensation import find_compensations, held_in_commands
+from sim_gap.attribution.position_answer import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_quiet, is_within
-from sim_gap.checks.check import check_recordings
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.check import check_recordings, unchecked_note
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joints import match_joints
-from sim_gap.checks.one_way import unchecked_note
 from sim_gap.checks.position_command import check_position_only, is_position_only
 from sim_gap.effects.registry import library_without
-from sim_gap.model.arm_joints import hinges_between
-from sim_gap.model.from_arm import ends_of
-from sim_gap.model.load import SimModel, load_compiled, load_model
-from sim_gap.residuals.besides import without_disturbances
+from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model
+from sim_gap.residuals.disregarded_rows import without_disturbances
 from sim_gap.residuals.preprocess import prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.model_selection import select_model
-from sim_gap.search.stepwise import Search
+from sim_gap.search.stepwise_search import StepwiseSearch
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
 OWN_HELDOUT_S = 3.0
 """Least length of it [s], up to half of a short recording."""
-LENT = "the first is fitted: by a body it differs from all training recordings"
+LENT = "since no training recording shows the body that it carries, or lacks: the first half is fitted"
 """Why half of a held-out recording is fitted."""
 MOUNTED = 2
 """How often the ways in which a body is mounted are looked at."""
@@ -117,35 +121,35 @@ def diagnose(
     library = library_without(withhold)
     search, estimate = _fitted(fit, library)
     judge = _placed(estimate, judge)
-    if "link.payload" in library and (lent := lacking(estimate, judge)):
+    if "link.payload" in library and (lent := recordings_with_another_body(estimate, judge)):
         more, rest, recordings = _lent(fit, judge, heldout, lent)
         other, again = _fitted(more, library)
         if body_of(again) is not None:
             search, estimate, judge, heldout = other, again, _placed(again, rest), recordings
-            heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} the second half, for {LENT}"
+            heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} only the second half, {LENT}"
     fit = estimate.store.data
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     within = is_within(judge) and is_within(fit)
     found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet, within=within)
     if within:
-        found, minor = founded_ones(found, minor)
+        found, minor = founded_causes(found, minor)
     if quiet and not found:
         made = answer(Internals(sim, fit, judge, None, tuple(heldout), estimate), [], [], heldout_is)
     else:
         made = answer(Internals(sim, fit, judge, estimate, tuple(heldout), estimate), found, minor, heldout_is)
-    compensated += missing_in_readings(estimate, (fit, judge))
+    compensated += find_compensations(estimate, (fit, judge))
     told = tuple(each.sentence() for each in compensated)
     aside = (*told, *unchecked_note(recordings))
     return replace(made, checks=findings, notes=(*made.notes, *aside), friction_compensation=tuple(compensated))
 
 
-def _placed(estimate: Estimate, heldout: ResidualSet) -> ResidualSet:
-    """The held-out recordings by the body that they have (`placed`), without what disturbed the arm."""
-    judge = placed(estimate, heldout)
+def _placed(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
+    """The held-out recordings by the body that they have (`numbered_by_body`), without what disturbed the arm."""
+    judge = numbered_by_body(estimate, heldout)
     return without_disturbances(judge, estimate.predict(judge))
 
 
-def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[Search, Estimate]:
+def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch, EffectEstimate]:
     """The search of the library and the fit (`_searched`); again without what disturbed the arm, if anything did."""
     search, estimate = _searched(fit, library)
     data = estimate.store.data
@@ -153,10 +157,10 @@ def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[Search, Estimate]
     return (search, estimate) if undisturbed is data else _searched(undisturbed, library)
 
 
-def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[Search, Estimate]:
+def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch, EffectEstimate]:
     """The search of the library and the fit; again if a body is mounted in different ways, kept if that is better."""
     search = select_model(ColumnStore(fit), library)
-    estimate = Estimate(search.normal.store, search.active)
+    estimate = EffectEstimate(search.normal.store, search.active)
     for _ in range(MOUNTED):
         signals = estimate.store.data.signals
         angles = mounts(estimate)
@@ -166,7 +170,7 @@ def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[Search, Estimat
         again = select_model(ColumnStore(ResidualSet(turned, fit.layout)), library)
         if again.score > search.score - CLEARLY:
             break
-        search, estimate = again, Estimate(again.normal.store, again.active)
+        search, estimate = again, EffectEstimate(again.normal.store, again.active)
     return search, estimate
 
 
@@ -194,7 +198,7 @@ def _checked(
     stated: Corrections,
     base: str | None,
     tip: str | None,
-) -> tuple[SimModel, list[Recording], tuple[Finding, ...]]:
+) -> tuple[SimModel, list[Recording], tuple[RecordingFinding, ...]]:
     """The model, the recordings with joints, units and clocks as they should be, and what was found in them."""
     compiled_model = load_compiled(source)
     own_base, own_tip = ends_of(source)
@@ -227,7 +231,6 @@ def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recor
 
 
 def _require_motion(data: ResidualSet) -> None:
-    """Raise BadInput if no joint moves."""
     if not any(s.moving.mean(0).max() > 0.02 for s in data.signals):
         raise BadInput(
             f"{data.signals[0].label}: no joint moves in the training recordings: they cannot tell what causes a gap; "

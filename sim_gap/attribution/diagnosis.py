@@ -8,9 +8,9 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.attribution.friction_compensation import Compensation
 from sim_gap.attribution.residual_laws import ResidualLaw
-from sim_gap.checks.finding import Finding
-from sim_gap.closed_loop.training.bands import SHARE, Band
-from sim_gap.residuals.where import Location
+from sim_gap.checks.finding import RecordingFinding
+from sim_gap.position_gap.training.bands import SHARE, Band
+from sim_gap.residuals.location import Location
 from sim_gap.search.estimate import Value
 
 HINT = 0.5
@@ -121,7 +121,7 @@ class Diagnosis:
     """Of the gap: N·m, or rad where no recording has a torque channel."""
     friction_compensation: tuple[Compensation, ...] = ()
     """Recordings whose controller compensates friction, by joint."""
-    checks: tuple[Finding, ...] = ()
+    checks: tuple[RecordingFinding, ...] = ()
     """Findings on mapping, units and clocks of the recordings."""
     internals: Any = field(default=None, repr=False, compare=False)
     """Fit and data behind the result (`answer.Internals`), for report and export."""

@@ -16,18 +16,14 @@ from scipy.signal import savgol_filter
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 
-MOST = 10_000
-"""Number of samples of a command that are looked at, spread over the recording."""
 LAGS = 3
 """Number of samples by which the command may follow the velocity, from 0."""
 VISCOUS = 3 * LAGS
 """First column of the viscous law."""
-SMOOTH = 21
-"""Samples over which the velocity is smoothed."""
 SPEEDS = tuple(0.0025 * 2.0 ** (k / 2) for k in range(15))
 """Speeds at which the compensation has half of its torque [rad/s]."""
 FEWEST, FEWEST_MOVING = 200, 50
@@ -46,8 +42,6 @@ CLEAR = 4.0
 
 @dataclass(frozen=True)
 class Compensation:
-    """Friction compensation of one joint in one recording."""
-
     recording: str
     joint: str
     channel: str
@@ -61,21 +55,20 @@ class Compensation:
     """Friction in the other recordings [N·m], where not held; None without others."""
 
     def sentence(self) -> str:
-        """One line for people."""
         if self.held:
             law = f"{self.torque:.2g} N·m" + (f" and {self.viscous:.2g} N·m·s/rad" if abs(self.viscous) > 0.01 else "")
             return (
-                f"{self.recording}: the controller compensates friction of {self.joint}: {self.channel} follows the "
-                f"measured velocity as friction of {law} would, and holds that torque"
+                f"{self.recording}: the controller compensates the friction of {self.joint}: {self.channel} contains "
+                f"a torque of {law} in the direction of the measured velocity"
             )
         beside = "" if self.usual is None else f" ({self.usual:.2g} in the other recordings)"
         return (
-            f"{self.recording}: {self.joint} shows {self.torque:.2g} N·m of friction{beside}: friction compensation "
-            f"that {self.channel} does not hold; leave this recording out, or give the whole command"
+            f"{self.recording}: {self.joint} shows {self.torque:.2g} N·m of friction{beside}: the controller "
+            f"compensates friction with a torque that {self.channel} lacks; "
+            "leave this recording out, or record the whole command"
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Entry of `friction_compensation` in the answer."""
         values = {name: getattr(self, name) for name in ("torque", "viscous", "usual")}
         numbers = {name: None if value is None else float(f"{value:.6g}") for name, value in values.items()}
         return {"recording": self.recording, "joint": self.joint, "channel": self.channel, "held": self.held, **numbers}
@@ -102,10 +95,10 @@ def _law(command: Array, velocity: Array, position: Array) -> tuple[float, float
     if len(command) < FEWEST:
         return None
     best: tuple[float, float, float] | None = None
-    smooth = np.asarray(savgol_filter(velocity, SMOOTH, 2, mode="nearest"))
+    smooth = np.asarray(savgol_filter(velocity, 21, 2, mode="nearest"))
     bent = _bent(command)[LAGS - 1 :]
     there = np.flatnonzero(np.isfinite(bent))
-    there = there[:: len(there) // MOST + 1]
+    there = there[:: len(there) // 10_000 + 1]  # so many samples are looked at
     for speed in SPEEDS:
         laws = (*(_dry(v, speed) for v in (velocity, smooth)), np.sign(smooth), velocity, smooth, position)
         bends = [_bent(law) for law in laws]
@@ -151,7 +144,7 @@ class _Friction:
     """Standard error, from blocks of time [N·m]."""
 
 
-def missing_in_readings(estimate: Estimate | None, sets: Sequence[ResidualSet]) -> list[Compensation]:
+def find_compensations(estimate: EffectEstimate | None, sets: Sequence[ResidualSet]) -> list[Compensation]:
     """Recordings in which joints have none of the friction that most others show, or drive themselves on.
 
     It must be more than half of the joints that show friction at all: a controller compensates an arm's, and one joint
@@ -174,7 +167,7 @@ def missing_in_readings(estimate: Estimate | None, sets: Sequence[ResidualSet]) 
     return [each for each in out.values() if 2 * lacking.count(each.recording) > len(shown[each.recording])]
 
 
-def _frictions(estimate: Estimate | None, data: ResidualSet) -> list[_Friction]:
+def _frictions(estimate: EffectEstimate | None, data: ResidualSet) -> list[_Friction]:
     """Friction of each joint in each recording, all other effects as estimated."""
     store = estimate.on(data) if estimate is not None else None
     links = tuple(term for term in estimate.terms if not term.effect.startswith("friction.")) if estimate else ()
@@ -194,7 +187,7 @@ def _frictions(estimate: Estimate | None, data: ResidualSet) -> list[_Friction]:
     return out
 
 
-def _friction(s: Signals, row: Row, y: Array, valid: Mask, blocks: NDArray[np.intp]) -> _Friction:
+def _friction(s: PreparedSignals, row: Row, y: Array, valid: Mask, blocks: NDArray[np.intp]) -> _Friction:
     """Friction from one recording's residual `y` at its `valid` samples, beside what rigid links may leave."""
     q, v, a, direction = (s.filtered(each)[valid, row[1]] for each in (s.q, s.v, s.a, s.direction))
     x = np.stack([direction, v, np.ones_like(q), np.sin(q), np.cos(q), a], axis=1)

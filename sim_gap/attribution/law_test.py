@@ -7,22 +7,18 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.effects.laws import LAWS
-from sim_gap.residuals.layout import Layout
+from sim_gap.residuals.layout import ChannelLayout
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.normal_equations import NormalEquations
-from sim_gap.search.stepwise import Search
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
-TRIED = 3
-"""Number of laws tried in place of a term: the best of a first screening."""
 CONTAINED = 1e-6
 """A cause is a case of a law if at most this share of the power of its columns is outside the span of the law's."""
 
 
 @dataclass(frozen=True)
 class StandIn:
-    """The best law in place of a cause."""
-
     worse: float
     """How much worse it scores: ½ log of the mean square summed over the rows; negative is better, infinite without a
     law."""
@@ -31,12 +27,10 @@ class StandIn:
 
 
 class LawTest:
-    """Tries the general laws in place of a cause."""
-
     def __init__(self, store: ColumnStore, active: Sequence[Term]) -> None:
         layout = store.data.layout
         offered = [Term(name, place) for name, law in LAWS.items() for place in law.signature.places(layout)]
-        self.search = Search(NormalEquations(store, [*active, *offered]), list(active))
+        self.search = StepwiseSearch(NormalEquations(store, [*active, *offered]), list(active))
         self.laws = [law for law in offered if law in self.search.normal.at]
 
     def best_law(self, terms: Sequence[Term]) -> StandIn:
@@ -56,7 +50,7 @@ class LawTest:
         for term in own:
             rest = search.without(term, rest)
         laws = [law for law in self.laws if not self._holds(law, own)]
-        for _, law in search.weighted.screen(rest, laws)[:TRIED]:
+        for _, law in search.weighted.screen(rest, laws)[:3]:
             beside = [term for term in rest if term.place == law.place and not term.form.signature.whole_arm]
             score, _ = search.pruned(search.possible([*rest, law]), beside)
             best = min(best, StandIn(score - search.score, law.effect), key=lambda each: each.worse)
@@ -79,7 +73,7 @@ class LawTest:
         return bool(np.all(power - _explained(law_gram, across) <= CONTAINED * power))
 
 
-def _family(term: Term, layout: Layout) -> str:
+def _family(term: Term, layout: ChannelLayout) -> str:
     """Family of a cause: without a torque sensor, an offset of the torque is the drive's."""
     return "actuator" if layout.sensor is None and term.effect == "torque.offset" else term.effect.split(".")[0]
 

@@ -10,25 +10,23 @@ from sim_gap.attribution.diagnosis import Cause
 from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.attribution.verdict import row_rms
 from sim_gap.effects.laws import LAWS
+from sim_gap.residuals.channel_quality import Stuck
 from sim_gap.residuals.disturbances import AROUND_S
 from sim_gap.residuals.layout import Row
+from sim_gap.residuals.location import Location, locate
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.residuals.stuck_channels import Stuck
-from sim_gap.residuals.where import Location, locate
-from sim_gap.search.estimate import NOMINAL, Estimate
+from sim_gap.search.estimate import NOMINAL, EffectEstimate
 from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants, shares_a_factor
 
 ALIKE = 0.05
 """A general law that scores worse than a cause by less than this is noted."""
-MOST_ROWS = 3
-"""Number of rows with a remaining gap that are noted."""
 
 
 def notes(
     found: Sequence[Cause],
     stuck: Sequence[Stuck],
-    estimate: Estimate | None,
+    estimate: EffectEstimate | None,
     fit: ResidualSet,
     judge: ResidualSet,
     left: dict[Row, Array],
@@ -40,10 +38,9 @@ def notes(
 
 
 def _noisy(data: ResidualSet) -> tuple[str, ...]:
-    """A note for each joint whose command passes over noisy channels."""
     layout, names = data.layout, data.signals[0].arm.names
     return tuple(
-        f"{names[j]}: too noisy: {' and '.join(layout.chain[: layout.beyond(j)])}; the command is compared with "
+        f"{names[j]}: {' and '.join(layout.chain[: layout.beyond(j)])} too noisy; the command is compared with "
         f"{layout.reference((str(layout.command), j)) or 'the model'} instead"
         for j in range(layout.n)
         if layout.beyond(j)
@@ -53,8 +50,8 @@ def _noisy(data: ResidualSet) -> tuple[str, ...]:
 def _stuck(stuck: Sequence[Stuck], data: ResidualSet) -> tuple[str, ...]:
     names = data.signals[0].arm.names
     lines = (
-        f"{names[one.joint]}: {one.channel} repeats one value for {one.seconds:.3g} s while the arm moves: stuck "
-        "sensor or channel; these samples are left out"
+        f"{names[one.joint]}: {one.channel} repeats one value for {one.seconds:.3g} s while the arm moves: the "
+        "sensor or the channel is stuck; these samples are left out"
         for one in stuck
     )
     return tuple(dict.fromkeys(lines))
@@ -69,8 +66,8 @@ def _spiked(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
         count, readings = (sum(getattr(one, part) for _, one in ours) for part in ("count", "readings"))
         joints = {name: sum(one.count for other, one in ours if other == name) for name, _ in ours}
         lines.append(
-            f"{channel}: {count} samples of {readings} ({count / readings:.2%}) are left out as spikes, each far from "
-            f"those before and after it ({', '.join(f'{name} {number}' for name, number in joints.items())})"
+            f"{channel}: {count} of {readings} samples ({count / readings:.2%}) are left out as spikes, far from the "
+            f"samples before and after ({', '.join(f'{name} {number}' for name, number in joints.items())})"
         )
     return tuple(lines)
 
@@ -84,10 +81,9 @@ def _impacts(data: ResidualSet) -> tuple[str, ...]:
 
 
 def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
-    """A note for each disturbance."""
     lines = (
-        f"{s.label}: at {one.start:.1f} s several joints are far off at once, {s.arm.names[one.joint]} by "
-        f"{one.torque:.2g} N·m, as at no other time: something touched the arm or torques were misread; "
+        f"{s.label}: at {one.start:.1f} s, and at no other time, several joints leave the fit at once, "
+        f"{s.arm.names[one.joint]} by {one.torque:.2g} N·m: something touched the arm, or torques were misread; "
         f"{one.end - one.start + 2.0 * AROUND_S:.1f} s are left out"
         for data in sets
         for s in data.signals
@@ -96,30 +92,30 @@ def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(lines))
 
 
-def _common_factor(estimate: Estimate | None, fit: ResidualSet) -> tuple[str, ...]:
+def _common_factor(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[str, ...]:
     """A note for torque constants, or masses, that motor torque alone tells: only their products are known."""
     if estimate is not None and masses_may_be_constants(fit.layout, estimate.terms):
         return (
-            f"{MASSES}: {fit.layout.motor} alone tells only products of masses and torque constants: constants of all "
-            "drives that are off by the same factor would look like this, too; creep sweeps with a weighed mass tell "
-            "them apart",
+            f"{MASSES}: {fit.layout.motor} alone shows only the products of masses and torque constants: if all "
+            "constants were off by one factor, the recordings would look the same; creep sweeps with a weighed mass "
+            "tell which it is",
         )
     if estimate is None or not shares_a_factor(fit.layout, estimate.terms):
         return ()
     return (
-        f"{CONSTANT}: a factor common to all torque constants and all masses is not determined by {fit.layout.motor} "
-        "alone: with all links 1 % heavier than in the model, all constants, friction and rotor inertias are 1 % "
+        f"{CONSTANT}: {fit.layout.motor} alone does not determine the scale of all masses and torque constants "
+        "together: if all links are 1 % heavier than in the model, all constants, friction and rotor inertias are 1 % "
         f"larger; the intervals allow for masses that are {2 * NOMINAL:.0%} off; creep sweeps with a weighed mass "
-        "determine it",
+        "determine the scale",
     )
 
 
-def _bound(estimate: Estimate | None, fit: ResidualSet, judge: ResidualSet) -> tuple[str, ...]:
+def _bound(estimate: EffectEstimate | None, fit: ResidualSet, judge: ResidualSet) -> tuple[str, ...]:
     """A note for effects in some recordings alone, and for a payload that includes model errors of the links."""
     lines = []
     for term in () if estimate is None else estimate.terms:
         if alone := recordings_with(term, (fit, judge)):
-            lines.append(f"{term.effect} is present in {' and '.join(alone)} alone")
+            lines.append(f"{term.effect} is present only in {' and '.join(alone)}")
         elif term.effect == "link.payload":
             lines.append(
                 "link.payload: includes mass errors of the links themselves; to separate them, add recordings of the "
@@ -133,17 +129,15 @@ def _bound(estimate: Estimate | None, fit: ResidualSet, judge: ResidualSet) -> t
 
 
 def _turned(sets: Sequence[ResidualSet]) -> list[str]:
-    """A note for each recording in which a body is mounted in another way."""
     return [
-        f"link.payload: in {s.label} it is turned by {np.degrees(s.mount):.0f}° about the axis of {s.arm.names[-1]} "
-        "against the other recordings; that angle was found from this recording"
+        f"link.payload: in {s.label} the payload is turned by {np.degrees(s.mount):.0f}° about the axis of "
+        f"{s.arm.names[-1]}, compared with the other recordings; the angle was found from this recording"
         for s in dict.fromkeys(s for data in sets for s in data.signals)
         if s.mount and s.number != ABSENT
     ]
 
 
 def _alike(found: Sequence[Cause]) -> tuple[str, ...]:
-    """A note for each cause that a general law could replace."""
     return tuple(
         f"{cause.effect}: {LAWS[cause.law].description} would look the same in this motion; the true cause may not be "
         "in the library"
@@ -158,7 +152,7 @@ def _remaining(data: ResidualSet, left: dict[Row, Array]) -> tuple[str, ...]:
     return tuple(
         f"{at.joint}: {at.rms:.2g} N·m of {at.channel} remain (noise {at.noise:.2g}), "
         + ("without a known regime" if at.regime == "other" else f"correlated with {at.regime} ({at.share:.0%})")
-        for at in (locate(data, left, above)[:MOST_ROWS] if above else [])
+        for at in (locate(data, left, above)[:3] if above else [])
     )
 
 
@@ -170,7 +164,7 @@ def _at_rest(data: ResidualSet) -> tuple[str, ...]:
     )
 
 
-def besides_notes(aside: Sequence[Location]) -> tuple[str, ...]:
+def aside_notes(aside: Sequence[Location]) -> tuple[str, ...]:
     """A note for each gap at rest, in creep or above the band that nothing known accounts for."""
     where = {"rest": "at rest", "creep": "in creep and around reversals"}
     return tuple(
@@ -183,10 +177,9 @@ def besides_notes(aside: Sequence[Location]) -> tuple[str, ...]:
 
 
 def law_notes(laws: Sequence[ResidualLaw], names: Sequence[str]) -> tuple[str, ...]:
-    """A note for each law that takes what the library leaves."""
     return tuple(
-        f"{names[law.joint]}: what is left of {law.channel} follows a law of {law.quantity} of {names[law.joint]}"
-        + (" that opposes the motion" if law.directed else "")
+        f"{names[law.joint]}: the remaining {law.channel} is a function of the joint's {law.quantity}"
+        + (", against the motion" if law.directed else "")
         + f" ({law.before:.2g} to {law.after:.2g} N·m on held-out data); its cause is not in the library"
         for law in laws
     )

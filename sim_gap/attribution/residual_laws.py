@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.residuals.besides import regimes, slides
+from sim_gap.residuals.disregarded_rows import regimes_left_out, slides
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
 
 KNOTS = 8
@@ -63,7 +63,7 @@ class ResidualLaw:
 
 
 @dataclass(frozen=True)
-class _Candidate:
+class _LawCandidate:
     quantity: str
     directed: bool
     at: Array
@@ -82,7 +82,7 @@ class _Candidate:
             return np.stack([np.ones_like(x), x - self.at[0]], axis=1)
         return np.stack([np.interp(x, self.at, unit) for unit in np.eye(len(self.at))], axis=1)
 
-    def columns(self, s: Signals, joint: int) -> Array:
+    def columns(self, s: PreparedSignals, joint: int) -> Array:
         """The basis along a recording, filtered like the readings, (k, m)."""
         x = _values(s, self.quantity, joint)
         own = self.basis(np.abs(x) if self.directed and self.quantity in ("velocity", "load") else x)
@@ -128,7 +128,7 @@ def as_effects(laws: Sequence[ResidualLaw], names: Sequence[str]) -> list[JointE
 def _samples(data: ResidualSet) -> dict[Row, Mask]:
     """Samples of the comparison and those in creep, for a row that is quiet but for creep, (K,) per row."""
     out = {row: valid.copy() for row, valid in data.valid.items()}
-    for (row, regime), mask in regimes(data).items():
+    for (row, regime), mask in regimes_left_out(data).items():
         if regime == "creep" and slides(data, row):
             out[row] |= mask
     return out
@@ -159,7 +159,7 @@ def _best(
     return ResidualLaw(law.quantity, joint, row[0], law.directed, law.at, at @ c, band, before, after)
 
 
-def _candidates(signals: Sequence[Signals], joint: int, friction: bool) -> Iterator[_Candidate]:
+def _candidates(signals: Sequence[PreparedSignals], joint: int, friction: bool) -> Iterator[_LawCandidate]:
     for quantity in ("velocity", "position", "load", "temperature", "time"):
         if quantity == "temperature" and any(s.temperature is None for s in signals):
             continue
@@ -174,11 +174,11 @@ def _candidates(signals: Sequence[Signals], joint: int, friction: bool) -> Itera
             at = at[np.r_[True, np.diff(at) > SMALLEST / KNOTS]]
             if len(at) > 2:
                 yield from (
-                    _Candidate(quantity, directed, at, tau) for tau in (WARM_UPS if quantity == "time" else (0.0,))
+                    _LawCandidate(quantity, directed, at, tau) for tau in (WARM_UPS if quantity == "time" else (0.0,))
                 )
 
 
-def _values(s: Signals, quantity: str, joint: int) -> Array:
+def _values(s: PreparedSignals, quantity: str, joint: int) -> Array:
     if quantity == "time":
         return s.t
     if quantity == "temperature":

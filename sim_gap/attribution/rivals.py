@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sim_gap.search.gauss_newton import converged
+from sim_gap.search.gauss_newton import converge
 from sim_gap.search.normal_equations import NormalEquations
-from sim_gap.search.stepwise import Search, shortlist
+from sim_gap.search.stepwise_search import StepwiseSearch, shortlist
 from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants
 
@@ -60,9 +60,7 @@ class Weighed:
 
 
 class Rivals:
-    """Tries every effect of the library in place of a cause."""
-
-    def __init__(self, search: Search) -> None:
+    def __init__(self, search: StepwiseSearch) -> None:
         self.search = search
 
     def weigh(self, effect: str, terms: Sequence[Term]) -> Weighed:
@@ -123,10 +121,10 @@ class Rivals:
         terms = self.search.with_beneath(other, rest)
         store = self.search.normal.store
         nominal, start = store.nominal or store, store.values
-        about, kept = converged(nominal, terms, {term: c for term, c in start.items() if term in rest})
+        about, kept = converge(nominal, terms, {term: c for term, c in start.items() if term in rest})
         if other.key not in {term.key for term in kept}:
             return float("inf")
-        again = Search(NormalEquations(about, kept), kept, usual=self.search.usual)
+        again = StepwiseSearch(NormalEquations(about, kept), kept, usual=self.search.usual)
         return again.score - self.search.score
 
 

@@ -14,18 +14,16 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
 from sim_gap.better_model import forward_effects
+from sim_gap.better_model.corrected_model import spec_of, with_effects
 from sim_gap.better_model.effects_module import joint_effects
-from sim_gap.better_model.export import Written, written
+from sim_gap.better_model.export import Written, model_files
 from sim_gap.better_model.forward_effects import JointEffect
-from sim_gap.better_model.with_effects import spec_of, with_effects
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.preprocess import CHANNELS
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
-MOST_EFFECTS = 12
-"""Number of effects, the most important first, that are also added and left out alone."""
 FEW_WINDOWS = 6
 """Number of windows of each of these."""
 NAME = "model.xml"
@@ -39,7 +37,7 @@ class RollOuts:
         sim: SimModel,
         heldout: ResidualSet,
         recordings: Sequence[Recording],
-        estimate: Estimate,
+        estimate: EffectEstimate,
         laws: Sequence[JointEffect] = (),
     ) -> None:
         """`laws` go with every simulation of effects, none with that of the nominal model."""
@@ -71,7 +69,7 @@ class RollOuts:
             entries += self.laws if terms else ()
             own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
             return corrected.model, forward_effects, own
-        files = written(self.sim, self.estimate, NAME, terms, number, self.laws if terms else (), self.spec, mount)
+        files = model_files(self.sim, self.estimate, NAME, terms, number, self.laws if terms else (), self.spec, mount)
         model, module = _compiled(files), _loaded(files)
         return model, module, module.Effects(model, module.EFFECTS, module.JOINTS or self.sim.arm.names)
 
@@ -80,9 +78,9 @@ def roll_out(
     sim: SimModel,
     heldout: ResidualSet,
     recordings: Sequence[Recording],
-    estimate: Estimate | None,
+    estimate: EffectEstimate | None,
     causes: Sequence[Cause],
-    nominal: Estimate,
+    nominal: EffectEstimate,
     laws: Sequence[JointEffect] = (),
 ) -> Rollout:
     """Position gap per joint of the nominal model, of the whole correction, and with each cause added or left out.
@@ -96,7 +94,7 @@ def roll_out(
         return Rollout(horizon, before, before)
     after = runs.of(estimate.terms, windows)
     out = []
-    for cause in causes[:MOST_EFFECTS]:
+    for cause in causes[:12]:  # most important first
         own = [term for term in estimate.terms if term.effect == cause.effect]
         rest = [term for term in estimate.terms if term not in own and not {t.key for t in own} & {*term.beneath}]
         needed = [term for term in estimate.terms if any(term.key in t.beneath for t in own)]

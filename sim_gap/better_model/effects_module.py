@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sim_gap.better_model import forward_effects as forward
-from sim_gap.better_model.with_effects import offsets
-from sim_gap.effects.sensor_nonlinearity import is_gradual
+from sim_gap.better_model.corrected_model import offsets
+from sim_gap.effects.torque import is_gradual
 from sim_gap.model.load import SimModel
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 
@@ -18,7 +18,7 @@ def module_path(model: Path) -> Path:
 
 
 def joint_effects(
-    sim: SimModel, estimate: Estimate, terms: Sequence[Term], held: Sequence[Term] = ()
+    sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term], held: Sequence[Term] = ()
 ) -> list[forward.JointEffect]:
     """The terms in the module's form, beside a model with those `held`; without those present in one recording alone.
 

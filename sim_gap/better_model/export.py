@@ -9,15 +9,13 @@ import numpy as np
 
 from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
-from sim_gap.better_model.coupled_motors import add_to, coupled_motors
+from sim_gap.better_model.corrected_model import add_to, compiled_copy, coupled_motors, spec_of, with_effects
 from sim_gap.better_model.effects_module import joint_effects, module_path, module_text
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import DRIVE, LONGEST_STEP_S, motors_of, put_drive
-from sim_gap.better_model.urdf import URDF, urdf_of
-from sim_gap.better_model.with_effects import compiled_copy, spec_of, with_effects
-from sim_gap.better_model.xml_comment import xml_comment
+from sim_gap.better_model.urdf import URDF, urdf_of, xml_comment
 from sim_gap.model.load import SimModel, linear_part, urdf_behind
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 HINGE = 3
@@ -36,12 +34,12 @@ class Written:
     lines: list[str]
     """A line per effect that MJCF cannot hold, and per link that is not as fitted."""
     effects: list[JointEffect]
-    """What the module holds."""
+    """Effects that the module holds."""
 
 
-def written(
+def model_files(
     sim: SimModel,
-    estimate: Estimate | None,
+    estimate: EffectEstimate | None,
     name: str,
     terms: Sequence[Term] | None = None,
     number: int = 0,
@@ -83,14 +81,16 @@ def written(
     return Written(comment + spec.to_xml(), source, spec, lines, effects)
 
 
-def write_model(sim: SimModel, estimate: Estimate | None, path: Path, laws: Sequence[JointEffect] = ()) -> list[str]:
+def write_model(
+    sim: SimModel, estimate: EffectEstimate | None, path: Path, laws: Sequence[JointEffect] = ()
+) -> list[str]:
     """Write the model with the effects as MJCF, or as URDF if the path ends so, and beside it a module for the rest.
 
     The module has the effects that MJCF cannot hold, and laws. Returns a line per effect that the file cannot hold; it
     lists them in a comment. A module of an earlier model of that name is removed if there is none now. Raises BadInput
     if the nominal model did not come from a file or a file cannot be written.
     """
-    files = written(sim, estimate, path.name, laws=laws)
+    files = model_files(sim, estimate, path.name, laws=laws)
     text, lines = files.xml, files.lines
     if path.suffix == URDF:
         text, lines = urdf_of(files.spec.compile(), urdf_behind(sim.path), lines)
@@ -106,8 +106,8 @@ def write_model(sim: SimModel, estimate: Estimate | None, path: Path, laws: Sequ
     return lines
 
 
-def _drives(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term]) -> dict[str, dict[str, float]]:
-    """What was found of the drives, joint → effect → value."""
+def _drives(sim: SimModel, estimate: EffectEstimate | None, terms: Sequence[Term]) -> dict[str, dict[str, float]]:
+    """Found values of the drives, joint → effect → value."""
     out: dict[str, dict[str, float]] = {}
     for term in terms:
         if estimate is not None and term.effect in DRIVE:
@@ -116,7 +116,7 @@ def _drives(sim: SimModel, estimate: Estimate | None, terms: Sequence[Term]) -> 
     return out
 
 
-def _line(sim: SimModel, estimate: Estimate, term: Term) -> str:
+def _line(sim: SimModel, estimate: EffectEstimate, term: Term) -> str:
     values = estimate.parameters(term)
     where = f"in recording {', '.join(map(str, term.bound))}" if term.bound else sim.arm.names[term.place]
     listed = (f"{name} {v.value:.6g}" + (f" {v.unit}" if v.unit != "1" else "") for name, v in values.items())

@@ -9,15 +9,15 @@ import numpy as np
 from armlink.content.atomic_file import open_whole, write_whole
 from armlink.errors import BadInput
 from sim_bus.effects.registry import effects as simulated
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 SUFFIXES = (".csv", ".json", ".parquet")
-LEAST_SHARE = 0.01
-"""A draw of a parameter that must be above zero is at least this share of its estimate."""
 
 
-def drawn_parameters(estimate: Estimate, names: Sequence[str], count: int, seed: int = 0) -> list[dict[str, float]]:
+def drawn_parameters(
+    estimate: EffectEstimate, names: Sequence[str], count: int, seed: int = 0
+) -> list[dict[str, float]]:
     """Draws of what the arm has, `JOINT.EFFECT.PARAMETER` → value in SI units; effects on the whole arm are `arm.…`.
 
     What only some recordings have, such as a body in the hand, is left out. Values are kept within what the simulated
@@ -47,7 +47,7 @@ def _accepted(effect: str, name: str, value: float, best: float) -> float:
         return value
     least, above = one.domain.least, one.domain.above
     value = value if least is None else max(value, least)
-    return value if above is None else max(value, above + LEAST_SHARE * (best - above))
+    return value if above is None else max(value, above + 0.01 * (best - above))
 
 
 def write_rows(rows: Sequence[Mapping[str, float]], path: Path) -> None:

@@ -7,12 +7,21 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
-from gcomp.arm.model_xml import parse_xml
+from gcomp.arm.model_file import parse_xml
 from gcomp.arrays import Array
-from sim_gap.better_model.with_effects import body_parameters, split
-from sim_gap.better_model.xml_comment import xml_comment
+from sim_gap.better_model.corrected_model import body_parameters, mass_centre_inertia
 from sim_gap.model.load import linear_part
+
+
+def xml_comment(lines: list[str]) -> str:
+    """Lines as an XML comment; two hyphens, which would end it, are parted."""
+    text = "\n  ".join(map(printable_text, lines))
+    while "--" in text:
+        text = text.replace("--", "- -")
+    return f"<!-- {text}\n-->\n"
+
 
 URDF = ".urdf"
 KINDS = {2: "prismatic", 3: "revolute"}
@@ -36,7 +45,7 @@ def urdf_of(model: Any, source: Path | None, effects: Sequence[str] = ()) -> tup
 
 
 def _left_out(model: Any) -> list[str]:
-    """What the model has beside links and joints, a line each."""
+    """Parts of the model beside links and joints, a line each."""
     lines = []
     fields = (
         ("armature", model.dof_armature, "kg·m²"),
@@ -67,7 +76,7 @@ def _changed(model: Any, source: Path) -> ET.Element:
     joints = {model.joint(joint).name: joint for joint in range(model.njnt)}
     for link in root.iter("link"):
         if (body := bodies.get(link.get("name", ""))) is not None and model.body_mass[body] > 0.0:
-            _put_inertial(link, *split(body_parameters(model, body, np.zeros(3), np.eye(3))))
+            _put_inertial(link, *mass_centre_inertia(body_parameters(model, body, np.zeros(3), np.eye(3))))
     for joint in root.iter("joint"):
         if (number := joints.get(joint.get("name", ""))) is not None:
             _put_dynamics(joint, model, number)

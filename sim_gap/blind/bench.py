@@ -1,24 +1,84 @@
-"""The blind check from end to end: cases from a separate process, sealed answers, opened labels, score."""
+"""The blind check from end to end: cases from a separate process, sealed answers, opened labels, score.
 
+Answers are hashed before a label is opened; labels are read only if the hashes match.
+"""
+
+import hashlib
+import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from armlink.errors import ArmlinkError, BadInput, Refused
-from sim_gap.blind.cases.make import HELDOUT_S, TRAIN_S
-from sim_gap.blind.cases.seal import open_labels, seal, write_answer
-from sim_gap.blind.judging.score import answer_name, score
-from sim_gap.blind.servo.score import score_positions
+from sim_gap.blind.cases import HELDOUT_S, TRAIN_S
+from sim_gap.blind.position_score import score_positions
+from sim_gap.blind.score import answer_name, score
 
-MAKER, SERVO_MAKER = "sim_gap.blind.cases.make", "sim_gap.blind.servo.make"
+MANIFEST = "manifest.json"
+SCHEMA = "armlink.blind-seal/1"
+
+
+def write_answer(folder: Path, name: str, answer: Mapping[str, Any]) -> None:
+    """Write one answer as `folder/NAME.json`. Raises Refused once the folder is sealed."""
+    if (folder / MANIFEST).exists():
+        raise Refused(f"{folder}: answers are sealed, answer {name} is too late: use another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.json").write_text(json.dumps(answer, indent=1, ensure_ascii=False), encoding="utf-8")
+
+
+def seal(folder: Path) -> str:
+    """Hash every answer into `folder/manifest.json` and return the manifest's own SHA-256 (hex)."""
+    if (folder / MANIFEST).exists():
+        raise Refused(f"{folder}: answers are sealed already")
+    hashes = _hashes(folder)
+    if not hashes:
+        raise BadInput(f"{folder}: no answers to seal")
+    content = json.dumps({"schema": SCHEMA, "sha256": hashes}, indent=1, sort_keys=True)
+    (folder / MANIFEST).write_text(content, encoding="utf-8")
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def verify(folder: Path, digest: str | None = None) -> dict[str, dict[str, Any]]:
+    """The sealed answers by name.
+
+    Raises Refused if an answer was changed, added or removed, or the manifest's own SHA-256 is not `digest`.
+    """
+    manifest = folder / MANIFEST
+    if not manifest.is_file():
+        raise Refused(f"{folder}: answers are not sealed: seal them before opening the labels")
+    content = manifest.read_bytes()
+    if digest is not None and hashlib.sha256(content).hexdigest() != digest:
+        raise Refused(f"{manifest}: not the manifest that was sealed")
+    sealed, now = json.loads(content)["sha256"], _hashes(folder)
+    for name in sorted(set(sealed) | set(now)):
+        if sealed.get(name) != now.get(name):
+            what = "was removed" if name not in now else "was added" if name not in sealed else "was changed"
+            raise Refused(f"{folder / name}: {what} after sealing")
+    return {name.removesuffix(".json"): json.loads((folder / name).read_text(encoding="utf-8")) for name in sealed}
+
+
+def open_labels(answers: Path, labels: Path, digest: str | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Answers and labels, both by name; the seal is checked first. Raises Refused."""
+    sealed = verify(answers, digest)
+    truths = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(labels.glob("*.json"))]
+    return sealed, {truth["case"]: truth for truth in truths}
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.glob("*.json"))
+        if path.name != MANIFEST
+    }
+
+
+MAKER, SERVO_MAKER = "sim_gap.blind.cases", "sim_gap.blind.servo_cases"
 """Modules that make the cases, of arms with torque channels and of arms with servos."""
-SERVO_LENGTHS = 36.0, 18.0
-"""Training and held-out recordings of arms with servos [s]."""
 MOST_EFFECTS = 10
 """Largest number of effects in one case."""
 Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], dict[str, Any]]
@@ -50,7 +110,7 @@ def run_bench(
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):
         raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
-    lengths = lengths or (SERVO_LENGTHS if positions else (TRAIN_S, HELDOUT_S))
+    lengths = lengths or ((36.0, 18.0) if positions else (TRAIN_S, HELDOUT_S))
     started = time.monotonic()
     progress("making cases", 0, cases)
     maker = SERVO_MAKER if positions else MAKER
@@ -79,13 +139,7 @@ def _require_range(effects: str) -> None:
 
 
 def make_apart(
-    out: Path,
-    seed: int,
-    cases: int,
-    workers: int,
-    lengths: tuple[float, float],
-    effects: str = "",
-    maker: str = MAKER,
+    out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float], effects: str = "", maker: str = MAKER
 ) -> Iterator[int]:
     """Make the cases in a separate process and yield their number from time to time. Raises Refused if it fails."""
     command = [sys.executable, "-m", maker, "--seed", str(seed), "--cases", str(cases)]

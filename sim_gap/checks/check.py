@@ -5,38 +5,63 @@ option that settles it.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.changed_order import find_changed_order
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.column_order import find_changed_order
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
+from sim_gap.checks.jumps import find_jumps, find_seam, unwrap
 from sim_gap.checks.mapping import SURE, find_mapping
-from sim_gap.checks.mounting import as_mounted
-from sim_gap.checks.one_way import goes_one_way
-from sim_gap.checks.rigid_fit import Motion, beside_slow_torques, fit_rigid, motion_of
-from sim_gap.checks.rows.clock import even_times, find_dropped, find_time_unit, without_repeats
-from sim_gap.checks.rows.held_positions import without_held
-from sim_gap.checks.rows.jumps import find_jumps, find_seam, unwrapped
+from sim_gap.checks.mounting import find_mounting
+from sim_gap.checks.rigid_fit import ChannelMotion, fit_beside_slow_torques, fit_rigid, motion_of
+from sim_gap.checks.sampling import drop_held, drop_repeats, even_times, find_dropped, find_time_unit
 from sim_gap.checks.small_zero import find_small_zero
-from sim_gap.checks.torque.delay import find_delay, find_short_delay
-from sim_gap.checks.torque.source import (
-    find_gain_command,
-    find_same,
-    find_source,
-    find_unsigned,
-)
-from sim_gap.checks.torque.unit import find_absent, find_joint_scale, find_outgrown, find_scale
+from sim_gap.checks.torque_delay import find_delay, find_short_delay
+from sim_gap.checks.torque_source import find_gain_command, find_same, find_source, find_unsigned
+from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import TRIM_S, Signals, prepare
+from sim_gap.residuals.preprocess import TRIM_S, PreparedSignals, prepare
+
+LEAST_WAY = 1.5
+"""Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
+LEAST_RANGE = 0.1
+"""Range from which a joint moves [rad]."""
+
+
+def goes_one_way(recording: Recording) -> bool:
+    """Whether the joints that move go to and fro less than once, or none moves.
+
+    Then every angle and every torque is one smooth curve over time, and a wrong column, sign or zero may fit such a
+    curve as well as the right one does.
+    """
+    t = np.arange(recording.t[0], recording.t[-1], 0.1)  # noise of closer positions would make up the way
+    q = np.column_stack([np.interp(t, recording.t[there := np.isfinite(x)], x[there]) for x in recording.position.T])
+    span = np.ptp(q, axis=0)
+    moving = span > LEAST_RANGE
+    if not moving.any():
+        return True
+    return bool(np.median(np.abs(np.diff(q[:, moving], axis=0)).sum(0) / span[moving]) < LEAST_WAY)
+
+
+def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """A sentence if no recording turns back."""
+    if not all(goes_one_way(recording) for recording in recordings):
+        return ()
+    return (
+        "order, signs, zeros and clocks of the columns could not be checked: the joints move one way only, or "
+        "hardly at all; record motion to and fro",
+    )
 
 
 def check_recordings(
     arm: RigidArm, recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
-) -> tuple[list[Recording], list[Finding]]:
+) -> tuple[list[Recording], list[RecordingFinding]]:
     """Correct recordings whose mapping, units or clocks are certainly wrong.
 
     Args:
@@ -57,15 +82,15 @@ def check_recordings(
 
 def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections
-) -> tuple[Recording, list[Finding]]:
+) -> tuple[Recording, list[RecordingFinding]]:
     """Check and correct one recording. Raises BadInput for a finding that is not certain."""
     for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
         raise BadInput(f"{label}: {finding.sentence()}")
-    recording, wrapped = unwrapped(recording)
+    recording, wrapped = unwrap(recording)
     for finding in find_jumps(recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
-    recording, repeated = without_repeats(recording)
-    recording, held = without_held(recording)
+    recording, repeated = drop_repeats(recording)
+    recording, held = drop_held(recording)
     recording, jitter = even_times(recording, stated)
     same = find_same(recording, stated)
     for finding in same:
@@ -75,10 +100,9 @@ def check_recording(
     found = [*wrapped, *repeated, *held, *jitter, *([] if repeated else find_dropped(recording)), *same]
     s = _prepared(recording, arm, label, stated)
     for channel in s.channels:
-        motion = motion_of(s, channel)
-        mounted = as_mounted(arm, motion)
+        view = _view(arm, s, channel, recording, stated)
         for look in (_unsigned, _mapping, _source):
-            findings = look(arm, mounted, s, motion, recording, stated)
+            findings = look(view)
             found += findings
             for finding in findings:
                 if not finding.corrected:
@@ -89,8 +113,7 @@ def check_recording(
             s = _prepared(recording, arm, label, stated)
             if channel not in s.channels:  # taken for another one
                 break
-            motion = motion_of(s, channel)
-            mounted = as_mounted(arm, motion)
+            view = _view(arm, s, channel, recording, stated)
     for finding in find_beyond_range(arm, recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, velocity = sound_velocity(recording, stated)
@@ -99,65 +122,80 @@ def check_recording(
     return recording, [*found, *velocity]
 
 
-def _prepared(recording: Recording, arm: RigidArm, label: str, stated: Corrections) -> Signals:
+def _prepared(recording: Recording, arm: RigidArm, label: str, stated: Corrections) -> PreparedSignals:
     """The recording with velocities of its own only if they are those of the positions."""
     return prepare(sound_velocity(recording, stated)[0], arm, label)
 
 
-def _unsigned(
-    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
-) -> list[Finding]:
+@dataclass(frozen=True, eq=False)
+class _ChannelView:
+    """One torque channel of a recording as the checks look at it."""
+
+    arm: RigidArm
+    mounted: RigidArm
+    s: PreparedSignals
+    motion: ChannelMotion
+    recording: Recording
+    stated: Corrections
+
+    @property
+    def rate(self) -> float:
+        """Rows per second."""
+        return float((len(self.motion.q) - 1) / max(self.s.t[-1] - 2.0 * TRIM_S, 1e-9))
+
+    def in_time(self, delay: RecordingFinding) -> ChannelMotion:
+        """The motion with a delay of its channel taken off."""
+        corrected = _corrected(self.recording, delay, self.s.label)
+        return motion_of(_prepared(corrected, self.arm, self.s.label, self.stated), self.motion.channel)
+
+
+def _view(arm: RigidArm, s: PreparedSignals, channel: str, recording: Recording, stated: Corrections) -> _ChannelView:
+    motion = motion_of(s, channel)
+    return _ChannelView(arm, find_mounting(arm, motion), s, motion, recording, stated)
+
+
+def _unsigned(view: _ChannelView) -> list[RecordingFinding]:
     """Joints that read amounts, unless they do not with the channel's delay taken off."""
-    found = find_unsigned(mounted, motion, stated)
-    if not found or goes_one_way(recording):
+    found = find_unsigned(view.mounted, view.motion, view.stated)
+    if not found or goes_one_way(view.recording):
         return found
-    delay, _ = find_delay(mounted, motion, _rate(s, motion), stated)
+    delay, _ = find_delay(view.mounted, view.motion, view.rate, view.stated)
     if not delay:
         return found
-    in_time = _prepared(_corrected(recording, delay[0], s.label), arm, s.label, stated)
-    return [] if not find_unsigned(mounted, motion_of(in_time, motion.channel), stated) else found
+    return [] if not find_unsigned(view.mounted, view.in_time(delay[0]), view.stated) else found
 
 
-def _mapping(
-    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
-) -> list[Finding]:
+def _mapping(view: _ChannelView) -> list[RecordingFinding]:
     """Findings on clock, order, sign, zero and angle unit, in the order in which they are corrected."""
-    if goes_one_way(recording):
+    arm, mounted, motion, stated = view.arm, view.mounted, view.motion, view.stated
+    if goes_one_way(view.recording):
         return []
-    follows = follows_position(recording)
+    follows = follows_position(view.recording)
     mapping, midway = find_mapping(arm, motion, stated, follows, mounted), find_changed_order(mounted, motion, stated)
     zero = [] if mapping or midway else find_small_zero(arm, motion, stated, follows)
-    rate = _rate(s, motion)
-    delay, fall = find_delay(mounted, motion, rate, stated)
+    delay, fall = find_delay(mounted, motion, view.rate, stated)
     gained, changed, moved = (sum(each.fall for each in found) for found in (mapping, midway, zero))
     if not delay or fall <= max(SURE + max(gained, changed), moved):
         if changed > SURE + gained:
             return midway
-        return mapping or midway or zero or find_short_delay(mounted, motion, rate, stated)
-    in_time = _prepared(_corrected(recording, delay[0], s.label), arm, s.label, stated)
-    return [*delay, *find_mapping(arm, motion_of(in_time, motion.channel), stated, follows)]
+        return mapping or midway or zero or find_short_delay(mounted, motion, view.rate, stated)
+    return [*delay, *find_mapping(arm, view.in_time(delay[0]), stated, follows)]
 
 
-def _source(
-    arm: RigidArm, mounted: RigidArm, s: Signals, motion: Motion, recording: Recording, stated: Corrections
-) -> list[Finding]:
+def _source(view: _ChannelView) -> list[RecordingFinding]:
     """Findings on the channel's scale and on what it is a reading of."""
-    fit = beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
+    arm, mounted, motion, stated = view.arm, view.mounted, view.motion, view.stated
+    fit = fit_beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
     scale = (
         find_joint_scale(mounted, motion, stated)
         or find_scale(arm, fit, motion, stated)
         or find_outgrown(arm, mounted, motion, stated)
-        or ([] if goes_one_way(recording) else find_absent(arm, fit, motion, stated))
+        or ([] if goes_one_way(view.recording) else find_absent(arm, fit, motion, stated))
     )
-    return [*scale, *find_source(fit, s, motion, stated)]
+    return [*scale, *find_source(fit, view.s, motion, stated)]
 
 
-def _rate(s: Signals, motion: Motion) -> float:
-    """Rate of a motion's rows [Hz]."""
-    return float((len(motion.q) - 1) / max(s.t[-1] - 2.0 * TRIM_S, 1e-9))
-
-
-def _corrected(recording: Recording, finding: Finding, label: str) -> Recording:
+def _corrected(recording: Recording, finding: RecordingFinding, label: str) -> Recording:
     """The recording after the correction that a finding's option makes."""
     name, _, value = finding.option.partition(" ")
     keys = {"--sign": "sign", "--units": "units", "--zero": "zero", "--clock": "clock", "--map": "columns"}

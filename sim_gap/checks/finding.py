@@ -1,5 +1,6 @@
-"""A finding of the check of mapping, units and clocks."""
+"""A finding of the check of a recording, and options that correct columns."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -9,7 +10,7 @@ Kind = Literal[
 
 
 @dataclass(frozen=True)
-class Finding:
+class RecordingFinding:
     """One thing that is wrong with the data as they stand, and the option that corrects it."""
 
     finding: Kind
@@ -26,11 +27,21 @@ class Finding:
     """Fall of the logarithm of what the model leaves unexplained, summed over the joints."""
 
     def sentence(self) -> str:
-        """One line for people."""
         where = f"{self.channel} of {'all joints' if self.joint == 'all' else self.joint}"
         done = "corrected" if self.corrected else "not corrected"
         return f"{where}: {self.evidence} ({self.finding}, {done}: {self.option})"
 
     def to_json(self) -> dict[str, Any]:
-        """Entry of `checks` in the answer."""
         return {name: value for name, value in vars(self).items() if name != "fall"}
+
+
+def exchange_option(channel: str, holds: Mapping[int, int]) -> str:
+    """The `--map` that gives every joint its column; empty where none can, since some joint's motion is in no column.
+
+    Args:
+        channel: prefix of the columns, such as `dq`.
+        holds: column that is wrong → joint whose motion it holds, both from 0.
+    """
+    if set(holds) != set(holds.values()):
+        return ""
+    return "--map " + ",".join(f"{channel}_{joint + 1}={channel}_{column + 1}" for column, joint in holds.items())

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import Kind
-from sim_gap.checks.rigid_fit import Motion, changed
+from sim_gap.checks.rigid_fit import ChannelMotion
 from sim_gap.model.rigid_body import RigidArm
 
 TURN = math.pi / 180.0
@@ -26,10 +26,12 @@ class Hypothesis:
     joints: tuple[int, ...]
     what: str
     option: str
-    change: Callable[[Motion], Motion]
+    change: Callable[[ChannelMotion], ChannelMotion]
 
 
-def hypotheses(arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
+def hypotheses(
+    arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]
+) -> Iterator[Hypothesis]:
     """Every way in which one column, or all of a channel, may be wrong, less those that the user has settled."""
     channel = motion.channel
 
@@ -64,7 +66,7 @@ def hypotheses(arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequ
         orders.append(tuple(reversed(range(arm.n))))
     for order in orders:
         for channels in ((*positions, channel), positions, (channel,)):
-            yield ordered(arm, order, channels, channel)
+            yield put_in_order(arm, order, channels, channel)
 
 
 def _exchanged(n: int, i: int, k: int) -> tuple[int, ...]:
@@ -73,47 +75,47 @@ def _exchanged(n: int, i: int, k: int) -> tuple[int, ...]:
     return tuple(order)
 
 
-def ordered(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str], torque: str) -> Hypothesis:
+def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str], torque: str) -> Hypothesis:
     """Columns of some channels in another order."""
     touched = tuple(j for j, other in enumerate(order) if j != other)
     names = ", ".join(arm.names[j] for j in touched)
     what = f"is in another order ({names} hold {', '.join(arm.names[order[j]] for j in touched)})"
     option = "--map " + ",".join(f"{name}_{j + 1}={name}_{order[j] + 1}" for name in channels for j in touched)
     values = [*(("q", "v", "a") if "q" in channels else ()), *(("reading",) if torque in channels else ())]
-    return Hypothesis("order", tuple(channels), touched, what, option, permuted(order, values))
+    return Hypothesis("order", tuple(channels), touched, what, option, permute(order, values))
 
 
-def _turned(joints: tuple[int, ...], torque: bool) -> Callable[[Motion], Motion]:
+def _turned(joints: tuple[int, ...], torque: bool) -> Callable[[ChannelMotion], ChannelMotion]:
     """Change of sign of the torques, or of the positions, of some joints."""
 
-    def change(motion: Motion) -> Motion:
+    def change(motion: ChannelMotion) -> ChannelMotion:
         sign = np.ones(motion.q.shape[1])
         sign[list(joints)] = -1.0
         if torque:
-            return changed(motion, reading=motion.reading * sign)
-        return changed(motion, q=motion.q * sign, v=motion.v * sign, a=motion.a * sign)
+            return replace(motion, reading=motion.reading * sign)
+        return replace(motion, q=motion.q * sign, v=motion.v * sign, a=motion.a * sign)
 
     return change
 
 
-def _moved(joint: int, angle: float) -> Callable[[Motion], Motion]:
-    def change(motion: Motion) -> Motion:
+def _moved(joint: int, angle: float) -> Callable[[ChannelMotion], ChannelMotion]:
+    def change(motion: ChannelMotion) -> ChannelMotion:
         q = motion.q.copy()
         q[:, joint] += angle
-        return changed(motion, q=q)
+        return replace(motion, q=q)
 
     return change
 
 
-def _degrees(motion: Motion) -> Motion:
-    return changed(motion, q=motion.q * TURN, v=motion.v * TURN, a=motion.a * TURN)
+def _degrees(motion: ChannelMotion) -> ChannelMotion:
+    return replace(motion, q=motion.q * TURN, v=motion.v * TURN, a=motion.a * TURN)
 
 
-def permuted(order: Sequence[int], names: Sequence[str]) -> Callable[[Motion], Motion]:
+def permute(order: Sequence[int], names: Sequence[str]) -> Callable[[ChannelMotion], ChannelMotion]:
     """Columns of some fields of a motion in another order."""
 
-    def change(motion: Motion) -> Motion:
+    def change(motion: ChannelMotion) -> ChannelMotion:
         values: dict[str, Array] = {name: getattr(motion, name)[:, list(order)] for name in names}
-        return changed(motion, **values)
+        return replace(motion, **values)  # type: ignore[arg-type]
 
     return change

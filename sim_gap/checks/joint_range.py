@@ -4,7 +4,7 @@ import numpy as np
 
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.rigid_body import RigidArm
 
 BEYOND = 0.2
@@ -17,7 +17,7 @@ FAR = 20.0
 """Range of a position [rad] from which whole numbers alone are counts, and a servo's turns are likely degrees."""
 
 
-def find_counts(recording: Recording, stated: Corrections) -> list[Finding]:
+def find_counts(recording: Recording, stated: Corrections) -> list[RecordingFinding]:
     """Positions of whole numbers alone: counts of encoders, of which the number a turn has to be given."""
     found = []
     for j, q in enumerate(recording.position.T):
@@ -27,11 +27,11 @@ def find_counts(recording: Recording, stated: Corrections) -> list[Finding]:
         follows = ",q_cmd=counts:TURN" if recording.position_command is not None else ""
         evidence = f"holds whole numbers from {q.min():.0f} to {q.max():.0f}: counts of an encoder, or degrees?"
         option = f"--units q=counts:TURN{follows} (counts a turn of the joint), or q=deg, or q=rad if it is right"
-        found.append(Finding("scale", "q", recording.names[j], evidence, option, False))
+        found.append(RecordingFinding("scale", "q", recording.names[j], evidence, option, False))
     return found
 
 
-def find_far(arm: RigidArm, recording: Recording, stated: Corrections) -> list[Finding]:
+def find_far(arm: RigidArm, recording: Recording, stated: Corrections) -> list[RecordingFinding]:
     """Servos of joints without a range that turn further than a cable lets them: degrees."""
     found = []
     for j, q in enumerate(recording.position.T):
@@ -43,7 +43,9 @@ def find_far(arm: RigidArm, recording: Recording, stated: Corrections) -> list[F
             continue
         evidence = f"runs from {np.nanmin(q):.1f} to {np.nanmax(q):.1f} rad: degrees?"
         found.append(
-            Finding("scale", "q", arm.names[j], evidence, f"{_degrees(recording)}, or q=rad if it is right", False)
+            RecordingFinding(
+                "scale", "q", arm.names[j], evidence, f"{_degrees(recording)}, or q=rad if it is right", False
+            )
         )
     return found
 
@@ -71,7 +73,7 @@ def _percent(arm: RigidArm, recording: Recording) -> str:
     return f'or per cent of the ranges, as LeRobot records them unless use_degrees is set: --units "{units}"{zero}, '
 
 
-def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) -> list[Finding]:
+def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) -> list[RecordingFinding]:
     """Joints that leave the model's range, unless the user stated sign, zero, unit or order of their positions."""
     found = []
     for j, (low, high) in enumerate(arm.range):
@@ -89,5 +91,5 @@ def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) 
         )
         if most - least > 2.0 * np.pi:
             option = f"{_degrees(recording)}, {_percent(arm, recording)}{option}"
-        found.append(Finding("zero", "q", arm.names[j], evidence, option, False))
+        found.append(RecordingFinding("zero", "q", arm.names[j], evidence, option, False))
     return found

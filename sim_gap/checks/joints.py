@@ -7,7 +7,7 @@ from dataclasses import replace
 from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording, default_names, take_joints
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import RecordingFinding
 
 FILLERS = {"joint", "joints", "jnt", "motor", "link", "arm", "robot", "actuator", "axis", "j", "pos"}
 """Words of joint names that say nothing about which joint it is."""
@@ -15,7 +15,7 @@ FILLERS = {"joint", "joints", "jnt", "motor", "link", "arm", "robot", "actuator"
 
 def match_joints(
     recording: Recording, model: Sequence[str], stated: Corrections, label: str
-) -> tuple[Recording, list[Finding]]:
+) -> tuple[Recording, list[RecordingFinding]]:
     """The recording's joints in the order of the model's, named as there.
 
     Args:
@@ -44,7 +44,9 @@ def match_joints(
             f"model's order, --joints {','.join(own[: len(model)])}"
         )
     pairs = ", ".join(f"{name} as {to}" for to, name in matched.items())
-    finding = Finding("order", "q", "all", f"taken by name: {pairs}", "--joints " + ",".join(matched.values()), True)
+    finding = RecordingFinding(
+        "order", "q", "all", f"taken by name: {pairs}", "--joints " + ",".join(matched.values()), True
+    )
     return _taken(recording, list(matched.values()), list(matched)), [finding]
 
 

@@ -13,14 +13,15 @@ import numpy as np
 
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
-from sim_gap.checks.finding import Finding
-from sim_gap.checks.hypotheses import Hypothesis, hypotheses, ordered
-from sim_gap.checks.mounting import as_loaded, as_mounted
-from sim_gap.checks.orders import likely_orders
+from sim_gap.checks.column_order import likely_orders
+from sim_gap.checks.finding import RecordingFinding
+from sim_gap.checks.hypotheses import Hypothesis, hypotheses, put_in_order
+from sim_gap.checks.mounting import find_load, find_mounting
 from sim_gap.checks.rigid_fit import (
     FEW,
+    SCREENED,
     STRONG_SHARE,
-    Motion,
+    ChannelMotion,
     RigidFit,
     fit_model,
     fit_models,
@@ -41,8 +42,6 @@ that no arm has, or if any other change does as much: it may be chance, of a hun
 of the thousands of orders of more than two joints."""
 TWICE = 2.0
 """Times a fall by which that of a change that is doubted must be larger to be asked about instead."""
-SCREENED = 0.3
-"""Share of that fall that a hypothesis must reach on few rows."""
 ALIKE = 0.05
 """Difference of the falls below which two changes cannot be told from each other."""
 NEARLY = 0.4
@@ -65,7 +64,7 @@ SPRUNG = 0.97
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class HypothesisTest:
     """A hypothesis beside the data as they were."""
 
     hypothesis: Hypothesis
@@ -80,19 +79,23 @@ class Change:
 
 
 def find_mapping(
-    arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequence[str] = (), mounted: RigidArm | None = None
-) -> list[Finding]:
+    arm: RigidArm,
+    motion: ChannelMotion,
+    stated: Corrections,
+    follows: Sequence[str] = (),
+    mounted: RigidArm | None = None,
+) -> list[RecordingFinding]:
     """Findings on order, sign, zero and angle unit of a motion, one after the other.
 
-    `mounted` is the arm `as_mounted` in this motion, if it is known. `follows` are the channels (of `dq`, `q_cmd`)
-    whose columns agree with the positions' as they are recorded, so that what is wrong with a position is wrong with
-    theirs. All findings are corrected, or none is. A slight fall counts only if every joint concerned is explained
-    then, and one that is not large is certain only then: a model that was fitted to another motion leaves some of them
-    to chance.
+    `mounted` is what `find_mounting` gives for this motion, if it is known. `follows` are the channels (of `dq`,
+    `q_cmd`) whose columns agree with the positions' as they are recorded, so that what is wrong with a position is
+    wrong with theirs. All findings are corrected, or none is. A slight fall counts only if every joint
+    concerned is explained then, and one that is not large is certain only then: a model that was fitted to another
+    motion leaves some of them to chance.
     """
-    fit = _as_an_arm(mounted or as_mounted(arm, motion), motion)
+    fit = _as_an_arm(mounted or find_mounting(arm, motion), motion)
     orders = _orders(arm, motion, stated, follows) if _is_odd(fit) else []
-    taken: list[Change] = []
+    taken: list[HypothesisTest] = []
     while len(taken) < 2 * arm.n and not (taken and taken[-1].doubted):
         first = [] if taken else orders
         best = _best(arm, motion, fit, [*hypotheses(arm, motion, stated, follows), *first])
@@ -118,26 +121,26 @@ def _is_odd(fit: RigidFit) -> bool:
     return bool(np.any(fit.explained < FITS)) or any(_contradicts(fit, [j]) for j in range(len(fit.scale)))
 
 
-def _orders(arm: RigidArm, motion: Motion, stated: Corrections, follows: Sequence[str]) -> list[Hypothesis]:
+def _orders(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]) -> list[Hypothesis]:
     """Orders of all joints' columns, of their positions and of their torques that fit best."""
     if stated.order or stated.joints:
         return []
     positions, torque = ("q", *follows), motion.channel
     return [
-        ordered(arm, order, (*(positions if moved else ()), *((torque,) if read else ())), torque)
+        put_in_order(arm, order, (*(positions if moved else ()), *((torque,) if read else ())), torque)
         for order, moved, read in likely_orders(arm, motion)
     ]
 
 
-def _as_an_arm(mounted: RigidArm, motion: Motion) -> RigidFit:
+def _as_an_arm(mounted: RigidArm, motion: ChannelMotion) -> RigidFit:
     """The fit as it stands, gravity, a tool and springs included where they explain it: effects of the arm."""
-    model = as_loaded(mounted, motion).carried(motion.q, motion.v, motion.a)
+    model = find_load(mounted, motion).carried(motion.q, motion.v, motion.a)
     plain, sprung = fit_model(model, motion), fit_model(model, motion, springs=True)
     beside = (sprung.scale > PLAUSIBLE[0]) | (sprung.own_share < STRONG_SHARE)  # not in place of gravity
     return replace(plain, explained=np.where(beside & (sprung.explained > SPRUNG), sprung.explained, plain.explained))
 
 
-def _best(arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypothesis]) -> Change | None:
+def _best(arm: RigidArm, motion: ChannelMotion, fit: RigidFit, possible: Sequence[Hypothesis]) -> HypothesisTest | None:
     """The hypothesis that lowers the cost most, if by enough; one that is doubted only if it does so by far more."""
     found = []
     for hypothesis, screened in zip(
@@ -152,11 +155,11 @@ def _best(arm: RigidArm, motion: Motion, fit: RigidFit, possible: Sequence[Hypot
         settled = _contradicts(fit, hypothesis.joints)  # which it no longer does
         doubted = (worse >= MOST_WORSE * fall and not settled) or _contradicts(better, hypothesis.joints)
         if fall > (DOUBTED if doubted else SURE):
-            found.append(Change(hypothesis, better, fall, doubted))
+            found.append(HypothesisTest(hypothesis, better, fall, doubted))
     return _likeliest(found) if found else None
 
 
-def _likeliest(found: Sequence[Change]) -> Change:
+def _likeliest(found: Sequence[HypothesisTest]) -> HypothesisTest:
     """The change that explains most, of orders that explain as much the one of fewest joints; with the others beside
     it that it cannot be told from."""
     best = max(found, key=lambda each: each.fall if each.doubted else TWICE * each.fall)
@@ -171,14 +174,14 @@ def _likeliest(found: Sequence[Change]) -> Change:
     return replace(best, others=tuple(others.values()))
 
 
-def _is_near(change: Change, best: Change, margin: float) -> bool:
+def _is_near(change: HypothesisTest, best: HypothesisTest, margin: float) -> bool:
     """Whether an order moves no more joints than the best one, and explains less by no more than so."""
     own, other = best.hypothesis, change.hypothesis
     both = other.kind == own.kind == "order"
     return both and len(other.joints) <= len(own.joints) and change.fall > best.fall - margin
 
 
-def _is_small_zero(arm: RigidArm, motion: Motion, fit: RigidFit, change: Change) -> bool:
+def _is_small_zero(arm: RigidArm, motion: ChannelMotion, fit: RigidFit, change: HypothesisTest) -> bool:
     """Whether joints move alike, so that another order does what a zero does that is slightly off, and is far rarer."""
     if change.hypothesis.kind != "order" or "q" not in change.hypothesis.channels:
         return False
@@ -187,12 +190,12 @@ def _is_small_zero(arm: RigidArm, motion: Motion, fit: RigidFit, change: Change)
     return float(fit.cost.sum()) - least > change.fall - margin
 
 
-def _is_of_many(change: Change) -> bool:
+def _is_of_many(change: HypothesisTest) -> bool:
     """Whether a change is an order of more than two joints, of which there are thousands."""
     return change.hypothesis.kind == "order" and len(change.hypothesis.joints) > 2
 
 
-def _screened(arm: RigidArm, few: Motion, possible: Sequence[Hypothesis]) -> list[RigidFit]:
+def _screened(arm: RigidArm, few: ChannelMotion, possible: Sequence[Hypothesis]) -> list[RigidFit]:
     """The fits with each hypothesis; torques of all motions that they make in one recursion, for it costs by calls."""
     motions = [few, *(hypothesis.change(few) for hypothesis in possible)]
     moved = [k for k, motion in enumerate(motions) if k == 0 or motion.q is not few.q]
@@ -201,7 +204,7 @@ def _screened(arm: RigidArm, few: Motion, possible: Sequence[Hypothesis]) -> lis
     return fit_models([(models.get(k, models[0]), motion) for k, motion in enumerate(motions)][1:])
 
 
-def _told(hypothesis: Hypothesis, moved: Motion, fit: RigidFit, better: RigidFit) -> Array:
+def _told(hypothesis: Hypothesis, moved: ChannelMotion, fit: RigidFit, better: RigidFit) -> Array:
     """Falls of the cost by joint with a hypothesis, without what only a coefficient that no arm has explains, (n,).
 
     Where friction outweighs the model's torque by far, only a coefficient of dozens makes that explain anything: what
@@ -246,15 +249,15 @@ def _is_plausible(fit: RigidFit, touched: Collection[int]) -> bool:
     return bool(np.all(((low < fit.scale) & (fit.scale < high) | ~explains)[list(touched)]))
 
 
-def _finding(arm: RigidArm, change: Change, fit: RigidFit, sure: bool) -> Finding:
+def _finding(arm: RigidArm, change: HypothesisTest, fit: RigidFit, sure: bool) -> RecordingFinding:
     own = change.hypothesis
     joint = "all" if len(own.joints) == arm.n > 1 else arm.names[own.joints[0]]
     share = float(np.min(fit.explained[list(own.joints)]))
-    evidence = f"{own.what}: then the model explains {share:.0%} (logarithm of what is left falls by {change.fall:.1f})"
+    evidence = f"{own.what}: with that the model explains {share:.0%} of the torque"
     if change.others:
         same = all(other.joints == own.joints for other in change.others)
         names = " or ".join(other.channels[0] for other in change.others) if same else "other changes"
-        evidence += f"; or {names}, with which it explains as much"
+        evidence += f"; {names} would explain as much"
     options = [each.option for each in (own, *change.others)]
     option = ", or ".join([*options[:MOST_OPTIONS], *(["another order"] if len(options) > MOST_OPTIONS else [])])
-    return Finding(own.kind, own.channels[0], joint, evidence, option, sure, change.fall)
+    return RecordingFinding(own.kind, own.channels[0], joint, evidence, option, sure, change.fall)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.checks.rigid_fit import FLOOR, Motion, fit_rigid
+from sim_gap.checks.rigid_fit import FLOOR, ChannelMotion, fit_rigid
 from sim_gap.model.rigid_body import RigidArm
 
 MOUNTED = 0.1
@@ -18,7 +18,7 @@ TOOL_REACH = 0.4
 is twice as far away as the link's own centre of mass."""
 
 
-def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
+def find_mounting(arm: RigidArm, motion: ChannelMotion) -> RigidArm:
     """The arm with gravity along the axis that fits best, if that is better than the nominal one.
 
     A tilted base is an effect of the arm, which the diagnosis finds; no fault of the data must be seen in it.
@@ -41,7 +41,7 @@ def as_mounted(arm: RigidArm, motion: Motion) -> RigidArm:
     return arm if upside_down and opposite.sum() < found.sum() + 0.3 else turned
 
 
-def as_loaded(arm: RigidArm, motion: Motion, without: int | None = None) -> RigidArm:
+def find_load(arm: RigidArm, motion: ChannelMotion, without: int | None = None) -> RigidArm:
     """The arm with the body at its last link that fits best, if it explains the readings and may exist.
 
     Args:
@@ -66,7 +66,9 @@ def as_loaded(arm: RigidArm, motion: Motion, without: int | None = None) -> Rigi
     return loaded if found.sum() < plain.sum() and found.mean() < np.log(MOUNTED + FLOOR) else arm
 
 
-def body_at(arm: RigidArm, motion: Motion, link: int, joints: Sequence[int] | None = None) -> tuple[Array, Array]:
+def body_at(
+    arm: RigidArm, motion: ChannelMotion, link: int, joints: Sequence[int] | None = None
+) -> tuple[Array, Array]:
     """Mass and mass moment (4,) of a body at a link that fits best, of any sign, and its torque (K, n).
 
     `joints` are those whose readings are fitted, by default all; friction, rotor and offset of each joint are its own.

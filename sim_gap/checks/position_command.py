@@ -9,10 +9,9 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import TORQUE_CHANNELS, Recording
 from gcomp.arrays import Array
-from sim_gap.checks.finding import Finding
+from sim_gap.checks.finding import RecordingFinding, exchange_option
 from sim_gap.checks.joint_range import find_beyond_range, find_counts, find_far
-from sim_gap.checks.rows.clock import even_times, find_dropped, without_repeats
-from sim_gap.checks.rows.held_columns import exchange_option
+from sim_gap.checks.sampling import drop_repeats, even_times, find_dropped
 from sim_gap.model.rigid_body import RigidArm
 
 FOLLOWS = 0.5
@@ -33,7 +32,7 @@ def is_position_only(recording: Recording) -> bool:
 
 def check_position_only(
     arm: RigidArm, recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
-) -> tuple[list[Recording], list[Finding]]:
+) -> tuple[list[Recording], list[RecordingFinding]]:
     """Recordings on their sample times, without repeated rows, and the findings.
 
     Raises BadInput where commands and positions do not belong together, with the option that settles it.
@@ -53,7 +52,7 @@ def check_position_only(
         )
         for finding in chain(*looks):
             raise BadInput(f"{label}: {finding.sentence()}")
-        recording, repeated = without_repeats(recording)
+        recording, repeated = drop_repeats(recording)
         recording, jitter = even_times(recording, stated)
         dropped = [] if repeated else find_dropped(recording)
         checked.append(recording)

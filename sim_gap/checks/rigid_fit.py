@@ -12,12 +12,14 @@ from scipy.optimize import nnls
 
 from gcomp.arrays import Array, Mask
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import PreparedSignals
 
 ROWS = 1500
 """Rows that the fit looks at."""
 FEW = 5
 """One in this many of them is enough to see that a hypothesis is wrong."""
+SCREENED = 0.3
+"""Share of the fall from which something is certain that it must reach on few rows to be looked at."""
 TURNING = 0.02
 """Speed from which friction has its full sign [rad/s]."""
 MOVING_SHARE = 0.3
@@ -31,7 +33,7 @@ STRONG_SHARE, STRONG_CORRELATION = 0.2, 0.8
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ChannelMotion:
     """Positions, velocities, accelerations and one torque channel on common rows, (K, n) each."""
 
     q: Array
@@ -70,29 +72,28 @@ class RigidFit:
 
     @property
     def strong(self) -> Mask:
-        """Whether the model says much of a joint's reading, (n,)."""
         share = self.own_share * np.maximum(self.scale, 1.0)
         return np.asarray((share > STRONG_SHARE) & (np.abs(self.correlation) > STRONG_CORRELATION))
 
 
-def motion_of(s: Signals, channel: str) -> Motion:
+def motion_of(s: PreparedSignals, channel: str) -> ChannelMotion:
     """The compared rows of a recording, thinned to about `ROWS`."""
     thin = slice(None, None, max(1, len(s.filtered(s.t)) // ROWS))
     q, v, a, reading = (s.filtered(x)[thin] for x in (s.q, s.v, s.a, s.reading[channel]))
-    return Motion(q, v, a, reading, channel)
+    return ChannelMotion(q, v, a, reading, channel)
 
 
-def fit_rigid(arm: RigidArm, motion: Motion, springs: bool = False) -> RigidFit:
+def fit_rigid(arm: RigidArm, motion: ChannelMotion, springs: bool = False) -> RigidFit:
     """Fit the reading of every joint by the model's torque at the motion; with `springs`, of either sign, too."""
     return fit_model(arm.carried(motion.q, motion.v, motion.a), motion, springs)
 
 
-def fit_model(model: Array, motion: Motion, springs: bool = False) -> RigidFit:
+def fit_model(model: Array, motion: ChannelMotion, springs: bool = False) -> RigidFit:
     """Fit the reading of every joint by a model torque (K, n); with `springs`, of either sign, too."""
     return fit_models([(model, motion)], springs)[0]
 
 
-def fit_models(pairs: Sequence[tuple[Array, Motion]], springs: bool = False) -> list[RigidFit]:
+def fit_models(pairs: Sequence[tuple[Array, ChannelMotion]], springs: bool = False) -> list[RigidFit]:
     """`fit_model` of several model torques and motions of one arm at once."""
     moving = np.array([np.mean(np.abs(motion.v) > TURNING, axis=0) for _, motion in pairs])
     sensed = np.array([[motion.channel == "tau"] for _, motion in pairs])
@@ -105,7 +106,7 @@ def fit_models(pairs: Sequence[tuple[Array, Motion]], springs: bool = False) -> 
     ]
 
 
-def least_costs(pairs: Sequence[tuple[Array, Motion]]) -> Array:
+def least_costs(pairs: Sequence[tuple[Array, ChannelMotion]]) -> Array:
     """Least summed cost of model torques and motions of one arm by least squares, whatever the signs, (M,)."""
     grams = np.array([_covariances(model, motion, False) for model, motion in pairs])
     grams /= np.maximum(grams[..., -1:, -1:], 1e-18)
@@ -116,7 +117,7 @@ def least_costs(pairs: Sequence[tuple[Array, Motion]]) -> Array:
     return np.asarray(np.log(1.0 - np.clip(explained, 0.0, 1.0) + FLOOR).sum(-1))
 
 
-def _covariances(model: Array, motion: Motion, springs: bool) -> Array:
+def _covariances(model: Array, motion: ChannelMotion, springs: bool) -> Array:
     """Of model torque, direction, velocity, acceleration, position and reading of every joint, (n, 6, 6)."""
     turned = motion.q if springs else 0.0 * motion.q
     columns = np.stack([model, motion.direction, motion.v, motion.a, turned, motion.reading]).transpose(2, 0, 1)
@@ -126,7 +127,7 @@ def _covariances(model: Array, motion: Motion, springs: bool) -> Array:
     return np.asarray((columns * weight) @ columns.transpose(0, 2, 1))
 
 
-def _telling(motion: Motion) -> Mask:
+def _telling(motion: ChannelMotion) -> Mask:
     """Rows that are fitted at each joint, (K, n): friction at rest takes any value, which a motor has to hold.
 
     All rows of a sensor on the link, and of a joint that hardly moves.
@@ -135,7 +136,7 @@ def _telling(motion: Motion) -> Mask:
     return np.asarray(moving | (motion.channel == "tau") | (moving.mean(0) < MOVING_LEAST))
 
 
-def beside_slow_torques(arm: RigidArm, motion: Motion, fit: RigidFit) -> RigidFit:
+def fit_beside_slow_torques(arm: RigidArm, motion: ChannelMotion, fit: RigidFit) -> RigidFit:
     """The fit with the friction that remains beside a drift of the reading and a spring across the joint.
 
     In a motion with few reversals a torque that grows with time or position varies with the direction, too.
@@ -206,12 +207,6 @@ def _positive_fit(gram: Array, signs: Sequence[tuple[float, ...]]) -> tuple[floa
     return float(coefficients[0]), float(1.0 - rest**2)
 
 
-def rows_of(motion: Motion, rows: slice) -> Motion:
-    """The motion in some of its rows."""
+def rows_of(motion: ChannelMotion, rows: slice) -> ChannelMotion:
     q, v, a, reading = (x[rows] for x in (motion.q, motion.v, motion.a, motion.reading))
-    return Motion(q, v, a, reading, motion.channel)
-
-
-def changed(motion: Motion, **values: Array) -> Motion:
-    """The motion with some of its channels replaced."""
-    return replace(motion, **values)  # type: ignore[arg-type]
+    return ChannelMotion(q, v, a, reading, motion.channel)

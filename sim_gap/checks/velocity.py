@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.checks.finding import Finding
-from sim_gap.checks.rows.held_columns import exchange_option
+from sim_gap.checks.finding import RecordingFinding, exchange_option
 
 SCALE = 0.7, 1.4
 """Velocity over derivative of the position outside which they disagree."""
@@ -46,7 +45,7 @@ def _same(values: Array, own: Array) -> bool:
     return bool(np.median(match) > 0.7 and low < np.median(slope) < high)
 
 
-def sound_velocity(recording: Recording, stated: Corrections) -> tuple[Recording, list[Finding]]:
+def sound_velocity(recording: Recording, stated: Corrections) -> tuple[Recording, list[RecordingFinding]]:
     """The recording, its velocity left out if it is not the derivative of the position."""
     if recording.velocity is None:
         return recording, []
@@ -54,7 +53,7 @@ def sound_velocity(recording: Recording, stated: Corrections) -> tuple[Recording
     return (replace(recording, velocity=None), found) if found else (recording, [])
 
 
-def _findings(recording: Recording, velocity: Array, stated: Corrections) -> list[Finding]:
+def _findings(recording: Recording, velocity: Array, stated: Corrections) -> list[RecordingFinding]:
     rate = np.gradient(recording.position, recording.t, axis=0)
     there = np.isfinite(rate).all(axis=1) & np.isfinite(velocity).all(axis=1)
     rate, velocity = rate[there], velocity[there]
@@ -70,7 +69,10 @@ def _findings(recording: Recording, velocity: Array, stated: Corrections) -> lis
     wrong = {
         "order": (clear & (best != np.arange(moves.size)) & (np.abs(np.diag(match)) < 0.5), "belongs to another joint"),
         "sign": (own & (scale < 0.0), "has the opposite sign of the position's derivative"),
-        "scale": (own & (scale > 0.0) & ~((low < scale) & (scale < high)), "is not the position's derivative in size"),
+        "scale": (
+            own & (scale > 0.0) & ~((low < scale) & (scale < high)),
+            "differs in size from the position's derivative",
+        ),
     }
     found = []
     for kind, (joints, what) in wrong.items():
@@ -80,12 +82,12 @@ def _findings(recording: Recording, velocity: Array, stated: Corrections) -> lis
                 f"{what} ({_listed(kind, names, moves, best, scale, recording.names)}): left out of the diagnosis"
             )
             joint = "all" if len(names) == len(moves) else recording.names[names[0]]
-            found.append(Finding(kind, "dq", joint, evidence, _option(kind, names, moves, best), True))  # type: ignore[arg-type]
+            found.append(RecordingFinding(kind, "dq", joint, evidence, _option(kind, names, moves, best), True))  # type: ignore[arg-type]
     if not found and own.any() and not stated.states("units", "dq_1"):
         late = _delay(recording, rate[:, moves], velocity[:, moves])
         if late:
-            evidence = f"is {late * 1e3:.0f} ms behind the position's derivative, as a filter makes it: left out"
-            found.append(Finding("filter", "dq", "all", evidence, "--units dq=rad (keep it)", True))
+            evidence = f"lags {late * 1e3:.0f} ms behind the position's derivative, as after a filter: left out"
+            found.append(RecordingFinding("filter", "dq", "all", evidence, "--units dq=rad (keep it)", True))
     return found
 
 

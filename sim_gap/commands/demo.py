@@ -14,11 +14,11 @@ def demo(
         str | None,
         typer.Option(help="Bundled arm, arm file with a sim section, or URDF or MJCF model; default: sarcos."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Draws another hidden truth.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the hidden truth.")] = 0,
     realism: Annotated[
         float | None,
         typer.Option(
-            min=0, help="All small troubles of a real arm: 1 a good one's, 3 a bad one's; default: the arm's."
+            min=0, help="Small imperfections of a real arm: 1 for a good one, 3 for a bad one; default: the arm file's."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for report.html, summary.json and the data.")] = Path(

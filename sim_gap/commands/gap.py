@@ -1,15 +1,16 @@
 """Explains why simulation and real arm disagree: where the gap is, its causes, and how far they close it."""
 
+from collections.abc import Callable
+
 import typer
 
+from armlink.commands.options import GroupedCommand
 from sim_gap.commands.gap_bench import bench
-from sim_gap.commands.gap_collect import collect
 from sim_gap.commands.gap_diagnose import diagnose
-from sim_gap.commands.gap_fleet import diagnose_fleet
-from sim_gap.commands.gap_plan import plan
-from sim_gap.commands.gap_trend import trend
+from sim_gap.commands.gap_fleet import diagnose_fleet, trend
+from sim_gap.commands.gap_motion import collect, plan
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None, no_args_is_help=True)
 
 
 @app.callback()
@@ -20,5 +21,13 @@ def gap() -> None:
     """
 
 
-for command in (diagnose, plan, collect, diagnose_fleet, trend, bench):
-    app.command()(command)
+SUMMARIES: dict[Callable[..., object], str] = {
+    diagnose: "Find the causes of the gap and how far they close it.",
+    plan: "Plan the motion that separates effects; nothing moves.",
+    collect: "Move the arm along a plan and record it.",
+    diagnose_fleet: "Diagnose the recordings of many arms.",
+    trend: "Find what changes over the recordings of one arm.",
+    bench: "Test the diagnosis on sealed cases.",
+}
+for command, summary in SUMMARIES.items():
+    app.command(cls=GroupedCommand, short_help=summary)(command)

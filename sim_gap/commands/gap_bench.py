@@ -10,17 +10,34 @@ def bench(
     seed: Annotated[int, typer.Option(help="Seed of arms, effects and motions.")] = 1,
     cases: Annotated[int, typer.Option(help="Number of cases.")] = 150,
     effects: Annotated[
-        str, typer.Option(metavar="LOW-HIGH", help="Number of effects in every case; default: none, one or two.")
+        str,
+        typer.Option(
+            metavar="LOW-HIGH",
+            help="Number of effects in every case; default: none, one or two.",
+            rich_help_panel="Other cases",
+        ),
     ] = "",
     channels: Annotated[
-        str, typer.Option(help="q,q_cmd: arms with position servos, seen as these alone; default: with torques.")
+        str,
+        typer.Option(
+            help="q,q_cmd: cases with position servos and no torques; default: with torques.",
+            rich_help_panel="Other cases",
+        ),
     ] = "",
     real: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Diagnose the recordings of real arms in DIR instead; see --known."),
+        typer.Option(
+            metavar="DIR",
+            help="Diagnose the recordings of real arms in DIR instead; see --known.",
+            rich_help_panel="Other cases",
+        ),
     ] = None,
     known: Annotated[
-        Path | None, typer.Option(help="What is known of these arms (YAML). Default: of the arms that are published.")
+        Path | None,
+        typer.Option(
+            help="Known effects of these arms (YAML); default: those of the published arms.",
+            rich_help_panel="Other cases",
+        ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the score here; - is standard output.")] = None,
     out: Annotated[Path | None, typer.Option(help="Keep cases, answers and labels in this new folder.")] = None,
@@ -41,11 +58,11 @@ def bench(
     from rich.progress import Progress, TaskID
 
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from sim_gap.blind.bench import diagnose_files, run_bench
-    from sim_gap.blind.judging.tables import show, show_positions, show_real
-    from sim_gap.blind.real import KNOWN, run_real
+    from sim_gap.blind.real_recordings import KNOWN, run_real
+    from sim_gap.blind.tables import show, show_positions, show_real
 
     if json is not None and str(json) != "-" and not json.resolve().parent.is_dir():
         raise BadInput(f"--json {json}: its folder does not exist: create it first")
@@ -75,5 +92,5 @@ def bench(
                 positions=positions,
             )
     shown = show_real if real is not None else show_positions if positions else show
-    shown(result, console)
+    shown(result, results(json))
     write_json(json, result)

@@ -24,10 +24,18 @@ def diagnose(
     columns: Columns = None,
     joints: Joints = "",
     base: Annotated[
-        str | None, typer.Option(help="Body of the model that carries the recorded arm; default: the world.")
+        str | None,
+        typer.Option(
+            help="Body of the model that carries the recorded arm; default: the world.",
+            rich_help_panel="About the arm and the recordings",
+        ),
     ] = None,
     tip: Annotated[
-        str | None, typer.Option(help="Body of the model that the recorded arm ends in, where it has several arms.")
+        str | None,
+        typer.Option(
+            help="Body of the model that the recorded arm ends in, where it has several arms.",
+            rich_help_panel="About the arm and the recordings",
+        ),
     ] = None,
     units: Units = None,
     sign: Sign = None,
@@ -41,6 +49,7 @@ def diagnose(
             metavar="NAME=REC[,REC…]",
             help="Recordings (held-out ones too) with a common body such as a payload; may be repeated. "
             "Default: found by itself.",
+            rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the result here; - is standard output.")] = None,
@@ -51,20 +60,37 @@ def diagnose(
             metavar="REC=VALUE",
             help="Gain of the position controller in a recording (patterns allowed), in any unit; only if there is no "
             "torque channel and recordings differ in it.",
+            rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
     samples: Annotated[
-        int, typer.Option(min=0, help="Number of draws of all parameters to write, for domain randomisation.")
+        int,
+        typer.Option(
+            min=0,
+            help="Number of draws of all parameters to write, for domain randomisation.",
+            rich_help_panel="For training in simulation",
+        ),
     ] = 0,
     out_samples: Annotated[
-        Path | None, typer.Option(help="Where the draws go: .csv, .json or .parquet. Default: samples.csv.")
+        Path | None,
+        typer.Option(
+            help="Where the draws go: .csv, .json or .parquet. Default: samples.csv.",
+            rich_help_panel="For training in simulation",
+        ),
     ] = None,
     out_actuators: Annotated[
         Path | None,
-        typer.Option(help="Write actuator entries for Isaac Lab and mjlab here (.py)."),
+        typer.Option(
+            help="Write actuator entries for Isaac Lab and mjlab here (.py).",
+            rich_help_panel="For training in simulation",
+        ),
     ] = None,
     physics_step: Annotated[
-        float, typer.Option(help="Step of the training simulation in which --out-actuators counts delays [s].")
+        float,
+        typer.Option(
+            help="Step of the training simulation, in which the entries count delays [s].",
+            rich_help_panel="For training in simulation",
+        ),
     ] = 0.005,
     out_model: Annotated[
         Path | None,
@@ -79,12 +105,13 @@ def diagnose(
     Example: armlink gap diagnose --sim arm.xml --train slow.csv --train fast.csv --heldout other.csv --json -
     """
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
     from sim_gap.commands.gap_tables import show
+    from sim_gap.report.effect_text import sentence
 
     console = PlainConsole()
     paths = [*train, *(heldout or [])]
@@ -121,22 +148,38 @@ def diagnose(
     for name, recording in {**fitted, **judged}.items():
         if recording.warning:
             console.print(f"{name}: {recording.warning}", style="yellow")
+    out = results(json)
     for finding in answer.checks:
-        console.print(finding.sentence(), style="yellow")
-    show(answer, console)
+        out.print(finding.sentence(), style="yellow")
+    show(answer, out)
     if report is not None:
         from sim_gap.report.page import write_report
 
         write_report(answer, report, subtitle=f"{sim} against {', '.join(str(path) for path in paths)}")
-        console.print(f"report: {report}")
+        out.print(f"report: {report}")
     if out_model is not None:
-        _write_model(answer, out_model, console)
+        _write_model(answer, out_model, out)
     if samples:
-        _write_samples(answer, samples, out_samples, console)
+        _write_samples(answer, samples, out_samples, out)
     if out_actuators is not None:
         _write_actuators(answer, out_actuators, physics_step)
-        console.print(f"actuator entries for Isaac Lab and mjlab: {out_actuators}")
+        out.print(f"actuator entries for Isaac Lab and mjlab: {out_actuators}")
     write_json(json, answer.to_json())
+    out.print(sentence(answer), style="bold")
+    _suggest(answer, sim, json, out_model)
+
+
+def _suggest(answer: "Diagnosis", sim: str, json: Path | None, out_model: Path | None) -> None:
+    """The next command after an ambiguous or explained gap."""
+    from armlink.arm_file import bundled_arms
+    from armlink.commands.plain_console import PlainConsole, command_line, suggest
+
+    if answer.verdict == "ambiguous":
+        arm = sim if sim in bundled_arms() or sim.endswith((".yaml", ".yml")) else "ARM.yaml"
+        written = "gap.json" if json is None or str(json) == "-" else json
+        suggest(command_line("gap", "plan", arm, answer=written, out="motion.csv"))
+    elif answer.verdict == "explained" and out_model is None:
+        PlainConsole().print("next: the same command with --out-model corrected.xml writes the corrected model")
 
 
 def _progress(console: "Console", status: "Status", stage: str) -> None:
@@ -147,8 +190,8 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
 
 
 def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
-    from sim_gap.better_model.motor_entries import write_motor_entries
-    from sim_gap.closed_loop.training.actuators import write_actuators
+    from sim_gap.better_model.actuator_entries import write_motor_entries
+    from sim_gap.position_gap.training.training_files import write_actuators
 
     if answer.unit == "rad":
         write_actuators(answer.internals, path, step)
@@ -158,13 +201,13 @@ def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
 
 def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
     from sim_gap.better_model.samples import drawn_parameters, write_rows
-    from sim_gap.closed_loop.training.posterior import write_samples
+    from sim_gap.position_gap.training.training_files import write_samples
 
     target = path or Path("samples.csv")
     if answer.unit == "rad":
         write_samples(answer.internals, count, target)
     elif answer.internals.estimate is None:
-        console.print("no draws of parameters: there is no gap that any would explain", style="yellow")
+        console.print("no draws written: there is no gap for parameters to explain", style="yellow")
         return
     else:
         write_rows(drawn_parameters(answer.internals.estimate, answer.names, count), target)
@@ -175,7 +218,7 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     kind = "URDF" if path.suffix == ".urdf" else "MJCF"
     if answer.unit == "rad":
         from sim_gap.better_model.effects_module import module_path
-        from sim_gap.closed_loop.training.posterior import batch_path, module_model, write_exported
+        from sim_gap.position_gap.training.training_files import batch_path, module_model, write_exported
 
         with_actuators = " with its position actuators" if kind == "MJCF" else ""
         for line in write_exported(answer.internals, path):

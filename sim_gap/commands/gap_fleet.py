@@ -1,5 +1,6 @@
-"""Diagnoses the recordings of a fleet on a cluster of workers, with a table by arm and effect."""
+"""Diagnoses the recordings of a fleet on a cluster of workers, and those of one arm in turn."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,12 +29,11 @@ def diagnose_fleet(
     from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
-    from sim_gap.fleet.cluster import cluster, open_to_all
-    from sim_gap.fleet.fleet import Answers, diagnose_fleet, find_cases
-    from sim_gap.fleet.fleet import table as table_of
-    from sim_gap.fleet.trends import fleet_outliers, fleet_trends
-    from sim_gap.fleet.trends import rows as rows_of
+    from armlink.commands.plain_console import PlainConsole, results
+    from sim_gap.fleet import Answers, cluster, diagnose_fleet, find_cases, open_to_all
+    from sim_gap.fleet import table as table_of
+    from sim_gap.trends import fleet_outliers, fleet_trends
+    from sim_gap.trends import rows as rows_of
 
     cases = find_cases(folder, sim)
     answers = Answers(out or folder / "answers.jsonl")
@@ -52,9 +52,12 @@ def diagnose_fleet(
                 bars.advance(task)
     found = {case.name: answers.found[case.name] for case in cases}
     rows = table_of(found)
-    _show(rows, console)
+    out_console = results(json_file)
+    _show(rows, out_console)
     trends, outliers = rows_of(fleet_trends(found)), rows_of(fleet_outliers(found))
-    show_changes(trends, outliers, console)
+    show_changes(trends, outliers, out_console)
+    failed = sum("error" in answer for answer in found.values())
+    out_console.print(f"{len(found) - failed} of {len(found)} cases are diagnosed: {answers.path}")
     if table is not None:
         _write_table(rows, table)
     write_json(json_file, {"schema": "armlink.gap-fleet/1", "answers": found, "trends": trends, "outliers": outliers})
@@ -96,7 +99,7 @@ def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], c
     for one in outliers:
         console.print(
             f"{one['arm']}: {one['effect']} of {one['joint']}: {one['parameter']} {one['value']:.3g} {one['unit']}, "
-            f"{one['others']:.3g} on the other arms",
+            f"{one['others']:.3g} on the other arms"
         )
 
 
@@ -112,3 +115,48 @@ def _write_table(rows: list[dict[str, Any]], path: Path) -> None:
             pq.write_table(pa.Table.from_pylist(rows), stream)
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error}") from None
+
+
+UNDATED = datetime.min.replace(tzinfo=UTC)
+
+
+def trend(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of recordings, with dates in their names.")],
+    sim: Annotated[Path, typer.Option(help="Nominal model: MJCF, URDF or arm file.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Answers, one JSON line each; recordings already in it are not repeated.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write newest answer and changes here; - is standard output.")
+    ] = None,
+) -> int:
+    """Diagnose an arm's recordings that are new, and show what changes; exit status 1 if the newest cannot be used.
+
+    A recording that was diagnosed may be deleted: its answer is kept.
+
+    Example: armlink gap trend recordings/ --sim arm.yaml
+    """
+    from armlink.commands.output import write_json
+    from armlink.commands.plain_console import results
+    from sim_gap.fleet import Answers, diagnose_case, find_cases
+    from sim_gap.model.load import load_compiled
+    from sim_gap.trends import date_of, fleet_trends, rows
+
+    load_compiled(sim)  # what is wrong with it is no answer of a recording
+    console = results(json_file)
+    answers = Answers(out or folder / "answers.jsonl")
+    newest = ""
+    for case in sorted(find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
+        newest = f"{folder.resolve().name}/{case.name}"
+        if newest not in answers.found:
+            answers.add(newest, diagnose_case(case))
+        answer = answers.found[newest]
+        console.print(f"{case.name}: {answer.get('verdict') or answer['error']}")
+    trends = rows(fleet_trends(answers.found))
+    show_changes(trends, [], console)
+    changes = f"{len(trends)} parameters change" if trends else "no parameter changes"
+    console.print(f"{len(answers.found)} recordings: {changes}")
+    newest_answer = answers.found[newest]
+    shown = {"case": newest.partition("/")[2], "answer": newest_answer}
+    write_json(json_file, {"schema": "armlink.gap-trend/1", "newest": shown, "trends": trends})
+    return int("error" in newest_answer)

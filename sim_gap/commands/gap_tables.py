@@ -1,15 +1,13 @@
-"""An answer on the terminal: verdict, causes with their parameters, gap of each joint."""
+"""An answer on the terminal: causes with their parameters, gap of each joint, notes."""
 
 from rich.console import Console
 from rich.table import Column, Table
 
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.report.effect_text import sentence
 
 
 def show(answer: Diagnosis, console: Console) -> None:
-    """Print verdict, causes and gap as tables."""
-    console.print(sentence(answer), style="bold")
+    """Print causes and gap as tables, then the notes."""
     if answer.causes:
         effect = Column("effect", no_wrap=True)
         headers = "joints", "RMS before", "after", "confidence", "confounded with"

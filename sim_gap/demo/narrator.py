@@ -1,4 +1,4 @@
-"""Says what the demo is doing: progress bars in a terminal, a line now and then elsewhere."""
+"""Headlines and progress of the demo: bars in a terminal, a line now and then elsewhere."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -11,67 +11,57 @@ from rich.text import Text
 from armlink.commands.plain_console import PlainColumn
 from armlink.content.printable_text import printable_text
 
-QUIET_SECONDS = 5.0
-"""Without a terminal, a line at most this often [s]."""
-
 Report = Callable[[float, float, float | None, str], None]
 """Called with (done, total, seconds left, what is being done)."""
 
 
 class Narrator:
-    """Headlines and progress on a console."""
+    """Lines with the time since the start, and progress, on a console."""
 
-    def __init__(self, console: Console) -> None:
-        """Speak on `console`."""
-        self._console = console
+    def __init__(self, console: Console, results: Console) -> None:
+        """Progress on `console`, tables and findings on `results`."""
+        self.console, self.results = console, results
         self._began = time.monotonic()
 
     @property
     def elapsed(self) -> float:
-        """Wall time since the start [s]."""
         return time.monotonic() - self._began
 
     def say(self, text: str, style: str = "") -> None:
-        """One line, with the time since the start."""
-        line = Text.assemble((f"{self.elapsed:5.0f} s", "dim"), "  ", (printable_text(text), style))
-        self._console.print(line, soft_wrap=True)
+        self.console.print(self._stamped(text, style), soft_wrap=True)
 
-    def show(self, table: object) -> None:
-        """A rich table."""
-        self._console.print(table)
+    def find(self, text: str) -> None:
+        """The same among the results."""
+        self.results.print(self._stamped(text, ""), soft_wrap=True)
+
+    def _stamped(self, text: str, style: str) -> Text:
+        return Text.assemble((f"{self.elapsed:5.0f} s", "dim"), "  ", (printable_text(text), style))
 
     @contextmanager
     def stage(self, headline: str) -> Iterator[Report]:
-        """A stage of the work; what it yields is told how far it is."""
+        """A stage of the work; the work calls the yielded function as it goes on."""
         self.say(headline, style="bold")
-        if self._console.is_terminal:
-            with self._bar() as report:
-                yield report
-        else:
-            yield self._lines()
-
-    @contextmanager
-    def _bar(self) -> Iterator[Report]:
         columns = (PlainColumn("        "), BarColumn(), PlainColumn("{task.description}"), TimeElapsedColumn())
-        with Progress(*columns, console=self._console, transient=True) as progress:
+        if not self.console.is_terminal:
+            yield self._lines()
+            return
+        with Progress(*columns, console=self.console, transient=True) as progress:
             task = progress.add_task("")
+            yield lambda done, total, left, text: progress.update(
+                task, completed=done, total=total, description=_with_time(text, left)
+            )
 
-            def report(done: float, total: float, left: float | None, text: str) -> None:
-                progress.update(task, completed=done, total=total, description=_line(text, left))
-
-            yield report
-
-    def _lines(self) -> Report:
+    def _lines(self, period_s: float = 5.0) -> Report:
         said = time.monotonic()
 
         def report(done: float, total: float, left: float | None, text: str) -> None:
             nonlocal said
-            if time.monotonic() - said >= QUIET_SECONDS:
+            if time.monotonic() - said >= period_s:
                 said = time.monotonic()
-                self.say(f"   {done / max(total, 1e-9):4.0%}  {_line(text, left)}")
+                self.say(f"   {done / max(total, 1e-9):4.0%}  {_with_time(text, left)}")
 
         return report
 
 
-def _line(text: str, left: float | None) -> str:
+def _with_time(text: str, left: float | None) -> str:
     return text if left is None else f"{text}, {left:.0f} s left"

@@ -1,6 +1,7 @@
-"""Drives whose torque does not follow the command: they show in the command against the drive's own estimate.
+"""Errors of motor and drive: the motor torque differs from what the drive reports, or does not follow the command.
 
-If a recording has a command but no estimate, they show in the command against the sensor or the model.
+What does not follow the command shows in it against the drive's own estimate; if a recording has a command but no
+estimate, against the sensor or the model.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,15 +10,34 @@ import numpy as np
 from scipy.signal import lfilter
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Effect, Plausibility, SearchHints, Shape, Signature, as_shape, between
-from sim_gap.effects.timing import late
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.effects.effect import (
+    CLIPPED,
+    NEAR_ONE,
+    Beneath,
+    InverseEffect,
+    Plausibility,
+    SearchHints,
+    Shape,
+    Signature,
+    added_or_taken_off,
+    as_shape,
+    between,
+    delay_effect,
+)
+from sim_gap.residuals.preprocess import PreparedSignals
 
 LONGEST = 0.2
 """Longest time that counts as a lag or delay [s]."""
-CLIPPED = 0.2
-"""Prior standard deviation of a clipped signal's coefficient about one: all above the level is cut off."""
-NEAR_ONE = between(0.6, 1.6)
+
+
+def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
+    """Torque produced per torque reported: the error of the torque constant."""
+    return 1.0 / (1.0 + coefficients)
+
+
+def _above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+    """The rotor may have less inertia than the model's armature."""
+    return added_or_taken_off(float(coefficients[0]), float(beneath["nominal"][2]), beneath)
 
 
 def _missing(lost: Callable[[Array, float, float], Array]) -> Signature:
@@ -42,7 +62,7 @@ def _clipped(command: Array, limit: float, _rate: float) -> Array:
     return np.asarray(command - np.clip(command, -limit, limit))
 
 
-def _levels(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+def _levels(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     """Levels that the command exceeds during some of the time [N·m]."""
     commands = np.concatenate([np.abs(s.reading["tau_cmd"][:, place]) for s in signals])
     shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
@@ -50,9 +70,22 @@ def _levels(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
 
 
 EFFECTS = (
-    late("actuator.lag", _missing(_lag), 0.01, LONGEST),
-    late("actuator.delay", _missing(_delay), 0.01, LONGEST),
-    Effect(
+    InverseEffect(  # the whole nominal motor torque: known rotor inertia and friction are scaled too
+        "actuator.gain",
+        Signature.at_motor(lambda s, j, _: s.motor_model[:, j], "motor", "drive"),
+        Plausibility(
+            background_std=0.002, prior_std=lambda _signals, _place: np.full(1, 0.5), allows=between(-0.5, 1.0)
+        ),
+        parameters_of=_gain,
+    ),
+    InverseEffect(
+        "actuator.rotor_inertia",
+        Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
+        Plausibility(prior_penalty=0, allows=_above_nominal),
+    ),
+    delay_effect("actuator.lag", _missing(_lag), 0.01, LONGEST),
+    delay_effect("actuator.delay", _missing(_delay), 0.01, LONGEST),
+    InverseEffect(
         "actuator.saturation",
         _missing(_clipped),
         Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE),

@@ -13,14 +13,14 @@ import numpy as np
 
 from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array
-from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import ABSENT, Signals
+from sim_gap.residuals.layout import ChannelLayout, Columns
+from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 
 Shape = tuple[float, ...]
 """Nonlinear parameters of an effect, such as its Stribeck velocity."""
 Key = tuple[str, int]
 """Id of an effect and the index of a joint or link (0 for the whole arm)."""
-Column = Callable[[Signals, int, Shape], Array]
+Column = Callable[[PreparedSignals, int, Shape], Array]
 """The columns of an effect at one place, (K,) or (K, p), from signals, place and shape."""
 Beneath = Mapping[str, Array]
 """Coefficients of the effects that one needs, by id. `nominal`: friction loss [N·m], damping [N·m·s/rad], armature
@@ -37,7 +37,7 @@ Channel = Literal["any", "sensor", "motor", "command"]
 Side = Literal["link", "motor", "drive", "distortion", "reading", "command"]
 """Where in the chain from link to command an effect acts: on the torque of the links, between link and motor, on the
 motor's report of all that, in the sensor before its gain, on the sensor's reading, between command and motor."""
-Moves = Callable[[Signals, Layout, int], Array]
+Moves = Callable[[PreparedSignals, ChannelLayout, int], Array]
 """Change of a joint's position, velocity and acceleration per unit of each coefficient, (K, p, 3)."""
 
 
@@ -45,7 +45,7 @@ Moves = Callable[[Signals, Layout, int], Array]
 class Signature:
     """How an effect shows in a recording."""
 
-    columns: Callable[[Signals, Layout, int, Shape], Columns]
+    columns: Callable[[PreparedSignals, ChannelLayout, int, Shape], Columns]
     """Columns at the work rate, by row."""
     channel: Channel = "any"
     whole_arm: bool = False
@@ -57,10 +57,10 @@ class Signature:
     side: Side = "link"
     moves: Moves | None = None
     """Of an effect that moves the true joint against its reading."""
-    offset: Callable[[Signals, Layout, Shape], Columns] | None = None
+    offset: Callable[[PreparedSignals, ChannelLayout, Shape], Columns] | None = None
     """Of a nonlinear effect linearised at its shape: what it is beside its columns, (K,) by row."""
 
-    slopes: Callable[[Signals, Layout, Shape, Array], Columns] | None = None
+    slopes: Callable[[PreparedSignals, ChannelLayout, Shape, Array], Columns] | None = None
     """Of a nonlinear effect: its columns about fitted coefficients."""
 
     def present(self, shape: Shape, number: int) -> bool:
@@ -68,7 +68,7 @@ class Signature:
         numbers = self.recordings(shape)
         return not self.body if number == ABSENT else not numbers or number in numbers
 
-    def places(self, layout: Layout) -> range:
+    def places(self, layout: ChannelLayout) -> range:
         """Joints or links at which it may be; empty if these channels cannot show it."""
         channels = {"sensor": layout.sensor, "motor": layout.motor, "command": layout.commanded}
         if self.channel != "any" and channels[self.channel] is None:
@@ -105,7 +105,6 @@ def _2d(columns: Array) -> Array:
 
 
 def always(_coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
-    """All coefficients are possible."""
     return True
 
 
@@ -124,12 +123,10 @@ def added_or_taken_off(coefficient: float, has: float, beneath: Beneath, noise: 
 
 
 def positive(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
-    """The first coefficient is above zero."""
     return bool(coefficients[0] > 0.0)
 
 
 def between(low: float, high: float) -> Callable[[Array, Shape, Beneath], bool]:
-    """The first coefficient lies strictly between two values."""
     return lambda coefficients, _shape, _beneath: bool(low < coefficients[0] < high)
 
 
@@ -141,7 +138,7 @@ class Plausibility:
     """Number of extra coefficients that the effect is charged for: 0 if every arm has it, more if few have."""
     prior_mean: float = 0.0
     """Prior mean of the coefficients: 1 if the shape alone determines the effect."""
-    prior_std: Callable[[Signals, int], Array] = lambda _signals, _place: np.full(1, np.inf)
+    prior_std: Callable[[PreparedSignals, int], Array] = lambda _signals, _place: np.full(1, np.inf)
     """Prior standard deviation of each coefficient (p,), its largest plausible size; infinite for none."""
     background_std: float = 0.0
     """Standard deviation of each coefficient over sound arms; confidence intervals include it."""
@@ -157,7 +154,7 @@ class SearchHints:
 
     shapes: tuple[Shape, ...] = ((),)
     """Shapes to start with; the best one is then refined between its neighbours."""
-    shapes_for: Callable[[Sequence[Signals], int], tuple[Shape, ...]] | None = None
+    shapes_for: Callable[[Sequence[PreparedSignals], int], tuple[Shape, ...]] | None = None
     """The same for given recordings and place."""
     discrete: frozenset[int] = frozenset()
     """Entries of the shape that are the number of something (a joint, a recording): they are not refined."""
@@ -167,15 +164,14 @@ class SearchHints:
     """Entry of the shape at which a nonlinear effect is linearised, by its secant; None if it is linear."""
     relinearise: Callable[[Array, Shape], Shape] = lambda coefficients, _shape: (float(coefficients[0]),)
     """The shape at which to linearise again, from the coefficients fitted at the last one."""
-    covers: Callable[[Layout, int], tuple[Key, ...]] = lambda _layout, _place: ()
+    covers: Callable[[ChannelLayout, int], tuple[Key, ...]] = lambda _layout, _place: ()
     """Effects whose columns this one contains: they are not fitted beside it."""
-    alternatives: Callable[[Layout, int, Shape], tuple[Key, ...]] = lambda _layout, _place, _shape: ()
+    alternatives: Callable[[ChannelLayout, int, Shape], tuple[Key, ...]] = lambda _layout, _place, _shape: ()
     """Simpler effects that together could replace this one; it must do better than they."""
     canonical: Callable[[int, Shape], tuple[int, Shape]] = lambda place, shape: (place, shape)
     """Place and shape under which it is reported, if two of them show alike."""
 
-    def grid(self, signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
-        """Shapes to start with on these recordings."""
+    def grid(self, signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
         return self.shapes if self.shapes_for is None else self.shapes_for(signals, place)
 
 
@@ -205,7 +201,7 @@ def as_share_of_shape(coefficients: Array, shape: Shape, _beneath: Beneath) -> A
 
 
 @dataclass(frozen=True)
-class Effect:
+class InverseEffect:
     """The inverse form of one effect."""
 
     id: str
@@ -219,5 +215,29 @@ class Effect:
 
     @property
     def reported(self) -> tuple[tuple[str, str], ...]:
-        """Name and unit of each reported parameter."""
         return CATALOGUE[self.id].reported
+
+
+SHORTEST_DELAY = 1e-3
+"""Shortest time that counts as a delay or a lag [s]."""
+CLIPPED = 0.2
+"""Prior standard deviation of a clipped signal's coefficient about one: all above the level is cut off."""
+NEAR_ONE = between(0.6, 1.6)
+
+
+def delay_effect(effect_id: str, signature: Signature, start: float, longest: float) -> InverseEffect:
+    """An effect whose shape is a time: the search starts at `start` and goes up to `longest` [s]."""
+
+    def allows(coefficients: Array, shape: Shape, _beneath: Beneath) -> bool:
+        return bool(SHORTEST_DELAY < coefficients[0] * shape[0] < longest)
+
+    def relinearise(coefficients: Array, shape: Shape) -> Shape:
+        return (float(np.clip(coefficients[0] * shape[0], SHORTEST_DELAY, longest)),)
+
+    return InverseEffect(
+        effect_id,
+        signature,
+        Plausibility(allows=allows),
+        SearchHints(shapes=((start,),), linearised_at=0, relinearise=relinearise),
+        parameters_of=as_share_of_shape,
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.effects.effect import (
     Beneath,
-    Effect,
+    InverseEffect,
     Key,
     Plausibility,
     SearchHints,
@@ -20,8 +20,8 @@ from sim_gap.effects.effect import (
     as_fitted_and_shape,
     not_negative,
 )
-from sim_gap.residuals.layout import Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.layout import ChannelLayout
+from sim_gap.residuals.preprocess import PreparedSignals
 
 COULOMB = ("friction.coulomb",)
 NOISE = 0.01
@@ -59,19 +59,19 @@ def _below_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
     return bool(abs(coefficients[0]) < dry(beneath))
 
 
-def _stribeck(s: Signals, joint: int, shape: Shape) -> Array:
+def _stribeck(s: PreparedSignals, joint: int, shape: Shape) -> Array:
     """Breakaway in excess of Coulomb friction, decaying as exp(−(v/vs)²)."""
     return np.asarray(s.direction[:, joint] * np.exp(-((s.v[:, joint] / shape[0]) ** 2)))
 
 
-def _velocities(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+def _velocities(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     """Velocities well within the recorded ones: beyond, the effect is friction that varies with speed."""
     fastest = float(np.quantile(np.concatenate([np.abs(s.v[:, place]) for s in signals]), 0.95))
     shapes = tuple((velocity,) for velocity in VELOCITIES)
     return tuple(shape for shape in shapes if shape[0] < WITHIN * fastest) or shapes[:1]
 
 
-def _viscous_or_load(_layout: Layout, place: int, _shape: Shape) -> tuple[Key, ...]:
+def _viscous_or_load(_layout: ChannelLayout, place: int, _shape: Shape) -> tuple[Key, ...]:
     """Friction that grows with speed, or with the load if that correlates with speed."""
     return ("friction.viscous", place), ("friction.load", place)
 
@@ -82,17 +82,17 @@ def _ratio(coefficients: Array, _shape: Shape, beneath: Beneath) -> Array:
 
 
 EFFECTS = (
-    Effect(
+    InverseEffect(
         "friction.coulomb",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint]),
         Plausibility(prior_penalty=0, background_std=0.03, background_nm=True, allows=_dry_above_nominal),
     ),
-    Effect(
+    InverseEffect(
         "friction.viscous",
         Signature.at_motor(lambda s, joint, _: s.v[:, joint]),
         Plausibility(prior_penalty=0, background_std=0.02, background_nm=True, allows=_viscous_above_nominal),
     ),
-    Effect(
+    InverseEffect(
         "friction.stribeck",
         Signature.at_motor(_stribeck),
         Plausibility(allows=_above_minus_dry),
@@ -100,14 +100,14 @@ EFFECTS = (
         needs=COULOMB,
         parameters_of=as_fitted_and_shape,
     ),
-    Effect(
+    InverseEffect(
         "friction.asymmetric",
         Signature.at_motor(lambda s, joint, _: np.abs(s.direction[:, joint])),
         Plausibility(allows=_below_dry),
         needs=COULOMB,
         parameters_of=_ratio,
     ),
-    Effect(
+    InverseEffect(
         "friction.load",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint] * np.abs(s.model[:, joint])),
         Plausibility(allows=not_negative),

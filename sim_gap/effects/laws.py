@@ -11,16 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Effect, Plausibility, Shape, Signature
-from sim_gap.effects.position import moving, reads
-from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.effects.effect import InverseEffect, Plausibility, Shape, Signature
+from sim_gap.effects.position import position_effect, reading_moves
+from sim_gap.residuals.layout import ChannelLayout, Columns
+from sim_gap.residuals.preprocess import PreparedSignals
 
 
 @dataclass(frozen=True)
 class Law:
-    """One general law."""
-
     id: str
     family: str
     """Effects of this family that are a case of the law say the same."""
@@ -28,12 +26,12 @@ class Law:
     signature: Signature
 
     @property
-    def effect(self) -> Effect:
+    def effect(self) -> InverseEffect:
         """The law as the search takes it: free of charge, without priors."""
-        return Effect(self.id, self.signature, Plausibility(prior_penalty=0))
+        return InverseEffect(self.id, self.signature, Plausibility(prior_penalty=0))
 
 
-def _smooth_in_position(s: Signals, joint: int, _shape: Shape) -> Array:
+def _smooth_in_position(s: PreparedSignals, joint: int, _shape: Shape) -> Array:
     q = s.q[:, joint]
     return np.column_stack([np.ones_like(q), q, np.sin(q), np.cos(q)])
 
@@ -47,19 +45,19 @@ def _derivatives(torque: Array, rate: float) -> Array:
     return np.column_stack([first, np.gradient(first, 1.0 / rate)])
 
 
-def _smooth_in_velocity(s: Signals, joint: int, _shape: Shape) -> Array:
+def _smooth_in_velocity(s: PreparedSignals, joint: int, _shape: Shape) -> Array:
     v = s.v[:, joint]
     return np.column_stack([v, v * np.abs(v)])
 
 
-def _body(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Columns:
+def _body(signals: PreparedSignals, layout: ChannelLayout, place: int, _shape: Shape) -> Columns:
     """The ten inertial parameters of a body fixed to a link."""
     carrying = np.flatnonzero(signals.arm.carries[:, place])
     columns = signals.link_regressor(place)
     return {(layout.against_model, int(j)): columns[:, j] for j in carrying}
 
 
-def _gravity(signals: Signals, layout: Layout, _place: int, _shape: Shape) -> Columns:
+def _gravity(signals: PreparedSignals, layout: ChannelLayout, _place: int, _shape: Shape) -> Columns:
     return {(layout.against_model, j): signals.gravity_columns[:, j] for j in range(signals.n)}
 
 
@@ -122,7 +120,7 @@ _LAWS = (
         "law.position_reading",
         "position",
         "any error of the position sensor that is constant or proportional to the position",
-        moving(reads(lambda q: (np.ones_like(q), q, 0 * q, np.ones_like(q), 0 * q, 0 * q))),
+        position_effect(reading_moves(lambda q: (np.ones_like(q), q, 0 * q, np.ones_like(q), 0 * q, 0 * q))),
     ),
     Law("law.body", "link", "any rigid body fixed to a link", Signature(_body)),
     Law("law.gravity", "base", "gravity of another direction or size", Signature(_gravity, whole_arm=True)),

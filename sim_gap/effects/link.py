@@ -6,10 +6,70 @@ from itertools import combinations
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Beneath, Effect, Key, Plausibility, SearchHints, Shape, Signature
-from sim_gap.effects.inertials import moment_to_inertia, mounted, point_slopes
-from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import ABSENT, Signals
+from sim_gap.effects.effect import Beneath, InverseEffect, Key, Plausibility, SearchHints, Shape, Signature
+from sim_gap.residuals.layout import ChannelLayout, Columns
+from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
+
+SIX = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+LIGHT_KG = 1e-6
+"""Least absolute mass of which a centre is taken [kg]."""
+
+
+def point_mass(mass: float, moment: Array) -> Array:
+    """Ten parameters of a point mass (negative if it is taken away) from its mass and first moment."""
+    centre = moment / mass if abs(mass) > LIGHT_KG else np.zeros(3)
+    inertia = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    return np.concatenate([[mass], moment, inertia[SIX]])
+
+
+def point_slopes(mass: float, moment: Array) -> Array:
+    """Derivative of `point_mass` in mass and moment, (10, 4); of its first four rows alone without a mass."""
+    out = np.vstack([np.eye(4), np.zeros((6, 4))])
+    if abs(mass) > LIGHT_KG:
+        centre = moment / mass
+        out[4:, 0] = -(centre @ centre * np.eye(3) - np.outer(centre, centre))[SIX]
+        out[4:, 1:] = moment_to_inertia(centre)
+    return out
+
+
+def mount_matrix(axis: Array, angle: float) -> Array:
+    """Mass and first moment of a body that is turned about an axis (3,) by an angle, from those before, (4, 4)."""
+    x, y, z = axis
+    hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    out = np.eye(4)
+    out[1:, 1:] += np.sin(angle) * hat + (1.0 - np.cos(angle)) * hat @ hat
+    return out
+
+
+def moment_to_inertia(centre: Array) -> Array:
+    """Change of the inertia about the joint with the first moment of a body with its centre of mass there, (6, 3).
+
+    I = Σ m (|r|² 1 − r rᵀ), so moving mass at c by δ adds 2 (c·mδ) 1 − (c mδᵀ + mδ cᵀ), to first order.
+    """
+    out = np.empty((6, 3))
+    for k, unit in enumerate(np.eye(3)):
+        change = 2.0 * centre @ unit * np.eye(3) - np.outer(centre, unit) - np.outer(unit, centre)
+        out[:, k] = change[SIX]
+    return out
+
+
+def move_mass(inertial: Array, moment: Array) -> Array:
+    """A link whose first moment is larger by `moment` (3,): its centre moves, mass and inertia about it stay, (10,)."""
+    mass = max(float(inertial[0]), 1e-9)
+    old, new = inertial[1:4] / mass, (inertial[1:4] + moment) / mass
+    change = mass * (new @ new - old @ old) * np.eye(3) - mass * (np.outer(new, new) - np.outer(old, old))
+    return np.concatenate([inertial[:1], inertial[1:4] + moment, inertial[4:] + change[SIX]])
+
+
+def pseudo_inertia(inertial: Array) -> Array:
+    """The pseudo-inertia matrix (4, 4) of ten parameters: positive definite for every body that can exist (Wensing)."""
+    inertia = inertial[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    out = np.empty((4, 4))
+    out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    out[:3, 3] = out[3, :3] = inertial[1:4]
+    out[3, 3] = inertial[0]
+    return out
+
 
 LEVER = 0.15
 """Plausible shift of a link's centre of mass [m], and radius of gyration of added mass [m]."""
@@ -27,13 +87,13 @@ FARTHEST = 0.6
 """Largest distance of a payload's centre of mass from the last joint [m]."""
 
 
-def _rows(signals: Signals, layout: Layout, link: int, columns: Array) -> Columns:
+def _rows(signals: PreparedSignals, layout: ChannelLayout, link: int, columns: Array) -> Columns:
     """Columns (K, n, p) at every joint that carries the link."""
     carrying = np.flatnonzero(signals.arm.carries[:, link])
     return {(layout.against_model, int(joint)): columns[:, joint] for joint in carrying}
 
 
-def _mass_moment(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Columns:
+def _mass_moment(signals: PreparedSignals, layout: ChannelLayout, place: int, _shape: Shape) -> Columns:
     """An error of a link's first moment m·s; its inertia about the joint changes with it.
 
     If only the inertia that comes with it would show, it is an error of the inertia and not of the moment.
@@ -45,12 +105,12 @@ def _mass_moment(signals: Signals, layout: Layout, place: int, _shape: Shape) ->
     return _rows(signals, layout, place, (moved + along) * shows)
 
 
-def _inertia(signals: Signals, layout: Layout, place: int, _shape: Shape) -> Columns:
+def _inertia(signals: PreparedSignals, layout: ChannelLayout, place: int, _shape: Shape) -> Columns:
     """An error of a link's inertia about its joint."""
     return _rows(signals, layout, place, signals.link_regressor(place)[..., 4:])
 
 
-def _payload(signals: Signals, layout: Layout, _place: int, shape: Shape) -> Columns:
+def _payload(signals: PreparedSignals, layout: ChannelLayout, _place: int, shape: Shape) -> Columns:
     """A mass fixed to the tip; its centre of mass is in the last link's frame, whose origin is on that joint's axis.
 
     If only some of the recordings were made with it, the shape holds their numbers as bits, the first as 1.
@@ -59,7 +119,7 @@ def _payload(signals: Signals, layout: Layout, _place: int, shape: Shape) -> Col
     return _rows(signals, layout, tip, signals.link_regressor(tip)[..., :4] @ _mount(signals) * _has(signals, shape))
 
 
-def _payload_slopes(signals: Signals, layout: Layout, shape: Shape, c: Array) -> Columns:
+def _payload_slopes(signals: PreparedSignals, layout: ChannelLayout, shape: Shape, c: Array) -> Columns:
     """The same about a fitted payload: a point mass, whose inertia changes with it."""
     tip, mount = signals.n - 1, _mount(signals)
     here = mount @ c
@@ -67,28 +127,27 @@ def _payload_slopes(signals: Signals, layout: Layout, shape: Shape, c: Array) ->
     return _rows(signals, layout, tip, slopes * _has(signals, shape))
 
 
-def _mount(signals: Signals) -> Array:
+def _mount(signals: PreparedSignals) -> Array:
     """Mass and first moment of the body in a recording, from those that it has in the others, (4, 4)."""
-    return mounted(signals.arm.axis[-1], signals.mount)
+    return mount_matrix(signals.arm.axis[-1], signals.mount)
 
 
-def _has(signals: Signals, shape: Shape) -> bool:
+def _has(signals: PreparedSignals, shape: Shape) -> bool:
     """Whether a recording was made with the body of this shape."""
-    return signals.number != ABSENT and (not shape or signals.number in numbers(shape))
+    return signals.number != ABSENT and (not shape or signals.number in recording_numbers(shape))
 
 
-def numbers(shape: Shape) -> tuple[int, ...]:
+def recording_numbers(shape: Shape) -> tuple[int, ...]:
     """Numbers of the recordings, from 1, in a shape that holds them as bits."""
     bits = int(shape[0]) if shape else 0
     return tuple(k + 1 for k in range(bits.bit_length()) if bits >> k & 1)
 
 
 def shape_of(chosen: Iterable[int]) -> Shape:
-    """The shape that holds these numbers."""
     return (float(sum(1 << (number - 1) for number in set(chosen))),)
 
 
-def _recordings(signals: Sequence[Signals], _place: int) -> tuple[Shape, ...]:
+def _recordings(signals: Sequence[PreparedSignals], _place: int) -> tuple[Shape, ...]:
     """In all recordings, in those of a group, or without groups in one of several or (of a few) in any but not all."""
     groups = {name: {s.number for s in signals if name in s.groups} for s in signals for name in s.groups}
     if groups:
@@ -99,11 +158,11 @@ def _recordings(signals: Sequence[Signals], _place: int) -> tuple[Shape, ...]:
     return ((), *(shape_of(each) for size in range(1, some + 1) for each in combinations(known, size)))
 
 
-def _tip_mass_moment(layout: Layout, _place: int) -> tuple[Key, ...]:
+def _tip_mass_moment(layout: ChannelLayout, _place: int) -> tuple[Key, ...]:
     return (("link.mass_moment", layout.n - 1),)
 
 
-def _all_mass_moments(layout: Layout, _place: int, _shape: Shape) -> tuple[Key, ...]:
+def _all_mass_moments(layout: ChannelLayout, _place: int, _shape: Shape) -> tuple[Key, ...]:
     return tuple(("link.mass_moment", link) for link in range(layout.n))
 
 
@@ -119,25 +178,25 @@ def _mass_and_centre(coefficients: Array, _shape: Shape, _beneath: Beneath) -> A
     return np.concatenate([[mass], coefficients[1:] / (mass if abs(mass) > 1e-6 else np.inf)])
 
 
-def _mass(signals: Signals, link: int) -> float:
+def _mass(signals: PreparedSignals, link: int) -> float:
     """Mass of a link [kg], as a scale of the plausible error of its inertials."""
     return max(float(signals.arm.inertial[link, 0]), LIGHTEST)
 
 
 EFFECTS = (
-    Effect(
+    InverseEffect(
         "link.mass_moment",
         Signature(_mass_moment),
         Plausibility(prior_penalty=0, prior_std=lambda signals, link: np.full(3, LEVER * _mass(signals, link))),
     ),
-    Effect(
+    InverseEffect(
         "link.inertia",
         Signature(_inertia),
         Plausibility(prior_std=lambda signals, link: np.full(6, LEVER**2 * _mass(signals, link))),
     ),
-    Effect(
+    InverseEffect(
         "link.payload",
-        Signature(_payload, whole_arm=True, recordings=numbers, body=True, slopes=_payload_slopes),
+        Signature(_payload, whole_arm=True, recordings=recording_numbers, body=True, slopes=_payload_slopes),
         Plausibility(
             prior_penalty=0, prior_std=lambda _signals, _place: np.array([20.0, 4.0, 4.0, 4.0]), allows=_near_the_tip
         ),

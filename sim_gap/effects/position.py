@@ -11,7 +11,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.effects.effect import (
     Beneath,
-    Effect,
+    InverseEffect,
     Moves,
     Plausibility,
     SearchHints,
@@ -20,10 +20,9 @@ from sim_gap.effects.effect import (
     as_gain,
     between,
 )
-from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.layout import ChannelLayout, Columns
+from sim_gap.residuals.preprocess import PreparedSignals
 
-EPSILON = 1e-4
 PART_OF_TURN = 2.0
 """Range [rad] from which an error with a period of one turn can be separated from a gain."""
 WORST_GAIN, WORST_ECCENTRICITY = 0.15, 0.2
@@ -33,12 +32,12 @@ Error = Callable[[Array], tuple[Array, ...]]
 """Errors δ(φ) of the reading φ per unit of each coefficient, then δ'(φ) of each, then δ''(φ), (K,) each."""
 
 
-def responses(signals: Signals, layout: Layout, joint: int, moves: Array, size: float = 0.0) -> Columns:
+def responses(signals: PreparedSignals, layout: ChannelLayout, joint: int, moves: Array, size: float = 0.0) -> Columns:
     """Change of the model torque per unit of each coefficient that moves a joint: (K, p, 3) → (K, p) by row.
 
     The secant over `size` of the first coefficient, or the derivative if that is zero.
     """
-    if abs(size) > EPSILON:
+    if abs(size) > 1e-4:
         moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
         for x, move in zip(moved, moves[:, 0].T, strict=True):
             x[:, joint] += size * move
@@ -49,7 +48,7 @@ def responses(signals: Signals, layout: Layout, joint: int, moves: Array, size: 
     return {(layout.against_model, i): change[:, i] for i in range(signals.n)}
 
 
-def moving(moves: Moves, shaped: bool = False) -> Signature:
+def position_effect(moves: Moves, shaped: bool = False) -> Signature:
     """An effect that moves the true joint against its reading; the shape, if any, is the size of its secant."""
     return Signature(
         lambda s, layout, place, shape: responses(
@@ -59,10 +58,10 @@ def moving(moves: Moves, shaped: bool = False) -> Signature:
     )
 
 
-def reads(error: Error) -> Moves:
+def reading_moves(error: Error) -> Moves:
     """Moves for an error of the reading, a function of the reading."""
 
-    def moves(signals: Signals, _layout: Layout, joint: int) -> Array:
+    def moves(signals: PreparedSignals, _layout: ChannelLayout, joint: int) -> Array:
         q, v, a = (x[:, joint] for x in (signals.read.q, signals.read.v, signals.read.a))
         parts = error(q)
         count = len(parts) // 3
@@ -73,7 +72,7 @@ def reads(error: Error) -> Moves:
     return moves
 
 
-def _far_enough(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+def _far_enough(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     """Only on a joint that turns far: on a small part of a turn the error is an offset and a gain."""
     seen = max(float(np.ptp(s.q[:, place])) for s in signals)
     return ((),) if seen > PART_OF_TURN else ()
@@ -87,28 +86,28 @@ def _within_a_few_degrees(coefficients: Array, _shape: Shape, _beneath: Beneath)
     return bool(np.hypot(*coefficients) < WORST_ECCENTRICITY)
 
 
-def _small(_signals: Signals, _place: int) -> Array:
+def _small(_signals: PreparedSignals, _place: int) -> Array:
     return np.full(1, 0.2)
 
 
 FROM_ZERO = SearchHints(shapes=((0.0,),), linearised_at=0)
 EFFECTS = (
-    Effect(
+    InverseEffect(
         "position.offset",
-        moving(reads(lambda q: (np.ones_like(q), 0 * q, 0 * q)), shaped=True),
+        position_effect(reading_moves(lambda q: (np.ones_like(q), 0 * q, 0 * q)), shaped=True),
         Plausibility(prior_std=_small),
         FROM_ZERO,
     ),
-    Effect(
+    InverseEffect(
         "position.gain",
-        moving(reads(lambda q: (q, np.ones_like(q), 0 * q)), shaped=True),
+        position_effect(reading_moves(lambda q: (q, np.ones_like(q), 0 * q)), shaped=True),
         Plausibility(prior_std=_small, allows=between(-WORST_GAIN, WORST_GAIN)),
         FROM_ZERO,
         parameters_of=as_gain,
     ),
-    Effect(
+    InverseEffect(
         "position.eccentricity",
-        moving(reads(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
+        position_effect(reading_moves(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
         Plausibility(prior_std=lambda _signals, _place: np.full(2, 0.1), allows=_within_a_few_degrees),
         SearchHints(shapes_for=_far_enough),
         parameters_of=_amplitude_and_phase,

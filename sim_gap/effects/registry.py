@@ -2,44 +2,19 @@
 
 from collections.abc import Sequence
 
-from sim_gap.effects import (
-    actuator,
-    base,
-    drive,
-    elasticity_backlash,
-    friction,
-    link,
-    position,
-    sensor_nonlinearity,
-    timing,
-    torque,
-    transmission,
-)
-from sim_gap.effects.effect import Effect
+from sim_gap.effects import base, drive, friction, link, position, torque, transmission
+from sim_gap.effects.effect import InverseEffect
 from sim_gap.effects.laws import LAWS
 
-FAMILIES = (
-    friction,
-    link,
-    base,
-    position,
-    torque,
-    sensor_nonlinearity,
-    timing,
-    transmission,
-    elasticity_backlash,
-    actuator,
-    drive,
-)
+FAMILIES = (friction, link, base, position, torque, transmission, drive)
 """Modules with an `EFFECTS`; effects are searched in this order."""
 NOT_DIAGNOSED = {"torque.nonlinearity": "noted as the general law `law.load`, which is not attributed"}
 """Catalogue ids without an inverse form, and why."""
-_LIBRARY: dict[str, Effect] = {each.id: each for family in FAMILIES for each in family.EFFECTS}
+_LIBRARY: dict[str, InverseEffect] = {each.id: each for family in FAMILIES for each in family.EFFECTS}
 _EFFECTS = _LIBRARY | {law.id: law.effect for law in LAWS.values()}
 
 
-def effects() -> dict[str, Effect]:
-    """All effects of the library and general laws by id."""
+def effects() -> dict[str, InverseEffect]:
     return _EFFECTS
 
 

@@ -1,20 +1,138 @@
-"""Linear errors of a joint torque sensor: they show in `tau` against the model, and negated in motor against `tau`."""
+"""Errors of a joint torque sensor: linear ones, distortions by its own torque or another joint's, and delay.
+
+They show in `tau` against the model, and negated in motor against `tau`.
+"""
+
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sim_gap.effects.effect import Effect, Plausibility, Signature, as_gain, between
+from gcomp.arrays import Array
+from sim_gap.effects.effect import (
+    CLIPPED,
+    NEAR_ONE,
+    InverseEffect,
+    Plausibility,
+    SearchHints,
+    Shape,
+    Signature,
+    as_fitted_and_shape,
+    as_gain,
+    as_shape,
+    as_share_of_shape,
+    between,
+    delay_effect,
+)
+from sim_gap.residuals.preprocess import PreparedSignals
 
+GRADUAL = (0.25, 0.75, 1.25, 1.75)
+"""Half widths of the plays of a hysteresis that sets in gradually, as in strain gauges, as shares of their mean."""
+
+
+def largest_torque(signals: Sequence[PreparedSignals], joint: int, share: float = 0.98) -> float:
+    """Quantile of a joint's absolute model torque [N·m]."""
+    return float(np.quantile(np.concatenate([np.abs(s.model[:, joint]) for s in signals]), share))
+
+
+def _other_joints(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
+    return tuple((float(source + 1),) for source in range(signals[0].n) if source != place)
+
+
+def _distorted(distort: Callable[[Array, Shape, float], Array]) -> Signature:
+    """Reading less true torque, `distort(torque (K,), shape, rate)`; the shape begins with a level."""
+    return Signature.at_sensor(lambda s, joint, shape: distort(s.passed_on[:, joint], shape, s.rate), side="distortion")
+
+
+def _shares(*shares: float) -> Callable[[Sequence[PreparedSignals], int], tuple[Shape, ...]]:
+    """Starting levels as shares of the joint's usual largest torque."""
+    return lambda signals, place: tuple((share * largest_torque(signals, place),) for share in shares)
+
+
+def _exceeded(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
+    """Levels that the torque exceeds during some of the time [N·m]."""
+    shares = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 0.999)
+    return tuple((largest_torque(signals, place, share),) for share in shares)
+
+
+def _stays_behind(torque: Array, shape: Shape, rate: float) -> Array:
+    """Reading less true torque with hysteresis: one play, or if the shape says so several of growing width."""
+    shares = GRADUAL if is_gradual(shape) else (1.0,)
+    return np.asarray(np.mean([play(torque, share * shape[0], rate) for share in shares], axis=0) - torque)
+
+
+def is_gradual(shape: Shape) -> bool:
+    """Whether a hysteresis of this shape sets in gradually."""
+    return len(shape) > 1
+
+
+def _abrupt_and_gradual(shape: Shape) -> tuple[Shape, ...]:
+    return (shape[:1], (shape[0], float(len(GRADUAL))))
+
+
+def play(x: Array, half: float, rate: float) -> Array:
+    """Output of a play (backlash operator) of half width `half` that starts in its middle, (K,)."""
+    step = max(1, int(rate / 50.0))  # smooth torques change little between its samples
+    coarse = x[::step]
+    steps = np.diff(coarse)
+    turns = np.concatenate([[0], 1 + np.flatnonzero(steps[1:] * steps[:-1] <= 0.0), [len(coarse) - 1]])
+    at, before = float(coarse[0]), []
+    for value in coarse[turns[1:]].tolist():  # within a run in one direction the output follows from its start
+        before.append(at)
+        at = min(max(at, value - half), value + half)
+    start = np.concatenate([coarse[:1], np.repeat(before, np.diff(turns))])
+    out = np.clip(start, coarse - half, coarse + half)
+    return np.asarray(np.interp(np.arange(len(x)), np.arange(len(coarse)) * step, out))
+
+
+def _delayed(signals: PreparedSignals, joint: int, shape: Shape) -> Array:
+    torque = signals.model[:, joint]
+    return np.asarray(np.interp(signals.t - shape[0], signals.t, torque) - torque)
+
+
+CUT_OFF = Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE)
+"""Of a level, beyond which all is cut off."""
 EFFECTS = (
-    Effect(  # without a sensor, an offset of the motor's torque
+    InverseEffect(  # without a sensor, an offset of the motor's torque
         "torque.offset",
         Signature.at_sensor(lambda s, _joint, _shape: np.ones(len(s.t)), "any"),
         Plausibility(prior_penalty=0, background_std=0.02, background_nm=True),
     ),
-    Effect(
+    InverseEffect(
         "torque.gain",
         Signature.at_sensor(lambda s, joint, _shape: s.sensed[:, joint]),
         Plausibility(prior_penalty=0, background_std=0.002, allows=between(-0.5, 1.0)),
         parameters_of=as_gain,
     ),
-    Effect("torque.drift", Signature.at_sensor(lambda s, _joint, _shape: s.t), needs=("torque.offset",)),
+    InverseEffect("torque.drift", Signature.at_sensor(lambda s, _joint, _shape: s.t), needs=("torque.offset",)),
+    InverseEffect(
+        "torque.crosstalk",
+        Signature.at_sensor(lambda s, _joint, shape: s.model[:, int(shape[0]) - 1], side="distortion"),
+        Plausibility(allows=between(-0.5, 0.5)),
+        SearchHints(shapes_for=_other_joints, discrete=frozenset({0})),
+        parameters_of=as_fitted_and_shape,
+    ),
+    InverseEffect(  # the width is the deviation after a long way
+        "torque.hysteresis",
+        _distorted(_stays_behind),
+        Plausibility(allows=NEAR_ONE),
+        SearchHints(
+            shapes_for=_shares(0.01, 0.03, 0.06, 0.12, 0.25), discrete=frozenset({1}), forms=_abrupt_and_gradual
+        ),
+        parameters_of=as_share_of_shape,
+    ),
+    InverseEffect(  # the width is what is lost beyond the band
+        "torque.deadband",
+        _distorted(lambda torque, shape, _rate: -np.clip(torque, -shape[0], shape[0])),
+        CUT_OFF,
+        SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4, 0.8)),
+        parameters_of=as_share_of_shape,
+    ),
+    InverseEffect(
+        "torque.saturation",
+        _distorted(lambda torque, shape, _rate: np.clip(torque, -shape[0], shape[0]) - torque),
+        CUT_OFF,
+        SearchHints(shapes_for=_exceeded),
+        parameters_of=as_shape,
+    ),
+    delay_effect("timing.delay", Signature.at_sensor(_delayed, "any", "distortion"), 0.005, 0.1),
 )

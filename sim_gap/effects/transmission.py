@@ -1,26 +1,48 @@
-"""Errors of the transmission between motor and torque sensor."""
+"""Errors of the transmission between motor and torque sensor.
+
+In one that gives, the position sensor is at the motor, and the link is at another angle, q − δ: δ = τ/K for elasticity;
+for backlash half the play, in the direction of the transmitted torque.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Beneath, Effect, Key, Plausibility, SearchHints, Shape, Signature, positive
+from sim_gap.effects.effect import (
+    Beneath,
+    InverseEffect,
+    Key,
+    Plausibility,
+    SearchHints,
+    Shape,
+    Signature,
+    between,
+    positive,
+)
+from sim_gap.effects.position import position_effect
 from sim_gap.model.rigid_body import CREEP
-from sim_gap.residuals.layout import Columns, Layout
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.layout import ChannelLayout, Columns
+from sim_gap.residuals.preprocess import PreparedSignals
 
 ALWAYS, MOST, SLOWLY = 24, 64, 0.25
 """Most cycles per radian of a ripple that is searched for: in any case, and if a joint turns slowly enough."""
+SMOOTH_HZ = 10.0
+"""Pass band of the transmitted torque before its acceleration is taken."""
+NOISY = 0.05
+"""Largest noise of a sensor, as a share of the joint's torque (RMS), for its reading to be used."""
+SETTLED = 0.02
+"""Share of the largest torque within which the play is crossed."""
 
 
-def _ripple(s: Signals, joint: int, shape: Shape) -> Array:
+def _ripple(s: PreparedSignals, joint: int, shape: Shape) -> Array:
     """Motor torque periodic in the position of the gear: amplitude·sin(cycles·q + phase)."""
     angle = shape[0] * s.q[:, joint]
     return np.column_stack([np.sin(angle), np.cos(angle)])
 
 
-def _cycles(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+def _cycles(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     """Up to ALWAYS cycles per radian; up to MOST, as far as the joint turns slowly enough during a share SLOWLY of its
     motion for them to be within the pass band.
     """
@@ -34,7 +56,7 @@ def _wave(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
     return np.array([np.hypot(*coefficients), shape[0], np.arctan2(coefficients[1], coefficients[0])])
 
 
-def _spring(s: Signals, joint: int, _shape: Shape) -> Array:
+def _spring(s: PreparedSignals, joint: int, _shape: Shape) -> Array:
     """A spring across the joint, such as a cable bundle: torque linear in position on the link side."""
     q = s.q[:, joint]
     return np.column_stack([q, np.ones_like(q)])
@@ -45,7 +67,7 @@ def _stiffness_and_rest(coefficients: Array, _shape: Shape, _beneath: Beneath) -
     return np.array([stiffness, -coefficients[1] / (stiffness if abs(stiffness) > 1e-9 else np.inf)])
 
 
-def _coupling(signals: Signals, layout: Layout, place: int, shape: Shape) -> Columns:
+def _coupling(signals: PreparedSignals, layout: ChannelLayout, place: int, shape: Shape) -> Columns:
     """The motor of this joint also turns with another joint and has friction and inertia in common with it.
 
     Motor i turns by q_i + c·q_j. Its friction follows that speed and loads joint j through the same lever c, so that
@@ -58,7 +80,7 @@ def _coupling(signals: Signals, layout: Layout, place: int, shape: Shape) -> Col
     return {(layout.motor_side, place): shared, (layout.motor_side, other): lever * shared}
 
 
-def _neighbours(signals: Sequence[Signals], place: int) -> tuple[Shape, ...]:
+def _neighbours(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
     neighbours = [place + step for step in (-1, 1) if 0 <= place + step < signals[0].n]
     return tuple((float(other + 1), lever) for other in neighbours for lever in (-1.0, -0.6, 0.6, 1.0))
 
@@ -69,8 +91,7 @@ def _outer_joint(place: int, shape: Shape) -> tuple[int, Shape]:
     return (other, (float(place + 1), lever)) if abs(lever) == 1.0 and other > place else (place, shape)
 
 
-def _own_rotors(_layout: Layout, place: int, shape: Shape) -> tuple[Key, ...]:
-    """Rotor inertia and friction of each joint's own."""
+def _own_rotors(_layout: ChannelLayout, place: int, shape: Shape) -> tuple[Key, ...]:
     own = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
     return tuple((effect, joint) for joint in (place, int(shape[0]) - 1) for effect in own)
 
@@ -83,21 +104,55 @@ def _coupled(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
     return np.array([shape[1], shape[0], *coefficients])
 
 
+def transmitted(signals: PreparedSignals, layout: ChannelLayout, joint: int) -> Array:
+    """Torque through the transmission, smooth, (K,): the sensor's; the model's if there is none or it is noisy.
+
+    Noise of the reading would explain itself.
+    """
+    model, sensor = signals.model[:, joint], layout.sensor
+    clear = sensor and signals.noise[sensor][joint] < NOISY * np.sqrt(np.mean(model**2))
+    torque = signals.reading[sensor][:, joint] if sensor and clear else model
+    cut = min(SMOOTH_HZ, 0.4 * signals.rate)
+    return np.asarray(sosfiltfilt(butter(4, cut, fs=signals.rate, output="sos"), torque))
+
+
+def _bend(signals: PreparedSignals, layout: ChannelLayout, place: int) -> Array:
+    """A spring between motor and link; the coefficient is its compliance."""
+    bend = transmitted(signals, layout, place)
+    speed = np.gradient(bend, 1.0 / signals.rate)
+    return -np.stack([bend, speed, np.gradient(speed, 1.0 / signals.rate)], axis=-1)[:, None]
+
+
+def _play(signals: PreparedSignals, layout: ChannelLayout, place: int) -> Array:
+    """Play between motor and link; the coefficient is its full width."""
+    torque = transmitted(signals, layout, place)
+    side = np.clip(torque / (SETTLED * np.abs(torque).max() + 1e-9), -1.0, 1.0)
+    return -0.5 * np.stack([side, 0.0 * side, 0.0 * side], axis=-1)[:, None]
+
+
+def _stiffness(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
+    return 1.0 / np.maximum(coefficients, 1e-12)
+
+
 EFFECTS = (
-    Effect(
+    InverseEffect(
         "transmission.ripple", Signature.at_motor(_ripple), hints=SearchHints(shapes_for=_cycles), parameters_of=_wave
     ),
-    Effect(
+    InverseEffect(
         "transmission.spring",
         Signature.at_link(_spring),
         Plausibility(allows=positive),
         parameters_of=_stiffness_and_rest,
     ),
-    Effect(
+    InverseEffect(
         "transmission.coupling",
         Signature(_coupling, side="motor"),
         Plausibility(allows=_all_positive),
         SearchHints(shapes_for=_neighbours, discrete=frozenset({0}), alternatives=_own_rotors, canonical=_outer_joint),
         parameters_of=_coupled,
     ),
+    InverseEffect(
+        "transmission.elasticity", position_effect(_bend), Plausibility(allows=positive), parameters_of=_stiffness
+    ),
+    InverseEffect("transmission.backlash", position_effect(_play), Plausibility(allows=between(0.0, 0.3))),
 )

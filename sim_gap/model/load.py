@@ -7,13 +7,105 @@ from typing import Any
 
 import numpy as np
 
+from armlink.arm_file import bundled_arms, load_arm
 from armlink.errors import BadInput
 from armlink.model_file import compile_spec, is_urdf, read_model
+from gcomp.arm.model_file import HAND, coupled_joints, upwards
 from gcomp.arrays import Array
-from sim_gap.model.arm_joints import arm_hinges, hinges_of
-from sim_gap.model.from_arm import is_arm_file, nominal_model
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 from sim_gap.model.solver_friction import creep_speeds
+
+
+def ends_of(source: Any) -> tuple[str | None, str | None]:
+    """Bodies between which the arm of an arm file lies in its model (`kinematics.base`, `kinematics.tip`), or None."""
+    if not isinstance(source, str | Path) or not is_arm_file(Path(source)):
+        return None, None
+    kinematics = load_arm(str(source)).kinematics
+    return kinematics.base, kinematics.tip
+
+
+def is_arm_file(path: Path) -> bool:
+    """Whether this is an arm file (by path or bundled name) and no model."""
+    return path.suffix in (".yaml", ".yml") or str(path) in bundled_arms()
+
+
+def nominal_model(path: Path) -> Any:
+    """Path of the model of an arm file (by path or bundled name), or the `mujoco.MjSpec` of its `sim` section.
+
+    The model counts if the section gives no masses of its own, so that both give the same answer. The section's effects
+    are left out. Raises BadInput if the file has no masses.
+    """
+    arm = load_arm(str(path))
+    if arm.model_path is not None and not (isinstance(arm.sim, dict) and arm.sim.get("links")):
+        return arm.model_path
+    if arm.sim is not None:
+        from sim_bus.effects.state import Imperfections
+        from sim_bus.physics.mjcf import build_model
+
+        spec = build_model(arm, Imperfections(arm.joint_names)).spec
+        for joint in spec.joints:
+            joint.frictionloss = 0.0  # the simulated arm sets its friction at run time
+        return spec
+    raise BadInput(f"{path}: has no masses: give kinematics.model (URDF or MJCF), a sim section, or --sim MJCF")
+
+
+def hinges_of(model: Any) -> dict[str, int]:
+    import mujoco
+
+    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    return {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j + 1}": j for j in hinges}
+
+
+def hinges_between(model: Any, base: str | None, tip: str | None) -> dict[str, int]:
+    """Hinges that body `base` carries (default: the world) on the way to body `tip` (default: all). Raises BadInput."""
+    if base is None and tip is None:
+        return hinges_of(model)
+    first = 0 if base is None else _body(model, base, "base")
+    last = None if tip is None else upwards(model, _body(model, tip, "tip"))
+    if last is not None and first not in last:
+        raise BadInput(f"--base {base} --tip {tip}: the one does not carry the other: give the bodies of one arm")
+    found = {}
+    for name, joint in hinges_of(model).items():
+        body = int(model.jnt_bodyid[joint])
+        if first in upwards(model, body)[1:] and (last is None or body in last):
+            found[name] = joint
+    if not found:
+        raise BadInput(f"--base {base or 'world'} --tip {tip or 'any'}: no hinge between them")
+    return found
+
+
+def arm_hinges(model: Any, hinges: dict[str, int], label: str) -> dict[str, int]:
+    """The longest chain of some hinges, without coupled joints and those of a hand at its end.
+
+    Raises BadInput for several chains of that length, as of a model with two arms.
+    """
+    coupled = coupled_joints(model)
+    ways: list[list[str]] = []
+    for tip in hinges.values():
+        carriers = set(upwards(model, int(model.jnt_bodyid[tip])))
+        way = [name for name, joint in hinges.items() if int(model.jnt_bodyid[joint]) in carriers]
+        while way and (way[-1] in coupled or HAND.search(way[-1])):
+            way.pop()
+        if way not in ways:
+            ways.append(way)
+    longest = max(map(len, ways), default=0)
+    arms = [way for way in ways if len(way) == longest]
+    if longest and len(arms) > 1:
+        tips = ", ".join(model.body(int(model.jnt_bodyid[hinges[way[-1]]])).name for way in arms)
+        raise BadInput(
+            f"{label}: has {len(arms)} arms of {longest} joints: name the body that it ends in, --tip: {tips}"
+        )
+    return {name: hinges[name] for way in arms for name in way}
+
+
+def _body(model: Any, name: str, option: str) -> int:
+    import mujoco
+
+    body = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name))
+    if body < 0:
+        names = ", ".join(model.body(each).name for each in range(1, model.nbody))
+        raise BadInput(f"--{option} {name}: no such body in the model; there are {names}")
+    return body
 
 
 @dataclass(frozen=True)
@@ -28,7 +120,6 @@ class SimModel:
 
     @property
     def n(self) -> int:
-        """Number of joints."""
         return len(self.joints)
 
 
@@ -69,10 +160,10 @@ def load_model(
 
 def load_compiled(source: Any) -> Any:
     """The `mujoco.MjModel` of a path, or the one given. Raises BadInput."""
-    return compiled(Path(source)) if isinstance(source, str | Path) else source
+    return compile_model(Path(source)) if isinstance(source, str | Path) else source
 
 
-def compiled(path: Path) -> Any:
+def compile_model(path: Path) -> Any:
     """Compile an MJCF, URDF or arm file (by path or bundled name) to a `mujoco.MjModel`. Raises BadInput."""
     return compile_spec(read_spec(path), path)
 

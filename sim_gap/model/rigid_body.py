@@ -16,7 +16,7 @@ CREEP = 0.01
 INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-Motion = tuple[list[Array], list[tuple[Array, Array, Array]]]
+LinkMotion = tuple[list[Array], list[tuple[Array, Array, Array]]]
 """Rotation of each link to its parent (3, 3, K); angular velocity, angular acceleration and acceleration of its origin
 less gravity, in its own frame, (3, K) each."""
 Wrenches = tuple[list[Array], list[Array]]
@@ -76,7 +76,6 @@ class RigidArm:
 
     @property
     def n(self) -> int:
-        """Number of joints."""
         return len(self.names)
 
     @cached_property
@@ -99,7 +98,6 @@ class RigidArm:
         return float(np.linalg.norm(self.gravity) * moments.sum())
 
     def with_inertial(self, inertial: Array) -> "RigidArm":
-        """The arm with other inertial parameters (n, 10)."""
         return replace(self, inertial=inertial)
 
     def torque(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
@@ -111,8 +109,8 @@ class RigidArm:
         _, couples = self.wrenches(motion)
         return np.stack([axis @ couple for axis, couple in zip(self.axis, couples, strict=True)], axis=1)
 
-    def wrenches(self, motion: Motion) -> Wrenches:
-        """What each joint passes on to the links that it carries so that they move so."""
+    def wrenches(self, motion: LinkMotion) -> Wrenches:
+        """Forces and couples that the joints pass on to the links that they carry so that they move so."""
         turns, moves = motion
         forces, couples = [], []
         for j, (omega, alpha, push) in enumerate(moves):
@@ -122,9 +120,9 @@ class RigidArm:
         for j in reversed(range(self.n)):
             up = self.parent[j]
             if up >= 0:
-                force = out_of(turns[j], forces[j])
+                force = out_of_frame(turns[j], forces[j])
                 forces[up] = forces[up] + force
-                couples[up] = couples[up] + out_of(turns[j], couples[j]) - cross(force, self.offset[j])
+                couples[up] = couples[up] + out_of_frame(turns[j], couples[j]) - cross(force, self.offset[j])
         return forces, couples
 
     def regressor(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
@@ -132,11 +130,11 @@ class RigidArm:
         motion = self.motion(q, v, a, gravity)
         return np.moveaxis(np.stack([self._of_link(motion, j) for j in range(self.n)], axis=1), -1, 0)
 
-    def link_regressor(self, motion: Motion, link: int) -> Array:
+    def link_regressor(self, motion: LinkMotion, link: int) -> Array:
         """Columns of `torque` in the ten inertial parameters of one link, (K, n, 10); zero where it is not carried."""
         return np.moveaxis(self._of_link(motion, link), -1, 0)
 
-    def _of_link(self, motion: Motion, link: int) -> Array:
+    def _of_link(self, motion: LinkMotion, link: int) -> Array:
         """The same, (n, 10, K)."""
         turns, moves = motion
         rows = moves[link][0].shape[1]
@@ -152,7 +150,7 @@ class RigidArm:
             i = self.parent[i]
         return out
 
-    def motion(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Motion:
+    def motion(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> LinkMotion:
         """How the links move, from base to tip."""
         field = self.gravity if gravity is None else gravity
         still = np.zeros((3, len(q)))
@@ -165,7 +163,7 @@ class RigidArm:
             if self.parent[j] >= 0:
                 lever = self.offset[j]
                 push = push + cross(alpha, lever) + cross(omega, cross(omega, lever))
-            omega, alpha, push = into(turn, omega), into(turn, alpha), into(turn, push)
+            omega, alpha, push = into_frame(turn, omega), into_frame(turn, alpha), into_frame(turn, push)
             spin = self.axis[j][:, None] * v[:, j]
             alpha = alpha + self.axis[j][:, None] * a[:, j] + cross(omega, spin)
             turns.append(turn)
@@ -173,11 +171,10 @@ class RigidArm:
         return turns, moves
 
     def carried(self, q: Array, v: Array, a: Array) -> Array:
-        """What the links take of a motor: `torque` and that of the springs across the joints [N·m], (K, n)."""
+        """Torque that the links take of a motor: `torque` and that of the springs across the joints [N·m], (K, n)."""
         return self.torque(q, v, a) + self.spring_torque(q)
 
     def spring_torque(self, q: Array) -> Array:
-        """Torque of the springs across the joints [N·m], (…, n)."""
         return np.asarray(self.stiffness * (q - self.rest))
 
     def nominal_joint_torque(self, v: Array, a: Array, direction: Array) -> Array:
@@ -210,12 +207,12 @@ def cross(x: Array, y: Array) -> Array:
     return out
 
 
-def into(turn: Array, vector: Array) -> Array:
+def into_frame(turn: Array, vector: Array) -> Array:
     """Into the rotated frame: Rᵀ x for rotations (3, 3, K) and vectors (3, K)."""
     return np.asarray(np.einsum("jik,jk->ik", turn, vector))
 
 
-def out_of(turn: Array, vector: Array) -> Array:
+def out_of_frame(turn: Array, vector: Array) -> Array:
     """Out of the rotated frame: R x."""
     return np.asarray(np.einsum("ijk,jk->ik", turn, vector))
 
@@ -238,3 +235,76 @@ def inertial_of(mass: float, centre: Array, inertia: Array) -> Array:
     """Ten parameters about the origin from mass [kg], centre [m] and inertia about the centre [kg·m²] (3, 3)."""
     about = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     return np.concatenate([[mass], mass * centre, about[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]])
+
+
+Change = tuple[Array, Array, Array]
+"""Change of a link's angular velocity, angular acceleration and acceleration of its origin, in its frame, (3, K)."""
+
+
+def torque_slopes(
+    arm: RigidArm, motion: LinkMotion, wrenches: Wrenches, v: Array, joint: int
+) -> tuple[Array, Array, Array]:
+    """∂τ/∂q, ∂τ/∂v and ∂τ/∂a of one joint, at a motion with velocities v (K, n) and its wrenches, (K, n) each.
+
+    The Newton-Euler recursion, differentiated: a joint changes the motion of the links that it carries, and its
+    position the frame in which their forces are passed on.
+    """
+    omega, alpha, push = motion[1][joint]
+    none = np.zeros_like(omega)
+    axis = none + arm.axis[joint][:, None]
+    spin = axis * v[:, joint]
+    entering = omega - spin
+    turning = cross(entering, axis)
+    by_position = turning, cross(alpha - cross(entering, spin), axis) + cross(turning, spin), cross(push, axis)
+    force, couple = (cross(axis, parts[joint]) for parts in wrenches)
+
+    def slope(start: Change, turned: tuple[Array, Array] | None = None) -> Array:
+        return _passed_on(arm, motion, _below(arm, motion, v, joint, start), joint, turned)
+
+    return slope(by_position, (force, couple)), slope((axis, turning, none)), slope((none, axis, none))
+
+
+def _below(arm: RigidArm, motion: LinkMotion, v: Array, joint: int, start: Change) -> dict[int, Change]:
+    """Changes of all links that a joint carries, from that of its own."""
+    turns, moves = motion
+    changes = {joint: start}
+    for link in range(joint + 1, arm.n):
+        up = arm.parent[link]
+        if up not in changes:
+            continue
+        (omega, alpha, push), above, lever = changes[up], moves[up][0], arm.offset[link]
+        push = push + cross(alpha, lever) + cross(omega, cross(above, lever)) + cross(above, cross(omega, lever))
+        omega, alpha, push = (into_frame(turns[link], x) for x in (omega, alpha, push))
+        changes[link] = omega, alpha + cross(omega, arm.axis[link][:, None] * v[:, link]), push
+    return changes
+
+
+def _passed_on(
+    arm: RigidArm, motion: LinkMotion, changes: dict[int, Change], joint: int, turned: tuple[Array, Array] | None
+) -> Array:
+    """Change of every joint's torque with those of the links' motion, (K, n); `turned` is what force and couple of the
+    joint change by as its link turns, for those before it."""
+    turns, moves = motion
+    rows = changes[joint][0].shape[1]
+    out, passed = np.zeros((rows, arm.n)), np.zeros((arm.n, 2, 3, rows))
+    for link, (omega, alpha, push) in changes.items():
+        mass, moment, inertia = arm.inertial[link, 0], arm.inertial[link, 1:4], symmetric(arm.inertial[link, 4:])
+        now = moves[link][0]
+        bent = cross(omega, cross(now, moment)) + cross(now, cross(omega, moment))
+        passed[link, 0] = mass * push + cross(alpha, moment) + bent
+        gyro = cross(omega, inertia @ now) + cross(now, inertia @ omega)
+        passed[link, 1] = inertia @ alpha + gyro - cross(push, moment)
+    for link in reversed(range(arm.n)):
+        if link not in changes and not arm.carries[link, joint]:
+            continue
+        force, couple = passed[link]
+        out[:, link] = arm.axis[link] @ couple
+        up = arm.parent[link]
+        if up < 0:
+            continue
+        if link == joint and turned is not None:
+            force, couple = force + turned[0], couple + turned[1]
+        force = out_of_frame(turns[link], force)
+        passed[up, 0] += force
+        passed[up, 1] += out_of_frame(turns[link], couple) - cross(force, arm.offset[link])
+    return out

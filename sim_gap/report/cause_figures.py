@@ -1,4 +1,4 @@
-"""A figure per cause: the residual that it has to explain and its own share, over the quantity it correlates with."""
+"""A figure per cause and per law outside the library: what it has to explain, and its own share, over one quantity."""
 
 from typing import Any
 
@@ -6,12 +6,14 @@ import numpy as np
 import plotly.graph_objects as go
 
 from gcomp.arrays import Array
+from sim_gap.attribution.causes import remainder
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
+from sim_gap.attribution.residual_laws import ResidualLaw
 from sim_gap.report.effect_text import CHANNEL_WORDS
-from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, stacked, thinned
+from sim_gap.report.figures import BELOW_TITLE, GREY, ORANGE, drawn_samples, stack
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 AGAINST = {
@@ -49,7 +51,7 @@ def cause_figure(answer: Diagnosis, cause: Cause) -> Any:
         return None
     row = max(sizes, key=lambda each: sizes[each])
     quantity = AGAINST.get(cause.effect, AGAINST.get(cause.effect.split(".")[0], "time"))
-    chosen = thinned(data.valid[row])
+    chosen = drawn_samples(data.valid[row])
     x = abscissa(data, row[1], quantity)[chosen]
     left = (data.values[row] - all_of_them[row] + own[row])[chosen]
     figure = go.Figure()
@@ -75,14 +77,39 @@ def abscissa(data: ResidualSet, joint: int, quantity: str) -> Array:
     if quantity == "time":
         return data.time
     names = {"velocity": "v", "position": "q", "load": "model", "acceleration": "a"}
-    return stacked(data, names[quantity])[:, joint]
+    return stack(data, names[quantity])[:, joint]
 
 
 def is_of(term: Term, cause: Cause, names: tuple[str, ...]) -> bool:
-    """Whether a term is a part of a cause at joints of these names."""
     return term.effect == cause.effect and ("arm" in cause.parameters or names[term.place] in cause.joints)
 
 
-def _sums(data: ResidualSet, estimate: Estimate, terms: tuple[Term, ...]) -> dict[Row, Array]:
+def _sums(data: ResidualSet, estimate: EffectEstimate, terms: tuple[Term, ...]) -> dict[Row, Array]:
     out: dict[Row, Array] = estimate.predict(data, terms=terms)
     return {row: np.asarray(values) for row, values in out.items()}
+
+
+def law_figure(answer: Diagnosis, law: ResidualLaw) -> Any:
+    """Residual that the effects leave of the law's row on held-out data, over its quantity; the law with its band."""
+    data, estimate = answer.internals.heldout, answer.internals.estimate
+    row, joint = (law.channel, law.joint), answer.names[law.joint]
+    left = (data.values if estimate is None else remainder(data, estimate.predict(data)))[row]
+    if law.directed:
+        left = left * np.sign(stack(data, "direction")[:, law.joint])
+    figure = go.Figure()
+    if law.quantity != "temperature":
+        chosen = drawn_samples(data.valid[row])
+        x = abscissa(data, law.joint, law.quantity)[chosen]
+        x = np.abs(x) if law.directed and law.quantity in ("velocity", "load") else x
+        marker = {"color": GREY, "size": 5, "opacity": 0.75}
+        figure.add_scatter(x=x.round(4), y=left[chosen].round(4), mode="markers", marker=marker, name="what is left")
+    ends = np.concatenate([law.at, law.at[::-1]])
+    band = np.concatenate([law.torque + law.band, (law.torque - law.band)[::-1]])
+    figure.add_scatter(x=ends, y=band, fill="toself", line={"width": 0}, opacity=0.3, fillcolor=ORANGE, name="band")
+    figure.add_scatter(x=law.at, y=law.torque, mode="lines", line={"color": ORANGE}, name=f"law of {law.quantity}")
+    figure.update_xaxes(title=f"{LABELS.get(law.quantity, 'temperature [°C]')} of {joint}")
+    figure.update_yaxes(
+        title=f"{CHANNEL_WORDS[law.channel]} of {joint} [N·m]" + (", against the motion" if law.directed else "")
+    )
+    figure.update_layout(title=f"Law of {law.quantity} of {joint}", height=340, legend=BELOW_TITLE)
+    return figure

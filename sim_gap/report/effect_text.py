@@ -1,27 +1,22 @@
-"""The verdict of a diagnosis in a sentence."""
+"""The verdict of a diagnosis in a sentence, and its parameters in rows."""
 
-from sim_gap.attribution.diagnosis import HINT, Diagnosis
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis
 
-WORDS = {
-    "explained": "explained",
-    "ambiguous": "ambiguous",
-    "unexplained": "not explained",
-    "no_gap": "no gap",
-}
+WORDS = {"explained": "explained", "ambiguous": "ambiguous", "unexplained": "not explained", "no_gap": "no gap"}
 """Verdicts as a heading."""
 CHANNEL_WORDS = {"tau": "torque sensor", "tau_motor": "motor torque", "tau_cmd": "commanded torque"}
 """Torque channels of a recording, for people."""
 
 
 def advice(answer: Diagnosis) -> str:
-    """What a person does about it, in a sentence."""
+    """Advice to a person, in a sentence."""
     if answer.verdict == "no_gap":
         return "Nothing needs to be changed: the simulator agrees with the arm within the noise of the recordings."
     if answer.verdict == "unexplained":
         return "Change nothing yet: look at where the gap is, check cabling, payload and model there, and record again."
     if answer.verdict == "ambiguous":
-        return "Record one more motion, which tells the candidates apart; gap plan makes it of the answer in JSON."
-    return "Add these effects to the simulator; the diagnosis writes the corrected model if it is given --out-model."
+        return "Record one more motion that separates the candidates; gap plan makes it of the answer in JSON."
+    return "Add these effects to the simulation: with --out-model the diagnosis writes the corrected model."
 
 
 def sentence(answer: Diagnosis) -> str:
@@ -31,7 +26,7 @@ def sentence(answer: Diagnosis) -> str:
     if answer.verdict == "unexplained" and answer.unexplained < 0.01 and answer.notes:
         return f"Gap not explained: {answer.notes[0]}"
     if answer.verdict == "unexplained":
-        return f"Gap not explained: {answer.unexplained:.0%} of it remains that no effect of the library explains"
+        return f"Gap not explained: no effect of the library accounts for {answer.unexplained:.0%} of it"
     first = answer.causes[0]
     if answer.verdict == "ambiguous" and not first.confounded_with:
         hints = ", ".join(cause.effect for cause in answer.causes if cause.confidence < HINT)
@@ -41,3 +36,12 @@ def sentence(answer: Diagnosis) -> str:
         return f"Cause ambiguous: {first.effect} fits, and so does {rivals}; to separate them, {first.separate_by}"
     share = f"{1.0 - answer.unexplained:.0%}"
     return f"Gap explained: {share} of it on held-out data, most of it by {first.effect}"
+
+
+def parameter_rows(cause: Cause) -> list[list[str]]:
+    """Rows of a table of what was fitted: effect, joint, parameter, value, interval, unit."""
+    return [
+        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
+        for joint, values in cause.parameters.items()
+        for name, v in values.items()
+    ]

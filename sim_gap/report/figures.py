@@ -12,7 +12,6 @@ from sim_gap.attribution.diagnosis import Diagnosis, Rollout
 from sim_gap.residuals.residual_set import ResidualSet
 
 GREY, ORANGE, BLUE, LIGHT = "#9aa7b3", "#d9622b", "#1f5fa8", "#cfd8e0"
-POINTS = 600
 BELOW_TITLE = {"orientation": "h", "y": 1.02, "x": 1, "xanchor": "right", "yanchor": "bottom"}
 """Place of a figure's legend."""
 
@@ -31,12 +30,7 @@ def gap_bars(answer: Diagnosis) -> Any:
     top = float(np.nanmax(answer.heldout_before)) * 2.0
     low = float(max(np.nanmin(np.concatenate([answer.noise_floor, answer.heldout_after])) / 3.0, top * 1e-6))
     figure.update_yaxes(type="log", title="RMS [N·m]", range=[np.log10(low), np.log10(top)], dtick=1)
-    figure.update_layout(
-        title="Torque gap on held-out data",
-        barmode="group",
-        height=380,
-        legend=BELOW_TITLE,
-    )
+    figure.update_layout(title="Torque gap on held-out data", barmode="group", height=380, legend=BELOW_TITLE)
     return figure
 
 
@@ -80,9 +74,9 @@ def residual_panels(answer: Diagnosis, channel: str) -> Any:
         horizontal_spacing=0.04,
         shared_yaxes=True,
     )
-    sides = [stacked(data, name) for _, name in columns]
+    sides = [stack(data, name) for _, name in columns]
     for line, j in enumerate(joints, start=1):
-        chosen = thinned(data.valid[channel, j])
+        chosen = drawn_samples(data.valid[channel, j])
         left, fit = data.values[channel, j][chosen], None if explained is None else explained[channel, j][chosen]
         for column, x in enumerate((*(side[:, j] for side in sides), data.time), start=1):
             _panel(figure, line, column, x[chosen], left, fit)
@@ -94,15 +88,15 @@ def residual_panels(answer: Diagnosis, channel: str) -> Any:
     return figure
 
 
-def stacked(data: ResidualSet, name: str) -> Array:
+def stack(data: ResidualSet, name: str) -> Array:
     """A quantity of the signals (`v`, `q`, `a`, `model`) at the rate of the comparison, concatenated, (K, n)."""
     return np.concatenate([s.filtered(getattr(s, name)) for s in data.signals])
 
 
-def thinned(valid: Mask) -> NDArray[np.intp]:
+def drawn_samples(valid: Mask) -> NDArray[np.intp]:
     """Indices of the samples that are drawn: some hundreds of the valid ones."""
     rows = np.flatnonzero(valid)
-    return rows[:: max(1, len(rows) // POINTS)]
+    return rows[:: max(1, len(rows) // 600)]
 
 
 def _panel(figure: Any, row: int, column: int, x: Array, residual: Array, explained: Array | None) -> None:

@@ -4,14 +4,14 @@ from pathlib import Path
 from typing import Any
 
 from armlink.effect_catalogue import CATALOGUE
-from calib.report.page import ReportTable, Section, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.page import ReportSection as Section
+from calib.report.page import ReportTable, html_of, paragraph, paragraphs, render, verdict_line
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
-from sim_gap.report.cause_figures import cause_figure
-from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, sentence
+from sim_gap.report.cause_figures import cause_figure, law_figure
+from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, parameter_rows, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
-from sim_gap.report.law_figure import law_figure
-from sim_gap.report.over_time import torque_over_time
 from sim_gap.report.position_page import position_sections
+from sim_gap.report.time_figures import torque_over_time
 
 
 def sections(answer: Diagnosis) -> list[Section]:
@@ -25,7 +25,6 @@ def sections(answer: Diagnosis) -> list[Section]:
 
 
 def write_report(answer: Diagnosis, path: Path, title: str = "Sim-to-real gap", subtitle: str = "") -> None:
-    """Write one self-contained HTML file."""
     render(path, title, sections(answer), subtitle)
 
 
@@ -44,7 +43,7 @@ def _verdict(answer: Diagnosis) -> Section:
         tables.append(
             ReportTable(
                 ("effect", "joint", "parameter", "value", "95 % interval", "unit"),
-                [row for cause in answer.causes for row in _parameter_rows(cause)],
+                [row for cause in answer.causes for row in parameter_rows(cause)],
                 "Fitted parameters.",
                 texts=3,
             )
@@ -64,14 +63,6 @@ def _cause_row(cause: Cause) -> list[str]:
         f"{cause.gap_after:.3g}",
         f"{cause.shrink:.0%}",
         f"{cause.confidence:.2f}",
-    ]
-
-
-def _parameter_rows(cause: Cause) -> list[list[str]]:
-    return [
-        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
-        for joint, values in cause.parameters.items()
-        for name, v in values.items()
     ]
 
 
@@ -115,7 +106,6 @@ def _over_time(answer: Diagnosis) -> list[Section]:
 
 
 def _causes(answer: Diagnosis) -> list[Section]:
-    """A figure for every cause."""
     figures = [cause_figure(answer, cause) for cause in answer.causes]
     shown = [figure for figure in figures if figure is not None]
     if not shown:
@@ -128,7 +118,6 @@ def _causes(answer: Diagnosis) -> list[Section]:
 
 
 def _laws(answer: Diagnosis) -> list[Section]:
-    """A figure for every law outside the library."""
     if not answer.laws:
         return []
     text = (

@@ -3,15 +3,16 @@
 from collections.abc import Sequence
 from typing import Any
 
-from calib.report.page import ReportTable, Section, html_of, paragraph, paragraphs, verdict_line
+from calib.report.page import ReportSection as Section
+from calib.report.page import ReportTable, html_of, paragraph, paragraphs, verdict_line
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
-from sim_gap.closed_loop.identify import Identified
-from sim_gap.closed_loop.training.export import WRITTEN
-from sim_gap.closed_loop.training.replay import Simulated, commanded, less, replay, simulated
-from sim_gap.report.effect_text import WORDS, advice, sentence
+from sim_gap.position_gap.identify import Identified
+from sim_gap.position_gap.training.export import WRITTEN
+from sim_gap.position_gap.training.replay import Simulated, commanded_rows, replay, simulated_model, without_groups
+from sim_gap.report.effect_text import WORDS, advice, parameter_rows, sentence
 from sim_gap.report.figures import BLUE, GREY, ORANGE
-from sim_gap.report.over_time import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, without
+from sim_gap.report.time_figures import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, lines_without_each
 
 
 def position_sections(answer: Diagnosis) -> list[Section]:
@@ -22,7 +23,7 @@ def position_sections(answer: Diagnosis) -> list[Section]:
     html += paragraphs(answer.notes)
     header = ("effect", "joints", "RMS before [rad]", "after [rad]", "confidence", "or")
     causes = ReportTable(header, [_cause_row(cause) for cause in answer.causes], "Causes, on held-out data.", texts=2)
-    rows = [row for cause in (*answer.causes, *answer.minor) for row in _parameter_rows(cause)]
+    rows = [row for cause in (*answer.causes, *answer.minor) for row in parameter_rows(cause)]
     parameters = ReportTable(
         ("effect", "joint", "parameter", "value", "95 % interval", "unit"), rows, "Fitted parameters.", texts=3
     )
@@ -55,13 +56,13 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
         return replay(arm.with_gain(gain), recording, SHOWN_S)
 
     made = found.beside or found.export
-    t, after, measured = moved(simulated(found.sim, made))
+    t, after, measured = moved(simulated_model(found.sim, made))
     if not len(t):
         return None
     command = recording.position_command
     assert command is not None
     lines: list[Line] = [
-        ("command", command[commanded(recording, SHOWN_S)], GREY, True),
+        ("command", command[commanded_rows(recording, SHOWN_S)], GREY, True),
         ("measured", measured, "black", True),
     ]
     if found.nominal_has_controller:
@@ -69,7 +70,9 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
     lines.append(("corrected model", after, BLUE, True))
     left_out = list(dict.fromkeys(cause.effect for cause in causes if cause.effect in WRITTEN))[:MOST_LEFT_OUT]
     groups = [[stage.group for stage in found.stages if stage.group[0].partition("@")[0] == e] for e in left_out]
-    lines += without(left_out, [moved(less(found.sim, found.search, made, own))[1] for own in groups])
+    lines += lines_without_each(
+        left_out, [moved(without_groups(found.sim, found.search, made, own))[1] for own in groups]
+    )
     return lines_over_time(t - t[0], names, lines, "rad")
 
 
@@ -81,12 +84,4 @@ def _cause_row(cause: Cause) -> list[str]:
         f"{cause.gap_after:.3g}",
         f"{cause.confidence:.2f}",
         ", ".join(cause.confounded_with),
-    ]
-
-
-def _parameter_rows(cause: Cause) -> list[list[str]]:
-    return [
-        [cause.effect, joint, name, f"{v.value:.4g}", f"{v.low:.4g} … {v.high:.4g}", v.unit]
-        for joint, values in cause.parameters.items()
-        for name, v in values.items()
     ]

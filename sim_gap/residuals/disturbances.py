@@ -35,7 +35,7 @@ class Disturbance:
     torque: float
 
 
-def far_off(left: Array, valid: Mask, noise: float, margin: float) -> Mask:
+def are_far_off(left: Array, valid: Mask, noise: float, margin: float) -> Mask:
     """Samples of one row at which what remains (K,) is far from usual and more than noise and margin [N·m], (K,)."""
     if not valid.any():
         return np.zeros(len(left), bool)
@@ -65,7 +65,7 @@ def disturbances(time: Array, far: Mask, judged: Mask, left: Array) -> tuple[Dis
     return tuple(one for one in out if one.end - one.start <= LONGEST_S)
 
 
-def calm(time: Array, found: tuple[Disturbance, ...]) -> Array:
+def calm_weight(time: Array, found: tuple[Disturbance, ...]) -> Array:
     """1 away from disturbances, 0 in them and around, (K,)."""
     out = np.ones(len(time))
     for one in found:

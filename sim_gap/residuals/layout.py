@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.preprocess import PreparedSignals
 
 Row = tuple[str, int]
 """A channel and the index of a joint: one residual over time."""
@@ -18,7 +18,7 @@ QUIETER = 0.5
 
 
 @dataclass(frozen=True)
-class Layout:
+class ChannelLayout:
     """The channels of a data set and the reference of each row.
 
     The sensor row of a joint is `tau` − model. With a sensor, the motor row is `tau_motor` − `tau`, in which errors of
@@ -62,7 +62,6 @@ class Layout:
 
     @property
     def chain(self) -> tuple[str, ...]:
-        """Channels between the command and the model."""
         return tuple(channel for channel in (self.motor, self.sensor) if channel)
 
     def beyond(self, joint: int) -> int:
@@ -93,7 +92,7 @@ class Layout:
         return out | ({(self.motor, joint): -column} if self.motor else {})
 
 
-def layout_of(signals: list[Signals]) -> Layout:
+def layout_of(signals: list[PreparedSignals]) -> ChannelLayout:
     """The channels that all recordings have, and the best reference of each joint's command."""
     common = set.intersection(*(set(s.channels) for s in signals))
     sensor = "tau" if "tau" in common else None
@@ -101,7 +100,7 @@ def layout_of(signals: list[Signals]) -> Layout:
     command = "tau_cmd" if {"tau_motor", "tau_cmd"} <= common else None
     n = signals[0].n
     if command is None:
-        return Layout(n, sensor, motor)
+        return ChannelLayout(n, sensor, motor)
     torque = np.sqrt(np.mean([np.mean(s.model**2, axis=0) for s in signals], axis=0))
     doubts = [_noise(signals, "tau_motor"), DOUBTED * torque]
     if sensor:
@@ -109,10 +108,10 @@ def layout_of(signals: list[Signals]) -> Layout:
     doubt = np.array(doubts)
     best = np.argmin(doubt, axis=0)
     clear = doubt[best, np.arange(n)] < QUIETER * doubt[0]
-    return Layout(n, sensor, motor, command, tuple(np.where(clear, best, 0).tolist()))
+    return ChannelLayout(n, sensor, motor, command, tuple(np.where(clear, best, 0).tolist()))
 
 
-def _noise(signals: list[Signals], channel: str) -> Array:
+def _noise(signals: list[PreparedSignals], channel: str) -> Array:
     """Noise of a channel that the command does not share, (n,): bounded by what their difference shows."""
     levels = [
         np.minimum(s.noise[channel], s.upper_half(s.filtered(s.reading["tau_cmd"] - s.reading[channel])))

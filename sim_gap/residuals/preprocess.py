@@ -16,13 +16,18 @@ from scipy.signal import butter, sosfiltfilt, sosfreqz
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.model.rigid_body import CREEP, Motion, RigidArm, Wrenches
-from sim_gap.model.torque_slopes import torque_slopes
-from sim_gap.residuals.channel_noise import band_noise
+from sim_gap.model.rigid_body import CREEP, LinkMotion, RigidArm, Wrenches, torque_slopes
+from sim_gap.residuals.channel_quality import (
+    Spikes,
+    Stuck,
+    are_near_spikes,
+    band_noise,
+    count_spikes,
+    spikes_of,
+    stuck_intervals,
+)
 from sim_gap.residuals.disturbances import Disturbance
-from sim_gap.residuals.resampling import SLOW_HZ, bridged, coverage, low_pass, thinner
-from sim_gap.residuals.spikes import Spikes, around_spikes, counted, spikes_of
-from sim_gap.residuals.stuck_channels import Stuck, stuck_intervals
+from sim_gap.residuals.resampling import SLOW_HZ, coverage, decimation, interpolate_even, low_pass
 
 SLIDES, MOST_CREEP = 1.5, 0.2
 """Speed from which a joint of a simulation slides, over that up to which it creeps; the most that it is [rad/s]."""
@@ -34,22 +39,18 @@ CALM_HZ = 8.0
 """Pass band of the model torque before a play or a clip is evaluated [Hz]."""
 WORK_HZ = 125.0
 """Highest rate at which columns are computed [Hz]; faster recordings are low-passed and decimated to it."""
-PAD_S = 1.0
-"""Length of the reflection at either end of a signal that is filtered [s]."""
 TRIM_S = 0.3
 """Length cut off at both ends after filtering [s]."""
 COLUMNS = 8
 """Number of columns that are filtered at a time."""
 SHORTEST_S = 3.0
-MOST_FILLED = 100.0
-"""Most even samples for each recorded row."""
 ABSENT = -1
 """Number of a recording without the body that training recordings have."""
 CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
 
 
 @dataclass(frozen=True, eq=False)
-class Signals:
+class PreparedSignals:
     """One recording at an even work rate, with the nominal model's torque along its motion."""
 
     label: str
@@ -85,16 +86,14 @@ class Signals:
     disturbances: tuple[Disturbance, ...] = ()
     """Moments at which something touched the arm, or torques were misread; there they are not `known`."""
     found: "Found | None" = None
-    """What an estimate has found, if q, v, a and arm are those of the estimate."""
+    """The estimate's torques, if q, v, a and arm are those of the estimate."""
 
     @property
     def n(self) -> int:
-        """Number of joints."""
         return int(self.q.shape[1])
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Torque channels present."""
         return tuple(self.reading)
 
     @cached_property
@@ -129,7 +128,7 @@ class Signals:
         return self.model if self.found is None else self.model + self.found.bent
 
     @property
-    def read(self) -> "Signals":
+    def read(self) -> "PreparedSignals":
         """The signals as they were read: positions without the corrections of an estimate."""
         return self if self.found is None else self.found.read
 
@@ -147,7 +146,7 @@ class Signals:
         return self.arm.link_regressor(self._motion, link)
 
     @cached_property
-    def _motion(self) -> Motion:
+    def _motion(self) -> LinkMotion:
         return self.arm.motion(self.q, self.v, self.a)
 
     @cached_property
@@ -190,7 +189,7 @@ class Signals:
 
         As a product of spectra, of the signal extended by its reflection in its ends.
         """
-        trim, pad = max(1, round(TRIM_S * self.rate)), min(round(PAD_S * self.rate), len(x) - 1)
+        trim, pad = max(1, round(TRIM_S * self.rate)), min(round(1.0 * self.rate), len(x) - 1)
         size = next_fast_len(len(x) + 2 * pad, real=True)
         columns = np.reshape(x, (len(x), -1)).T
         out = np.empty((len(columns), len(range(trim, len(x) - trim, self.step))))
@@ -238,16 +237,16 @@ class Signals:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What an estimate adds to the torques along a recording."""
+    """Torques that an estimate adds along a recording."""
 
-    read: Signals
+    read: PreparedSignals
     """The signals before the estimate."""
     link: Array
     """Torque of the links and of springs across the joints [N·m], (K, n)."""
     lost: Array
     """Torque between link and motor beside the nominal model's: friction, rotors, ripple [N·m], (K, n)."""
     bent: Array
-    """What the sensor adds by hysteresis, crosstalk and the like, before gain and offset [N·m], (K, n)."""
+    """Torque that the sensor adds by hysteresis, crosstalk and the like, before gain and offset [N·m], (K, n)."""
     springs: Array | float = 0.0
     """Share of `link` that springs across the joints have [N·m], (K, n)."""
 
@@ -269,7 +268,7 @@ def prepare(
     number: int = 0,
     groups: tuple[str, ...] = (),
     start: float | None = None,
-) -> Signals:
+) -> PreparedSignals:
     """Prepare a recording for the comparison with `arm`. Raises BadInput if it cannot be used, with the reason.
 
     `start` is the time at which the recording that this is a part of began [s]; times count from there.
@@ -278,7 +277,7 @@ def prepare(
         raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
     raw_step = float(np.median(np.diff(recording.t)))
     span = float(recording.t[-1] - recording.t[0])
-    if span > MOST_FILLED * raw_step * recording.t.size:
+    if span > 100.0 * raw_step * recording.t.size:  # even samples for a row
         raise BadInput(
             f"{label}: {recording.t.size} rows over {span:.3g} s, mostly {raw_step:.2g} s apart: stamped together? "
             "Record the times of sampling"
@@ -289,14 +288,14 @@ def prepare(
     band = min(BAND_HZ, rate / 5.0)
     if band < 0.5:
         raise BadInput(f"{label}: {rate:.3g} rows a second are too few: record at 10 Hz or more")
-    thin = thinner(1.0 / raw_step, stride)
-    q = thin(bridged(recording.t, recording.position, even, label, "q"))
+    thin = decimation(1.0 / raw_step, stride)
+    q = thin(interpolate_even(recording.t, recording.position, even, label, "q"))
     smooth = low_pass(min(SMOOTH_HZ, 0.4 * rate), rate)
     times = even[::stride]
     spline = make_interp_spline(times, smooth(q), k=5)
     q, v, a = (np.asarray(spline(times, order)) for order in range(3))
     if rate < SLOW_HZ and recording.velocity is not None and np.isfinite(recording.velocity).all():
-        v = smooth(thin(bridged(recording.t, recording.velocity, even, label, "dq")))
+        v = smooth(thin(interpolate_even(recording.t, recording.velocity, even, label, "dq")))
         a = np.asarray(make_interp_spline(times, v, k=5)(times, 1))
     reading, known, noise = {}, {}, {}
     channels = {channel: getattr(recording, name) for channel, name in CHANNELS.items()}
@@ -305,17 +304,19 @@ def prepare(
         values = np.where(spiked, np.nan, channels[channel])
         if not np.isfinite(values).any():
             continue
-        reading[channel] = thin(bridged(recording.t, values, even, label, channel))
+        reading[channel] = thin(interpolate_even(recording.t, values, even, label, channel))
         known[channel] = coverage(recording.t, values, even)[::stride]
         noise[channel] = np.array([band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
         raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
-    near = around_spikes(recording.t, list(spikes.values()), times)
+    near = are_near_spikes(recording.t, list(spikes.values()), times)
     known = {channel: there * ~near for channel, there in known.items()}
     clock = times - (times[0] if start is None else start)
     temperature = _warmth(recording, times)
-    signals = Signals(label, rate, band, clock, q, v, a, reading, known, noise, arm, temperature, number, groups)
-    return _without_stuck(replace(signals, spikes=counted(spikes, channels)), recording)
+    signals = PreparedSignals(
+        label, rate, band, clock, q, v, a, reading, known, noise, arm, temperature, number, groups
+    )
+    return _without_stuck(replace(signals, spikes=count_spikes(spikes, channels)), recording)
 
 
 def _warmth(recording: Recording, times: Array) -> Array | None:
@@ -328,7 +329,7 @@ def _warmth(recording: Recording, times: Array) -> Array | None:
     return np.stack(parts, axis=1)
 
 
-def _without_stuck(s: Signals, recording: Recording) -> Signals:
+def _without_stuck(s: PreparedSignals, recording: Recording) -> PreparedSignals:
     """The signals with stuck readings marked as not known."""
     known, found = dict(s.known), []
     for channel in s.channels:

@@ -12,11 +12,9 @@ from gcomp.arrays import Array
 SLOW_HZ = 60.0
 """Below this rate [Hz] the recorded velocity is used; above, the position is differentiated, for drives report velocity
 late."""
-SPLINED = 3.5
-"""Largest ratio of a step between readings to the median step for interpolation by splines."""
 
 
-def bridged(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
+def interpolate_even(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
     """Values on the even time base, by cubic splines for a channel that is slow and even, else linear.
 
     Raises BadInput if a whole column is missing.
@@ -31,7 +29,7 @@ def bridged(t: Array, values: Array, even: Array, label: str, column: str) -> Ar
             )
         own = t[there]
         steps, usual = np.diff(own), float(np.median(np.diff(own)))
-        even_enough = steps.max() < SPLINED * usual and steps.min() > usual / SPLINED and usual > 1.0 / SLOW_HZ
+        even_enough = steps.max() < 3.5 * usual and steps.min() > usual / 3.5 and usual > 1.0 / SLOW_HZ
         curve = CubicSpline(own, values[there, j]) if even_enough else None
         inside = np.clip(even, own[0], own[-1])
         out[:, j] = np.interp(inside, own, values[there, j]) if curve is None else curve(inside)
@@ -49,7 +47,7 @@ def coverage(t: Array, values: Array, even: Array) -> Array:
     return out
 
 
-def thinner(rate: float, stride: int) -> Callable[[Array], Array]:
+def decimation(rate: float, stride: int) -> Callable[[Array], Array]:
     """Decimation by `stride` of a signal at `rate` [Hz], after a low pass."""
     if stride == 1:
         return lambda x: x

@@ -1,4 +1,8 @@
-"""Residuals of a set of recordings: one row per channel and joint, with its noise floor, valid samples and folds."""
+"""Residuals of a set of recordings: one row per channel and joint, with its noise floor, valid samples and folds.
+
+When a gear with play changes sides, the residual jumps as no smooth effect does, in several joints. No inverse form
+follows such an impact: its samples are left out of the comparison, and the impacts are reported.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +13,35 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
 from gcomp.arrays import Array, Mask
-from sim_gap.residuals.gear_impacts import near_impacts
-from sim_gap.residuals.layout import Layout, Row, layout_of
-from sim_gap.residuals.preprocess import Signals
+from sim_gap.residuals.layout import ChannelLayout, Row, layout_of
+from sim_gap.residuals.preprocess import PreparedSignals
+
+BEFORE_S, AFTER_S = 0.4, 0.6
+"""Time left out before and after a change of sign of the torque [s]."""
+SHARP = 25.0
+"""Least ratio of the residual's second difference (RMS) near these changes to that elsewhere."""
+LEAST_LEFT = 0.2
+"""Share of a recording that must remain."""
+
+
+def near_impacts(s: PreparedSignals, channel: str, residual: Array) -> dict[int, Mask]:
+    """Joints whose gear hits at their torque reversals, and the samples near those, (k,) each.
+
+    `residual` is that of the link-side sensor `channel`, (k, n), at the rate of the comparison.
+    """
+    torque = s.filtered(s.reading[channel])
+    before, after = (round(seconds * s.rate / s.step) for seconds in (BEFORE_S, AFTER_S))
+    out = {}
+    for joint in range(s.n):
+        near = np.zeros(len(torque), bool)
+        for k in np.flatnonzero(np.diff(np.sign(torque[:, joint])) != 0).tolist():
+            near[max(0, k - before) : k + after + 1] = True
+        bend = np.zeros(len(torque))
+        bend[1:-1] = np.diff(residual[:, joint], 2) ** 2
+        if near.any() and (~near).mean() > LEAST_LEFT and bend[near].mean() > SHARP**2 * bend[~near].mean():
+            out[joint] = near
+    return out
+
 
 MODEL_FLOOR = 1e-3
 """Numerical and geometrical error granted to every model, as a share of its torque."""
@@ -28,7 +58,6 @@ RELEVANT, RELEVANT_INNER, RELEVANT_COMMAND = 0.016, 0.007, 0.001
 against motor."""
 QUIET = 0.5
 """Share of the relevant gap below which there is nothing to search for."""
-FOLDS = 6
 MOVING_SHARE = 0.95
 """A sample of the motor row counts if the joint moves during this share of the filter's window."""
 SETTLE_S, SETTLED_LEAST = 0.08, 0.4
@@ -41,12 +70,11 @@ BLOCK_S = 2.0
 class ResidualSet:
     """Recordings with a common layout. Arrays are at the decimated rate, recordings concatenated."""
 
-    signals: tuple[Signals, ...]
-    layout: Layout
+    signals: tuple[PreparedSignals, ...]
+    layout: ChannelLayout
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Channel and joint of each residual."""
         return self.layout.rows
 
     @cached_property
@@ -66,10 +94,9 @@ class ResidualSet:
 
     @cached_property
     def _stacked(self) -> list[dict[Row, Array]]:
-        """`values` of each recording."""
         return [self._differences(s) for s in self.signals]
 
-    def _differences(self, s: Signals) -> dict[Row, Array]:
+    def _differences(self, s: PreparedSignals) -> dict[Row, Array]:
         layout = self.layout
         out: dict[Row, Array] = {}
         joints = s.arm.nominal_joint_torque(s.v, s.a, s.direction)
@@ -155,7 +182,7 @@ class ResidualSet:
         build = max(float(self.usual_torque.max()), self.signals[0].arm.stretched_torque)
         return torque * min(1.0, build / SMALL_ARM_NM)
 
-    def _floor(self, s: Signals, row: Row, rest: Array) -> float:
+    def _floor(self, s: PreparedSignals, row: Row, rest: Array) -> float:
         channel, joint = row
         reference = self.layout.reference(row)
         noise = float(np.linalg.norm([s.noise[name][joint] for name in (channel, reference) if name]))
@@ -171,7 +198,7 @@ class ResidualSet:
         """
         total, out, first = sum(self.lengths), [], 0
         for length in self.lengths:
-            count = max(min(2, len(self.lengths)), round(FOLDS * length / total))
+            count = max(min(2, len(self.lengths)), round(6 * length / total))
             out.append(first + np.minimum(np.arange(length) * count // length, count - 1))
             first += count
         return np.concatenate(out)
@@ -211,13 +238,15 @@ class ResidualSet:
         return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), least) for row in self.rows}
 
 
-def residual_sets(train: Sequence[Signals], heldout: Sequence[Signals]) -> tuple[ResidualSet, ResidualSet]:
+def residual_sets(
+    train: Sequence[PreparedSignals], heldout: Sequence[PreparedSignals]
+) -> tuple[ResidualSet, ResidualSet]:
     """Residuals of the training and of the held-out recordings, in a common layout."""
     layout = layout_of([*train, *heldout])
     return ResidualSet(tuple(train), layout), ResidualSet(tuple(heldout), layout)
 
 
-def sliding(s: Signals) -> Mask:
+def sliding(s: PreparedSignals) -> Mask:
     """Samples at which each joint slides before and after, so that its friction is fully developed, (k, n).
 
     Around rest and reversals friction builds up over some distance. If a joint hardly does anything else, these samples

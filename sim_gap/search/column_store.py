@@ -8,7 +8,7 @@ import numpy as np
 from gcomp.arrays import Array, Mask
 from sim_gap.residuals.layout import Columns, Row
 from sim_gap.residuals.residual_set import ResidualSet
-from sim_gap.search.about import About, Values, about
+from sim_gap.search.estimate_signals import EstimateSignals, Values, signals_about
 from sim_gap.search.term import Term
 
 UNCHANGED, LINEAR = 1e-12, 1e-9
@@ -46,13 +46,7 @@ class ColumnStore:
         self._columns: dict[Term, Columns] = {}
         self._offsets: dict[Term, Columns] = {}
 
-    def at(
-        self,
-        values: Values,
-        pins: Values | None = None,
-        slopes: "ColumnStore | None" = None,
-    ) -> "ColumnStore":
-        """The columns about other values."""
+    def at(self, values: Values, pins: Values | None = None, slopes: "ColumnStore | None" = None) -> "ColumnStore":
         return ColumnStore(self.data, values, self.nominal or self, pins, slopes=slopes)
 
     def beside(self, near: "ColumnStore | None") -> "ColumnStore":
@@ -96,9 +90,8 @@ class ColumnStore:
         return np.asarray(np.max(moved, axis=0) > CLOSE * np.max(size, axis=0))
 
     @cached_property
-    def about(self) -> list[About]:
-        """Each recording about the estimate."""
-        return [about(s, self.data.layout, self.values) for s in self.data.signals]
+    def about(self) -> list[EstimateSignals]:
+        return [signals_about(s, self.data.layout, self.values) for s in self.data.signals]
 
     def release(self) -> None:
         """Free what the columns were computed from and no others will be."""
@@ -118,7 +111,7 @@ class ColumnStore:
         return self._columns[term]
 
     def offset(self, term: Term) -> Columns:
-        """What a nonlinear term is beside its columns times its coefficients, (K, 1) per row; empty if it is linear."""
+        """Part of a nonlinear term beside its columns times its coefficients, (K, 1) per row; empty if it is linear."""
         if term not in self._columns:
             self._compute(term)
         return self._offsets[term]
@@ -169,7 +162,7 @@ class ColumnStore:
         return self.slopes._columns.get(term)
 
     def _beside(self, term: Term) -> Columns:
-        """What a term is beside derivatives that are not about its estimate, (K, 1) per row."""
+        """Part of a term beside derivatives that are not about its estimate, (K, 1) per row."""
         own, layout = self._columns[term], self.data.layout
         parts = []
         for one in self.about:
@@ -180,7 +173,7 @@ class ColumnStore:
         linear = np.abs(whole).max(initial=0.0) * LINEAR
         return beside if any(np.abs(x).max(initial=0.0) > linear for x in beside.values()) else {}
 
-    def _of(self, one: About, term: Term) -> tuple[Columns, Columns]:
+    def _of(self, one: EstimateSignals, term: Term) -> tuple[Columns, Columns]:
         """Columns of a term in one recording and what it is beside them, at the work rate."""
         layout, signature = self.data.layout, term.form.signature
         values = self.values.get(term)
@@ -200,7 +193,7 @@ class ColumnStore:
                 beside = {}
         return layout.compared(own), layout.compared(beside)
 
-    def _through(self, one: About, term: Term, plain: Columns) -> Columns:
+    def _through(self, one: EstimateSignals, term: Term, plain: Columns) -> Columns:
         """Derivatives of the readings: what changes the torque goes through sensor and motor as they are found."""
         layout, side = self.data.layout, term.form.signature.side
         if side == "motor":
@@ -226,7 +219,7 @@ class ColumnStore:
         return out
 
 
-def _alike(ours: Sequence[About], theirs: Sequence[About]) -> Mask | None:
+def _alike(ours: Sequence[EstimateSignals], theirs: Sequence[EstimateSignals]) -> Mask | None:
     """Joints with torques close in two estimates, (n,); None unless angles, gravity and gains are close."""
     same = np.ones(len(ours[0].motor_gain), bool)
     for one, other in zip(ours, theirs, strict=True):
@@ -242,7 +235,7 @@ def _alike(ours: Sequence[About], theirs: Sequence[About]) -> Mask | None:
     return same
 
 
-def _own_gain(one: About, joint: int) -> float:
+def _own_gain(one: EstimateSignals, joint: int) -> float:
     return float(one.sensor_gain[joint, joint])
 
 

@@ -13,16 +13,13 @@ from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.normal_equations import CORRELATED, NormalEquations
-from sim_gap.search.stepwise import Search
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import shares_a_factor
 
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
 """Undetected error of the nominal mass moments of all links, relative: NOMINAL, or WORSE times the largest error found
 at a link, up to WORST."""
-SHAPE_STEP = 1e-2
-SHORT_M = 0.01
-"""Least distance of a link's centre of mass from its joint's axis [m] for judging errors of its moment."""
 SYSTEMATIC = 0.3
 """Share of a row's residual and of its relevance floor that can mimic an effect, independent of the recording's
 length."""
@@ -30,15 +27,13 @@ length."""
 
 @dataclass(frozen=True)
 class Value:
-    """One reported parameter."""
-
     value: float
     low: float
     high: float
     unit: str
 
 
-class Estimate:
+class EffectEstimate:
     """Terms fitted to a training set."""
 
     def __init__(self, store: ColumnStore, terms: list[Term]) -> None:
@@ -46,12 +41,11 @@ class Estimate:
         self.store = store
         self.normal = NormalEquations(store, terms)
         self.terms = tuple(self.normal.terms)
-        self.search = Search(self.normal, list(self.terms))
+        self.search = StepwiseSearch(self.normal, list(self.terms))
         self.index, self.coefficients = self.search.weighted.fit(self.terms)
         self._elsewhere: ColumnStore | None = None
 
     def of(self, term: Term) -> Array:
-        """Coefficients of one term."""
         return self.coefficients[self.normal.at[term]]
 
     def subset(self, terms: list[Term]) -> Array:
@@ -82,11 +76,10 @@ class Estimate:
 
     @cached_property
     def _shaped(self) -> list[Term]:
-        """Terms with a fitted entry of the shape."""
         return [term for term in self.terms if term.free is not None]
 
     def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
-        step = SHAPE_STEP * abs(term.shape[i])
+        step = 1e-2 * abs(term.shape[i])
         sides = []
         for sign in (1.0, -1.0):
             shape = tuple(s + sign * step * (k == i) for k, s in enumerate(term.shape))
@@ -149,7 +142,7 @@ class Estimate:
         """
         arm = self.store.data.signals[0].arm
         found = {term.place: self.of(term) for term in self.terms if term.effect == "link.mass_moment"}
-        usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), SHORT_M * arm.inertial[:, 0])
+        usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), 0.01 * arm.inertial[:, 0])
         wrong = max((float(np.linalg.norm(found[link]) / usual[link]) for link in found), default=0.0)
         share = min(max(NOMINAL, WORSE * wrong), WORST)
         open_links = np.repeat([link not in found for link in range(arm.n)], 3)
@@ -174,7 +167,6 @@ class Estimate:
         return float(stdtrit(self._freedom, 0.975))
 
     def parameters(self, term: Term) -> dict[str, Value]:
-        """Reported parameters with 95 % intervals."""
         reported, start, chosen = self._reported(term)
         centre, steps = reported(start), 1e-5 * np.maximum(np.abs(start), 1e-3)
         slopes = [

@@ -9,25 +9,22 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.feasible import pins
+from sim_gap.search.feasibility import pins
 from sim_gap.search.normal_equations import NormalEquations
-from sim_gap.search.stepwise import Search
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
-STEPS = 10
-"""Most steps."""
 AGREED = 5e-3
 """Largest change of a row's prediction by a step, as a share of the residual beside it and the relevance floor."""
 WORSE = 1e-3
 """Increase of the score from which a step is halved."""
-HALVED = 3
 SLOW = 0.5
 """Change of a step, as a share of the last one's, from which derivatives are evaluated again."""
 
 Values = dict[Term, Array]
 
 
-def converged(
+def converge(
     nominal: ColumnStore, terms: Sequence[Term], start: Values | None = None
 ) -> tuple[ColumnStore, list[Term]]:
     """Columns of the terms about their own coefficients (`values` of the store), and the terms that remain plausible.
@@ -40,15 +37,15 @@ def converged(
     best, kept, held, last = np.inf, values, Values(), np.inf
     arm = nominal.data.signals[0].arm
     slopes: ColumnStore | None = None
-    for _ in range(STEPS):
+    for _ in range(10):  # steps at most
         store = nominal.at(values, slopes=slopes)
-        search = Search(NormalEquations(store, terms), terms)
+        search = StepwiseSearch(NormalEquations(store, terms), terms)
         now = score(store, values, search.normal)
         halved = 0
-        while values and now > best + WORSE and halved < HALVED:
+        while values and now > best + WORSE and halved < 3:
             values = {t: 0.5 * (c + kept.get(t, 0.0 * c)) for t, c in values.items()}
             store = nominal.at(values, slopes=slopes)
-            search = Search(NormalEquations(store, terms), terms)
+            search = StepwiseSearch(NormalEquations(store, terms), terms)
             now, halved = score(store, values, search.normal), halved + 1
         if values:
             best, kept, slopes = now, values, slopes or store
@@ -66,7 +63,7 @@ def converged(
     return nominal.at(values, {term: c for term, c in held.items() if term in values}), terms
 
 
-def _step(search: Search) -> tuple[list[Term], Values]:
+def _step(search: StepwiseSearch) -> tuple[list[Term], Values]:
     """The terms of a fit, nonlinear ones at the size fitted, and their coefficients."""
     index, coefficients = search.weighted.fit(search.active)
     whole = np.zeros(search.normal.size)
@@ -99,7 +96,7 @@ def score(store: ColumnStore, values: Values, normal: NormalEquations) -> float:
     return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
 
 
-def _change(search: Search, old: Values, new: Values) -> float:
+def _change(search: StepwiseSearch, old: Values, new: Values) -> float:
     """Largest change of a row's prediction by a step, as a share of the residual beside it and the relevance floor."""
     normal = search.normal
     change = np.zeros(normal.size)

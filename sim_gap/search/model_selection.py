@@ -10,24 +10,43 @@ from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import SYSTEMATIC
-from sim_gap.search.gauss_newton import Values, converged
+from sim_gap.search.gauss_newton import Values, converge
 from sim_gap.search.normal_equations import NormalEquations, Weighted
-from sim_gap.search.stepwise import TRIES, Search, impossible, shortlist
+from sim_gap.search.stepwise_search import TRIES, StepwiseSearch, impossible_terms, shortlist
 from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
-from sim_gap.search.whole_body import one_body
+
+MOMENTS, BODY = "link.mass_moment", "link.payload"
 
 
-def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
+def one_body(store: ColumnStore, search: StepwiseSearch, offered: Sequence[Term]) -> list[Term] | None:
+    """The active terms with a payload in place of the mass moments, if that fits as well about itself; else None.
+
+    Linear in its mass and first moment, a payload lacks the inertia that its mass has where it hangs; mass moments of
+    all links together then fit a little better, and no single exchange leads back. `store` has the columns about the
+    nominal model.
+    """
+    active = search.active
+    bodies = [term for term in offered if term.effect == BODY and not term.shape]
+    moments = [term for term in active if term.effect == MOMENTS]
+    if len(moments) < 2 or not bodies or any(term.effect == BODY for term in active):
+        return None
+    about, kept = converge(store, [*(term for term in active if term not in moments), bodies[0]])
+    found = StepwiseSearch(NormalEquations(about, kept), kept)
+    there = any(term.effect == BODY for term in found.active)
+    return found.active if there and found.score < search.score else None
+
+
+def select_model(store: ColumnStore, library: Sequence[str]) -> StepwiseSearch:
     """Search the library, refine the shapes of the selected terms, and drop those that no longer earn their place."""
     offered, active = first_search(store, library)
     store.keep(offered)
-    search = searched_again(store, active, offered)
+    search = search_again(store, active, offered)
     if (body := one_body(store, search, offered)) is not None:
-        again = searched_again(store, body, offered)
+        again = search_again(store, body, offered)
         search = again if again.score < search.score else search
     if drives_are_off(search):
-        again = searched_again(store, every_constant(search, offered), offered, CONSTANTS)
+        again = search_again(store, every_constant(search, offered), offered, CONSTANTS)
         better = again.score + price_of_all(again) < search.score
         search = again if better and most_are_off(again) else search
     for held in (store, search.normal.store.beside(None)):  # frees the columns of rivals and of the estimate before
@@ -35,16 +54,16 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> Search:
     return search
 
 
-def searched_again(
+def search_again(
     store: ColumnStore, active: Sequence[Term], offered: Sequence[Term], usual: frozenset[str] = frozenset()
-) -> Search:
+) -> StepwiseSearch:
     """The terms offered, searched about the fit of those that are active, until both agree."""
-    chosen = refine(store, one_each([canonical(term) for term in active]))
+    chosen = refine(store, first_of_each([canonical_term(term) for term in active]))
     values: Values = {}
     near: ColumnStore | None = None
     rounds = 0
     for _ in range(MOST_ROUNDS):
-        search = about_itself(store, chosen, offered, values, near, usual)
+        search = refit_about_itself(store, chosen, offered, values, near, usual)
         keys = {term.key for term in search.active}
         gone = {term.key for term in chosen} - keys
         if rounds == ROUNDS and not gone:
@@ -58,43 +77,43 @@ def searched_again(
             break
         near = search.normal.store
         values = near.values
-        chosen = one_each([canonical(term) for term in search.active])
+        chosen = first_of_each([canonical_term(term) for term in search.active])
     return search
 
 
 def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term], list[Term]]:
     """The terms that are offered to the search about the estimate, and those that a search about the nominal model
     selects."""
-    search = Search(NormalEquations(store, candidates(store.data, library)))
+    search = StepwiseSearch(NormalEquations(store, candidates(store.data, library)))
     search.run()
-    search = without_doubtful(search)
+    search = replace_doubtful(search)
     return likely_shapes(search), search.active
 
 
-def about_itself(
+def refit_about_itself(
     nominal: ColumnStore,
     chosen: list[Term],
     offered: Sequence[Term],
     start: Values,
     near: ColumnStore | None = None,
     usual: frozenset[str] = frozenset(),
-) -> Search:
+) -> StepwiseSearch:
     """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
     `start` on. `near` is the store of an earlier fit, whose columns of rivals serve if it is close."""
-    store, chosen = with_lost(nominal, chosen, *converged(nominal, chosen, start))
+    store, chosen = restore_lost(nominal, chosen, *converge(nominal, chosen, start))
     refined = refine(store, chosen)
     if refined != chosen:
-        again, kept = converged(nominal, refined, store.values)
+        again, kept = converge(nominal, refined, store.values)
         if len(kept) == len(refined):  # all can exist about themselves
             store, chosen = again, kept
     store = store.beside(near)
     keys = {term.key for term in chosen}
-    others = [term for term in with_levels(store, offered) if term.key not in keys]
+    others = [term for term in set_levels(store, offered) if term.key not in keys]
     rivals = relinearised_in_place(store, chosen, others)
-    return Search(NormalEquations(store, [*chosen, *rivals]), chosen, usual=usual)
+    return StepwiseSearch(NormalEquations(store, [*chosen, *rivals]), chosen, usual=usual)
 
 
-def with_lost(
+def restore_lost(
     nominal: ColumnStore, wanted: Sequence[Term], store: ColumnStore, chosen: list[Term]
 ) -> tuple[ColumnStore, list[Term]]:
     """A fit of the `chosen` terms with those of the `wanted` ones that cannot exist about themselves with their shape,
@@ -106,12 +125,12 @@ def with_lost(
     shapes = [Term(*key, shape) for key, grid in grids.items() for shape in grid]
     needed = {key for term in shapes for key in term.beneath} - {term.key for term in chosen} - lost
     beneath = [term for term in wanted if term.key in needed]
-    search = Search(NormalEquations(store, [*chosen, *shapes, *beneath]), chosen)
+    search = StepwiseSearch(NormalEquations(store, [*chosen, *shapes, *beneath]), chosen)
     search.take_back(lost)
-    return converged(nominal, search.active, store.values) if len(search.active) > len(chosen) else (store, chosen)
+    return converge(nominal, search.active, store.values) if len(search.active) > len(chosen) else (store, chosen)
 
 
-def with_levels(store: ColumnStore, offered: Sequence[Term]) -> list[Term]:
+def set_levels(store: ColumnStore, offered: Sequence[Term]) -> list[Term]:
     """The terms offered, with levels of limits, plays and dead bands from the torques about an estimate."""
     other, signals = store.other_torques, [one.signals for one in store.about]
 
@@ -144,7 +163,7 @@ def candidates(data: ResidualSet, library: Sequence[str]) -> list[Term]:
     ]
 
 
-def likely_shapes(search: Search) -> list[Term]:
+def likely_shapes(search: StepwiseSearch) -> list[Term]:
     """The terms of a search, of each effect and place only the SHAPES that would help most beside the active ones."""
     rest = [term for term in search.normal.terms if term not in search.active]
     count = Counter[Key]()
@@ -156,17 +175,17 @@ def likely_shapes(search: Search) -> list[Term]:
     return [term for term in search.normal.terms if term in set(kept)]
 
 
-def canonical(term: Term) -> Term:
+def canonical_term(term: Term) -> Term:
     """The term under which one is reported, of those that show exactly alike."""
     return Term(term.effect, *term.form.hints.canonical(term.place, term.shape))
 
 
-def one_each(terms: Sequence[Term]) -> list[Term]:
+def first_of_each(terms: Sequence[Term]) -> list[Term]:
     """The terms, only the first of each effect and place: two shapes approximate one between them."""
     return list({term.key: term for term in reversed(terms)}.values())[::-1]
 
 
-def without_doubtful(search: Search) -> Search:
+def replace_doubtful(search: StepwiseSearch) -> StepwiseSearch:
     """Search again with terms that leave a large residual on their rows replaced by their simpler alternatives.
 
     Single steps do not get there if several alternatives are needed at once.
@@ -179,7 +198,7 @@ def without_doubtful(search: Search) -> Search:
     for term in doubtful:
         rest = search.without(term, rest)
     wanted = {key for term in doubtful for key in parts[term]} - {other.key for other in rest}
-    again = Search(search.normal, [*rest, *(other for other in search.normal.terms if other.key in wanted)])
+    again = StepwiseSearch(search.normal, [*rest, *(other for other in search.normal.terms if other.key in wanted)])
     again.added.update({term.key: TRIES - 1 for term in doubtful})
     again.run()
     return again if again.score < search.score - 1e-3 else search
@@ -204,13 +223,13 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
             normal = NormalEquations(store, [other if each == term else each for each in out])
             start = normal.square.sum(0) / np.maximum(normal.count.sum(0), 1.0)
             index, coefficients = Weighted(normal, start).fit(normal.terms)
-            if other in impossible(normal, normal.terms, coefficients):
+            if other in impossible_terms(normal, normal.terms, coefficients):
                 return float("inf")
             squares = normal.mean_square(index, coefficients)
             return float(0.5 * np.log(squares + normal.floor**2)[normal.seen].sum())
 
         def best(form: Term, low: float, high: float, free: int = free) -> Term:
-            return form.reshaped(free, golden(lambda value: fit(form.reshaped(free, value)), low, high))
+            return form.reshaped(free, golden_section(lambda value: fit(form.reshaped(free, value)), low, high))
 
         size = term.shape[free]
         trials = [term, best(term, low, high), *(best(form, 0.5 * size, 1.5 * size) for form in term.forms)]
@@ -237,7 +256,7 @@ def relinearised(store: ColumnStore, active: list[Term]) -> list[Term]:
     if all(term.form.hints.linearised_at is None for term in active):
         return active
     normal = NormalEquations(store, active)
-    search = Search(normal, list(normal.terms))
+    search = StepwiseSearch(normal, list(normal.terms))
     _, values = search.weighted.fit(normal.terms)
     return [term.relinearised(values[normal.at[term]]) for term in normal.terms]
 
@@ -248,7 +267,7 @@ def relinearised_in_place(store: ColumnStore, chosen: list[Term], offered: list[
         nonlinear = [term for term in offered if term.form.hints.linearised_at is not None]
         if not nonlinear or not chosen:
             return offered
-        search = Search(NormalEquations(store, [*chosen, *nonlinear]), list(chosen))
+        search = StepwiseSearch(NormalEquations(store, [*chosen, *nonlinear]), list(chosen))
         best: dict[Term, tuple[float, Term]] = {}
         for term in search.active:
             rest = search.without(term, search.active)
@@ -263,7 +282,7 @@ def relinearised_in_place(store: ColumnStore, chosen: list[Term], offered: list[
     return offered
 
 
-def golden(function: Callable[[float], float], low: float, high: float, steps: int = 10) -> float:
+def golden_section(function: Callable[[float], float], low: float, high: float, steps: int = 10) -> float:
     """Minimum of a function between two values by golden-section search."""
     ratio = 0.5 * (np.sqrt(5.0) - 1.0)
     a, b = high - ratio * (high - low), low + ratio * (high - low)

@@ -34,8 +34,9 @@ class NormalEquations:
         of_motor = float(self.layout.motor is not None)
         known = [of_motor * arm.frictionloss, of_motor * arm.damping, of_motor * arm.armature]
         self.known_joint = np.stack([*known, speed], axis=1)
-        """What the nominal model has at each joint that readings are compared with, and its usual speed, (n, 4) as in
-        `Beneath`. A sensor on the link reads nothing of the motor's."""
+        """Friction, damping and armature of the nominal model, and the joint's usual speed, (n, 4) as in `Beneath`.
+
+        A sensor on the link reads nothing of the motor's."""
         self.tip_mass = arm.inertial[-1, :1]
         widths = [next(iter(store.columns(term).values())).shape[1] for term in self.terms]
         ends = np.cumsum([0, *widths])
@@ -74,7 +75,6 @@ class NormalEquations:
         self.pin({term: c for term, c in store.pins.items() if term in self.at})
 
     def pin(self, kept: Mapping[Term, Array]) -> None:
-        """Keep coefficients in every fit."""
         power = sum((b.diagonal(self.size) for b in self.blocks), np.zeros(self.size))
         for term, c in kept.items():
             at = self.at[term]
@@ -161,7 +161,7 @@ class NormalEquations:
         return np.asarray(np.array(sums) / np.maximum(self.count.sum(0), 1.0))
 
     def parts(self, index: NDArray[np.intp]) -> "list[_Part]":
-        """What the columns `index` sum up to in each row."""
+        """Sums of the columns `index` in each row."""
         return [block.part(index) for block in self.blocks]
 
     def errors(self, parts: "Sequence[_Part]", coefficients: Array) -> Array:
@@ -197,7 +197,6 @@ class _Block:
         return np.asarray(self.gram.sum(0))
 
     def part(self, index: NDArray[np.intp]) -> "_Part":
-        """The sums of some columns."""
         there = np.flatnonzero(self.position[index] >= 0)
         at = self.position[index[there]]
         return _Part(there, self.gram[:, at[:, None], at], self.side[:, at])

@@ -4,15 +4,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Effect, Key, Shape
+from sim_gap.effects.effect import InverseEffect, Key, Shape
 from sim_gap.effects.registry import effects
-from sim_gap.residuals.layout import Layout
+from sim_gap.residuals.layout import ChannelLayout
 
 
 @dataclass(frozen=True)
 class Term:
-    """One effect at one place with one shape."""
-
     effect: str
     place: int
     shape: Shape = ()
@@ -29,8 +27,7 @@ class Term:
         return Term, (self.effect, self.place, self.shape)
 
     @cached_property
-    def form(self) -> Effect:
-        """The inverse form of its effect."""
+    def form(self) -> InverseEffect:
         return effects()[self.effect]
 
     @cached_property
@@ -39,7 +36,6 @@ class Term:
         return self.effect, self.place
 
     def reshaped(self, entry: int, value: float) -> "Term":
-        """The same term with one entry of its shape replaced."""
         return Term(self.effect, self.place, (*self.shape[:entry], value, *self.shape[entry + 1 :]))
 
     @property
@@ -51,16 +47,13 @@ class Term:
 
     @property
     def forms(self) -> "tuple[Term, ...]":
-        """The same effect in its other forms."""
         shapes = self.form.hints.forms(self.shape)
         return tuple(Term(self.effect, self.place, shape) for shape in shapes if shape != self.shape)
 
-    def covers(self, layout: Layout) -> tuple[Key, ...]:
-        """Keys of the terms that it contains."""
+    def covers(self, layout: ChannelLayout) -> tuple[Key, ...]:
         return self.form.hints.covers(layout, self.place)
 
-    def alternatives(self, layout: Layout) -> tuple[Key, ...]:
-        """Keys of the simpler terms that together could replace it."""
+    def alternatives(self, layout: ChannelLayout) -> tuple[Key, ...]:
         return self.form.hints.alternatives(layout, self.place, self.shape)
 
     def relinearised(self, coefficients: Array) -> "Term":
@@ -82,5 +75,4 @@ class Term:
 
     @cached_property
     def beneath(self) -> tuple[Key, ...]:
-        """Keys of the terms that it needs."""
         return tuple((name, self.place) for name in self.form.needs)

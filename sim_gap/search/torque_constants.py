@@ -10,8 +10,8 @@ one factor, the masses are named, and the answer says that they may be the const
 from collections.abc import Sequence
 
 from sim_gap.effects.registry import effects
-from sim_gap.residuals.layout import Layout
-from sim_gap.search.stepwise import Search
+from sim_gap.residuals.layout import ChannelLayout
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
 CONSTANT = "actuator.gain"
@@ -22,7 +22,7 @@ OFF = 0.05
 """A torque constant is off from this share on."""
 
 
-def drives_are_off(search: Search) -> bool:
+def drives_are_off(search: StepwiseSearch) -> bool:
     """Whether drives of an arm without torque sensors have another torque constant than they take it for.
 
     Several have, or one has while links seem to be wrong.
@@ -33,35 +33,35 @@ def drives_are_off(search: Search) -> bool:
     return off > 1 or (off == 1 and links)
 
 
-def most_are_off(search: Search) -> bool:
+def most_are_off(search: StepwiseSearch) -> bool:
     """Whether most drives have another constant: those of an arm come from one maker, and are in doubt together."""
     return 2 * _count_off(search) > search.normal.layout.n
 
 
-def _count_off(search: Search) -> int:
+def _count_off(search: StepwiseSearch) -> int:
     index, values = search.weighted.fit(search.active)
     found = [term for term in search.active if term.effect == CONSTANT]
     return sum(abs(float(values[index == search.normal.at[term][0]][0])) > OFF for term in found)
 
 
-def price_of_all(search: Search) -> float:
+def price_of_all(search: StepwiseSearch) -> float:
     """Price of the constants of all drives together: that of one effect that few arms have."""
     return search.normal.price * (1 + effects()[CONSTANT].plausibility.prior_penalty)
 
 
-def shares_a_factor(layout: Layout, terms: Sequence[Term]) -> bool:
+def shares_a_factor(layout: ChannelLayout, terms: Sequence[Term]) -> bool:
     """Whether the terms have torque constants that are known only up to a factor common to them and all masses."""
     return layout.sensor is None and any(term.effect == CONSTANT for term in terms)
 
 
-def masses_may_be_constants(layout: Layout, terms: Sequence[Term]) -> bool:
+def masses_may_be_constants(layout: ChannelLayout, terms: Sequence[Term]) -> bool:
     """Whether mass moments of most links are named, and torque constants all off alike would look the same."""
     links = {term.place for term in terms if term.effect == MASSES}
     constants = any(term.effect == CONSTANT for term in terms)
     return layout.sensor is None and not constants and 2 * len(links) > layout.n
 
 
-def every_constant(search: Search, offered: Sequence[Term]) -> list[Term]:
+def every_constant(search: StepwiseSearch, offered: Sequence[Term]) -> list[Term]:
     """Where to search from again: every drive's constant free, the links as in the model, all else as found."""
     drives = [term for term in offered if term.effect == CONSTANT]
     return [*drives, *(term for term in search.active if term.effect not in (CONSTANT, *LINKS))]

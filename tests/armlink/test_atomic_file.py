@@ -16,7 +16,7 @@ from armlink.commands.output import write_json
 from armlink.content.atomic_file import open_whole, write_whole
 from armlink.recording.files import load_recording, save_recording
 from armlink.recording.recording import Recording
-from calib.report.page import Section, paragraph, render
+from calib.report.page import ReportSection, paragraph, render
 from sim_gap.better_model.samples import write_rows
 
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
@@ -57,7 +57,7 @@ def test_a_convert_onto_a_file_on_a_full_disk_keeps_it(suffix, tmp_path, capsys)
 
 WRITERS = {
     "answer.json": lambda path: write_json(path, {"values": list(range(1000))}),
-    "report.html": lambda path: render(path, "report", [Section("one", paragraph("text " * 100))]),
+    "report.html": lambda path: render(path, "report", [ReportSection("one", paragraph("text " * 100))]),
     "draws.csv": lambda path: write_rows([{"a": k / 3} for k in range(1000)], path),
     "draws.json": lambda path: write_rows([{"a": k / 3} for k in range(1000)], path),
     "draws.parquet": lambda path: write_rows([{"a": k / 3} for k in range(1000)], path),

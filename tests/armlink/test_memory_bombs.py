@@ -79,7 +79,7 @@ def test_budgets_of_threads_do_not_mix(tmp_path):
 
 @pytest.mark.parametrize("text", ["a: &a [*a]\n", "a: &a {b: *a}\n"])
 def test_an_alias_of_what_it_is_in_is_refused(text, tmp_path):
-    with pytest.raises(BadInput, match="an alias stands for a part of the file in which it is"):
+    with pytest.raises(BadInput, match="an alias refers to a part of the file that contains it"):
         parse_yaml(text, tmp_path / "a.yaml")
 
 

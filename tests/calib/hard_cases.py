@@ -17,7 +17,7 @@ from rank_test import undetermined
 from sweep_arms import random_arm, with_section
 
 from armlink.arm_file import ArmFile
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.plan.types import SweepPlan
 from calib.sweep import run as runner
@@ -79,7 +79,7 @@ def troubled(case: str, arm: ArmFile, truth: Truth, seed: int) -> tuple[ArmFile,
     """The arm with the case's trouble, and its simulation."""
     if case == "range":
         arm = _short(arm)
-    rated = float(Limits.of(arm).rated[JOINT])
+    rated = float(DriveLimits.of(arm).rated[JOINT])
     simulated = SimulatedArm(arm, truth, seed)
     if case == "spring":
         simulated.set_effects([*simulated.effects, _effect(arm, "transmission.spring", stiffness=SPRING * rated)])
@@ -143,14 +143,14 @@ def stick(simulated: SimulatedArm, bit: int) -> None:
 @contextmanager
 def _weakened(simulated: SimulatedArm, wanted: bool) -> Iterator[Callable[[], int]]:
     """The plan presses one resting joint too weakly for gravity; gives how often a joint was pressed again."""
-    plans, more, slips = runner._final_plan, runner._Pass._firmer, []
+    plans, more, slips = runner._final_plan, runner._StepPass._firmer, []
 
     def weak(*given: Any) -> SweepPlan:
         plan = plans(*given)
         pulls = {
             (place, joint): _against(simulated, plan, place, joint) / limit
             for place, sweep in enumerate(plan.sweeps)
-            for joint, limit in enumerate(Limits.of(simulated.arm).rated)
+            for joint, limit in enumerate(DriveLimits.of(simulated.arm).rated)
             if sweep.stops[joint] and not sweep.servo[joint]
         }
         (place, joint), pull = max(pulls.items(), key=lambda item: item[1])
@@ -167,7 +167,7 @@ def _weakened(simulated: SimulatedArm, wanted: bool) -> Iterator[Callable[[], in
         return more(*given)
 
     with (
-        patch.object(runner._Pass, "_firmer", counted),
+        patch.object(runner._StepPass, "_firmer", counted),
         patch.object(runner, "_final_plan", weak if wanted else plans),
     ):
         yield lambda: len(slips)

@@ -11,7 +11,7 @@ from armlink.arm_file import ArmFile, parse_arm
 from armlink.arrays import Array
 from armlink.link.link import Link
 from calib.arm.kinematics import gcomp_arm
-from calib.arm.unseen import vertical
+from calib.creep.choice import is_vertical
 from calib.creep.fit import QUANTILE, CreepFit, fit_creep
 from calib.creep.plan import plan_creep
 from calib.creep.record import missing
@@ -165,7 +165,7 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
     given = loaded & fit.found("beta").any()
     share = np.where(given, error / np.maximum(largest, 1e-9), np.nan)
     nominal = nominal_error(arm, simulated, gain) / np.maximum(largest, 1e-9)
-    upright = [name for joint, name in enumerate(fit.names) if vertical(described, joint)]
+    upright = [name for joint, name in enumerate(fit.names) if is_vertical(described, joint)]
     wrong = [f"{name}: gain {each:+.2%}" for name, each in zip(fit.names, off, strict=True) if abs(each) > GAIN]
     bound = np.maximum(COULOMB, COULOMB_SHARE * state.coulomb)
     wrong += [f"{fit.names[j]}: friction {friction[j]:+.3f}" for j in range(n) if abs(friction[j]) > bound[j]]

@@ -6,7 +6,7 @@ from rest_arm import RestArm
 
 from armlink.arm_file import ArmFile
 from calib.observer.config import ObserverConfig
-from calib.observer.discrepancy.level import Level
+from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.observer import Observer
 from gcomp.gravity.torque import gravity_regressor
 from sim_bus.effects.realism import add_realism
@@ -89,6 +89,6 @@ class RealArm(RestArm):
     def observer(self, config: ObserverConfig | None = None, *, told: bool = True) -> Observer:
         """With the level that the calibration tells, if it does."""
         config = config or ObserverConfig()
-        level = Level.expected(self.level, np.full(self.n, 0.5)) if told else None
+        level = DiscrepancyLevel.expected(self.level, np.full(self.n, 0.5)) if told else None
         sigma = config.noise_share * self.rated
         return Observer(self.arm, self.model, self.covariance, sigma, config, level=level)

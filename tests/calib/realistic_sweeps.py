@@ -15,8 +15,8 @@ from armlink.arm_file import ArmFile
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import SweepPlan
 from calib.sweep.dataset import Manifest, SweepData
+from calib.sweep.run import APPROACH
 from calib.sweep.scout import rough_model
-from calib.sweep.thresholds import APPROACH
 from sim_bus.physics.joint_torques import Cables, unevenness
 from sim_bus.physics.sensors import NOISE_BLOCK
 from sim_bus.simulated_arm import SimulatedArm

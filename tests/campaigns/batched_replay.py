@@ -21,10 +21,10 @@ from armlink.recording.files import load_recording
 from armlink.recording.recording import slice_rows
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.better_model.native_drives import hold
-from sim_gap.closed_loop.identify import Identified
-from sim_gap.closed_loop.training.draws import draw
-from sim_gap.closed_loop.training.posterior import batched
-from sim_gap.closed_loop.training.replay import OPENING_S, Simulated, actuator_of, commanded, replay
+from sim_gap.position_gap.identify import Identified
+from sim_gap.position_gap.training.draws import draw
+from sim_gap.position_gap.training.replay import OPENING_S, Simulated, actuator_of, commanded_rows, replay
+from sim_gap.position_gap.training.training_files import export_batched
 
 AGREE = 0.05
 """Largest difference of the RMS gap to the measured position between both simulators, over all joints."""
@@ -112,8 +112,8 @@ def main() -> None:
     found = answer.internals
     assert isinstance(found, Identified)
     assert found.export is not None
-    model = mujoco.MjModel.from_xml_string((batched(found) or found.export).xml)
-    recording = slice_rows(found.recordings[0], commanded(found.recordings[0]))
+    model = mujoco.MjModel.from_xml_string((export_batched(found) or found.export).xml)
+    recording = slice_rows(found.recordings[0], commanded_rows(found.recordings[0]))
     t, ours, measured = replay(Simulated(model, found.sim.joints), recording)
     rows = int(np.searchsorted(t, t[0] + given.seconds))
     started = time.process_time()

@@ -31,11 +31,8 @@ from calib.install.plausibility import admit
 from calib.plan.types import SweepPlan
 from calib.records.store import RecordStore
 from gcomp.gravity.batch import GravityModel
-from sim_gap.demo.bench import Bench
-from sim_gap.demo.creep_run import quick
-from sim_gap.demo.motion import travel
-from sim_gap.demo.sag import WeakHold, sag_poses
-from sim_gap.demo.script import WEAK_SHARE
+from sim_gap.demo.bench import WEAK_SHARE, Bench, WeakHold, sag_poses, travel
+from sim_gap.demo.run import quick
 
 LEFT = 0.25
 """Largest share of the nominal model's sag and drift that may be left."""

@@ -34,7 +34,7 @@ LEFT_OUT = {
     "armlink sim": "runs all the while",
     "sudo ": "changes the machine",
     "podman ": "builds an image; tests/house/test_container.py checks its files and options",
-    "armlink gap diagnose --sim so101.xml": "needs recordings of that arm; tests/sim_gap/closed_loop has its own",
+    "armlink gap diagnose --sim so101.xml": "needs recordings of that arm; tests/sim_gap/position_gap has its own",
     "armlink gap diagnose-fleet": "needs a dask scheduler; tests/sim_gap runs it on one",
 }
 """Beginning of a line: why it is not run."""

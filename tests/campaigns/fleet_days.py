@@ -21,8 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "sim_gap"))
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.fleet.trends import Trend, fleet_trends
-from sim_gap.fleet.watched import watched
+from sim_gap.trends import Trend, fleet_trends, watched_parameters
 
 START = date(2026, 9, 1)
 FRICTION, GAIN, PLAY = 0.30, -0.03, np.radians(0.2)
@@ -97,7 +96,7 @@ def main() -> int:
             recording = replace(clean, **channels)
             with patch("sim_gap.attribution.answer.roll_out", return_value=None):  # no trend needs it
                 found = diagnose(model(), [recording])
-            made = found.to_json() | {"watched": watched(found)}
+            made = found.to_json() | {"watched": watched_parameters(found)}
             answers[case] = made
             if asked.answers:
                 with asked.answers.open("a") as file:

@@ -33,8 +33,8 @@ from test_web_schema import SETTINGS, check_all
 
 from calib.daemon.service_view import ServiceView
 from calib.daemon.web import peer
-from calib.daemon.web.rate import RateLimit
-from calib.observer.decision import Finding
+from calib.daemon.web.guard import RateLimit
+from calib.observer.decision import DriftFinding
 
 A_GO, EXAMPLES, GROWTH = 100, 5, 200.0
 """Raw requests and examples of each route between two looks at the clock; growth of memory [MB]."""
@@ -190,7 +190,7 @@ def begin(folder: Path) -> ServiceView:
     bench = DaemonBench(folder, small_arm())
     bench.run(3.0)
     for joint in ("base", "elbow"):
-        finding = Finding(2, "drift", 1.02, 0.1, np.diag([1e-6, 1e-4]), 40, 0.99)
+        finding = DriftFinding(2, "drift", 1.02, 0.1, np.diag([1e-6, 1e-4]), 40, 0.99)
         bench.service.journal.add_proposal(bench.wall(), joint, "ab" * 4, "cd" * 4, finding)
     for _ in range(20):
         bench.service.save(history=True)

@@ -31,7 +31,7 @@ from fuzzing import FAMILIES, known_frames, spoilt, take_in
 from served_page import served
 
 from calib.daemon.web import peer
-from calib.daemon.web.rate import RateLimit
+from calib.daemon.web.guard import RateLimit
 
 CORPUS = Path(__file__).parents[1] / "faults" / "corpus"
 LARGEST = 20_000

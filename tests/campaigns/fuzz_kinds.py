@@ -45,14 +45,14 @@ from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.commands.poses_csv import load_poses
 from calib.daemon.settings import daemon_section
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.records.store import RecordStore
 from calib.sweep.dataset import load_data
 from gcomp.arm.load import load_model
 from gcomp.errors import BadModel
 from sim_bus.truth import Truth
-from sim_gap.experiment.motion_file import load_motion
-from sim_gap.fleet.fleet import Answers
+from sim_gap.experiment import load_motion
+from sim_gap.fleet import Answers
 from sim_gap.model.load import load_compiled
 
 ROOT = Path(__file__).parents[2]
@@ -273,7 +273,7 @@ def journals(folder: Path) -> list[Seed]:
     bench = DaemonBench(folder, small_arm())
     bench.run(3.0)
     journal, when = bench.service.journal, bench.wall()
-    finding = Finding(2, "drift", 1.02, 0.1, np.diag([1e-6, 1e-4]), 40, 0.99)
+    finding = DriftFinding(2, "drift", 1.02, 0.1, np.diag([1e-6, 1e-4]), 40, 0.99)
     for joint in ("elbow", "elbow", "base"):
         journal.add_proposal(when, joint, "ab" * 4, "cd" * 4, finding)
     journal.decide(3, when, "rejected", "ann")
@@ -330,8 +330,8 @@ def answers(_: Path) -> list[Seed]:
 
 
 def read_answers(path: Path) -> None:
-    from sim_gap.fleet.fleet import table
-    from sim_gap.fleet.trends import fleet_trends, rows
+    from sim_gap.fleet import table
+    from sim_gap.trends import fleet_trends, rows
 
     found = Answers(path).found
     table(found)

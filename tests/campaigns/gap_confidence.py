@@ -4,7 +4,7 @@
 
 BENCH is the --out of an `armlink gap bench`. The first cause of every answer counts, right or wrong as the bench's
 judge says; answers with the true effect in the library and answers without it weigh the same in all, as if every
-second cause were none of the library's. The weights printed are those of `sim_gap/attribution/confidence.py`; the
+second cause were none of the library's. The weights printed are those of `sim_gap/attribution/verdict.py`; the
 table below them is the reliability of the confidences that the answers themselves gave.
 """
 
@@ -17,11 +17,11 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from sim_gap.attribution.confidence import features
 from sim_gap.attribution.diagnosis import Signs
-from sim_gap.blind.cases.seal import open_labels
-from sim_gap.blind.judging.judge import judge
-from sim_gap.blind.judging.score import BINS, WITHHELD
+from sim_gap.attribution.verdict import features
+from sim_gap.blind.bench import open_labels
+from sim_gap.blind.judge import judge
+from sim_gap.blind.score import BINS, WITHHELD
 
 RIDGE = 0.01
 """Strength of the pull towards no influence, per answer and squared influence of a feature's spread."""

@@ -21,7 +21,7 @@ from wrong_arms import THREE, Wrong, record
 from armlink.recording.recording import Recording
 from sim_gap.attribution.bodies import recordings_with
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.effects.base import tilted
+from sim_gap.effects.base import tilt_gravity
 
 ANGLE_DEG, OTHERS, MASS = 0.5, 0.5, 0.05
 SECONDS, RATE = 30.0, 50.0
@@ -33,13 +33,13 @@ def tilt(random: np.random.Generator) -> tuple[bool, str]:
     angle, heading = np.radians(random.uniform(5.0, 180.0)), random.uniform(0.0, 2.0 * np.pi)
     wanted = angle * np.array([np.cos(heading), np.sin(heading)])
     real = mujoco.MjModel.from_xml_string(THREE)
-    real.opt.gravity[:] = tilted(np.array([0.0, 0.0, -9.81]), wanted)
+    real.opt.gravity[:] = tilt_gravity(np.array([0.0, 0.0, -9.81]), wanted)
     fit, other = (recorded(real, Wrong(coulomb=np.full(3, 0.3)), int(random.integers(2**31))) for _ in range(2))
     answer = diagnose(mujoco.MjModel.from_xml_string(THREE), [fit], [other])
     found = [cause for cause in answer.causes if cause.effect == "base.tilt"]
     values = found[0].parameters["arm"] if found else {}
     turned = np.array([values[name].value for name in ("angle_1", "angle_2")]) if found else np.zeros(2)
-    down = [tilted(np.array([0.0, 0.0, -9.81]), each) for each in (turned, wanted)]
+    down = [tilt_gravity(np.array([0.0, 0.0, -9.81]), each) for each in (turned, wanted)]
     error = float(np.degrees(np.arccos(np.clip(down[0] @ down[1] / 9.81**2, -1.0, 1.0))))
     false = [c.effect for c in answer.causes if c.confidence > OTHERS and c.effect not in ("base.tilt", FRICTION)]
     good = bool(found) and error < ANGLE_DEG and not false

@@ -23,7 +23,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.creep.fit import fit_rows
 from calib.creep.plan import plan_creep
 from calib.creep.record import calibration_record, gravity_record
-from calib.observer.moving.observer import MovingObserver
+from calib.observer.motion.observer import MovingObserver
 
 GAIN, FRICTION, PAYLOAD = 0.05, 1.3, 0.3
 UNCHANGED = 480

@@ -25,9 +25,9 @@ from scipy.ndimage import maximum_filter1d
 
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
-from sim_gap.blind.servo.make import make_cases, recipes
-from sim_gap.closed_loop.surface import find_surface
+from sim_gap.blind.servo_cases import make_cases, recipes
 from sim_gap.model.load import load_model
+from sim_gap.position_gap.surface import find_surface
 
 FALSE, FOUND, CLEAR_RAD, LIFTS, LONG_S = 0.01, 0.8, (0.02, 0.5), 0.25, 2.0
 TIP = 1.5

@@ -23,9 +23,9 @@ import numpy as np
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.closed_loop.surface import find_surface, touched
-from sim_gap.closed_loop.training.replay import Simulated, replay_rms
 from sim_gap.model.load import load_model
+from sim_gap.position_gap.surface import find_surface, rows_of_touch
+from sim_gap.position_gap.training.replay import Simulated, replay_rms
 
 WINDOW_S, STEP_S = 6.0, 0.004
 STICKS = (0.999, 0.9999, 0.001, 0.5, 2.0)
@@ -126,7 +126,7 @@ def main() -> int:
         for name, model in (("diagnosis", ours), ("mujoco.sysid", theirs))
     }
     surface = find_surface(nominal.arm, [*train, *heldout])
-    apart = [touched(surface, nominal.arm, recording) for recording in heldout]
+    apart = [rows_of_touch(surface, nominal.arm, recording) for recording in heldout]
     if surface is not None:
         print(f"while the arm presses on nothing ({1.0 - np.concatenate(apart).mean():.0%} of the rows):")
         for name, model in (("nominal", nominal.mujoco_model), ("diagnosis", ours), ("mujoco.sysid", theirs)):

@@ -19,7 +19,7 @@ from fuzzing import command_too_much, take_in
 from served_page import served
 
 from calib.daemon.web import peer
-from calib.daemon.web.rate import RateLimit
+from calib.daemon.web.guard import RateLimit
 
 CORPUS = Path(__file__).parent / "corpus"
 FILES = [folder for kind in KINDS for folder in sorted(CORPUS.glob(f"{kind}/*"))]

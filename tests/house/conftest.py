@@ -1,8 +1,10 @@
 """Reads docs/formats.md: its numbered sections and the rows of their tables."""
 
 import re
+import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "sim_gap"))  # importlib mode leaves this folder out
 PAGE = (Path(__file__).parent.parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
 
 

@@ -226,6 +226,22 @@ def test_every_help_has_an_example_that_begins_with_the_command(words, capsys):
     assert f"Example: armlink {words[0]}" in text
 
 
+@pytest.mark.parametrize("words", SUB_COMMANDS, ids=" ".join)
+def test_a_help_with_many_options_groups_them_and_keeps_units(words, capsys):
+    assert cli.run([*words, "--help"]) == 0
+    text = capsys.readouterr().out
+    sections = re.findall(r"^(\w.*):\n", text, re.MULTILINE)
+    if len(re.findall(r"^  --", text, re.MULTILINE)) > 11:
+        assert len([each for each in sections if each != "Arguments"]) > 1
+    if words == ("gap", "diagnose"):
+        common = text.partition("Options:\n")[2].partition("\n\n")[0]
+        assert re.findall(r"^  (--[a-z-]+)", common, re.MULTILINE) == [
+            *("--sim", "--train", "--heldout", "--json", "--report", "--out-model", "--help")
+        ]
+        assert "[rad]" in text
+        assert "[s]" in text
+
+
 def test_the_list_is_sorted_one_line_each_in_one_style(capsys):
     cli.run(["--help"])
     listed = capsys.readouterr().out.partition("Commands:\n")[2].partition("\n\n")[0].splitlines()

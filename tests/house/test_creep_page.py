@@ -68,8 +68,8 @@ def test_every_command_of_the_page_and_the_same_in_python(
         if left_out(line) or line.startswith(NOT_HERE) or " dry" in line:
             continue
         status = cli.run(shlex.split(here(line))[1:])
-        said = capsys.readouterr().err
-        assert status == 0, f"{line}: {said}"
+        said = capsys.readouterr()
+        assert status == 0, f"{line}: {said.err}"
     copied = armlink.load_arm("copy.yaml")
     assert copied.serial == "DOCS"
     assert copied.require_link().bus.channel.endswith("my-openarm.yaml")

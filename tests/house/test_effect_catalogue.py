@@ -10,8 +10,8 @@ from calib.fit import unmodelled_effects
 from calib.observer.effect_dictionary import CAUSES
 from sim_bus.effects.registry import NOT_SIMULATED
 from sim_bus.effects.registry import effects as forward_effects
-from sim_gap.blind.effects.drawn import Drawn
-from sim_gap.blind.effects.library import DRAWS, NOT_DRAWN
+from sim_gap.blind.effects import DRAWS, NOT_DRAWN
+from sim_gap.blind.effects.drawn_effect import DrawnEffect
 from sim_gap.effects.registry import NOT_DIAGNOSED, effects, library_without
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -55,7 +55,7 @@ def test_the_forms_share_parameters_and_units() -> None:
 
 def test_a_blind_effect_with_a_parameter_outside_the_catalogue_is_refused() -> None:
     with pytest.raises(ValueError, match="strength not in the catalogue"):
-        Drawn("friction.coulomb", {"joint_1": {"strength": 1.0}}, lambda _arm: None)
+        DrawnEffect("friction.coulomb", {"joint_1": {"strength": 1.0}}, lambda _arm: None)
 
 
 def test_the_sensor_fit_and_the_cause_test_use_its_ids() -> None:

@@ -57,7 +57,7 @@ def test_diagnose_a_gap_names_the_causes(tmp_path):
 def test_the_arm_of_the_examples_has_its_simulated_bus_for_commands_from_any_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run(["scan", str(EXAMPLES / "planar3.yaml")]) == 0
-    assert "wrist" in capsys.readouterr().err
+    assert "wrist" in capsys.readouterr().out
 
 
 def test_every_example_is_run_here():

@@ -129,7 +129,7 @@ def test_one_line_names_the_thing_and_the_remedy(write, arguments, words, tmp_pa
     lines = [line for line in err.splitlines() if line.startswith("armlink: ")]
     assert status in (2, 3), err
     assert "Traceback" not in err
-    assert out == ""
+    assert status == 3 or out == ""  # scan and check show what they found before a bus fault ends them
     assert len(lines) == 1
     for word in words:
         assert re.search(re.escape(word), lines[0]), lines[0]

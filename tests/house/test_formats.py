@@ -16,7 +16,7 @@ from armlink.recording.files import SUFFIXES
 from armlink.recording.mcap import TOPICS
 from armlink.recording.recording import COLUMNS, Recording
 from calib.motion.static_reading import StaticReading
-from calib.records.records import CalibrationRecord, GravityRecord, Record
+from calib.records.records import ArmRecord, CalibrationRecord, GravityRecord
 from calib.sweep.dataset import Manifest, PlanLine, StallLine
 from sim_bus.effects.registry import effects as forward_effects
 from sim_gap.effects.laws import LAWS
@@ -158,9 +158,9 @@ def test_units_of_the_arm_file(model):
         ("3.2", StaticReading, None),
         ("3.3", PlanLine, None),
         ("3.4", StallLine, None),
-        ("4.1", Record, None),
-        ("4.2", CalibrationRecord, Record),
-        ("4.3", GravityRecord, Record),
+        ("4.1", ArmRecord, None),
+        ("4.2", CalibrationRecord, ArmRecord),
+        ("4.3", GravityRecord, ArmRecord),
     ],
 )
 def test_data_sets_and_records(number, model, common):

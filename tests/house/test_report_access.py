@@ -7,7 +7,8 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, sync_playwright
 
-from calib.report.page import ReportTable, Section, paragraph, render
+from calib.report.page import ReportSection as Section
+from calib.report.page import ReportTable, paragraph, render
 
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]}
 

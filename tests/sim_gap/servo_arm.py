@@ -7,12 +7,12 @@ import mujoco
 import numpy as np
 
 from armlink.recording.recording import Recording
-from sim_gap.closed_loop.columns import with_columns
-from sim_gap.closed_loop.controller import nominal_controller, nominal_point, scales_of
-from sim_gap.closed_loop.fit import Fit, improve
-from sim_gap.closed_loop.search import Search
-from sim_gap.closed_loop.windows import windows_of
 from sim_gap.model.load import load_model
+from sim_gap.position_gap.columns import with_columns
+from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
+from sim_gap.position_gap.fit import LoopFit, improve
+from sim_gap.position_gap.search import LoopSearch
+from sim_gap.position_gap.windows import windows_of
 
 JOINTS = ("shoulder", "elbow")
 
@@ -99,7 +99,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def fitted(*friction: float, weightless: bool = False) -> tuple[Search, Fit]:
+def fitted(*friction: float, weightless: bool = False) -> tuple[LoopSearch, LoopFit]:
     """A fit of gain, friction and damping to one recording of the arm with each friction [N·m].
 
     Without weight, neither gravity nor what inertia there is shows the scale of a torque.
@@ -116,6 +116,6 @@ def fitted(*friction: float, weightless: bool = False) -> tuple[Search, Fit]:
     sim = load_model(mujoco.MjModel.from_xml_string(text(0.2)))
     made = [record(text(x), seed, 21.0) for seed, x in enumerate(friction, start=1)]
     data = with_columns(windows_of(sim.arm, made, [f"run {k}" for k in range(len(made))]))
-    search = Search(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
+    search = LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
     names = ("kp", "coulomb", "viscous")
-    return search, improve(data, Fit(search.nominal, (names, names)), search.scales)
+    return search, improve(data, LoopFit(search.nominal, (names, names)), search.scales)

@@ -15,9 +15,9 @@ from armlink.drives.orders import Mode
 from armlink.errors import BusFault
 
 LOST: Mapping[Entry, str] = {
-    objects.RPDO_DEADLINE: "no deadline for commands: the heartbeat alone tells that the host is gone",
+    objects.RPDO_DEADLINE: "no deadline for commands: only its heartbeat shows that the host is gone",
     objects.HEARTBEAT_CONSUMER: "the device does not watch its host",
-    objects.HEARTBEAT_PRODUCER: "a device that leaves the bus is noticed by its readings alone",
+    objects.HEARTBEAT_PRODUCER: "only missing readings show that the device has left the bus",
     objects.ABORT_OPTION: "what it does when its host falls silent cannot be set",
     objects.QUICK_STOP_OPTION: "whether it holds after a quick stop cannot be set",
     objects.MAX_TORQUE: "the device does not bound torque: the host alone does",
@@ -30,7 +30,7 @@ LOST: Mapping[Entry, str] = {
     objects.VELOCITY: "no velocity reading: no torque control",
     objects.RATED_TORQUE: "rated torque as the arm file has it",
     objects.SUPPORTED_MODES: "modes as they are displayed",
-    objects.MODE_DISPLAY: "a refused mode shows by the motion alone",
+    objects.MODE_DISPLAY: "only the motion shows that a mode is refused",
     objects.TORQUE_OFFSET: "nothing latched to clear",
     objects.PROFILE_VELOCITY: "no profile position mode",
     objects.TORQUE_SLOPE: "no profile torque mode",

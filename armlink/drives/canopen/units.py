@@ -101,7 +101,7 @@ def _stock_units(services: NodeServices, joint: LinkJoint, settings: CanopenSett
     position = settings.position_unit or _position_unit(services)
     if position is None:
         raise BadInput(
-            f"{joint.name} ({settings.address}): 6092h, 608Fh and 60A8h do not tell the unit of 6064h: "
+            f"{joint.name} ({settings.address}): 6092h, 608Fh and 60A8h do not give the unit of 6064h: "
             "give drive.position_unit, radians of one count"
         )
     velocity = settings.velocity_unit or _velocity_unit(services, position)

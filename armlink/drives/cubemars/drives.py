@@ -135,7 +135,7 @@ class CubeMarsDrives(MitDrives):
             )
         self._known[joint] = known = _CubeMarsState(ranges, known.grid, limit, reply.feedback.position, on=False)
         self.powers[joint], self.faults[joint] = Power.OFF, error_text(reply.error)
-        notes = (_watched(settings), "scales by the arm file: the drive tells none")
+        notes = (_watched(settings), "scales are the arm file's: the drive reports none")
         where = ("position_range", "velocity_range", "torque_range")
         remedy = "if that is the drive's own range, take a drive with more; else correct it or drive.model"
         return mit_setup(reply.feedback.position, settings.kp, settings.kd, ranges, notes, where, remedy)

@@ -82,7 +82,7 @@ def _result(ask: Ask, name: str, settings: DamiaoSettings, ranges: Ranges, known
     if reply is None:
         raise BusFault(f"{name}: {settings.address} answers registers, but sends no feedback")
     if reply.state == DamiaoStatus.ENABLED:
-        raise BusFault(f"{name}: {settings.address} stays enabled although it was told to disable")
+        raise BusFault(f"{name}: {settings.address} stays enabled although it was commanded to disable")
     constant = known[DamiaoRegister.TORQUE_CONSTANT]
     notes = [
         f"torque constant {constant:g} N·m/A"

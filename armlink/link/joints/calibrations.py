@@ -59,7 +59,7 @@ class Calibrations:
         missing = [self.names[joint] for joint in hosted if found[joint] is None]
         if missing and not simulated:
             log.warning(
-                "%s: no calibration record is in force for %s: torque is what the drives take it for",
+                "%s: no calibration record is in force for %s: torque is as the drives report it",
                 self.arm.name,
                 ", ".join(missing),
             )

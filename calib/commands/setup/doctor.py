@@ -1,6 +1,5 @@
 """Says what is missing or doubtful between an arm file, this machine and its bus, first things first."""
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -25,11 +24,11 @@ def doctor(
     Example: armlink doctor sarcos --json -
     """
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from calib.commissioning.doctor import examine
 
-    console = PlainConsole()
-    with console.status(f"examining {arm}"):
+    console = results(json_file)
+    with PlainConsole().status(f"examining {arm}"):
         findings = examine(arm, bus, offline)
     for found in findings:
         console.print(found.level, style=COLOURS[found.level], end=": ")
@@ -38,6 +37,7 @@ def doctor(
     if errors:
         console.print(f"{errors} {'error' if errors == 1 else 'errors'} to deal with first")
     else:
-        console.print(f"no errors; next: {shlex.join(['armlink', 'check', arm])}")
+        console.print("no errors")
+        suggest(command_line("check", arm, bus=bus))
     write_json(json_file, {"schema": "armlink.doctor/1", "arm": arm, "findings": [each.to_json() for each in findings]})
     return 1 if errors else 0

@@ -1,6 +1,5 @@
 """Makes an arm file from a URDF or MJCF model, and finds its drives on a bus."""
 
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,17 +25,26 @@ def new(
         typer.Option(help="Arm file to write; default: the model's name with .yaml, here; arm.yaml without one."),
     ] = None,
     base: Annotated[
-        str | None, typer.Option(help="Body that carries the arm, such as a torso; default: the world.")
+        str | None,
+        typer.Option(help="Body that carries the arm, such as a torso; default: the world.", rich_help_panel="Model"),
     ] = None,
     tip: Annotated[
-        str | None, typer.Option(help="Body that the arm ends in; default: the end of the longest chain.")
+        str | None,
+        typer.Option(help="Body that the arm ends in; default: the end of the longest chain.", rich_help_panel="Model"),
     ] = None,
     stops: Annotated[
-        list[str] | None, typer.Option(help="JOINT:LOWER:UPPER [rad], instead of the model's limits; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            help="JOINT:LOWER:UPPER [rad], instead of the model's limits; may be repeated.", rich_help_panel="Model"
+        ),
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the arm; default: the model's.")] = None,
     bus: Annotated[
-        str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]: find the drives there, and write them down.")
+        str | None,
+        typer.Option(
+            help="INTERFACE:CHANNEL[@BITRATE]: find the drives there, and write them down.",
+            rich_help_panel="Drives on a bus",
+        ),
     ] = None,
     by_hand: Annotated[
         bool | None,
@@ -44,6 +52,7 @@ def new(
             help="With --bus: find each joint's drive, direction and gear by turning the joint by hand, without power;"
             " else the drives are taken in the order of their node ids. Default: ask.",
             show_default=False,
+            rich_help_panel="Drives on a bus",
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
@@ -61,9 +70,9 @@ def new(
     """
     from armlink.arm_file import MODEL_SUFFIXES, bundled_arms
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole
+    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.errors import BadInput
-    from calib.commands.setup.on_bus import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
+    from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
     from calib.commands.setup.terminal import Terminal, hand, parse_stops
     from calib.commissioning.new_arm import new_arm
 
@@ -80,7 +89,7 @@ def new(
             raise BadInput("--base, --tip and --stops are for a model: give one, or change the arm file itself")
         out = out or Path("arm.yaml")
         _require_free(out, force, interactive)
-        return begin_with_drives(console, out, bus, name, hand(by_hand, interactive), json_file)
+        return begin_with_drives(out, bus, name, hand(by_hand, interactive), json_file)
     bundled = bundled_arms().get(str(model))
     is_arm_file = bundled is not None or model.suffix.lower() in (".yaml", ".yml")
     if is_arm_file and bus is None:
@@ -95,9 +104,11 @@ def new(
         found = bundled or model
         if drives_by_ids(found):
             if by_hand:
-                raise BadInput("--by-hand: these drives are found by the ids in the arm file, and tell no position yet")
-            return copy(console, found, out, str(bus), bundled is not None, json_file)
-        return rewire(console, found, out, str(bus), hand(by_hand, interactive), json_file)
+                raise BadInput(
+                    "--by-hand: these drives are found by their ids in the arm file and give no position yet"
+                )
+            return copy(found, out, str(bus), bundled is not None, json_file)
+        return rewire(found, out, str(bus), hand(by_hand, interactive), json_file)
     with console.status(f"reading {model} and looking for collisions"):
         asked = Terminal(console) if interactive else None
         made = new_arm(model, out, base=base, tip=tip, stops=parse_stops(stops or []), name=name, questions=asked)
@@ -113,9 +124,9 @@ def new(
         made.draft.bus = bus_keys(bus, out)
     made.parsed()
     made.write()
-    _show(console, made)
-    step = shlex.join(["armlink", *(["demo", "--arm"] if bus is None else ["check"]), str(out)])
-    console.print(f"next: {step}", style="bold")
+    _show(results(json_file), made)
+    step = command_line("demo", arm=out) if bus is None else command_line("check", str(out))
+    suggest(step)
     write_json(json_file, _answer(made, step))
     return 1 if any(found.level == "error" for found in made.findings) else 0
 
@@ -154,7 +165,7 @@ def _show(console: Any, made: "NewArm") -> None:
 
 
 def _answer(made: "NewArm", step: str) -> dict[str, Any]:
-    from calib.commands.setup.on_bus import SCHEMA
+    from calib.commands.setup.bus_setup import SCHEMA
 
     draft = made.draft
     return {

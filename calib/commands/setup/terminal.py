@@ -1,4 +1,4 @@
-"""What `armlink new` asks a person at a terminal, and reads from its options."""
+"""Questions of `armlink new` to a person at a terminal, and answers from its options."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -41,13 +41,10 @@ def hand(by_hand: bool | None, interactive: bool) -> "Ask | None":
 
 
 class Terminal:
-    """Asks a person."""
-
     def __init__(self, console: "Console") -> None:
         self._console = console
 
     def which(self, chains: "Sequence[Chain]") -> "Chain":
-        """Which of several arms in a model is meant."""
         for number, chain in enumerate(chains, start=1):
             names = ", ".join(joint.name for joint in chain.joints)
             self._console.print(f"{number}: ends in {chain.tip}: {names}")
@@ -55,9 +52,9 @@ class Terminal:
         return chains[min(max(number, 1), len(chains)) - 1]
 
     def stops(self, joint: str) -> tuple[float, float] | None:
-        """Stops [rad] of a joint without limits; None where it has none."""
         text = ask(
-            f"{joint} has no limits in the model. Its lower and upper stop [rad], as -2.9 2.9; Enter: it has none",
+            f"{joint} has no limits in the model. Give its lower and upper stop [rad], such as -2.9 2.9,"
+            " or Enter for none",
             default="",
             show_default=False,
         )

@@ -16,12 +16,6 @@ from calib.daemon.loop.loop_messages import Batch
 
 SECONDS = 60.0
 """Length of a minute; a pause in the samples ends it before [s]."""
-PAUSE = 1.0
-"""Longest pause in the samples within a minute [s]."""
-RATE = 250.0
-"""Rows are thinned to about this rate if the bus is faster [Hz]."""
-ROWS = 300
-"""Rows written at a time: some hundredths of a second."""
 
 
 Rows = tuple[Array, dict[str, NDArray[np.float32]]]
@@ -44,7 +38,7 @@ class Minute:
                 for k, at in enumerate((t - begun).tolist()):
                     writer.append(at, {name: values[k] for name, values in channels.items()})
                 written += len(t)
-                if written >= ROWS:
+                if written >= 300:  # some hundredths of a second
                     written = 0
                     yield
 
@@ -54,16 +48,15 @@ class BusiestMinute:
 
     def __init__(self, rate: float) -> None:
         """For samples at `rate` [Hz]."""
-        self._stride = max(1, round(rate / RATE))
+        self._stride = max(1, round(rate / 250.0))  # [Hz]: rows of a faster bus are thinned
         self._parts: list[Rows] = []
         self._travel = 0.0
         self._at: Array | None = None
         self._best: Minute | None = None
 
     def append(self, batch: Batch) -> None:
-        """Take the samples of a batch."""
         t = batch.t[:: self._stride].copy()
-        if self._parts and not 0.0 <= t[0] - self._parts[-1][0][-1] <= PAUSE:
+        if self._parts and not 0.0 <= t[0] - self._parts[-1][0][-1] <= 1.0:  # [s]: a longer pause ends the minute
             self._end()
         self._parts.append((t, {name: x[:: self._stride].astype(np.float32) for name, x in batch.channels.items()}))
         at = batch.channels["position"][-1]

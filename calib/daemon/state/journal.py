@@ -25,15 +25,11 @@ from calib.daemon.environment import Immediate, RunAside
 from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.state.proposal_row import PROPOSALS, ProposalRow, proposal_of
 from calib.daemon.view.api_models import EventRecord
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 
 R = TypeVar("R")
 
 SCHEMA = 1
-LOCK_SECONDS = 0.05
-"""Wait for another program's lock [s]; what cannot be kept now is kept later."""
-OPEN_SECONDS = 10.0
-"""Likewise at the start [s]."""
 RETRY_SECONDS = 1.0
 """Time from a failure to the next attempt [s]."""
 SILENT_SECONDS = 2.0
@@ -46,8 +42,6 @@ LARGEST_ROW = 2**53 - 1
 """The largest whole number that JSON carries everywhere (RFC 8259, section 6)."""
 MOST_PROPOSALS = 1000
 """Proposals in memory, the newest; of an older one nothing can be decided any more."""
-CACHE_KB = 256
-"""SQLite's page cache: the default 2 MB fills over days, which looks like a memory leak."""
 AGED_EVENTS = 20_000
 """Events whose age is asked for: of a daemon that says 20 faults an hour, those of a month."""
 _TABLES = """
@@ -74,7 +68,7 @@ log = logging.getLogger("armlink.daemon")
 
 
 @dataclass(frozen=True)
-class Belief:
+class SavedBelief:
     """The observer's saved state, and the records that it is relative to."""
 
     calibration: str | None
@@ -195,8 +189,9 @@ class Journal:
     def _open(self) -> None:
         path = self.path
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._db = sqlite3.connect(path, isolation_level=None, timeout=OPEN_SECONDS, check_same_thread=False)
-        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"cache_size=-{CACHE_KB}"):
+        self._db = sqlite3.connect(path, isolation_level=None, timeout=10.0, check_same_thread=False)
+        # the default cache of 2 MB fills over days, which looks like a memory leak
+        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "cache_size=-256"):
             self._db.execute(f"PRAGMA {pragma}")
         found = self._db.execute("PRAGMA quick_check(1)").fetchone()[0]
         if found != "ok":
@@ -215,7 +210,8 @@ class Journal:
                     )
             self._db.execute(f"PRAGMA user_version={SCHEMA}")
         self._file = _identity(path)
-        self._db.execute(f"PRAGMA busy_timeout={int(LOCK_SECONDS * 1000)}")
+        # [ms] for another program's lock; what cannot be kept now is kept later
+        self._db.execute("PRAGMA busy_timeout=50")
         self._read_proposals()
         newest = "SELECT COALESCE(MAX(id), 0) FROM "
         event, proposal = (int(self._db.execute(newest + table).fetchone()[0]) for table in ("events", "proposals"))
@@ -431,7 +427,7 @@ class Journal:
 
     # ---- proposals
 
-    def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: Finding) -> int:
+    def add_proposal(self, time: datetime, joint: str, record: str, base: str, finding: DriftFinding) -> int:
         """Append a pending proposal and return its id; earlier pending ones of the joint are superseded."""
         number, self._next_proposal = self._next_proposal, self._next_proposal + 1
         statement = "INSERT INTO proposals(id, time, joint, record, base, finding) VALUES (?, ?, ?, ?, ?, ?)"
@@ -456,7 +452,6 @@ class Journal:
         return list(self._rows.values())[:limit]
 
     def pending(self) -> int:
-        """Number of pending proposals."""
         return sum(row.state == "pending" for row in self.proposals())
 
     def proposal(self, number: int) -> ProposalRow | None:
@@ -476,11 +471,11 @@ class Journal:
             waits.statements = [each for each in waits.statements if each[0] is not _BELIEF]
         self._write(_BELIEF, _iso(time), *self._belief)
 
-    def belief(self) -> Belief | None:
+    def belief(self) -> SavedBelief | None:
         """The observer's saved state; None if there is none or it cannot be read."""
         row = self._belief
         try:
-            return None if row is None else Belief(row[0], row[1], json.loads(row[2]))
+            return None if row is None else SavedBelief(row[0], row[1], json.loads(row[2]))
         except (ValueError, TypeError):
             return None
 

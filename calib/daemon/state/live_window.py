@@ -17,7 +17,6 @@ class LiveWindow:
     """One row per batch, ten times a second; rows are never changed once they are kept."""
 
     def __init__(self, n: int) -> None:
-        """For `n` joints."""
         self._unknown = np.full(n, np.nan)
         self._rows: deque[tuple[float, tuple[Array, ...]]] = deque()
 

@@ -7,14 +7,12 @@ from datetime import datetime
 from typing import Any
 
 from calib.daemon.view.api_models import Proposal
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.records.records import number_of
 
 
 @dataclass(frozen=True)
 class ProposalRow:
-    """One proposed recalibration."""
-
     id: int
     """Its row in this journal; a journal that is begun anew counts from 1 again, so that nobody outside knows it."""
     time: datetime
@@ -44,9 +42,9 @@ class ProposalRow:
         return hashlib.sha256(content.encode()).hexdigest()
 
     @property
-    def finding(self) -> Finding:
+    def finding(self) -> DriftFinding:
         """The drift that it was made from."""
-        return Finding.from_json(self.values)
+        return DriftFinding.from_json(self.values)
 
     def answer(self) -> Proposal:
         """As the API shows it."""
@@ -77,7 +75,7 @@ PROPOSALS = (
     "SELECT p.id, p.time, p.joint, p.record, p.base, p.finding, d.state, d.by, d.time, d.note FROM proposals p "
     "LEFT JOIN decisions d ON d.id = (SELECT MAX(id) FROM decisions WHERE proposal = p.id)"
 )
-"""What `proposal_of` takes."""
+"""Columns that `proposal_of` takes."""
 
 
 def proposal_of(row: tuple[Any, ...]) -> ProposalRow:

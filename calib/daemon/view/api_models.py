@@ -85,7 +85,7 @@ class Status(Answer):
     last_event: int = 0
     """Id of the newest event; 0 if there is none."""
     store_fault: str | None = None
-    """Why the record store cannot be read, in one line; the records in force stay in force."""
+    """Why the record store cannot be read, in one line; the records in force are kept."""
     journal_fault: str | None = None
     """Why the journal cannot be written, in one line; events wait until it can."""
     report: Path | None = None

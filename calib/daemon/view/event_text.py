@@ -82,7 +82,7 @@ def _load(cause: str, evidence: dict[str, Any]) -> str:
     mass, place = evidence["mass"], ", ".join("?" if x is None else f"{x:.3f}" for x in evidence["com"])
     held = "estimates are held" if cause == "payload" else "it stays: a tool, part of the model from now on"
     if mass is None:
-        return f"payload whose mass no lever between the axes shows; {held}"
+        return f"payload of unknown mass, since no lever between the axes shows it; {held}"
     if mass < 0:
         return f"{-mass:.3f} kg removed at ({place}) m in the last link's frame"
     return f"payload of {mass:.3f} kg at ({place}) m in the last link's frame; {held}"

@@ -5,9 +5,6 @@ from collections import deque
 
 from calib.daemon.view.api_models import EventItem, JointsItem
 
-QUEUE_ITEMS = 50
-"""Largest number of items that wait for one client: five seconds of joints."""
-
 Item = JointsItem | EventItem
 
 
@@ -16,7 +13,7 @@ class Client:
 
     def __init__(self, hub: "Hub") -> None:
         self._hub = hub
-        self._items: deque[Item] = deque(maxlen=QUEUE_ITEMS)
+        self._items: deque[Item] = deque(maxlen=50)  # five seconds of joints
         self._more = asyncio.Event()
 
     def put(self, item: Item) -> None:
@@ -32,23 +29,18 @@ class Client:
         return self._items.popleft()
 
     def close(self) -> None:
-        """Unsubscribe."""
         self._hub.clients.discard(self)
 
 
 class Hub:
-    """All clients of the stream."""
-
     def __init__(self) -> None:
         self.clients: set[Client] = set()
 
     def subscribe(self) -> Client:
-        """A new client."""
         client = Client(self)
         self.clients.add(client)
         return client
 
     def publish(self, item: Item) -> None:
-        """Give an item to every client."""
         for client in self.clients:
             client.put(item)

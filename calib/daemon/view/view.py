@@ -6,6 +6,7 @@ thread); no answer waits for bus or disk.
 
 from collections.abc import Iterator
 from concurrent.futures import Future
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Protocol
 
@@ -20,7 +21,20 @@ from calib.daemon.view.api_models import (
     Proposal,
     Status,
 )
-from calib.daemon.view.window import Window
+from gcomp.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """K rows of n joints, oldest first."""
+
+    names: tuple[str, ...]
+    time: datetime
+    """Of the newest row."""
+    t: Array
+    """Time since the oldest row (K,) [s]."""
+    channels: dict[str, Array]
+    """`position` [rad], `torque` and `model_torque` [N·m], `temperature` [°C] → (K, n); NaN if missing."""
 
 
 class NotPossible(Exception):

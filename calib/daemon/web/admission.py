@@ -39,9 +39,7 @@ class Connection(Protocol):
         """End it in good order: its client has asked for nothing."""
         ...
 
-    def cut(self) -> None:
-        """End it at once."""
-        ...
+    def cut(self) -> None: ...
 
     def unsent(self) -> int:
         """Bytes that its client has not taken."""
@@ -129,7 +127,6 @@ class Admission:
         self._stuck.pop(connection, None)
 
     def leave(self, connection: Connection) -> None:
-        """It has ended."""
         self._local.discard(connection)
         self._idle.pop(connection, None)
         self._queued.pop(connection, None)

@@ -26,7 +26,7 @@ JOINT = (
     ("torque", "joint_torque_newton_metres", "Torque sensor as the controller calibrates it."),
     ("model_torque", "joint_model_torque_newton_metres", "Gravity model at this position."),
     ("residual", "joint_residual_newton_metres", "Torque minus model torque; meaningful at rest."),
-    ("temperature", "joint_temperature_celsius", "Of the drive, where it tells it."),
+    ("temperature", "joint_temperature_celsius", "Of the drive, if it reports one."),
     ("sample_age_s", "joint_sample_age_seconds", "Time since position and torque last arrived."),
 )
 ESTIMATE = (
@@ -45,7 +45,6 @@ class DaemonCollector(Collector):
         self._view, self._streams = view, streams
 
     def collect(self) -> Iterable[Metric]:
-        """All families."""
         status = self._view.status()
         yield from _of_status(status)
         yield from _of_joints(JOINT, self._view.joints())

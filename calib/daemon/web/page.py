@@ -20,8 +20,6 @@ _EXPORT = re.compile(r"^export ", re.MULTILINE)
 
 @dataclass(frozen=True)
 class PageFile:
-    """One file as it is sent."""
-
     content: bytes
     media_type: str
     etag: str

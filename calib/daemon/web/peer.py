@@ -30,8 +30,6 @@ TAKE_SECONDS = 10.0
 """A client that has not taken what was sent to it, down to a rest, within this time is cut [s]."""
 HEAD_SECONDS = 10.0
 """A connection that has not sent a complete request head within this time is cut [s]."""
-WRITE_BUFFER = 32 * 1024
-"""Bytes buffered for one client; an item of the stream is about 2 kB."""
 ENDLESS = ("/api/stream",)
 """Routes whose answer does not end: nothing that is sent after such a request is ever read."""
 _UCRED = struct.Struct("3i")
@@ -99,7 +97,7 @@ class BoundedProtocol(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Identify the peer and start the deadline of the first request."""
         super().connection_made(cast(asyncio.Transport, LingeringTransport(transport)))
-        transport.set_write_buffer_limits(high=WRITE_BUFFER)
+        transport.set_write_buffer_limits(high=32 * 1024)  # an item of the stream is about 2 kB
         peer, app = replace(describe_peer(transport), trust=lambda: self.admission.trust(self)), self.app
         self.address, self.owner = peer.address, peer.owner
 

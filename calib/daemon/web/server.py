@@ -26,8 +26,6 @@ MOST_CONNECTIONS = 1280
 """More than all that `admission` lets in together."""
 ACCEPTED_AT_ONCE = 32
 """Connections accepted in one go: those that find no room are closed before the next go."""
-WAITING = 512
-"""Connections that the kernel holds until they are accepted; beyond it connect() on the Unix socket fails."""
 FILES = 4096
 """Open files that the daemon asks the system for, as far as its hard limit allows."""
 CLOSING_SECONDS = 2
@@ -120,14 +118,14 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-class _Server(uvicorn.Server):
+class _ApiServer(uvicorn.Server):
     """uvicorn's server without its signal handlers (the service has its own), and with a queue longer than one go."""
 
     async def startup(self, sockets: list[sockets.socket] | None = None) -> None:
         """As uvicorn's, whose backlog is both the kernel's queue and what is accepted in one go."""
         await super().startup(sockets)
         for listening in sockets or ():
-            listening.listen(WAITING)
+            listening.listen(512)  # beyond them connect() on the Unix socket fails
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -150,7 +148,7 @@ async def _run(view: DaemonView, listening: list[sockets.socket], access: Access
         limit_concurrency=MOST_CONNECTIONS,
         timeout_graceful_shutdown=CLOSING_SECONDS,
     )
-    server = _Server(config)
+    server = _ApiServer(config)
     running = asyncio.create_task(server.serve(sockets=listening))
     try:
         await asyncio.shield(running)

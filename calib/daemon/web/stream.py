@@ -25,8 +25,6 @@ _log = logging.getLogger(__name__)
 
 
 class Streams:
-    """All clients of the stream."""
-
     def __init__(self, view: DaemonView) -> None:
         self._view, self.histories = view, Histories(view)
         self._tasks: dict[asyncio.Task[None], str] = {}

@@ -12,8 +12,7 @@ from fastapi.responses import Response
 
 from armlink.recording.mcap import TOPICS, RecordingWriter
 from calib.daemon.view.api_models import WindowRows
-from calib.daemon.view.view import DaemonView
-from calib.daemon.view.window import Window
+from calib.daemon.view.view import DaemonView, Window
 from calib.daemon.web.history import Histories
 from calib.daemon.web.parameters import WindowQuery
 from calib.daemon.web.peer import Owner

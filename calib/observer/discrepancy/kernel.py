@@ -23,8 +23,6 @@ CONSTANT, SLOPE, SIDE = 0.1, 0.1, 0.05
 is discrepancy, and of the side of approach (hysteresis)."""
 WARM = 20.0
 """Rise of temperature over which a zero moves by the size that is expected of it [K]: a joint that has warmed up."""
-POSES = 256
-"""Random poses over the joint ranges from which the typical gravity torque is taken."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class Kernel:
         """beta (2n,) [kg·m] is the gravity model."""
         self._arm, self._beta = arm, beta
         lower, upper = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
-        self.poses: Array = np.random.default_rng(0).uniform(lower, upper, (POSES, arm.n))
+        self.poses: Array = np.random.default_rng(0).uniform(lower, upper, (256, arm.n))
         """Random poses over the joint ranges [rad]."""
         typical = gravity_torque(arm, beta, self.poses).std(axis=0)
         self.typical: Array = np.maximum(typical, 1e-3 * max(float(typical.max()), 1e-9))

@@ -14,8 +14,6 @@ SHARES = np.array([0.4, 0.3, 0.2, 0.1])
 """Shares of the parts (`kernel.PARTS`, then the rough one) in the variance, before the first row."""
 SPREAD_SHARES = 0.7
 """Standard deviation of the logarithm of a part, beside that of the whole."""
-DEPENDENT = 1e-6
-"""Singular value of columns of unit length below which one of them depends on the others."""
 STEPS, LONGEST = 6, 0.7
 """Steps of the search by Fisher scoring, and the longest one, in the logarithm of a standard deviation."""
 SPREAD_UNKNOWN, SPREAD_KNOWN = 1.2, 0.4
@@ -24,7 +22,7 @@ with one, since work is not done at the calibration's poses."""
 
 
 @dataclass(frozen=True)
-class Level:
+class DiscrepancyLevel:
     """Standard deviations of each joint's discrepancy [N·m]."""
 
     smooth: Array
@@ -39,19 +37,19 @@ class Level:
     """Rows that it was learned from."""
 
     @classmethod
-    def none(cls, n: int) -> "Level":
+    def none(cls, n: int) -> "DiscrepancyLevel":
         """A model without error."""
         zero = np.zeros(n)
         return cls(np.zeros((len(PARTS), n)), zero, zero, zero + SPREAD_UNKNOWN)
 
     @classmethod
-    def expected(cls, before: Array, spread: Array | None = None) -> "Level":
+    def expected(cls, before: Array, spread: Array | None = None) -> "DiscrepancyLevel":
         """Before the first row; spread (n,) if a calibration has measured it."""
         parts = np.sqrt(SHARES)[:, None] * before
         return cls(parts[:-1], parts[-1], before, np.full_like(before, SPREAD_UNKNOWN) if spread is None else spread)
 
     @classmethod
-    def of_record(cls, calibration: CalibrationRecord, otherwise: Array) -> "Level":
+    def of_record(cls, calibration: CalibrationRecord, otherwise: Array) -> "DiscrepancyLevel":
         """As the record has it, `otherwise` (n,) [N·m] for joints of which it says nothing."""
         level, std = calibration.discrepancy("level"), calibration.discrepancy("level_std")
         said = level > 0
@@ -69,7 +67,7 @@ class Level:
         """Whether rows or a calibration have told it."""
         return self.rows > 0 or bool((self.spread < SPREAD_UNKNOWN).all())
 
-    def fitted(self, unit: Array, residual: Array, noise: Array, known: Array, free: Array) -> "Level":
+    def fitted(self, unit: Array, residual: Array, noise: Array, known: Array, free: Array) -> "DiscrepancyLevel":
         """The level of greatest restricted likelihood, given what was expected; by Fisher scoring.
 
         unit (parts, n, N, N): covariance of the discrepancy's parts at level 1. residual (n, N) [N·m]: readings less
@@ -110,6 +108,6 @@ def _complement(columns: Array) -> tuple[Array, Array]:
     """
     size = np.linalg.norm(columns, axis=1, keepdims=True)
     vectors, lengths, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0))
-    rank = (lengths > DEPENDENT).sum(axis=1)
+    rank = (lengths > 1e-6).sum(axis=1)  # of unit columns, below which one depends on the others
     told = np.arange(columns.shape[1]) >= rank[:, None]
     return vectors * told[:, None, :], told

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.observer.discrepancy.kernel import Kernel, Points
-from calib.observer.discrepancy.level import Level
+from calib.observer.discrepancy.level import DiscrepancyLevel
 from gcomp.arrays import Array
 
 
@@ -26,7 +26,14 @@ class Posterior:
     """Residuals at other poses as reference rows predict them: mean and covariance, jointly over joints and poses."""
 
     def __init__(
-        self, kernel: Kernel, level: Level, noise: Array, free: Array, thermal: Array, data: Data, shared: int
+        self,
+        kernel: Kernel,
+        level: DiscrepancyLevel,
+        noise: Array,
+        free: Array,
+        thermal: Array,
+        data: Data,
+        shared: int,
     ) -> None:
         """noise (n,) [N·m]: of one row. free (n,) [N·m]: size of an offset or gain's change between two epochs. thermal
         (n,) [N·m]: how far a zero moves as the joint warms by `kernel.WARM`.

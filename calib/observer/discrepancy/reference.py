@@ -94,7 +94,6 @@ class Reference:
         return self.rows[: same[0]] if len(same) else self.rows
 
     def save(self) -> dict[str, Any]:
-        """Rows as JSON values."""
         values = {name: [known(getattr(rows, name)) for rows in (self.rows, self._pending)] for name in ROWS}
         return {"reference": {**values, "open": self._epoch}}
 

@@ -19,7 +19,6 @@ class Cusum:
     """
 
     def __init__(self, n: int, config: ObserverConfig) -> None:
-        """n joints."""
         self._config = config
         self._sums: Array = np.zeros((n, len(CHANNELS)))
         self._rising = np.zeros((n, len(CHANNELS)), dtype=int)
@@ -38,7 +37,6 @@ class Cusum:
         return [(int(j), CHANNELS[c]) for j, c in np.argwhere(self._sums > self._config.alarm_threshold)]
 
     def reset(self) -> None:
-        """Set every sum to zero."""
         self._sums, self._rising = np.zeros_like(self._sums), np.zeros_like(self._rising)
 
     def rising(self, joint: int, channel: str) -> int:

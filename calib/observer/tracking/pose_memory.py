@@ -17,7 +17,6 @@ class PoseMemory:
     """
 
     def __init__(self, n: int, config: ObserverConfig) -> None:
-        """n joints."""
         self._config = config
         self._position: Array = np.empty((0, n))
         self._mean: Array = np.empty((0, n))

@@ -78,7 +78,6 @@ class SensorFilter:
         self.rejected[j] = 0
 
     def estimate(self) -> Estimate:
-        """Gain, offset and their standard deviations."""
         gain_std, offset_std = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)).T
         gain, offset = self.state.T.copy()
         return Estimate(gain, gain_std, offset, offset_std, self.accepted.copy())

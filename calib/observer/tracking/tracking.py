@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading, batch, stack
-from calib.observer.cause_test import CauseTest
+from calib.observer.cause_test import CauseTest, DetectionLimits, limits
 from calib.observer.config import ObserverConfig
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.saved_values import UNREADABLE, read_rows, save_rows
 from calib.observer.tracking.cusum import Cusum
-from calib.observer.tracking.limits import Limits, limits
 from calib.observer.tracking.pose_memory import PoseMemory
 from calib.observer.tracking.sensor_filter import SensorFilter
 from gcomp.arrays import Array, as_array
@@ -157,7 +156,7 @@ class Tracking:
         self.belief.carry(values, covariance)
         self._poses.forget()
 
-    def install(self, finding: Finding) -> None:
+    def install(self, finding: DriftFinding) -> None:
         """The finding was written: its joint is as installed, within the finding's uncertainty."""
         floor = np.diag([self._config.drift_gain**2, self._config.drift_offset**2])
         self.filter.restart(finding.joint, covariance=finding.covariance + floor)
@@ -170,7 +169,7 @@ class Tracking:
         self._since.clear()
         self._suspected = 0
 
-    def limits(self, rows: list[StaticReading]) -> Limits:
+    def limits(self, rows: list[StaticReading]) -> DetectionLimits:
         """Limits in work like these rows; over the whole range while they are few."""
         config, belief = self._config, self.belief
         wait = 0 if belief.level.is_known else max(0, config.window - self.rows)

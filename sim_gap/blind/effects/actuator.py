@@ -2,37 +2,36 @@
 
 import numpy as np
 
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
-from sim_gap.blind.effects.drawn import Draw, Drawn, added, motor_level, pick, replaced, sign
+from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, add_to_entry, motor_level, pick, set_entry, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 LATE_S = (0.008, 0.016)
 """Delays and lags [s]: two to four sample intervals."""
 SLOW = "needs steps, a chirp or faster logging"
 
 
-def gain(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """Torque produced per torque reported."""
+def gain(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     wanted = np.maximum(1.3 * motor_level(scene, random) / rms(scene.torque + scene.rotor_torque), 0.07)
     j = pick(wanted, 0.3, random)
     if j is None:
         return None
     value = 1.0 + sign(random) * float(wanted[j])
-    return Drawn.at(scene, j, "actuator.gain", {"gain": value}, replaced(lambda arm: arm.motor_gain, j, value))
+    return DrawnEffect.at(scene, j, "actuator.gain", {"gain": value}, set_entry(lambda arm: arm.motor_gain, j, value))
 
 
-def rotor_inertia(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def rotor_inertia(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """A rotor inertia larger than the nominal model's."""
     wanted = motor_level(scene, random) / rms(scene.motion[2])
     j = pick(wanted, 2.0, random)
     if j is None:
         return None
     inertia = float(wanted[j])
-    put = added(lambda true: true.arm.armature, j, inertia)
-    return Drawn.at(scene, j, "actuator.rotor_inertia", {"inertia": inertia}, put)
+    put = add_to_entry(lambda true: true.arm.armature, j, inertia)
+    return DrawnEffect.at(scene, j, "actuator.rotor_inertia", {"inertia": inertia}, put)
 
 
-def _late(scene: Scene, random: np.random.Generator, effect: str, other: str) -> Drawn | None:
+def _late(scene: Scene, random: np.random.Generator, effect: str, other: str) -> DrawnEffect | None:
     """A lag or delay of the drive, at a joint whose torque changes fast enough to show it; slow motion confuses it with
     the `other`."""
     time = float(random.uniform(*LATE_S))
@@ -46,20 +45,18 @@ def _late(scene: Scene, random: np.random.Generator, effect: str, other: str) ->
         times[j] = time
         true.bandwidth[j] = min(true.bandwidth[j], 0.35 / (1.8 * time))
 
-    return Drawn.at(scene, j, effect, {"time": time}, apply, undecided=SLOW, confused_with=(other,))
+    return DrawnEffect.at(scene, j, effect, {"time": time}, apply, undecided=SLOW, confused_with=(other,))
 
 
-def lag(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A first-order lag from command to torque."""
+def lag(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     return _late(scene, random, "actuator.lag", "actuator.delay")
 
 
-def delay(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A dead time from command to torque."""
+def delay(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     return _late(scene, random, "actuator.delay", "actuator.lag")
 
 
-def saturation(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def saturation(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """The motor torque clipped: above the torque that holds the arm against gravity, below the peaks of its motion."""
     size = np.abs(scene.torque + scene.rotor_torque)
     hold = np.abs(scene.gravity).max(0)
@@ -69,8 +66,8 @@ def saturation(scene: Scene, random: np.random.Generator) -> Drawn | None:
     if j is None:
         return None
     limit = float(limits[j])
-    return Drawn.at(
-        scene, j, "actuator.saturation", {"limit": limit}, replaced(lambda true: true.motor_limit, j, limit)
+    return DrawnEffect.at(
+        scene, j, "actuator.saturation", {"limit": limit}, set_entry(lambda true: true.motor_limit, j, limit)
     )
 
 

@@ -5,19 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
-from sim_gap.blind.effects.drawn import Draw, Drawn, added, motor_level, pick, replaced, sign
-
-MOVING = 0.02
-"""Speed [rad/s] below which friction does not show in the readings."""
+from sim_gap.blind.arms import BenchArm
+from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, add_to_entry, motor_level, pick, set_entry, sign
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 
-def _known_coulomb(joint: int, torque: float, known: bool) -> tuple[Callable[[Arm], Arm] | None, tuple[str, ...]]:
+def _known_coulomb(
+    joint: int, torque: float, known: bool
+) -> tuple[Callable[[BenchArm], BenchArm] | None, tuple[str, ...]]:
     """Coulomb friction under another effect: either the nominal model has it, or it is implied."""
 
-    def nominal(arm: Arm) -> Arm:
+    def nominal(arm: BenchArm) -> BenchArm:
         frictionloss = arm.frictionloss.copy()
         frictionloss[joint] = torque
         return replace(arm, frictionloss=frictionloss)
@@ -25,25 +24,27 @@ def _known_coulomb(joint: int, torque: float, known: bool) -> tuple[Callable[[Ar
     return (nominal, ()) if known else (None, ("friction.coulomb",))
 
 
-def coulomb(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A constant torque against the motion."""
+def coulomb(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     j = int(random.integers(scene.arm.n))
     torque = float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0))
-    return Drawn.at(scene, j, "friction.coulomb", {"torque": torque}, added(lambda true: true.coulomb, j, torque))
+    return DrawnEffect.at(
+        scene, j, "friction.coulomb", {"torque": torque}, add_to_entry(lambda true: true.coulomb, j, torque)
+    )
 
 
-def viscous(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A torque proportional to the velocity."""
+def viscous(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     j = int(random.integers(scene.arm.n))
     damping = float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0) / rms(scene.motion[1])[j])
-    return Drawn.at(scene, j, "friction.viscous", {"damping": damping}, added(lambda true: true.viscous, j, damping))
+    return DrawnEffect.at(
+        scene, j, "friction.viscous", {"damping": damping}, add_to_entry(lambda true: true.viscous, j, damping)
+    )
 
 
-def stribeck(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def stribeck(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """More friction at low speed, in addition to Coulomb friction."""
     j = int(random.integers(scene.arm.n))
     level, speed = float(motor_level(scene, random)[j]), np.abs(scene.motion[1][:, j])
-    moving = speed[speed > MOVING]
+    moving = speed[speed > 0.02]  # below, friction does not show
     velocity = float(np.clip(np.quantile(moving, random.uniform(0.25, 0.5)), 0.05, 0.35))
     breakaway = float(1.2 * level / rms(np.exp(-((moving / velocity) ** 2))))
     base = breakaway * random.uniform(0.8, 1.6)
@@ -54,11 +55,10 @@ def stribeck(scene: Scene, random: np.random.Generator) -> Drawn | None:
         true.breakaway[j], true.stribeck_velocity[j] = breakaway, velocity
 
     values = {"breakaway": breakaway, "velocity": velocity}
-    return Drawn.at(scene, j, "friction.stribeck", values, apply, nominal, implied)
+    return DrawnEffect.at(scene, j, "friction.stribeck", values, apply, nominal, implied)
 
 
-def asymmetric(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """Friction that differs between directions."""
+def asymmetric(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     j = int(random.integers(scene.arm.n))
     ratio = sign(random) * random.uniform(0.25, 0.6)
     base = float(1.5 * motor_level(scene, random)[j] / abs(ratio))
@@ -67,10 +67,10 @@ def asymmetric(scene: Scene, random: np.random.Generator) -> Drawn | None:
     def apply(true: TrueArm) -> None:
         true.coulomb[j], true.asymmetry[j] = base, ratio
 
-    return Drawn.at(scene, j, "friction.asymmetric", {"ratio": ratio}, apply, nominal, implied)
+    return DrawnEffect.at(scene, j, "friction.asymmetric", {"ratio": ratio}, apply, nominal, implied)
 
 
-def load(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def load(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Friction proportional to the transmitted torque, on a joint whose torque varies."""
     size = np.abs(scene.torque)
     varies = size.std(0) > 0.4 * size.mean(0)
@@ -79,8 +79,8 @@ def load(scene: Scene, random: np.random.Generator) -> Drawn | None:
     if j is None:
         return None
     coefficient = float(wanted[j])
-    put = replaced(lambda true: true.load_friction, j, coefficient)
-    return Drawn.at(scene, j, "friction.load", {"coefficient": coefficient}, put)
+    put = set_entry(lambda true: true.load_friction, j, coefficient)
+    return DrawnEffect.at(scene, j, "friction.load", {"coefficient": coefficient}, put)
 
 
 DRAWS: dict[str, Draw] = {

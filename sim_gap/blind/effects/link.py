@@ -6,24 +6,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import TrueArm
-from sim_gap.blind.effects.drawn import Draw, Drawn, sensor_level
+from sim_gap.blind.arms import BenchArm
+from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, sensor_level
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import TrueArm
 
 XYZ = ("x", "y", "z")
-WEIGHS = 0.1
-"""Share of a moved mass's torque that is its weight, below which it shows as an inertia alone."""
 UPRIGHT = "the axis is upright: a moved mass shows by its inertia alone"
 INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
 
 
-def _scale(scene: Scene, other: Arm, joints: NDArray[np.intp], random: np.random.Generator) -> float:
+def _scale(scene: Scene, other: BenchArm, joints: NDArray[np.intp], random: np.random.Generator) -> float:
     """Factor on a change at which it shows at the most sensitive of `joints`."""
     return float(1.0 / (rms(scene.change(other)) / sensor_level(scene, random))[joints].max())
 
 
-def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def mass_moment(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """A shifted centre of mass, across the link's own axis, so that its own joint shows it."""
     arm, level = scene.arm, sensor_level(scene, random)
     shift = random.uniform(0.15, 0.3)
@@ -35,18 +33,18 @@ def mass_moment(scene: Scene, random: np.random.Generator) -> Drawn | None:
         if np.linalg.norm(moment) / arm.mass[link] > shift:
             continue
         moved = arm.with_moved(link, moment)
-        weighs = float(rms(scene.change_at_rest(moved))[link]) > WEIGHS * float(rms(scene.change(moved))[link])
+        weighs = float(rms(scene.change_at_rest(moved))[link]) > 0.1 * float(rms(scene.change(moved))[link])
 
         def apply(true: TrueArm, link: int = link, moment: Array = moment) -> None:
             true.arm = true.arm.with_moved(link, moment)
 
         values = dict(zip(XYZ, moment.tolist(), strict=True))
         why, others = ("", ()) if weighs else (UPRIGHT, ("link.inertia",))
-        return Drawn.at(scene, link, "link.mass_moment", values, apply, undecided=why, confused_with=others)
+        return DrawnEffect.at(scene, link, "link.mass_moment", values, apply, undecided=why, confused_with=others)
     return None
 
 
-def inertia(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def inertia(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Additional inertia, mostly about the joint's own axis, that no shift of mass explains."""
     arm, level = scene.arm, 1.3 * sensor_level(scene, random)
     for link in random.permutation(arm.n).tolist():
@@ -60,18 +58,17 @@ def inertia(scene: Scene, random: np.random.Generator) -> Drawn | None:
         def apply(true: TrueArm, link: int = link, added: Array = added) -> None:
             true.arm = _thicker(true.arm, link, added)
 
-        return Drawn.at(scene, link, "link.inertia", {name: float(added[r, c]) for name, r, c in INERTIA}, apply)
+        return DrawnEffect.at(scene, link, "link.inertia", {name: float(added[r, c]) for name, r, c in INERTIA}, apply)
     return None
 
 
-def _thicker(arm: Arm, link: int, added: Array) -> Arm:
+def _thicker(arm: BenchArm, link: int, added: Array) -> BenchArm:
     out = replace(arm, inertia=arm.inertia.copy())
     out.inertia[link] += added
     return out
 
 
-def payload(scene: Scene, random: np.random.Generator) -> Drawn | None:
-    """A mass fixed to the last link."""
+def payload(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     arm, tip = scene.arm, scene.arm.n - 1
     com = arm.com[tip] * 1.5 + random.uniform(-0.06, 0.06, 3)
     light = _loaded(arm, 0.5, com)
@@ -82,15 +79,15 @@ def payload(scene: Scene, random: np.random.Generator) -> Drawn | None:
     def apply(true: TrueArm) -> None:
         true.arm = _loaded(true.arm, mass, com)
 
-    return Drawn("link.payload", {"arm": {"mass": mass, **dict(zip(XYZ, com.tolist(), strict=True))}}, apply)
+    return DrawnEffect("link.payload", {"arm": {"mass": mass, **dict(zip(XYZ, com.tolist(), strict=True))}}, apply)
 
 
-def _loaded(arm: Arm, mass: float, com: Array) -> Arm:
+def _loaded(arm: BenchArm, mass: float, com: Array) -> BenchArm:
     about = mass * (com @ com * np.eye(3) - np.outer(com, com)) + 0.002 * mass * np.eye(3)
     return arm.with_added(arm.n - 1, mass, mass * com, about)
 
 
-def tilt(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def tilt(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """The base rotated by a small angle about an axis across gravity."""
     arm = scene.arm
     down = arm.gravity / np.linalg.norm(arm.gravity)
@@ -109,10 +106,10 @@ def tilt(scene: Scene, random: np.random.Generator) -> Drawn | None:
     )  # the two base axes closest to perpendicular to gravity
     aligned = np.abs(down).max() > 0.999
     values = {f"angle_{k + 1}": float(turn[axis]) for k, axis in enumerate(named)} if aligned else {}
-    return Drawn("base.tilt", {"arm": values}, apply)
+    return DrawnEffect("base.tilt", {"arm": values}, apply)
 
 
-def _tilted(arm: Arm, turn: Array) -> Arm:
+def _tilted(arm: BenchArm, turn: Array) -> BenchArm:
     """The base rotated by the rotation vector `turn` [rad]: gravity rotates the other way in the base frame."""
     angle = float(np.linalg.norm(turn))
     axis, g = turn / angle, arm.gravity

@@ -5,18 +5,24 @@ from dataclasses import replace
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.arms import Arm
-from sim_gap.blind.cases.scene import Scene, rms
-from sim_gap.blind.cases.true_arm import SharedMotor, TrueArm
-from sim_gap.blind.effects.drawn import OFTEN, Draw, Drawn, motor_level, pick, replaced, reversals, sensor_level, sign
+from sim_gap.blind.arms import BenchArm
+from sim_gap.blind.effects.drawn_effect import (
+    OFTEN,
+    Draw,
+    DrawnEffect,
+    motor_level,
+    pick,
+    reversals,
+    sensor_level,
+    set_entry,
+    sign,
+)
+from sim_gap.blind.plant.plant import STEP
+from sim_gap.blind.scene import Scene, rms
+from sim_gap.blind.true_arm import SharedMotor, TrueArm
 
-STEP_S = 5e-4
-"""Time step of the plant [s]: springs must be slower."""
-ELASTIC_LEAST = 0.25
-"""Least RMS torque caused by the deflection of an elastic joint [N·m]."""
 
-
-def ripple(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def ripple(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Torque lost to the meshing gear: amplitude·sin(cycles·θ + phase), slow enough to pass a 6 Hz filter."""
     fastest = np.quantile(np.abs(scene.motion[1]), 0.9, axis=0)
     j = int(random.integers(scene.arm.n))
@@ -30,10 +36,10 @@ def ripple(scene: Scene, random: np.random.Generator) -> Drawn | None:
     def apply(true: TrueArm) -> None:
         true.ripple[j] = list(values.values())
 
-    return Drawn.at(scene, j, "transmission.ripple", values, apply)
+    return DrawnEffect.at(scene, j, "transmission.ripple", values, apply)
 
 
-def spring(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def spring(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """A cable bundle across the joint: −stiffness·(θ − rest) on the link."""
     q = scene.motion[0]
     wanted = 1.3 * np.maximum(sensor_level(scene, random), 0.2) / q.std(0)
@@ -44,7 +50,7 @@ def spring(scene: Scene, random: np.random.Generator) -> Drawn | None:
     def apply(true: TrueArm) -> None:
         true.spring[j] = stiffness, rest
 
-    return Drawn.at(scene, j, "transmission.spring", {"stiffness": stiffness, "rest": rest}, apply)
+    return DrawnEffect.at(scene, j, "transmission.spring", {"stiffness": stiffness, "rest": rest}, apply)
 
 
 def _turn_felt(scene: Scene, error: Array) -> Array:
@@ -52,21 +58,21 @@ def _turn_felt(scene: Scene, error: Array) -> Array:
     return np.array([rms(scene.slope[:, :, j] * error[:, j, None]).max() for j in range(scene.arm.n)])
 
 
-def elasticity(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def elasticity(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Rotor and link with a spring between them; the position sensor is at the rotor."""
     stiffness_of = rms(scene.torque) / random.uniform(0.015, 0.04)  # from the RMS deflection [rad]
     resonance, stiffest = (2 * np.pi * 4.0) ** 2 * scene.inertia, _stiffest(scene)
     shown = _turn_felt(scene, scene.torque / stiffness_of)
-    fit = (shown > ELASTIC_LEAST) & (stiffness_of > resonance) & (stiffness_of < stiffest)
+    fit = (shown > 0.25) & (stiffness_of > resonance) & (stiffness_of < stiffest)  # N·m of deflection
     if not fit.any():
         return None
     j = int(random.choice(np.flatnonzero(fit)))
     stiffness = float(stiffness_of[j])
-    put = replaced(lambda true: true.stiffness, j, stiffness)
-    return Drawn.at(scene, j, "transmission.elasticity", {"stiffness": stiffness}, put)
+    put = set_entry(lambda true: true.stiffness, j, stiffness)
+    return DrawnEffect.at(scene, j, "transmission.elasticity", {"stiffness": stiffness}, put)
 
 
-def backlash(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def backlash(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Backlash between rotor and link, on a joint whose torque changes sign often."""
     level = np.maximum(sensor_level(scene, random), 0.2)
     wanted = 2.2 * level / np.maximum(_turn_felt(scene, np.ones_like(scene.torque)), 1e-9)
@@ -79,17 +85,17 @@ def backlash(scene: Scene, random: np.random.Generator) -> Drawn | None:
     def apply(true: TrueArm) -> None:
         true.backlash[j], true.stiffness[j] = play, stiffness
 
-    return Drawn.at(scene, j, "transmission.backlash", {"width": play}, apply)
+    return DrawnEffect.at(scene, j, "transmission.backlash", {"width": play}, apply)
 
 
 def _stiffest(scene: Scene) -> Array:
     """Stiffness of a stiff gear that the time step still resolves, (n,)."""
     link = np.maximum(scene.inertia - scene.arm.armature, 2e-3)
     reduced = link * scene.arm.armature / (link + scene.arm.armature)
-    return np.asarray(np.minimum(0.04 * reduced / STEP_S**2, 4e4))
+    return np.asarray(np.minimum(0.04 * reduced / STEP**2, 4e4))
 
 
-def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
+def coupling(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """The motor of a joint also turns with its neighbour; the nominal model does not have that motor."""
     n = scene.arm.n
     j = int(random.integers(1, n))
@@ -100,7 +106,7 @@ def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
     coulomb, viscous = 1.5 * level, 0.8 * level / float(rms(speed))
     rotor = 0.5 * level / float(rms(push))
 
-    def nominal(arm: Arm) -> Arm:
+    def nominal(arm: BenchArm) -> BenchArm:
         out = replace(
             arm, armature=arm.armature.copy(), damping=arm.damping.copy(), frictionloss=arm.frictionloss.copy()
         )
@@ -120,7 +126,7 @@ def coupling(scene: Scene, random: np.random.Generator) -> Drawn | None:
         "viscous": viscous,
     }
     own = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
-    return Drawn.at(scene, j, "transmission.coupling", values, apply, nominal, own)
+    return DrawnEffect.at(scene, j, "transmission.coupling", values, apply, nominal, own)
 
 
 DRAWS: dict[str, Draw] = {

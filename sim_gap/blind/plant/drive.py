@@ -1,4 +1,11 @@
-"""Motors, friction, gears and position sensors of many arms: from commanded torque to the forces on the links."""
+"""Motors, friction, gears and position sensors of many arms: from commanded torque to the forces on the links.
+
+Friction is elasto-plastic (Dupont, Hayward, Armstrong, Altpeter 2002): LuGre friction without drift at rest.
+
+f = σ₀ z + σ₁ ż + d v,  ż = v (1 − α(z, v) z/z_ss),  z_ss = g(v, τ)/σ₀ in the direction of v; α is 0 in the elastic
+range (|z| below 0.7 z_ss, or v and z of opposite sign), rises smoothly and is 1 in sliding.
+g = (coulomb + breakaway·exp(−(v/v_s)²) + load·|τ|)·(1 ± asymmetry).
+"""
 
 from collections.abc import Sequence
 
@@ -6,14 +13,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array, Mask
-from sim_gap.blind.cases.true_arm import TrueArm
-from sim_gap.blind.plant.friction import Bristles, padded
+from sim_gap.blind.true_arm import TrueArm
 
-SPRING_DAMPING = 0.04
-"""Damping ratio of an elastic transmission."""
+STIFFEST = 0.05
+"""σ₀ h²/(inertia) is at most this, for a stable step."""
 
 
-class Drives:
+class Bristles:
+    """Friction of many arms at once, (B, width); columns beyond an arm's joints are frictionless."""
+
+    def __init__(self, truths: Sequence[TrueArm], inertia: Array, step: float) -> None:
+        """`inertia` (B, width): least inertia that each motor moves [kg·m²]; `step` [s]."""
+        width = inertia.shape[1]
+        self.coulomb, self.viscous, self.breakaway, self.load = (
+            pad_rows([getattr(t, name) for t in truths], width)
+            for name in ("coulomb", "viscous", "breakaway", "load_friction")
+        )
+        self.fade = 1.0 / pad_rows([t.stribeck_velocity for t in truths], width, 1.0) ** 2
+        self.asymmetry = pad_rows([t.asymmetry for t in truths], width)
+        self.rows = np.array([t.breakaway.any() or t.asymmetry.any() or t.load_friction.any() for t in truths])
+        largest = np.maximum(self.coulomb + self.breakaway, 0.05)
+        self.bristle = np.minimum(largest / 2e-4, STIFFEST * inertia / step**2)
+        self.bristle_damping = 0.3 * np.sqrt(self.bristle * inertia)
+        self.step = step
+        self.bend = np.zeros_like(inertia)
+
+    def force(self, v: Array, load: Array) -> Array:
+        """Friction torque against motor velocities `v` [rad/s] of the first len(v) arms, `load` the torque carried."""
+        k = len(v)
+        level = self.coulomb[:k]
+        if self.rows[:k].any():
+            level = level + self.breakaway[:k] * np.exp(-(v**2) * self.fade[:k]) + self.load[:k] * np.abs(load)
+            level *= 1.0 + self.asymmetry[:k] * np.sign(v)
+        longest = level / self.bristle[:k] + 1e-12
+        z = self.bend[:k]
+        ratio = z * np.sign(v) / longest
+        slip = np.clip((ratio - 0.7) / (1.0 - 0.7), 0.0, 1.0)
+        slip *= slip * (3.0 - 2.0 * slip)
+        rate = v * (1.0 - slip * np.abs(ratio))
+        z += self.step * rate
+        np.clip(z, -longest, longest, out=z)
+        return np.asarray(self.bristle[:k] * z + self.bristle_damping[:k] * rate + self.viscous[:k] * v)
+
+
+def pad_rows(rows: Sequence[Array], width: int, fill: float = 0.0) -> Array:
+    """Rows of different lengths as one array (B, width)."""
+    out = np.full((len(rows), width), fill)
+    for row, values in zip(out, rows, strict=True):
+        row[: len(values)] = values
+    return out
+
+
+class PlantDrives:
     """State of all drives, (B, width); methods act on the first k arms, k being the length of their arguments."""
 
     def __init__(
@@ -22,40 +73,40 @@ class Drives:
         """`inertia` (B, width): least inertia that each motor moves [kg·m²]; `angle`, `torque` at rest; `step` [s]."""
         width = angle.shape[1]
         self.step, self.count = step, 0
-        self.current = padded(torque, width)
-        lag = padded([t.motor_lag for t in truths], width, step)
+        self.current = pad_rows(torque, width)
+        lag = pad_rows([t.motor_lag for t in truths], width, step)
         self.follow = 1.0 - np.exp(-step / np.maximum(lag, 0.1 * step))
-        self.limit = padded([t.motor_limit for t in truths], width, np.inf)
-        self.gain = padded([t.motor_gain for t in truths], width, 1.0)
-        delay = np.rint(padded([t.motor_delay for t in truths], width) / step).astype(int)
+        self.limit = pad_rows([t.motor_limit for t in truths], width, np.inf)
+        self.gain = pad_rows([t.motor_gain for t in truths], width, 1.0)
+        delay = np.rint(pad_rows([t.motor_delay for t in truths], width) / step).astype(int)
         self.late = _Cells(delay > 0)
         self.wait = delay[self.late.all]
         self.queue = np.repeat(self.current[None], int(delay.max()) + 1, axis=0)
         self.bristles = Bristles(truths, inertia, step)
-        self.ripple = [padded([t.ripple[:, c] for t in truths], width) for c in range(3)]
-        self.spring, self.rest = (padded([t.spring[:, c] for t in truths], width) for c in range(2))
+        self.ripple = [pad_rows([t.ripple[:, c] for t in truths], width) for c in range(3)]
+        self.spring, self.rest = (pad_rows([t.spring[:, c] for t in truths], width) for c in range(2))
         self.shared = [(b, s) for b, t in enumerate(truths) for s in t.shared]
-        self.armature = padded([np.where(t.elastic, 0.0, t.arm.armature) for t in truths], width)
+        self.armature = pad_rows([np.where(t.elastic, 0.0, t.arm.armature) for t in truths], width)
         self.passed = self.current.copy()
         self.carried = self.current.copy()
         self._sense(truths, width)
         self._two_masses(truths, angle)
 
     def _sense(self, truths: Sequence[TrueArm], width: int) -> None:
-        self.position_gain = padded([t.position_gain for t in truths], width, 1.0)
-        self.position_offset = padded([t.position_offset for t in truths], width)
-        self.bent = _Cells(padded([t.eccentricity[:, 0] for t in truths], width) != 0.0)
+        self.position_gain = pad_rows([t.position_gain for t in truths], width, 1.0)
+        self.position_offset = pad_rows([t.position_offset for t in truths], width)
+        self.bent = _Cells(pad_rows([t.eccentricity[:, 0] for t in truths], width) != 0.0)
         self.amplitude, self.phase = (
-            padded([t.eccentricity[:, c] for t in truths], width)[self.bent.all] for c in range(2)
+            pad_rows([t.eccentricity[:, c] for t in truths], width)[self.bent.all] for c in range(2)
         )
 
     def _two_masses(self, truths: Sequence[TrueArm], angle: Array) -> None:
-        self.soft = _Cells(np.isfinite(padded([t.stiffness for t in truths], angle.shape[1], np.inf)))
+        self.soft = _Cells(np.isfinite(pad_rows([t.stiffness for t in truths], angle.shape[1], np.inf)))
         rows = list(zip(*(cells.tolist() for cells in self.soft.all), strict=True))
         self.stiffness = np.array([truths[b].stiffness[j] for b, j in rows])
         self.half_play = np.array([0.5 * truths[b].backlash[j] for b, j in rows])
         self.rotor = np.array([truths[b].arm.armature[j] for b, j in rows])
-        self.spring_damping = 2.0 * SPRING_DAMPING * np.sqrt(self.stiffness * self.rotor)
+        self.spring_damping = 2.0 * 0.04 * np.sqrt(self.stiffness * self.rotor)  # damping ratio 0.04
         torque = self.current[self.soft.all]
         self.motor_angle = angle[self.soft.all] + torque / self.stiffness + self.half_play * np.sign(torque)
         self.motor_half, self.motor_speed, self.motor_push = (np.zeros(len(rows)) for _ in range(3))

@@ -12,16 +12,15 @@ from typing import Any, Protocol
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.arms import mjcf
-from sim_gap.blind.cases.motion import RATE
-from sim_gap.blind.cases.true_arm import TrueArm
-from sim_gap.blind.plant.controller import Controller
-from sim_gap.blind.plant.drive import Drives
-from sim_gap.blind.plant.rigid_body import quiet
-from sim_gap.blind.plant.runs import Log, Run
+from sim_gap.blind.arms import mjcf, quiet
+from sim_gap.blind.motion import RATE
+from sim_gap.blind.plant.controller import PidControllers
+from sim_gap.blind.plant.drive import PlantDrives
+from sim_gap.blind.true_arm import Log, PlantRun, TrueArm
 
 SUBSTEPS = 4
 STEP = 1.0 / (RATE * SUBSTEPS)
+"""Time step [s]: springs must be slower."""
 CHANNELS = ("position", "torque", "motor", "command", "angle")
 
 
@@ -32,24 +31,24 @@ class Commands(Protocol):
         """Torques [N·m], (k, width)."""
 
 
-Control = Callable[[Sequence[Run], Array, int], Commands]
+Control = Callable[[Sequence[PlantRun], Array, int], Commands]
 """Makes the controllers from the runs, the initial readings (B, width) [rad], and the width."""
 
 
-def simulate(runs: Sequence[Run], controller: Control = Controller) -> list[Log]:
+def simulate(runs: Sequence[PlantRun], controller: Control = PidControllers) -> list[Log]:
     """Simulate all runs together, each with a controller of this kind, and return their logs in order."""
     order = sorted(range(len(runs)), key=lambda i: -len(runs[i].command))
-    logs = _Batch([runs[i] for i in order], controller).run()
+    logs = _ArmBatch([runs[i] for i in order], controller).run()
     out: list[Log] = [logs[0]] * len(runs)
     for place, i in enumerate(order):
         out[i] = logs[place]
     return out
 
 
-class _Batch:
+class _ArmBatch:
     """Arms sorted by the length of their runs, longest first, so that those still moving are always the first k."""
 
-    def __init__(self, runs: list[Run], controller: Control) -> None:
+    def __init__(self, runs: list[PlantRun], controller: Control) -> None:
         import mujoco
 
         self.forward = mujoco.mj_forward
@@ -65,12 +64,13 @@ class _Batch:
             mine = [x[b, :n] for x in (self.angle, self.velocity, self.force, self.acceleration)]
             self.worlds.append((model, data, data.qpos, data.qvel, data.qfrc_applied, data.qacc, *mine))
         truths = [run.truth for run in runs]
-        self.drives = Drives(truths, self._least_inertia(), self.angle, [run.feed_forward[0] for run in runs], STEP)
+        self.drives = PlantDrives(
+            truths, self._least_inertia(), self.angle, [run.feed_forward[0] for run in runs], STEP
+        )
         self.controller = controller(runs, self.drives.reading(self.angle), self.width)
         self.kept = {name: np.zeros((self.lengths[0], *shape)) for name in CHANNELS}
 
     def run(self) -> list[Log]:
-        """Simulate until the longest run is over."""
         k = len(self.runs)
         for tick in range(self.lengths[0]):
             while self.lengths[k - 1] <= tick:
@@ -117,7 +117,7 @@ class _Batch:
         return out
 
 
-def _start(run: Run) -> Array:
+def _start(run: PlantRun) -> Array:
     """Link angles at which the position sensors read the trajectory's first point, at rest [rad]."""
     truth, reading = run.truth, run.command[0]
     bent = truth.eccentricity[:, 0] * np.sin(reading + truth.eccentricity[:, 1])

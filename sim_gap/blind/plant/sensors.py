@@ -5,17 +5,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.cases.motion import RATE
-from sim_gap.blind.cases.true_arm import TrueArm
-from sim_gap.blind.plant.runs import Log
+from sim_gap.blind.motion import RATE
+from sim_gap.blind.true_arm import Log, TrueArm
 
 JITTER_S = 4e-4
-LATE_SHARE = 0.003
-"""Share of rows that are late by a good part of a period."""
-LOST_SHARE = 0.001
 HALVES, SHARES = (0.4, 1.0, 1.8), (0.35, 0.4, 0.25)
 """Half widths of the plays of a hysteresis, as shares of its width, and their weights before normalisation."""
-SENSOR_BITS = 16
 
 
 def record(
@@ -26,11 +21,13 @@ def record(
     t = _times(clock[-1], rate, random)
     shape = (len(t), truth.n)
     step = truth.encoder_step
-    torque = _at(t, clock, _sensor(truth, log.torque, clock)) + truth.torque_noise * random.standard_normal(shape)
+    torque = columns_at(t, clock, _sensor(truth, log.torque, clock)) + truth.torque_noise * random.standard_normal(
+        shape
+    )
     limit = truth.torque_limit
-    resolution = 4.0 * truth.rated / 2**SENSOR_BITS
-    motor = _at(t, clock, log.motor) + truth.motor_noise * random.standard_normal(shape)
-    position = _at(t, clock, log.position) / step + 0.4 * random.standard_normal(shape)
+    resolution = 4.0 * truth.rated / 2**16  # bits over four times the rated torque
+    motor = columns_at(t, clock, log.motor) + truth.motor_noise * random.standard_normal(shape)
+    position = columns_at(t, clock, log.position) / step + 0.4 * random.standard_normal(shape)
     last = (t * RATE + 1e-9).astype(int)  # rows end before the log does
     columns = {
         "t": t,
@@ -43,7 +40,7 @@ def record(
         "q_cmd": command[last],
     }
     if velocity:
-        columns["dq"] = _at(t, clock, _drive_velocity(log.position, step, random))
+        columns["dq"] = columns_at(t, clock, _drive_velocity(log.position, step, random))
     return columns
 
 
@@ -51,14 +48,15 @@ def _times(duration: float, rate: float, random: np.random.Generator) -> Array:
     """Uneven times: jitter on every row, some rows late, a few lost."""
     t = np.arange(0.0, duration - 2.0 / rate, 1.0 / rate)
     t[1:] += np.clip(JITTER_S * random.standard_normal(len(t) - 1), -0.4 / rate, 0.4 / rate)
-    late = random.random(len(t)) < LATE_SHARE
+    late = random.random(len(t)) < 0.003  # by a good part of a period
     t[late] += random.uniform(0.1, 0.3, int(late.sum())) / rate
-    kept = random.random(len(t)) >= LOST_SHARE
+    kept = random.random(len(t)) >= 0.001  # lost rows
     kept[0] = True
     return np.asarray(np.sort(t)[kept])
 
 
-def _at(t: Array, clock: Array, values: Array) -> Array:
+def columns_at(t: Array, clock: Array, values: Array) -> Array:
+    """Columns (K, n) at other times, along straight lines."""
     return np.column_stack([np.interp(t, clock, column) for column in values.T])
 
 

@@ -63,7 +63,7 @@ def test_a_window_that_no_frame_carries_is_refused(side):
     units = Units(0.04, 0.5, 0.5, 1e-6)
     assert tried(joint(), window, units).lower == window[0]
     beyond = (window[0] + min(side, 0) * 0.5, window[1] + max(side, 0) * 0.5)  # one user unit more
-    with pytest.raises(BadInput, match=r"elbow: its range is more than 607Ah carries at 0\.5 rad a user unit"):
+    with pytest.raises(BadInput, match=r"elbow: 607Ah cannot carry its range at 0\.5 rad a user unit"):
         tried(joint(), beyond, units)
 
 

@@ -66,7 +66,7 @@ def test_a_velocity_that_is_none():
     wild = moved.velocity * (3 + np.sign(np.sin(20 * moved.t)) * 4)
     (found,) = judge([integrated(ScaleTrack(moved.t, moved.position, wild, *[np.full(4000, np.nan)] * 6))])
     assert found.quantities == ("velocity",)
-    assert "is no velocity" in found.text
+    assert "velocity is unsteady" in found.text
 
 
 def test_a_velocity_that_scatters_is_known_as_well_as_its_windows_agree():

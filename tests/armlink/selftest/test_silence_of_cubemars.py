@@ -76,7 +76,7 @@ def test_a_can_timeout_that_is_stated_and_not_set_is_found():
 def test_a_joint_that_carries_no_load_shows_nothing_and_that_is_said():
     results, _ = checked(content(upright=True))
     assert results["hinge_1", "silence"].outcome == "not run"
-    assert "tells no state, and the joint carries no load here" in results["hinge_1", "silence"].found
+    assert "reports no state, and the joint carries no load here" in results["hinge_1", "silence"].found
     assert results["hinge_2", "silence"].outcome == "passed"
 
 
@@ -92,7 +92,7 @@ def test_without_a_can_timeout_it_is_scanned_and_checked_and_not_driven(tmp_path
     monkeypatch.chdir(tmp_path)
     Path("pair.yaml").write_text(yaml.safe_dump(described))
     assert run(["scan", "pair.yaml"]) == 0
-    assert capsys.readouterr().err.count("CubeMars AK80-9") == 2
+    assert capsys.readouterr().out.count("CubeMars AK80-9") == 2
     assert run(["check", "pair.yaml", "--json", "-"]) == 1
     checks = {(each["joint"], each["check"]): each for each in json.loads(capsys.readouterr().out)["checks"]}
     assert checks["hinge_1", "answers"]["outcome"] == "passed"

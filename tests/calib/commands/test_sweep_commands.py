@@ -13,7 +13,7 @@ from sweep_arms import random_arm
 from armlink.arm_file import load_arm
 from armlink.cli import run
 from armlink.link.link import Link
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.install import apply
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
@@ -107,7 +107,7 @@ def test_a_dry_run_makes_the_whole_sweep_on_the_simulated_arm(
     mass = answer["recommended_reference_mass"]
     assert mass > 0
     again = f"armlink sweep {arm_path} --dry-run --reference-mass {mass:g} --out {out}-loaded"
-    assert said.err.splitlines()[-1] == again
+    assert said.err.splitlines()[-1] == f"next: {again}"
 
 
 def test_where_the_model_does_not_hold_nothing_is_written_unless_accepted(
@@ -148,7 +148,7 @@ def test_recalibrate_writes_what_drifted_to_the_controllers(
     assert run(["calibrate", *passes, *store]) == 0
     assert run(["identify", *passes, *store]) == 0
     arm = load_arm(str(arm_path))
-    gain, offset = np.array([1.04, 0.97]), 0.01 * Limits.of(arm).rated
+    gain, offset = np.array([1.04, 0.97]), 0.01 * DriveLimits.of(arm).rated
     truth = replace(Truth.of(arm), gain=gain, offset=offset)
     simulated = SimulatedArm(arm, truth, 5)
     with Link(arm, LockStepBus(arm=simulated)) as link:
@@ -164,7 +164,7 @@ def test_recalibrate_writes_what_drifted_to_the_controllers(
         assert (held.gain, held.offset) == (np.float32(joint.gain), np.float32(joint.offset))
         assert held.gain == pytest.approx(true, rel=0.01)
     assert [each.offset for each in record.joints] == pytest.approx(
-        offset.tolist(), abs=0.003 * Limits.of(arm).rated.max()
+        offset.tolist(), abs=0.003 * DriveLimits.of(arm).rated.max()
     )
 
 

@@ -102,7 +102,7 @@ def test_a_hostile_model_injects_nothing(injected, tmp_path, capsys):
     arm = load_arm(str(out))
     assert not arm.kinematics.stops
     assert arm.daemon is None
-    assert all(each.isprintable() or each == "\n" for each in capsys.readouterr().err)
+    assert all(each.isprintable() or each == "\n" for each in "".join(capsys.readouterr()))
 
 
 def test_a_hostile_name_of_a_joint_of_the_arm_is_one_line(tmp_path, capsys):

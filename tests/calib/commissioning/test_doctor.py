@@ -62,7 +62,7 @@ def test_a_damping_that_is_too_low_for_what_the_joint_turns_is_named(tmp_path):
 
     def found():
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(content))
-        return [each for each in examine(str(tmp_path / "arm.yaml"), offline=True) if "damps" in each.what]
+        return [each for each in examine(str(tmp_path / "arm.yaml"), offline=True) if "damping" in each.what]
 
     assert found() == []
     drive = content["link"]["joints"][3]["drive"]
@@ -70,8 +70,8 @@ def test_a_damping_that_is_too_low_for_what_the_joint_turns_is_named(tmp_path):
     (named,) = found()
     assert (named.level, named.where) == ("warning", "openarm_right_joint4")
     inertia, kp = 0.26, 50.0
-    assert named.what.startswith(f"kd 1 damps its swing by a ratio of {1 / (2 * math.sqrt(kp * inertia)):.2f} where")
-    assert "kd 2.2 or more, or kp 11 or less" in named.remedy
+    assert named.what.startswith(f"kd 1 gives a damping ratio of only {1 / (2 * math.sqrt(kp * inertia)):.2f} at")
+    assert "kd to 2.2 or more, or kp to 11 or less" in named.remedy
     drive["kd"] = 2.25
     assert found() == []
 

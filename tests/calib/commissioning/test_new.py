@@ -83,7 +83,7 @@ def test_prismatic_fingers_are_set_aside_and_a_range_is_chosen_where_nothing_tou
 
 
 def test_limits_more_than_a_turn_apart_are_no_stops(tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
+    monkeypatch.setattr("calib.commissioning.new_arm.find_clear_range", lambda arm_file: None)
     made = new_arm(MODELS / "ur10e.urdf", tmp_path / "ur10e.yaml")
     assert made.parsed().sweep.hold == "servo"
     limits = gcomp_arm(made.parsed())
@@ -91,7 +91,7 @@ def test_limits_more_than_a_turn_apart_are_no_stops(tmp_path, monkeypatch):
 
 
 def test_two_arms_in_a_model(tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
+    monkeypatch.setattr("calib.commissioning.new_arm.find_clear_range", lambda arm_file: None)
     text = (MODELS / "own.xml").read_text()
     body = text[text.index('<body name="turret"') : text.index("  </worldbody>")]
     second = body
@@ -145,7 +145,7 @@ def test_a_lift_and_a_waist_before_the_arm(tmp_path, monkeypatch):
 
 
 def test_joints_of_an_attached_model_keep_the_slash_in_their_names(tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
+    monkeypatch.setattr("calib.commissioning.new_arm.find_clear_range", lambda arm_file: None)
     text = (MODELS / "own.xml").read_text()
     (tmp_path / "left.xml").write_text(text.replace('name="yaw', 'name="left/yaw'))
     made = new_arm(tmp_path / "left.xml", tmp_path / "left.yaml")
@@ -155,7 +155,7 @@ def test_joints_of_an_attached_model_keep_the_slash_in_their_names(tmp_path, mon
 
 def test_a_small_arm_has_drives_of_its_own_strength(tmp_path, monkeypatch):
     """0.06 N·m of load, not the 2 N·m that a wrist of a larger arm has at least: friction is a share of that."""
-    monkeypatch.setattr("calib.commissioning.new_arm.narrowed", lambda arm_file: None)
+    monkeypatch.setattr("calib.commissioning.new_arm.find_clear_range", lambda arm_file: None)
     (tmp_path / "small.xml").write_text(
         '<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 1 0" range="-1 1"/>'
         '<inertial pos="0.1 0 0" mass="0.05" diaginertia="1e-5 1e-5 1e-5"/><body pos="0.1 0 0">'
@@ -228,7 +228,7 @@ def test_permuted_ids_a_turned_sign_and_another_gear_are_found_by_hand(made, tmp
 def test_the_command_finds_other_ids_by_hand_and_its_file_passes_the_check(made, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arm = real_arm(made, tmp_path, nodes=[12, 10, 11, 13], position_gain=[1.0] * 4)
-    monkeypatch.setattr("calib.commands.setup.on_bus.open_named", lambda bus: LockStepBus(arm=arm))
+    monkeypatch.setattr("calib.commands.setup.bus_setup.open_named", lambda bus: LockStepBus(arm=arm))
     monkeypatch.setattr("calib.commands.setup.terminal.hand", lambda by_hand, interactive: hands(arm, made))
     line = ["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]
     assert cli.run(line) == 0
@@ -257,7 +257,7 @@ def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_b
     assert json.loads(capsys.readouterr().out)["next"] == "armlink check arm.yaml"
     assert cli.run(["check", "arm.yaml", "--passive"]) == 0
     assert cli.run(["doctor", "arm.yaml"]) == 1
-    assert "geometry is not known" in capsys.readouterr().err
+    assert "geometry is not known" in capsys.readouterr().out
     assert cli.run(["new"]) == 2
     assert "--bus" in capsys.readouterr().err
 

@@ -8,9 +8,8 @@ import yaml
 
 from armlink.arm_file import ArmFile, load_arm
 from calib.arm.kinematics import gcomp_arm
-from calib.arm.unseen import VERTICAL, vertical
 from calib.commissioning.model_checks import model_findings
-from calib.creep.choice import sweep_motion
+from calib.creep.choice import VERTICAL, is_vertical, sweep_motion
 from calib.creep.plan import plan_creep
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "yam.yaml"
@@ -64,5 +63,5 @@ def test_upright_the_first_joint_is_named_with_the_remedy(folder: Path) -> None:
 
 def test_on_a_tilted_base_it_can_be_seen(folder: Path) -> None:
     arm = tilted(folder)
-    assert not vertical(gcomp_arm(arm), 0)
+    assert not is_vertical(gcomp_arm(arm), 0)
     assert not [each for each in model_findings(arm) if "vertical" in each.what]

@@ -161,7 +161,7 @@ def test_a_decision_that_names_another_content_is_refused(tmp_path: Path) -> Non
     daemon = drifted(tmp_path, "propose")
     (proposal,) = daemon.view.proposals()
     for decide in (daemon.view.decisions.approve, daemon.view.decisions.reject):
-        with pytest.raises(NotPossible, match=f"proposal {proposal.id} is not the one of hash 000000000000…: look at"):
+        with pytest.raises(NotPossible, match=f"proposal {proposal.id} is not that of hash 000000000000…: look at"):
             decide(proposal.id, "ann", "0" * 64)
     assert not any(call.startswith("write") for call in daemon.sdo)
     daemon.kill()

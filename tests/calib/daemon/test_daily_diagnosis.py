@@ -15,7 +15,7 @@ from armlink.link.types import Stats
 from armlink.recording.files import load_recording
 from calib.daemon.environment import Environment
 from calib.daemon.loop.loop_messages import CHANNELS, Batch
-from calib.daemon.observing.daily_diagnosis import DailyDiagnosis
+from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.settings import Configuration, DaemonSection, DiagnosisSettings
 from calib.daemon.state.busiest_minute import SECONDS, BusiestMinute
 

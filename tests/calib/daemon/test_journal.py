@@ -9,7 +9,7 @@ import pytest
 
 from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.state.journal import Journal
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 
 NOW = datetime(2026, 5, 1, tzinfo=UTC)
 
@@ -21,7 +21,7 @@ def journal(tmp_path: Path) -> Journal:
 
 def test_a_newer_proposal_supersedes_the_pending_one_of_its_joint_alone(journal: Journal) -> None:
     def propose(joint: str) -> int:
-        finding = Finding(0, "gain", 1.02, 0.0, np.zeros((2, 2)), 40, 0.99)
+        finding = DriftFinding(0, "gain", 1.02, 0.0, np.zeros((2, 2)), 40, 0.99)
         return journal.add_proposal(NOW, joint, "00c0ffee", "0ddba115", finding)
 
     decided, other, first = propose("j1"), propose("j2"), propose("j1")
@@ -77,7 +77,7 @@ def test_ids_that_leave_no_room_for_more_are_damage(tmp_path: Path) -> None:
 
 def test_ids_go_on_over_a_restart_and_where_a_file_is_begun_anew_under_way(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.db", lambda: 0.0)
-    finding = Finding(0, "gain", 1.02, 0.0, np.zeros((2, 2)), 40, 0.99)
+    finding = DriftFinding(0, "gain", 1.02, 0.0, np.zeros((2, 2)), 40, 0.99)
     assert [journal.add_proposal(NOW, "j1", "0a", "0b", finding) for _ in range(2)] == [1, 2]
     journal.failed(sqlite3.DatabaseError("database disk image is malformed"))
     journal.probe()

@@ -130,7 +130,7 @@ def test_an_approval_waits_for_the_disk_and_no_controller_is_written_before(tmp_
     assert [each for each in daemon.sdo if each.startswith("write")] == []
     assert daemon.view.proposals()[0].state == "pending"
     for decide in (daemon.view.decisions.approve, daemon.view.decisions.reject):
-        with pytest.raises(NotPossible, match="decided already, which waits for the disk"):
+        with pytest.raises(NotPossible, match="decided already; the decision waits for the disk"):
             decide(waiting(daemon), "bob")
     daemon.disk.release()
     assert answer.result(0).state in ("approved", "applied")

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.field.heldout import heldout_errors
-from calib.field.thresholds import BLOCK
+from calib.field.field_fit import BLOCK, heldout_errors
 from gcomp.identify.readings import StaticReadings
 
 

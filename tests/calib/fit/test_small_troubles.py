@@ -10,7 +10,7 @@ from realistic_sweeps import RestingArm, both_passes, plans
 
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.lags import Lags
-from calib.fit.levels import LEAST, Effects, learn
+from calib.fit.levels import LEAST, RandomEffects, learn
 from calib.fit.position_field import PositionField, kernel
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.fit.small_troubles import FAMILIES, UNITS, Setting, troubles
@@ -55,7 +55,9 @@ def test_levels_of_drawn_effects_are_found() -> None:
         fixed, effects = random.normal(size=(120, 4)), random.normal(size=(120, 60))
         drawn = np.where(family == 0, 2.0, 0.4) * random.normal(size=60)
         target = fixed @ (10 * random.normal(size=4)) + effects @ drawn + random.normal(size=120)
-        found.append(learn(Effects.of(1e3 * fixed, effects, target, family, 2), np.ones(2), np.full(2, LARGEST)).level)
+        found.append(
+            learn(RandomEffects.of(1e3 * fixed, effects, target, family, 2), np.ones(2), np.full(2, LARGEST)).level
+        )
     assert np.mean(found, axis=0) == pytest.approx([2.0, 0.45], rel=0.15)
 
 
@@ -65,7 +67,7 @@ def test_nothing_to_find_leaves_what_the_readings_cannot_exclude_and_a_large_eff
     effects, family = 3 * random.normal(size=(200, 40)), np.zeros(40, dtype=np.int64)
     for size, low, high in ((0.0, 1.1 * LEAST, 0.012), (60.0, LARGEST, LARGEST)):
         target = effects @ (size * random.normal(size=40)) + random.normal(size=200)
-        found = Effects.of(np.zeros((200, 1)), effects, target, family, 1)
+        found = RandomEffects.of(np.zeros((200, 1)), effects, target, family, 1)
         level = learn(found, np.ones(1), np.array([LARGEST])).level[0]
         assert low * (1 - 1e-9) <= level <= high * (1 + 1e-9)
 
@@ -109,7 +111,6 @@ def _unloaded(q: np.ndarray) -> SweepReadings:
         felt=nothing,
         motor_torque=nothing,
         target=nothing,
-        noise=np.ones(q.shape[1]),
         position_sigma=np.zeros(q.shape[1]),
         resolution=np.zeros(q.shape[1]),
     )

@@ -12,7 +12,7 @@ from armlink.arm_file import load_arm
 from armlink.errors import BusFault, Refused
 from armlink.link.link import Link
 from armlink.link.types import Calibration
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.install.check_motion import CheckMotion, check_poses
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, admit, check_bounds, check_change, history_std, past_changes
@@ -262,7 +262,7 @@ def test_a_controller_that_does_not_use_its_new_pair_is_found(simulated: Simulat
 
 
 def test_check_poses_are_near_off_the_stops_and_move_every_joint_both_ways() -> None:
-    limits = Limits.of(load_arm("sarcos"))
+    limits = DriveLimits.of(load_arm("sarcos"))
     for begin in ((limits.lower + limits.upper) / 2, limits.lower.copy(), limits.upper.copy()):
         poses = check_poses(begin, limits)
         assert (poses > limits.lower).all()

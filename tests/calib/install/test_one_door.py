@@ -14,7 +14,7 @@ from armlink.link.types import Calibration
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import GateRefused, Refusal, admit, admit_rollback
 from calib.observer.check_at_rests import Checked
-from calib.observer.decision import Finding
+from calib.observer.decision import DriftFinding
 from calib.observer.recalibrator import Recalibrator
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
@@ -141,7 +141,7 @@ class Guarded(Controllers):
         return super().write_calibration(joint, calibration, store)
 
 
-FINDING = Finding(1, "drift", 1.03, 0.3, np.diag([4e-8, 1e-5]), 40, 0.999)
+FINDING = DriftFinding(1, "drift", 1.03, 0.3, np.diag([4e-8, 1e-5]), 40, 0.999)
 
 
 def _install(store: RecordStore, controllers: Controllers) -> None:

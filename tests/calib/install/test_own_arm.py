@@ -41,7 +41,9 @@ def test_nothing_is_written_to_an_arm_without_a_serial_number(store: RecordStore
 def test_a_record_is_written_to_the_drives_that_it_was_measured_on(store: RecordStore) -> None:
     controllers, measured = Controllers(), NEW.model_copy(update={"drives": ("1:1:a", "1:1:b")})
     controllers.drives = OTHER
-    with pytest.raises(Refused, match=r"none of its drives \(1:1:c …\) is one of those that record .* was measured on"):
+    with pytest.raises(
+        Refused, match=r"none of its drives \(1:1:c …\) is one of the drives on which record .* was measured"
+    ):
         write(store, controllers, measured)
     assert controllers.held == Controllers().held
     controllers.drives = ["1:1:c", "1:1:b"]  # one drive was exchanged
@@ -118,7 +120,7 @@ def test_sweeps_tell_the_drives_and_of_two_arms_are_refused() -> None:
     assert drives_of([swept(), swept()]) == ()
     assert drives_of([swept("1:1:a", "1:1:b"), swept(), swept("1:1:c", "1:1:b")]) == ("1:1:c", "1:1:b")
     assert swept("", "").manifest.drives == ()
-    with pytest.raises(Refused, match="they are of two arms"):
+    with pytest.raises(Refused, match="they come from two arms"):
         drives_of([swept("1:1:a", ""), swept("1:1:c", "")])
 
 

@@ -10,7 +10,7 @@ from drawn_arms import drawn_arm
 from effects_on_readings import CONFIG, SIGMA, payload
 
 from calib.arm.kinematics import gcomp_arm
-from calib.observer.cause_test import CauseTest, Verdict, smallest_noticed, span
+from calib.observer.cause_test import CauseTest, Verdict, smallest_noticed_change, span
 from calib.observer.effect_dictionary import dictionary
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.arm.arm import Arm
@@ -291,5 +291,5 @@ def test_a_rival_counts_for_what_its_columns_show_and_no_more() -> None:
     dependent = np.column_stack([columns, columns @ [1.0, -2.0, 0.5], np.zeros(20)])
     assert span(dependent).shape == (20, 3)
     np.testing.assert_allclose(span(dependent) @ span(dependent).T, span(columns) @ span(columns).T, atol=1e-12)
-    once, twice = (smallest_noticed(own, [(span(each), 4)], 10.0) for each in (columns, dependent))
+    once, twice = (smallest_noticed_change(own, [(span(each), 4)], 10.0) for each in (columns, dependent))
     assert once == pytest.approx(twice, rel=1e-9)

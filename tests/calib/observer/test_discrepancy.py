@@ -9,7 +9,7 @@ from rest_arm import RestArm, harmonics
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.discrepancy.kernel import Kernel
-from calib.observer.discrepancy.level import Level
+from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.effect_dictionary import DRIFT
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.identify.readings import StaticReadings
@@ -17,7 +17,9 @@ from gcomp.identify.readings import StaticReadings
 NOISE = 0.02
 
 
-def field(kernel: Kernel, level: Level, q: np.ndarray, side: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def field(
+    kernel: Kernel, level: DiscrepancyLevel, q: np.ndarray, side: np.ndarray, random: np.random.Generator
+) -> np.ndarray:
     """A draw of the field (K, n) at poses, by the prior itself."""
     points = kernel.points(q, side)
     covariance = kernel.weighted(level.smooth, points, points)
@@ -34,8 +36,10 @@ def test_the_level_is_found_whatever_was_expected(sarcos, sarcos_beta) -> None:
     """A tenth to ten times of what was expected: within 40 % on each joint (7 % of 120 rows, and a part's share)."""
     for share in (0.1, 1.0, 10.0):
         random = np.random.default_rng(int(10 * share))
-        truth = Level.expected(np.full(7, 0.2 * share))
-        belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=Level.expected(np.full(7, 0.2)))
+        truth = DiscrepancyLevel.expected(np.full(7, 0.2 * share))
+        belief = GravityBelief(
+            sarcos, sarcos_beta, np.zeros((14, 14)), level=DiscrepancyLevel.expected(np.full(7, 0.2))
+        )
         q, side = rows(sarcos, 120, random)
         torque = belief.torque(q) + field(belief.kernel, truth, q, side, random) + NOISE * random.normal(size=q.shape)
         belief.learn(q, torque, side, np.full(7, NOISE))
@@ -46,7 +50,7 @@ def test_the_level_is_found_whatever_was_expected(sarcos, sarcos_beta) -> None:
 
 def test_an_offset_a_gain_and_a_payload_are_not_taken_for_discrepancy(sarcos, sarcos_beta) -> None:
     random = np.random.default_rng(3)
-    expected = Level.expected(np.full(7, 0.05))
+    expected = DiscrepancyLevel.expected(np.full(7, 0.05))
     belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=expected)
     q, side = rows(sarcos, 60, random)
     torque = 1.05 * belief.torque(q) + 0.5 + NOISE * random.normal(size=q.shape)
@@ -60,7 +64,7 @@ def test_columns_that_depend_on_others_change_nothing(sarcos) -> None:
     unit = np.broadcast_to(np.exp(-np.abs(np.subtract.outer(range(14), range(14))) / 3.0), (3, 7, 14, 14))
     residual, free = random.normal(size=(7, 14)), random.normal(size=(7, 14, 3))
     known = 0.01 * random.normal(size=(7, 14, 2))
-    level = Level.expected(np.full(7, 0.5))
+    level = DiscrepancyLevel.expected(np.full(7, 0.5))
     plain = level.fitted(unit, residual, np.full(7, NOISE), known, free)
     twice = np.concatenate([free, free @ random.normal(size=(3, 2)), np.zeros((7, 14, 1))], axis=2)
     again = level.fitted(unit, residual, np.full(7, NOISE), known, twice)
@@ -71,7 +75,7 @@ def test_columns_that_depend_on_others_change_nothing(sarcos) -> None:
 def test_what_is_predicted_holds_within_its_covariance(sarcos, sarcos_beta) -> None:
     """Drawn from the prior, predicted at other poses from 100 rows: whitened errors are standard normal."""
     random, ratios, shrunk = np.random.default_rng(4), [], []
-    truth = Level.expected(np.full(7, 0.2))
+    truth = DiscrepancyLevel.expected(np.full(7, 0.2))
     std = 2e-3 * np.ones(14)
     for _ in range(6):
         belief = GravityBelief(sarcos, sarcos_beta, np.diag(std**2), level=truth)
@@ -92,7 +96,7 @@ def test_what_is_predicted_holds_within_its_covariance(sarcos, sarcos_beta) -> N
 def test_a_drift_of_later_rows_is_not_learned(sarcos, sarcos_beta) -> None:
     """A gain of 2 % more in every later epoch stays in what is left."""
     random = np.random.default_rng(5)
-    level = Level.expected(np.full(7, 0.2))
+    level = DiscrepancyLevel.expected(np.full(7, 0.2))
     belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=level)
     q, side = rows(sarcos, 400, random)
     torque = belief.torque(q) + field(belief.kernel, level, q, side, random) + NOISE * random.normal(size=q.shape)
@@ -108,7 +112,7 @@ def test_a_drift_of_later_rows_is_not_learned(sarcos, sarcos_beta) -> None:
 def warmed(sarcos, sarcos_beta, warmer: float, *, told: bool) -> CauseTest:
     """40 rows, warmer than the reference; a zero has moved by 0.35 N·m, where 0.2 are expected of 20 K."""
     random = np.random.default_rng(6)
-    level = Level.expected(np.full(7, 0.2))
+    level = DiscrepancyLevel.expected(np.full(7, 0.2))
     belief = GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14)), level=level)
     q, side = rows(sarcos, 160, random)
     torque = belief.torque(q) + field(belief.kernel, level, q, side, random) + NOISE * random.normal(size=q.shape)

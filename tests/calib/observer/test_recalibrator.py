@@ -14,15 +14,15 @@ from armlink.errors import BusFault, Refused
 from armlink.torque_calibration import TorqueCalibration
 from calib.install.journaled_write import recover
 from calib.observer.check_at_rests import Checked
-from calib.observer.decision import Finding
-from calib.observer.recalibrator import Recalibrator, recalibrated
+from calib.observer.decision import DriftFinding
+from calib.observer.recalibrator import Recalibrator, recalibrated_record
 from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.records.store import RecordStore
 
 
-def finding(gain: float = 1.03, offset: float = 0.3, at: int = 1, cause: str = "drift") -> Finding:
-    return Finding(at, cause, gain, offset, np.array([[4e-8, -1e-8], [-1e-8, 1e-5]]), 40, 0.999)
+def finding(gain: float = 1.03, offset: float = 0.3, at: int = 1, cause: str = "drift") -> DriftFinding:
+    return DriftFinding(at, cause, gain, offset, np.array([[4e-8, -1e-8], [-1e-8, 1e-5]]), 40, 0.999)
 
 
 def still_gravity() -> GravityRecord:
@@ -53,7 +53,7 @@ def test_two_recalibrations_compose_to_the_whole_drift() -> None:
 
 
 def test_the_new_record_follows_from_the_old(store: RecordStore) -> None:
-    new = recalibrated(record(), ARM, finding(), installed_gain=1.1, by="observer")
+    new = recalibrated_record(record(), ARM, finding(), installed_gain=1.1, by="observer")
     assert new.parent == record().id
     assert new.joints[0] == record().joints[0]
     assert (new.joints[1].gain, new.joints[1].offset) == (1.1 * 1.03, -0.4 + 1.1 * 0.3)
@@ -61,7 +61,7 @@ def test_the_new_record_follows_from_the_old(store: RecordStore) -> None:
 
 
 def test_its_covariance_is_that_of_both_by_monte_carlo() -> None:
-    new = recalibrated(record(), ARM, finding(), installed_gain=1.1, by=None)
+    new = recalibrated_record(record(), ARM, finding(), installed_gain=1.1, by=None)
     random = np.random.default_rng(0)
     old = random.multivariate_normal((1.1, -0.4), np.diag([1e-6, 1e-4]), 200_000)
     change = random.multivariate_normal((1.03, 0.3), finding().covariance, 200_000)
@@ -72,10 +72,10 @@ def test_its_covariance_is_that_of_both_by_monte_carlo() -> None:
 
 def test_a_joint_without_gain_follows_its_offset_only() -> None:
     vertical = record(joints=(joint("shoulder", gain=None), joint("elbow")), covariance_of=(), covariance=())
-    new = recalibrated(vertical, ARM, finding(1.0, 0.3, at=0, cause="offset"), installed_gain=1.0, by=None)
+    new = recalibrated_record(vertical, ARM, finding(1.0, 0.3, at=0, cause="offset"), installed_gain=1.0, by=None)
     assert (new.joints[0].gain, new.joints[0].offset) == (None, pytest.approx(-0.1))
     with pytest.raises(Refused, match="shoulder: record"):
-        recalibrated(vertical, ARM, finding(at=0), installed_gain=1.0, by=None)
+        recalibrated_record(vertical, ARM, finding(at=0), installed_gain=1.0, by=None)
 
 
 def test_apply_writes_record_and_controller(store: RecordStore) -> None:
@@ -199,7 +199,7 @@ def test_a_second_drift_is_relative_to_the_first_recalibration(store: RecordStor
     ("change", "what"),
     [(finding(1.2, 0.0), r"elbow: gain 1\.3200 is \+20\.0%"), (finding(1.0, 6.0), r"elbow: offset 6\.200 N·m")],
 )
-def test_an_implausible_change_is_refused(store: RecordStore, change: Finding, what: str) -> None:
+def test_an_implausible_change_is_refused(store: RecordStore, change: DriftFinding, what: str) -> None:
     controllers = Controllers()
     with pytest.raises(Refused, match=what):
         Recalibrator(ARM, controllers, store, "apply").handle(change)
@@ -211,7 +211,7 @@ def test_bounds_are_against_the_last_sweep_not_the_last_step(store: RecordStore)
     recalibrator = Recalibrator(ARM, Controllers(), store, "apply")
     recalibrator.handle(finding(1.06, 0.0))
     again = Recalibrator(ARM, recalibrator._controllers, store, "apply")  # after a restart too
-    with pytest.raises(Refused, match="at most 10% is drift"):
+    with pytest.raises(Refused, match="a drift is at most 10%"):
         again.handle(finding(1.06, 0.0))
 
 

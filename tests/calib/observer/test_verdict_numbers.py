@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from effects_on_readings import CONFIG, SIGMA, payload
 
-from calib.observer.cause_test import CauseTest, smallest_noticed
+from calib.observer.cause_test import CauseTest, smallest_noticed_change
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.gravity.torque import gravity_torque
 from gcomp.identify.readings import StaticReadings
@@ -18,7 +18,7 @@ def test_a_change_that_a_rival_resembles_must_be_larger_and_less_so_where_the_ri
     once = np.log(rows)
     sizes = {}
     for name, rivals in (("none", []), ("simple", [(basis, 1)]), ("dear", [(basis, 2)])):
-        sizes[name] = size = smallest_noticed(own, rivals, evidence)
+        sizes[name] = size = smallest_noticed_change(own, rivals, evidence)
         change = size * own
         left = change - basis @ (basis.T @ change)
         against = [change @ change - once, *(left @ left + (price - 1) * once for _, price in rivals)]

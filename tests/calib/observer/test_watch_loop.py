@@ -173,7 +173,7 @@ def test_a_refused_recalibration_is_an_event(tmp_path: Path) -> None:
     setup.watch(50)
     setup.link.gain[1] *= 1.2
     history = setup.watch(90)
-    assert "at most 10% is drift" in next(e.evidence["reason"] for e in history.events if e.kind == "refused")
+    assert "a drift is at most 10%" in next(e.evidence["reason"] for e in history.events if e.kind == "refused")
     assert history.recalibrations == []
 
 

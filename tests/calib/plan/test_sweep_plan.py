@@ -7,7 +7,7 @@ from sweep_arms import random_arm, synthetic_pass, with_section
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BadInput
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import SweepPlan
 from calib.sweep.scout import rough_model
@@ -23,7 +23,7 @@ def scouted_plan(arm: ArmFile, truth: Truth) -> SweepPlan:
 @pytest.mark.parametrize("name", ["sarcos", "parallel6"])
 def test_the_plan_goes_from_tip_to_base_inside_the_stops(name: str) -> None:
     arm = load_arm(name)
-    plan, limits = plan_sweep(arm), Limits.of(arm)
+    plan, limits = plan_sweep(arm), DriveLimits.of(arm)
     joints = [sweep.joint for sweep in plan.sweeps]
     assert joints == sorted(joints, reverse=True)
     assert set(joints) == set(range(len(arm.joint_names)))
@@ -65,7 +65,7 @@ def test_a_joint_along_gravity_is_swept_once_for_its_offset() -> None:
 def test_bias_exceeds_true_gravity_and_friction_and_never_the_limit(seed: int, n: int, headroom: float) -> None:
     """Checked with MuJoCo's gravity, which the plan has not seen."""
     arm = random_arm(seed, n, headroom=headroom)
-    truth, limits = Truth.draw(arm, seed), Limits.of(arm)
+    truth, limits = Truth.draw(arm, seed), DriveLimits.of(arm)
     simulated = SimulatedArm(arm, truth)
     pressed = 0
     for sweep in scouted_plan(arm, truth).sweeps:
@@ -90,7 +90,7 @@ def test_joints_are_servo_held_where_the_bias_allowed_cannot_press_them() -> Non
 
 def test_the_reference_mass_overloads_no_joint() -> None:
     arm = random_arm(5, 5, headroom=1.4)
-    truth, limits = Truth.draw(arm, 5), Limits.of(arm)
+    truth, limits = Truth.draw(arm, 5), DriveLimits.of(arm)
     mass = scouted_plan(arm, truth).reference_mass
     simulated = SimulatedArm(arm, truth)
     simulated.attach_mass(mass)
@@ -108,7 +108,7 @@ def test_servo_hold_presses_nothing() -> None:
 def test_held_joints_can_bear_the_reaction_of_the_one_that_moves() -> None:
     """Checked with MuJoCo's inertia, which the plan has not seen; this upright arm's first drive has little torque."""
     arm, truth = drawn_arm(9, upright=True, hold="servo")
-    limits, simulated, slowed = Limits.of(arm), SimulatedArm(arm, truth), 0
+    limits, simulated, slowed = DriveLimits.of(arm), SimulatedArm(arm, truth), 0
     for sweep in scouted_plan(arm, truth).sweeps:
         poses = np.tile(sweep.rest, (len(sweep.steps), 1))
         poses[:, sweep.joint] = sweep.steps

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import calib.report.page as report_page
-from calib.report.page import ReportTable, Section, bullets, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.page import ReportSection, ReportTable, bullets, html_of, paragraph, paragraphs, render, verdict_line
 
 HOSTILE = (
     "<x-evil>",
@@ -58,7 +58,7 @@ def page_with(name: str, folder: Path) -> Tags:
     html += html_of("<b>{}</b>", name)
     table = ReportTable((name, "value"), [[name, "1"], [html_of("<i>{}</i>", name), name]], name)
     path = folder / "page.html"
-    render(path, name, [Section(name, html, [figure], [table]), Section("other", name)], name)
+    render(path, name, [ReportSection(name, html, [figure], [table]), ReportSection("other", name)], name)
     found = Tags()
     found.feed(path.read_text(encoding="utf-8"))
     return found
@@ -96,6 +96,6 @@ def test_a_name_reads_as_it_is(name: str, folder: Path) -> None:
 
 def test_texts_of_figures_are_escaped_for_plotly_too() -> None:
     """It reads tags in them by itself."""
-    made = report_page.styled(graph.Figure().add_bar(x=["<b>a</b>"], y=[1.0], name="<a href='x'>b</a>"))
+    made = report_page.styled_figure(graph.Figure().add_bar(x=["<b>a</b>"], y=[1.0], name="<a href='x'>b</a>"))
     assert made["data"][0]["name"] == "&lt;a href=&#39;x&#39;&gt;b&lt;/a&gt;"
     assert list(made["data"][0]["x"]) == ["&lt;b&gt;a&lt;/b&gt;"]

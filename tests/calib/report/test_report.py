@@ -9,11 +9,10 @@ from sweep_arms import random_arm
 from synthetic_sweeps import passes
 
 from armlink.errors import Refused
-from calib.field.field_fit import fit_field
+from calib.field.field_fit import fit_field, heldout_errors
 from calib.field.field_record import field_record
-from calib.field.heldout import heldout_errors
 from calib.field.rows import rows_of_sweeps
-from calib.fit.findings import Finding
+from calib.fit.findings import FitFinding
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.heldout import heldout_scores, worse_joint
 from calib.fit.sensor_fit import SensorFit, fit_sensors
@@ -104,8 +103,8 @@ def test_the_gates_let_a_right_calibration_pass_and_name_what_is_wrong(record, t
 
 
 def test_a_joint_on_which_the_model_does_not_hold_is_not_written() -> None:
-    cable = Finding("j2", "spring", 0.8, "N·m/rad", "a spring of 0.8 N·m/rad pulls on it: is a cable caught?")
-    outlier = Finding("j1", "outliers", 2.0, "1", "2 readings were left out")
+    cable = FitFinding("j2", "spring", 0.8, "N·m/rad", "a spring of 0.8 N·m/rad pulls on it: is a cable caught?")
+    outlier = FitFinding("j1", "outliers", 2.0, "1", "2 readings were left out")
     check_holds([outlier])
     check_holds([outlier, cable], accepted=["j2"])
     with pytest.raises(Refused, match="j2: the sensor model does not hold: a spring of"):

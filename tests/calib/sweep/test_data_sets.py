@@ -12,8 +12,7 @@ from armlink.cli import run
 from armlink.errors import BadInput
 from calib.fit.sensor_fit import fit_sensors
 from calib.plan.sweep_plan import plan_sweep
-from calib.sweep.data_sets import data_sets, labels
-from calib.sweep.dataset import MANIFEST, DataWriter, Manifest, PlanLine, load_data
+from calib.sweep.dataset import MANIFEST, DataWriter, Manifest, PlanLine, data_sets, labels, load_data
 from sim_bus.truth import Truth
 
 ARM = random_arm(1, 3)

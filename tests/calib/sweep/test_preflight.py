@@ -13,18 +13,17 @@ from sweep_arms import random_arm
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.link import Link
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.motion.encoder_check import EncoderFault
 from calib.plan.drawing import stops_seconds
-from calib.sweep.preflight import find_stops, listen
-from calib.sweep.thresholds import HOT
+from calib.sweep.preflight import HOT, find_stops, listen
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.sim_section import EffectEntry
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
 ARM = random_arm(31, 2)
-RATED = float(Limits.of(ARM).rated[1])
+RATED = float(DriveLimits.of(ARM).rated[1])
 
 
 @contextmanager
@@ -104,7 +103,7 @@ def test_stops_are_found_where_the_arm_file_has_them_and_named_where_not() -> No
     with enabled(simulated) as link:
         listened, begun = listen(link, ARM), simulated.time
         found = find_stops(link, ARM, listened, lambda done, total: counted.append((done, total)))
-        limits = Limits.of(ARM)
+        limits = DriveLimits.of(ARM)
         reading = (np.column_stack([limits.lower, limits.upper])) / simulated.truth.position_gain[:, None]
         np.testing.assert_allclose(found.stops, reading, atol=0.004)
         assert counted[-1] == (4, 4)

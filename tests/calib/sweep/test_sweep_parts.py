@@ -17,14 +17,13 @@ from armlink.errors import BadInput, Refused
 from armlink.link.integral import slowest_time
 from armlink.link.types import Sample
 from calib.arm.sweep_section import SweepSection
-from calib.commands.screen import unsettled_said
-from calib.motion.mover import Mover
+from calib.commands.screen import unsettled_lines
+from calib.motion.mover import STOP_TOLERANCE, Mover
 from calib.motion.settle_rule import SettleRule
 from calib.motion.static_reading import StaticReading
-from calib.motion.thresholds import STOP_TOLERANCE
 from calib.motion.trajectory import trajectory
 from calib.plan.sweep_plan import plan_sweep
-from calib.sweep.dataset import DataWriter, Manifest, PlanLine, encoded, load_data
+from calib.sweep.dataset import DataWriter, Manifest, PlanLine, encode, load_data
 from gcomp.arrays import Array
 from sim_bus.truth import Truth
 
@@ -37,7 +36,7 @@ NONE = np.array([np.nan])
 
 def same(ours: Sequence[StaticReading], theirs: Sequence[StaticReading]) -> bool:
     """Equal to the last digit, as the file has them."""
-    return list(map(encoded, ours)) == list(map(encoded, theirs))
+    return list(map(encode, ours)) == list(map(encode, theirs))
 
 
 @given(
@@ -245,9 +244,9 @@ def test_a_data_set_that_another_process_writes_is_not_resumed(tmp_path: Path) -
 def test_unsettled_readings_are_told_with_their_sweeps() -> None:
     arm = random_arm(1, 3)
     data = synthetic_pass(arm, Truth.of(arm), plan_sweep(arm), 0.0, np.random.default_rng(0))
-    assert unsettled_said(data) == []
+    assert unsettled_lines(data) == []
     swung = replace(data.readings[0], settled=False)
-    (line,) = unsettled_said(replace(data, readings=(swung, *data.readings[1:])))
+    (line,) = unsettled_lines(replace(data, readings=(swung, *data.readings[1:])))
     assert line.startswith(f"1 of {len(data.readings)} readings had not settled")
     assert "in scout: they count less" in line
 

@@ -11,7 +11,7 @@ from sweep_arms import at_rate, random_arm, with_section
 from armlink.arm_file import ArmFile
 from armlink.errors import HostLate, Refused, Stall
 from armlink.link.link import Link
-from calib.arm.drive_limits import Limits
+from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
@@ -84,7 +84,7 @@ def test_resume_goes_on_with_exactly_the_next_reading(chain: Chain) -> None:
 
 
 def test_resting_joints_stand_at_their_stops(chain: Chain) -> None:
-    limits, truth = Limits.of(chain.arm), chain.simulated.truth
+    limits, truth = DriveLimits.of(chain.arm), chain.simulated.truth
     plan = chain.data[0].plan
     assert plan is not None
     sweeps = {sweep.name: sweep for sweep in plan.sweeps}
@@ -100,12 +100,12 @@ def test_resting_joints_stand_at_their_stops(chain: Chain) -> None:
 
 def test_sensors_and_gravity_come_out_right(chain: Chain) -> None:
     truth, fit = chain.simulated.truth, chain.fit
-    rated = Limits.of(chain.arm).rated
+    rated = DriveLimits.of(chain.arm).rated
     assert np.abs(fit.value("gain") / truth.gain - 1).max() < 0.006
     assert np.all(np.abs(fit.value("offset") - truth.offset) < 0.003 * rated)
     assert np.abs(fit.value("position_gain") - truth.position_gain).max() < 0.004
     gravity = identify_gravity(chain.arm, chain.data, fit)
-    limits = Limits.of(chain.arm)
+    limits = DriveLimits.of(chain.arm)
     poses = np.random.default_rng(0).uniform(limits.lower, limits.upper, (200, 3))
     true = chain.simulated.gravity_torque(poses)
     from calib.arm.kinematics import gcomp_arm
@@ -121,7 +121,7 @@ def test_the_model_holds_at_poses_that_no_fit_has_seen(chain: Chain) -> None:
     check = run_verify(chain.link, chain.arm, gravity, record, poses=6, seed=1)
     assert check.passed
     assert check.sensor.shape == (6, 3)
-    assert np.all(check.rms < 0.003 * Limits.of(chain.arm).rated)
+    assert np.all(check.rms < 0.003 * DriveLimits.of(chain.arm).rated)
 
 
 def test_a_pose_that_a_stall_interrupts_is_repeated(chain: Chain, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,7 +154,7 @@ def test_a_pose_that_a_stall_interrupts_is_repeated(chain: Chain, monkeypatch: p
 
 
 def test_a_travel_to_where_the_arm_stands_moves_nothing(chain: Chain) -> None:
-    mover = Mover(chain.link, sweep_section(chain.arm), Limits.of(chain.arm))
+    mover = Mover(chain.link, sweep_section(chain.arm), DriveLimits.of(chain.arm))
     mover.hold_all()
     before = mover.command.position.copy()
     mover.travel(before.copy(), 1.0)
@@ -163,7 +163,7 @@ def test_a_travel_to_where_the_arm_stands_moves_nothing(chain: Chain) -> None:
 
 def test_a_joint_that_cannot_be_held_on_its_stop_is_noticed(chain: Chain) -> None:
     """Pressed with too little torque it slips within the press, and is caught."""
-    mover = Mover(chain.link, sweep_section(chain.arm), Limits.of(chain.arm))
+    mover = Mover(chain.link, sweep_section(chain.arm), DriveLimits.of(chain.arm))
     mover.hold_all()
     plan = chain.data[0].plan
     assert plan is not None
@@ -181,9 +181,9 @@ def test_a_joint_that_cannot_be_held_on_its_stop_is_noticed(chain: Chain) -> Non
 
 
 def test_a_joint_that_slips_is_pressed_harder_and_at_its_limit_the_others_move_slower(chain: Chain) -> None:
-    limits = Limits.of(chain.arm)
+    limits = DriveLimits.of(chain.arm)
     mover = Mover(chain.link, sweep_section(chain.arm), limits)
-    run = runner._Pass(mover, None, [], lambda *_: None, lambda: 0.0)
+    run = runner._StepPass(mover, None, None, lambda: 0.0, [])
     assert chain.data[0].plan is not None
     sweep = chain.data[0].plan.sweeps[0]
     joint = int(np.flatnonzero(sweep.stops)[0])
@@ -200,8 +200,8 @@ def test_a_joint_that_slips_is_pressed_harder_and_at_its_limit_the_others_move_s
 
 
 def test_a_stop_that_is_not_where_the_arm_file_has_it_is_named(chain: Chain) -> None:
-    limits = Limits.of(chain.arm)
-    wrong = Limits(limits.lower + 0.3, limits.upper - 0.3, limits.rated, limits.max_torque, limits.speed)
+    limits = DriveLimits.of(chain.arm)
+    wrong = DriveLimits(limits.lower + 0.3, limits.upper - 0.3, limits.rated, limits.max_torque, limits.speed)
     mover = Mover(chain.link, sweep_section(chain.arm), wrong)
     mover.hold_all()
     mover.travel(np.array([(limits.lower[0] + limits.upper[0]) / 2, wrong.upper[1], 0.0]), 1.0)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from gcomp.arm.inertia import joint_inertias
-from gcomp.arm.load import place_chain
+from gcomp.arm.load import joint_inertias, place_chain
 
 MODEL = """
 <mujoco><worldbody>

@@ -1,13 +1,12 @@
-"""Choice of sweeps: against exhaustive and random choice, what it promises is what a fit then finds; cures."""
+"""Choice of sweeps: against exhaustive and random choice, and what it promises is what a fit then finds."""
 
 import numpy as np
 import pytest
-from gravity_rig import DOWN, SARCOS_BETA, make_readings, make_sarcos, sweep_rows
+from gravity_rig import SARCOS_BETA, make_readings, sweep_rows
 
 from gcomp.arm.arm import Arm
-from gcomp.design.remedies import remedies
 from gcomp.design.selection import sweep_jacobian
-from gcomp.design.sweep_design import Design, Sweep, choose_sweeps, readings_of, stop_combinations
+from gcomp.design.sweep_design import Design, JointSweep, choose_sweeps, readings_of, stop_combinations
 from gcomp.errors import BadArray
 from gcomp.gravity.torque import gravity_levers
 from gcomp.identify.global_fit import Prediction, identify_global, predict_covariance
@@ -48,7 +47,7 @@ def test_greedy_choice_is_the_best_of_all_on_a_small_arm(rng) -> None:
     )  # fmt: skip
     guess = Parameters.nominal(3, beta=[2.0, 0.5, 1.0, -0.3, 0.4, 0.2])
     design = choose_sweeps(arm, guess, sigma=0.05, unknown=MOMENTS, poses=1, steps=9)
-    choices = [[Sweep(j, pose, np.linspace(arm.lower[j], arm.upper[j], 9)) for pose in stop_combinations(arm, j)]
+    choices = [[JointSweep(j, pose, np.linspace(arm.lower[j], arm.upper[j], 9)) for pose in stop_combinations(arm, j)]
                for j in range(3)]  # fmt: skip
     every = [
         log_volume(predict_covariance(arm, readings_of(arm, [x, y, z], 0.05), guess, unknown=MOMENTS))
@@ -105,51 +104,12 @@ def test_a_joint_without_limits_has_no_stops() -> None:
         stop_combinations(arm, 0)
 
 
-def test_cure_of_a_missing_sweep_names_it_and_works(sarcos) -> None:
-    """Joint 4 was never swept: the sentence names a sweep of it, and with that sweep the fit is complete."""
-    rng = np.random.default_rng(1)
-    positions, marks = sweep_rows(sarcos, 1, 9, rng)
-    kept = np.isnan(marks[:, 3])
-    rows = make_readings(sarcos, GUESS, positions[kept], marks[kept], sigma=SIGMA)
-    found = identify_global(sarcos, rows, unknown=MOMENTS)
-    advice = remedies(sarcos, rows, found.complete, unknown=MOMENTS)
-    assert set(advice) == set(found.not_identifiable)
-    assert "mass_moment_x[joint_4]" in advice
-    assert advice["mass_moment_x[joint_4]"].startswith("sweep joint_4 with joint_1 at its ")
-    pose = [
-        (sarcos.lower if f"joint_{i + 1} at its lower" in advice["mass_moment_x[joint_4]"] else sarcos.upper)[i]
-        for i in range(7)
-    ]
-    sweep = Sweep(3, np.array(pose), np.linspace(sarcos.lower[3], sarcos.upper[3], 9))
-    more = rows.joined(readings_of(sarcos, [sweep], SIGMA))
-    assert not set(advice) & set(identify_global(sarcos, more, unknown=MOMENTS).not_identifiable)
-
-
-def test_cure_of_the_missing_scale_is_a_reference_mass(sarcos) -> None:
-    rng = np.random.default_rng(1)
-    rows = make_readings(sarcos, GUESS, *sweep_rows(sarcos, 2, 9, rng), sigma=SIGMA)
-    found = identify_global(sarcos, rows, unknown=CALIBRATION)
-    advice = remedies(sarcos, rows, found.complete, unknown=CALIBRATION)
-    assert "with a reference mass" in advice["gain[joint_1]"]
-
-
-def test_vertical_joint_is_beyond_cure_but_for_tilting_the_base() -> None:
-    arm, rng = make_sarcos(DOWN), np.random.default_rng(1)
-    rows = make_readings(arm, GUESS, *sweep_rows(arm, 2, 9, rng), sigma=SIGMA)
-    found = identify_global(arm, rows, unknown=MOMENTS)
-    advice = remedies(arm, rows, found.complete, unknown=MOMENTS)
-    assert advice == dict.fromkeys(
-        ("mass_moment_x[joint_1]", "mass_moment_y[joint_1]"),
-        "no sweep: gravity does not act on it in any pose; tilt the base",
-    )
-
-
 def test_the_jacobian_of_candidate_sweeps_is_the_sensor_model_s(rng, random_arm) -> None:
     built = random_arm(rng, 5)
     arm, n = built.arm, 5
     guess = Parameters(*(rng.uniform(0.5, 1.5, size) for size in (n, n, n, n, 2 * n, 3)))
     free, sigma, loads = rng.random(6 * n + 3) < 0.7, rng.uniform(0.1, 0.3, n), (0.0, 1.5)
-    sweeps = [Sweep(2, pose, np.linspace(-1.0, 1.0, 4)) for pose in rng.uniform(-1, 1, (3, n))]
+    sweeps = [JointSweep(2, pose, np.linspace(-1.0, 1.0, 4)) for pose in rng.uniform(-1, 1, (3, n))]
     ours = sweep_jacobian(arm, guess, 2, np.stack([sweep.positions() for sweep in sweeps]), sigma, free, loads)
     for sweep, jacobian in zip(sweeps, ours, strict=True):
         rows = readings_of(arm, [sweep], sigma, loads)

@@ -218,7 +218,7 @@ def test_each_node_answers_on_its_own_bus_alone(served, path):
 
 def test_the_scan_finds_the_joints_of_both_buses(served, path, capsys):
     assert run(["scan", str(path)]) == 0
-    shown = capsys.readouterr().err
+    shown = capsys.readouterr().out
     assert "base" in shown
     assert "tip" in shown
     assert "no answer" not in shown

@@ -11,10 +11,9 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.model.load import load_model
-from sim_gap.residuals.gear_impacts import near_impacts
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
-from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.residuals.residual_set import ResidualSet, near_impacts
 
 Odd = Callable[[Recording], Recording]
 

@@ -7,42 +7,42 @@ import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
-from sim_gap.attribution.bodies import _turn, lacking, placed
+from sim_gap.attribution.bodies import _turn, numbered_by_body, recordings_with_another_body
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
-from sim_gap.residuals.preprocess import ABSENT, Signals, prepare
+from sim_gap.residuals.preprocess import ABSENT, PreparedSignals, prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 BARE, LOADED = Wrong(), Wrong(payload=0.8)
 
 
-def signals(wrong: Wrong, seed: int, number: int = 0) -> Signals:
+def signals(wrong: Wrong, seed: int, number: int = 0) -> PreparedSignals:
     recording = record(model(), wrong, seed, seconds=12.0, rate=50.0, channels=("tau",))
     return replace(prepare(recording, load_model(model()).arm), number=number)
 
 
-def data(*some: Signals) -> ResidualSet:
+def data(*some: PreparedSignals) -> ResidualSet:
     return ResidualSet(some, layout_of(some))
 
 
 @pytest.fixture(scope="module")
-def loaded_second() -> Estimate:
+def loaded_second() -> EffectEstimate:
     """An estimate from two recordings, of which the second has a body."""
     train = data(signals(BARE, 1, 1), signals(LOADED, 2, 2))
-    return Estimate(ColumnStore(train), [Term("link.payload", 0, (2.0,))])
+    return EffectEstimate(ColumnStore(train), [Term("link.payload", 0, (2.0,))])
 
 
-def test_another_recording_is_numbered_by_whether_the_body_explains_it(loaded_second: Estimate) -> None:
-    heldout = placed(loaded_second, data(signals(LOADED, 3), signals(BARE, 4)))
+def test_another_recording_is_numbered_by_whether_the_body_explains_it(loaded_second: EffectEstimate) -> None:
+    heldout = numbered_by_body(loaded_second, data(signals(LOADED, 3), signals(BARE, 4)))
     assert [s.number for s in heldout.signals] == [2, ABSENT]
 
 
 def test_a_recording_with_a_body_that_no_training_recording_has_is_said() -> None:
-    alone = Estimate(ColumnStore(data(signals(BARE, 1, 1))), [Term("torque.offset", 0)])
-    assert lacking(alone, data(signals(LOADED, 3), signals(BARE, 4))) == [0]
+    alone = EffectEstimate(ColumnStore(data(signals(BARE, 1, 1))), [Term("torque.offset", 0)])
+    assert recordings_with_another_body(alone, data(signals(LOADED, 3), signals(BARE, 4))) == [0]
 
 
 def test_a_body_is_turned_if_it_is_as_heavy_and_its_moment_as_large() -> None:

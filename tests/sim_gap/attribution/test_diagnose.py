@@ -9,7 +9,7 @@ from wrong_arms import Wrong, model, record
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.search.model_selection import one_each
+from sim_gap.search.model_selection import first_of_each
 from sim_gap.search.term import Term
 
 BOTH, MOTOR = ("tau", "tau_motor"), ("tau_motor",)
@@ -160,4 +160,4 @@ def test_where_the_sensors_drown_in_noise_the_command_is_compared_with_the_model
 def test_two_shapes_of_one_effect_at_one_place_become_one():
     two = [Term("transmission.coupling", 2, (2.0, lever)) for lever in (-1.0, -0.6)]
     friction = Term("friction.coulomb", 0)
-    assert set(one_each([two[0], friction, two[1]])) == {two[0], friction}
+    assert set(first_of_each([two[0], friction, two[1]])) == {two[0], friction}

@@ -11,8 +11,8 @@ from wrong_arms import THREE, Wrong, model, record
 from armlink.model_file import compile_model
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.effects.base import angles_of, tilted
-from sim_gap.effects.inertials import moved, point, point_slopes, pseudo_inertia
+from sim_gap.effects.base import angles_of, tilt_gravity
+from sim_gap.effects.link import move_mass, point_mass, point_slopes, pseudo_inertia
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -48,12 +48,14 @@ def test_a_sensors_gain_and_a_payload():
 def test_a_base_that_is_turned_far(degrees):
     angles = np.radians(degrees) * np.array([0.8, -0.6])
     real = mujoco.MjModel.from_xml_string(THREE)
-    real.opt.gravity[:] = tilted(GRAVITY, angles)
+    real.opt.gravity[:] = tilt_gravity(GRAVITY, angles)
     train, other = (record(real, Wrong(coulomb=np.full(3, 0.3)), seed=s, seconds=40) for s in (1, 2))
     answer = diagnose(_upright(), [train], [other])
     assert answer.causes[0].effect == "base.tilt"
     found = np.array([value(answer, "base.tilt", "arm", f"angle_{k}").value for k in (1, 2)])
-    between = np.degrees(np.arccos(np.clip(tilted(GRAVITY, found) @ tilted(GRAVITY, angles) / 9.81**2, -1, 1)))
+    between = np.degrees(
+        np.arccos(np.clip(tilt_gravity(GRAVITY, found) @ tilt_gravity(GRAVITY, angles) / 9.81**2, -1, 1))
+    )
     assert between < 0.5
     assert {c.effect for c in answer.causes if c.confidence > 0.5} == {"base.tilt", "friction.coulomb"}
 
@@ -63,28 +65,28 @@ def _upright() -> mujoco.MjModel:
 
 
 def test_gravity_turns_as_the_rotation_vector_says():
-    quarter = tilted(GRAVITY, np.array([np.pi / 2, 0.0]))
+    quarter = tilt_gravity(GRAVITY, np.array([np.pi / 2, 0.0]))
     np.testing.assert_allclose(quarter, [0.0, -9.81, 0.0], atol=1e-12)
     for angles in np.random.default_rng(0).uniform(-2.0, 2.0, (20, 2)):
-        np.testing.assert_allclose(angles_of(GRAVITY, tilted(GRAVITY, angles)), angles, atol=1e-6)
+        np.testing.assert_allclose(angles_of(GRAVITY, tilt_gravity(GRAVITY, angles)), angles, atol=1e-6)
 
 
 def test_bodies_that_are_moved_or_added_can_exist():
     link = np.array([2.0, 0.1, 0.2, -0.3, 0.3, 0.01, 0.0, 0.3, 0.02, 0.2])
     assert np.linalg.eigvalsh(pseudo_inertia(link)).min() > 0.0
-    far = moved(link, np.array([1.0, -2.0, 0.5]))
+    far = move_mass(link, np.array([1.0, -2.0, 0.5]))
     body = pseudo_inertia(far)
     assert np.linalg.eigvalsh(body).min() > 0.0
     inertia = np.trace(body[:3, :3]) * np.eye(3) - body[:3, :3]
     np.testing.assert_allclose([body[3, 3], *body[:3, 3], *inertia[np.triu_indices(3)]], far)
-    assert np.linalg.eigvalsh(pseudo_inertia(link + point(1.5, np.array([0.2, 0.0, 0.3])))).min() > 0.0
+    assert np.linalg.eigvalsh(pseudo_inertia(link + point_mass(1.5, np.array([0.2, 0.0, 0.3])))).min() > 0.0
 
 
 def test_slopes_of_a_point_mass_are_those_of_differences():
     mass, moment, step = -0.7, np.array([0.1, -0.05, 0.2]), 1e-6
     slopes = point_slopes(mass, moment)
     for k, unit in enumerate(np.eye(4)):
-        up, down = (point(mass + s * step * unit[0], moment + s * step * unit[1:]) for s in (1, -1))
+        up, down = (point_mass(mass + s * step * unit[0], moment + s * step * unit[1:]) for s in (1, -1))
         np.testing.assert_allclose(slopes[:, k], (up - down) / (2 * step), atol=1e-6)
 
 
@@ -110,7 +112,7 @@ def test_a_payload_of_one_training_and_of_the_held_out_recording(groups):
     ]
     answer = diagnose(model(), made[:2], made[2:], labels=["a", "b", "c"], groups=groups)
     assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(1.2, rel=0.05)
-    assert "link.payload is present in b and c alone" in answer.notes
+    assert "link.payload is present only in b and c" in answer.notes
     assert np.all(answer.heldout_after < 0.1)
 
 
@@ -163,7 +165,7 @@ def test_loaded_recordings_judged_on_one_without_the_body():
     answer = diagnose(model(), made[:2], made[2:], labels=["a", "b", "c"])
     assert answer.verdict == "explained"
     assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(0.6, rel=0.03)
-    assert "link.payload is present in a and b alone" in answer.notes
+    assert "link.payload is present only in a and b" in answer.notes
     assert "second half" in answer.heldout_is
 
 

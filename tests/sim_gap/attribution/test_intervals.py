@@ -12,7 +12,7 @@ from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 TRIALS = 60
@@ -36,7 +36,7 @@ def test_coverage(monkeypatch):
         signals = prepare(replace(clean, motor_torque=clean.motor_torque + 0.2 * noise), nominal.arm)
         data = ResidualSet((signals,), layout_of([signals]))
         terms = [Term(effect, j) for effect in ("friction.coulomb", "friction.viscous") for j in range(3)]
-        estimate = Estimate(ColumnStore(data), terms)
+        estimate = EffectEstimate(ColumnStore(data), terms)
         for term in terms:
             (value,) = estimate.parameters(term).values()
             held.append(value.low <= (0.5 if term.effect == "friction.coulomb" else 0.8) <= value.high)
@@ -59,7 +59,7 @@ def test_an_arm_that_is_a_little_wrong_everywhere_is_allowed_for():
         signals = prepare(record(model(), wrong, seed=trial, seconds=40, rate=50), nominal.arm)
         data = ResidualSet((signals,), layout_of([signals]))
         terms = [Term("friction.coulomb", 1), Term("torque.offset", 2)]
-        estimate = Estimate(ColumnStore(data), terms)
+        estimate = EffectEstimate(ColumnStore(data), terms)
         for term, truth in zip(terms, (0.8, 0.5), strict=True):
             (value,) = estimate.parameters(term).values()
             held.append(value.low <= truth <= value.high)
@@ -78,7 +78,7 @@ def test_what_every_arm_has_besides_is_less_on_an_arm_of_little_strength():
     assert motor is not None
     weak = replace(recording, torque=tau / 1000.0, motor_torque=motor / 1000.0)
     signals = prepare(weak, load_model(light).arm)
-    estimate = Estimate(ColumnStore(ResidualSet((signals,), layout_of([signals]))), [Term("friction.coulomb", 1)])
+    estimate = EffectEstimate(ColumnStore(ResidualSet((signals,), layout_of([signals]))), [Term("friction.coulomb", 1)])
     (value,) = estimate.parameters(Term("friction.coulomb", 1)).values()
     assert 0.0 < value.low <= 0.0008 <= value.high < 0.0016
 

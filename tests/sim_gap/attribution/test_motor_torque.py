@@ -64,7 +64,7 @@ def test_friction_and_rotors_are_told_in_true_newton_metres(answer, effect, name
 
 
 def test_what_masses_and_constants_have_in_common_is_said_to_be_unknown(answer):
-    assert any("common to all torque constants and all masses" in note for note in answer.notes)
+    assert any("the scale of all masses and torque constants" in note for note in answer.notes)
     for each in values(answer, "actuator.gain", "gain"):
         assert each.high - each.low > 2 * 0.015 * each.value
 
@@ -87,4 +87,4 @@ def test_constants_that_are_all_off_alike_may_be_masses_and_the_answer_says_so(m
     assert masses.confounded_with[0] == "actuator.gain"
     assert "known payload" in masses.separate_by
     assert answer.verdict == "ambiguous"
-    assert any("only products of masses and torque constants" in note for note in answer.notes)
+    assert any("only the products of masses and torque constants" in note for note in answer.notes)

@@ -9,7 +9,7 @@ from wrong_arms import Wrong, model, record
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.effects.elasticity_backlash import transmitted
+from sim_gap.effects.transmission import transmitted
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare

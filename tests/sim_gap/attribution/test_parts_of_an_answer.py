@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from sim_gap.attribution import notes, rollout
-from sim_gap.attribution.causes import ordered
+from sim_gap.attribution.causes import order_of_effects, steadiness
 from sim_gap.attribution.diagnosis import Rollout
-from sim_gap.attribution.positions.answer import _where
-from sim_gap.attribution.positions.notes import running_free
-from sim_gap.attribution.residual_laws import ResidualLaw, _Candidate
+from sim_gap.attribution.position_answer import _where
+from sim_gap.attribution.position_notes import running_free
+from sim_gap.attribution.residual_laws import ResidualLaw, _LawCandidate
 from sim_gap.attribution.rollout import RollOuts
-from sim_gap.attribution.steadiness import steadiness
 from sim_gap.better_model.export import _line
-from sim_gap.residuals.layout import Layout
-from sim_gap.residuals.where import Location, _features
+from sim_gap.residuals.layout import ChannelLayout
+from sim_gap.residuals.location import Location, _features
 from sim_gap.search.estimate import Value
 from sim_gap.search.term import Term
 
@@ -29,7 +28,7 @@ def test_the_effect_that_takes_most_off_any_joint_comes_first() -> None:
         heldout=SimpleNamespace(layout=SimpleNamespace(n=2)),
         rms=lambda terms: np.ones(2) - sum((falls[term] for term in terms), np.zeros(2)),
     )
-    steps = ordered(SimpleNamespace(terms=(COULOMB, OFFSET)), scorer)
+    steps = order_of_effects(SimpleNamespace(terms=(COULOMB, OFFSET)), scorer)
     assert [step.effect for step in steps] == ["torque.offset", "friction.coulomb"]
     np.testing.assert_allclose(steps[1].before, [0.5, 1.0])
 
@@ -73,7 +72,7 @@ def test_a_remaining_gap_is_noted_with_its_regime_where_one_is_clear(monkeypatch
 def test_a_joint_that_rests_tells_nothing_of_its_friction() -> None:
     moving = np.zeros((100, 2))
     moving[:10, 0] = 1.0
-    layout = Layout(2, "tau", "tau_motor")
+    layout = ChannelLayout(2, "tau", "tau_motor")
     signals = SimpleNamespace(moving=moving, arm=SimpleNamespace(names=("shoulder", "wrist")))
     (said,) = notes._at_rest(SimpleNamespace(signals=(signals,), layout=layout, rows=layout.rows))
     assert said.startswith("wrist hardly moves: its tau_motor")
@@ -104,7 +103,7 @@ def test_a_directed_law_turns_with_the_motion_and_is_nothing_at_rest() -> None:
     direction = np.array([[1.0], [0.5], [0.0], [-1.0]])
     half = np.full((4, 1), 0.5)
     signals = SimpleNamespace(q=half, v=half, model=half, direction=direction, filtered=lambda x: x)
-    columns = _Candidate("position", True, np.array([0.0, 1.0])).columns(signals, 0)
+    columns = _LawCandidate("position", True, np.array([0.0, 1.0])).columns(signals, 0)
     np.testing.assert_allclose(columns, 0.5 * direction * np.ones(2))
 
 
@@ -151,7 +150,7 @@ def test_a_written_model_that_runs_away_from_the_fit_is_said() -> None:
     )
     far, near = (Rollout(6.0, np.full(2, np.nan), np.array([0.05, left]), closed_loop=True) for left in (0.2, 0.14))
     (note,) = running_free(found, far, gap=True)
-    assert note.endswith("is further off: b 0.2 rad (the fit 0.01)")
+    assert note.endswith("leaves more than the fit: b 0.2 rad (fit 0.01)")
     assert running_free(found, near, gap=True) == []
     assert running_free(found, None, gap=True) == []
 
@@ -167,6 +166,8 @@ def test_a_written_model_that_leaves_more_than_the_nominal_one_is_said() -> None
     assert running_free(found, better, gap=True) == []
     worse = Rollout(6.0, np.array([0.03, 0.03]), np.array([0.05, 0.02]), closed_loop=True)
     (note,) = running_free(found, worse, gap=False)
-    assert note.endswith("use the model as it is")
+    assert note.endswith("use the nominal model")
     (note,) = running_free(found, worse, gap=True)
-    assert note.startswith("running free, the corrected model leaves more (0.0381 rad) than the nominal one (0.03 rad)")
+    assert note.startswith(
+        "running free, the corrected model leaves a larger gap (0.0381 rad) than the nominal one (0.03 rad)"
+    )

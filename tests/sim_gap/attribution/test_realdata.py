@@ -51,7 +51,7 @@ def test_the_payload_of_one_recording_is_found_beside_what_is_wrong_with_the_arm
     assert mass.value == pytest.approx(2.6, rel=0.1)
     assert mass.low < 2.6 < mass.high
     assert payload.confidence > 0.8
-    assert any("is present in recording 3 alone" in note for note in answer.notes)
+    assert any("is present only in recording 3" in note for note in answer.notes)
 
 
 @pytest.mark.long

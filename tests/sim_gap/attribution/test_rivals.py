@@ -88,9 +88,9 @@ def in_order(terms: list[Term], turned: bool) -> list[Term]:
 
 @pytest.mark.parametrize(("kept", "worse"), [([DELAY], 0.2), ([], float("inf"))])
 def test_a_rival_that_a_fit_about_itself_drops_is_none(monkeypatch, kept, worse):
-    monkeypatch.setattr(module, "converged", lambda nominal, terms, start: (None, kept))
+    monkeypatch.setattr(module, "converge", lambda nominal, terms, start: (None, kept))
     monkeypatch.setattr(module, "NormalEquations", lambda about, terms: None)
-    monkeypatch.setattr(module, "Search", lambda normal, terms, usual: SimpleNamespace(score=1.2))
+    monkeypatch.setattr(module, "StepwiseSearch", lambda normal, terms, usual: SimpleNamespace(score=1.2))
     search = SimpleNamespace(
         score=1.0,
         usual=None,

@@ -7,16 +7,15 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution import diagnose
-from sim_gap.attribution.causes import _Scorer, founded_ones
-from sim_gap.attribution.confidence import founded
+from sim_gap.attribution.causes import _Scorer, founded_causes
 from sim_gap.attribution.diagnosis import Cause, Signs
-from sim_gap.attribution.verdict import carries
+from sim_gap.attribution.verdict import carries, is_founded
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import Estimate
+from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 SIGNS = Signs(1.0, 0.0, 1.0, 0.0)
@@ -40,7 +39,7 @@ def test_what_is_missed_without_a_term_is_what_no_other_takes():
     data = ResidualSet((signals,), layout_of([signals]))
     terms = [Term("friction.coulomb", j) for j in range(3)] + [Term("friction.viscous", j) for j in range(3)]
     slow = Term("friction.stribeck", 1, (0.25,))
-    scorer = _Scorer(Estimate(ColumnStore(data), [*terms, slow]), data)
+    scorer = _Scorer(EffectEstimate(ColumnStore(data), [*terms, slow]), data)
     alone = np.max(scorer.rms(terms[:3]) - scorer.rms([*terms[:3], slow]))
     assert scorer.missed([slow]) < 0.1 * alone
     assert scorer.missed([slow, terms[4]]) > 0.5 * alone
@@ -49,16 +48,16 @@ def test_what_is_missed_without_a_term_is_what_no_other_takes():
 def test_a_cause_that_its_rival_could_replace_is_founded_together_with_it():
     """That a rival does as well leaves no evidence for either alone: the answer is ambiguous, not unexplained."""
     replaceable = replace(SIGNS, evidence=0.001, left=0.05)
-    assert not founded(replaceable)
-    assert founded(replaceable, rivals=1)
-    assert not founded(replace(replaceable, left=1.0, elsewhere=0.5), rivals=1)
+    assert not is_founded(replaceable)
+    assert is_founded(replaceable, rivals=1)
+    assert not is_founded(replace(replaceable, left=1.0, elsewhere=0.5), rivals=1)
 
 
 def test_within_the_margins_a_cause_that_nothing_founds_is_minor():
     """An arm that is within its margins has no gap; rivals share their evidence, which founds them together."""
     sure, weak = cause("friction.coulomb", 1.0, 0.9), cause("torque.offset", 0.5, 0.2)
     rival = replace(weak, confounded_with=("link.mass_moment",))
-    assert founded_ones([sure, weak, rival], []) == ([sure, rival], [weak])
+    assert founded_causes([sure, weak, rival], []) == ([sure, rival], [weak])
 
 
 @pytest.mark.parametrize(("within", "named"), [(False, True), (True, False)])
@@ -67,6 +66,6 @@ def test_within_the_margins_what_may_be_nothing_is_minor(monkeypatch, within, na
     wrong = Wrong(coulomb=0.6)
     recordings = [record(model(), wrong, seed=seed, seconds=12.0, rate=50.0) for seed in (1, 2)]
     monkeypatch.setattr(diagnose, "is_within", lambda data: within)
-    monkeypatch.setattr(Estimate, "may_be_nothing", lambda self, term: True)
+    monkeypatch.setattr(EffectEstimate, "may_be_nothing", lambda self, term: True)
     answer = diagnose.diagnose(model(), recordings[:1], recordings[1:])
     assert [bool(each) for each in (answer.causes, answer.minor)] == [named, not named]

@@ -13,7 +13,7 @@ from armlink import cli
 from armlink.errors import BadInput
 from armlink.recording.files import save_recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.better_model.motor_entries import write_motor_entries
+from sim_gap.better_model.actuator_entries import write_motor_entries
 from sim_gap.better_model.samples import drawn_parameters
 
 TRUE = np.array([0.6, 0.4, 0.02])

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from sim_gap.better_model.actuator_entries import write_entries
 from sim_gap.better_model.effects_module import module_text
-from sim_gap.better_model.xml_comment import xml_comment
+from sim_gap.better_model.urdf import xml_comment
 
 HOSTILE = (
     '"]); import os; os.system("touch made") #',

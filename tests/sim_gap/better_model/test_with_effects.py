@@ -9,7 +9,7 @@ from wrong_arms import THREE, Wrong, model, motion, record
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.better_model.coupled_motors import CoupledMotor, add_to, coupled_motors
+from sim_gap.better_model.corrected_model import CoupledMotor, add_to, coupled_motors
 from sim_gap.better_model.export import write_model
 from sim_gap.model.load import load_model, tendons_of
 
@@ -108,7 +108,7 @@ def test_an_arm_files_model_can_be_written_too(tmp_path):
 def test_a_joint_s_name_does_not_end_a_comment():
     from xml.etree import ElementTree
 
-    from sim_gap.better_model.xml_comment import xml_comment
+    from sim_gap.better_model.urdf import xml_comment
 
     comment = xml_comment(["first", "friction of a--->--><body/>: 3", "--"])
     assert [child.tag for child in ElementTree.fromstring(f"<mujoco>{comment}</mujoco>")] == []

@@ -10,17 +10,16 @@ import pinocchio as pin
 import pytest
 
 from armlink.recording.files import load_recording
-from sim_gap.blind.cases.arms import Arm, draw_arm
-from sim_gap.blind.cases.make import make_cases
-from sim_gap.blind.cases.motion import KINDS, RATE, Limits, derivatives, trajectory
-from sim_gap.blind.cases.recipe import Recipe
-from sim_gap.blind.cases.scene import Scene
-from sim_gap.blind.cases.true_arm import sound
-from sim_gap.blind.effects.library import DRAWS, EFFECTS
-from sim_gap.blind.plant.friction import Bristles
+from sim_gap.blind.arms import BenchArm, draw_arm
+from sim_gap.blind.cases import make_cases
+from sim_gap.blind.effects import DRAWS, EFFECTS
+from sim_gap.blind.motion import KINDS, RATE, MotionLimits, derivatives, trajectory
+from sim_gap.blind.plant.drive import Bristles
 from sim_gap.blind.plant.plant import simulate
-from sim_gap.blind.plant.runs import Log, Run
 from sim_gap.blind.plant.sensors import _stays_behind, record
+from sim_gap.blind.recipe import CaseRecipe
+from sim_gap.blind.scene import Scene
+from sim_gap.blind.true_arm import Log, PlantRun, sound_arm
 
 ALL = {
     "link.mass_moment",
@@ -59,20 +58,22 @@ MOTOR_ONLY = ("friction.", "transmission.ripple", "transmission.coupling", "actu
 COMMAND_ONLY = ("actuator.lag", "actuator.delay", "actuator.saturation")
 
 
-def limits(n: int) -> Limits:
-    return Limits(np.full(n, -1.5), np.full(n, 1.5), np.linspace(1.0, 2.0, n), np.linspace(3.0, 8.0, n))
+def limits(n: int) -> MotionLimits:
+    return MotionLimits(np.full(n, -1.5), np.full(n, 1.5), np.linspace(1.0, 2.0, n), np.linspace(3.0, 8.0, n))
 
 
 @pytest.fixture(scope="module")
-def no_effect() -> tuple[Run, Log]:
+def no_effect() -> tuple[PlantRun, Log]:
     random = np.random.default_rng(3)
     arm = draw_arm(random, 5)
     scene = Scene(arm, trajectory(("sines",), 8.0, limits(5), random))
-    run = Run(sound(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 7)
+    run = PlantRun(
+        sound_arm(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 7
+    )
     return run, simulate([run])[0]
 
 
-def test_link_torque_is_pinocchios_for_the_true_arm(no_effect: tuple[Run, Log]) -> None:
+def test_link_torque_is_pinocchios_for_the_true_arm(no_effect: tuple[PlantRun, Log]) -> None:
     run, log = no_effect
     model = _pinocchio(run.truth.arm)
     velocity = derivatives(log.angle)[0][1:-1]
@@ -86,7 +87,7 @@ def test_link_torque_is_pinocchios_for_the_true_arm(no_effect: tuple[Run, Log]) 
     assert (left < 0.01 * np.abs(log.torque).max(0) + 0.01).all()
 
 
-def _pinocchio(arm: Arm) -> pin.Model:
+def _pinocchio(arm: BenchArm) -> pin.Model:
     model, parent = pin.Model(), 0
     model.gravity.linear = arm.gravity
     for k in range(arm.n):
@@ -97,7 +98,7 @@ def _pinocchio(arm: Arm) -> pin.Model:
     return model
 
 
-def test_motor_torque_is_link_torque_plus_rotor_and_friction(no_effect: tuple[Run, Log]) -> None:
+def test_motor_torque_is_link_torque_plus_rotor_and_friction(no_effect: tuple[PlantRun, Log]) -> None:
     run, log = no_effect
     acceleration = (log.angle[2:] - 2 * log.angle[1:-1] + log.angle[:-2]) * RATE**2
     rest = run.truth.motor_gain * log.motor[1:-1] - log.torque[1:-1] - run.truth.arm.armature * acceleration
@@ -109,24 +110,26 @@ def test_motor_torque_is_link_torque_plus_rotor_and_friction(no_effect: tuple[Ru
     assert (mean > 0.0).all()
 
 
-def test_arm_stays_on_its_trajectory(no_effect: tuple[Run, Log]) -> None:
+def test_arm_stays_on_its_trajectory(no_effect: tuple[PlantRun, Log]) -> None:
     run, log = no_effect
     assert np.abs(log.position - run.command).max() < 0.05
 
 
-def test_a_run_is_the_same_whoever_its_neighbours_are(no_effect: tuple[Run, Log]) -> None:
+def test_a_run_is_the_same_whoever_its_neighbours_are(no_effect: tuple[PlantRun, Log]) -> None:
     run, log = no_effect
-    short = Run(run.truth, run.command[:500], run.feed_forward[:500], run.inertia, run.seed)
+    short = PlantRun(run.truth, run.command[:500], run.feed_forward[:500], run.inertia, run.seed)
     random = np.random.default_rng(11)
     arm = draw_arm(random, 7)
     scene = Scene(arm, trajectory(("points",), 2.0, limits(7), random))
-    other = Run(sound(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 1)
+    other = PlantRun(
+        sound_arm(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 1
+    )
     beside = simulate([short, other])[0]
     for name in ("position", "torque", "motor", "command"):
         np.testing.assert_allclose(getattr(beside, name), getattr(log, name)[:500], rtol=0, atol=1e-9)
 
 
-def test_recording_is_uneven_quantised_and_complete(no_effect: tuple[Run, Log]) -> None:
+def test_recording_is_uneven_quantised_and_complete(no_effect: tuple[PlantRun, Log]) -> None:
     run, log = no_effect
     columns = record(run.truth, log, 250.0, True, run.command, np.random.default_rng(0))
     step = np.diff(columns["t"])
@@ -175,7 +178,7 @@ def test_a_short_motion_from_point_to_point_moves_and_comes_back() -> None:
 def _bristles(coulomb: float) -> Bristles:
     random = np.random.default_rng(0)
     arm = draw_arm(random, 3)
-    truth = sound(arm, np.full(3, 10.0), random)
+    truth = sound_arm(arm, np.full(3, 10.0), random)
     truth.coulomb[:], truth.viscous[:] = coulomb, 0.0
     return Bristles([truth], np.full((1, 3), 0.1), 5e-4)
 
@@ -233,7 +236,7 @@ SHOWN = (
 def labels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A short case of an effect of every kind, made as the check makes them; the labels by effect."""
     folder = tmp_path_factory.mktemp("blind")
-    wanted = [Recipe(f"case_{k:04d}", (effect,), (23, k)) for k, effect in enumerate(SHOWN)]
+    wanted = [CaseRecipe(f"case_{k:04d}", (effect,), (23, k)) for k, effect in enumerate(SHOWN)]
     make_cases(wanted, folder / "cases", folder / "labels", train_s=10.0, heldout_s=7.0)
     found = [json.loads(path.read_text()) for path in sorted((folder / "labels").glob("*.json"))]
     return {label["effects"][0]["effect"]: label for label in found}
@@ -259,7 +262,7 @@ def test_effect_shows_in_its_channels_only(labels: dict[str, Any], effect: str) 
 
 
 def test_cases_are_the_same_for_the_same_seed(tmp_path: Path) -> None:
-    wanted = [Recipe("case_0000", ("friction.coulomb",), (5, 1))]
+    wanted = [CaseRecipe("case_0000", ("friction.coulomb",), (5, 1))]
     for folder in ("a", "b"):
         make_cases(wanted, tmp_path / folder, tmp_path / f"{folder}_labels", train_s=3.0, heldout_s=3.0)
     for name in ("sim.xml", "train.csv", "heldout.csv"):
@@ -268,8 +271,8 @@ def test_cases_are_the_same_for_the_same_seed(tmp_path: Path) -> None:
 
 def test_a_case_that_no_arm_shows_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(DRAWS, "torque.offset", lambda scene, random: None)
-    monkeypatch.setattr("sim_gap.blind.cases.recipe.ATTEMPTS", 3)
-    wanted = [Recipe("case_0000", ("torque.offset",), (6, 1)), Recipe("case_0001", (), (6, 2))]
+    monkeypatch.setattr("sim_gap.blind.recipe.ATTEMPTS", 3)
+    wanted = [CaseRecipe("case_0000", ("torque.offset",), (6, 1)), CaseRecipe("case_0001", (), (6, 2))]
     make_cases(wanted, tmp_path / "c", tmp_path / "l", train_s=3.0, heldout_s=3.0)
     assert [path.name for path in (tmp_path / "c").iterdir()] == ["case_0001"]
     make_cases(wanted[:1], tmp_path / "c", tmp_path / "l", train_s=3.0, heldout_s=3.0)
@@ -277,7 +280,7 @@ def test_a_case_that_no_arm_shows_is_left_out(tmp_path: Path, monkeypatch: pytes
 
 
 def test_nominal_model_and_recordings_load(tmp_path: Path) -> None:
-    make_cases([Recipe("case_0000", (), (6, 1))], tmp_path / "c", tmp_path / "l", train_s=4.0, heldout_s=3.0)
+    make_cases([CaseRecipe("case_0000", (), (6, 1))], tmp_path / "c", tmp_path / "l", train_s=4.0, heldout_s=3.0)
     recording = load_recording(tmp_path / "c/case_0000/train.csv")
     label = json.loads((tmp_path / "l/case_0000.json").read_text())
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "c/case_0000/sim.xml"))

@@ -7,11 +7,10 @@ from typing import Any
 import pytest
 
 from armlink.errors import BadInput, Refused
-from sim_gap.blind.bench import _answers, run_bench
-from sim_gap.blind.cases.recipe import draw, recipes
-from sim_gap.blind.cases.seal import MANIFEST, open_labels, seal, verify, write_answer
-from sim_gap.blind.judging.judge import judge
-from sim_gap.blind.judging.score import answer_name, score
+from sim_gap.blind.bench import MANIFEST, _answers, open_labels, run_bench, seal, verify, write_answer
+from sim_gap.blind.judge import judge
+from sim_gap.blind.recipe import draw, recipes
+from sim_gap.blind.score import answer_name, score
 
 
 def truth(effect: str, joint: str = "joint_2", undecided: str = "", **parameters: float) -> dict[str, Any]:

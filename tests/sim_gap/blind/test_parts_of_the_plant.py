@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 
 from sim_gap.blind import bench
-from sim_gap.blind.cases.arms import draw_arm
-from sim_gap.blind.cases.motion import RATE
-from sim_gap.blind.cases.true_arm import TrueArm, sound
-from sim_gap.blind.plant.drive import Drives
-from sim_gap.blind.plant.friction import STIFFEST, Bristles
-from sim_gap.blind.plant.runs import Log
-from sim_gap.blind.plant.sensors import SENSOR_BITS, record
-from sim_gap.blind.servo.law import FINE, ServoLaw, ServoRun, Servos
-from sim_gap.blind.servo.make import Recipe, draw, recorded
+from sim_gap.blind.arms import draw_arm
+from sim_gap.blind.motion import RATE
+from sim_gap.blind.plant.controller import FINE, ServoLaw, ServoRun, Servos
+from sim_gap.blind.plant.drive import STIFFEST, Bristles, PlantDrives
+from sim_gap.blind.plant.sensors import record
+from sim_gap.blind.servo_cases import ServoRecipe, draw, recorded
+from sim_gap.blind.true_arm import Log, TrueArm, sound_arm
 
 STEP = 5e-4
 """Of the plant [s]."""
@@ -22,13 +20,13 @@ STEP = 5e-4
 
 def truth(rated: float = 10.0) -> TrueArm:
     random = np.random.default_rng(0)
-    return sound(draw_arm(random, 3), np.full(3, rated), random)
+    return sound_arm(draw_arm(random, 3), np.full(3, rated), random)
 
 
 def test_a_drive_with_a_lag_follows_a_step_by_all_but_one_eth_in_that_time() -> None:
     arm = truth()
     arm.motor_lag[:] = 21 * STEP
-    drives = Drives([arm], np.full((1, 3), 0.1), np.zeros((1, 3)), [np.zeros(3)], STEP)
+    drives = PlantDrives([arm], np.full((1, 3), 0.1), np.zeros((1, 3)), [np.zeros(3)], STEP)
     for _ in range(21):
         drives._follow(np.ones((1, 3)))
     np.testing.assert_allclose(drives.current, 1.0 - np.exp(-1.0), rtol=1e-9)
@@ -54,7 +52,7 @@ def test_a_sensor_reads_the_torque_in_whole_steps() -> None:
     arm.torque_noise[:], arm.torque_gain[:], arm.torque_offset[:] = 0.0, 1.0, 0.0
     torque = np.tile(np.array([7.0, -3.0, 0.1]), (500, 1))
     read = record(arm, Log(torque, torque, torque, torque, torque), 250.0, False, torque, np.random.default_rng(0))
-    step = 4.0 * 10.0 / 2**SENSOR_BITS
+    step = 4.0 * 10.0 / 2**16
     np.testing.assert_allclose(read["tau"] / step, np.rint(read["tau"] / step), atol=1e-6)
     assert np.abs(read["tau"] - torque[0]).max() <= 0.5 * step + 1e-12
 
@@ -82,7 +80,7 @@ def test_positions_are_recorded_at_their_times_beside_the_command_of_their_turn(
 
 
 def test_servos_of_a_case_have_the_bandwidth_and_damping_of_hobby_servos() -> None:
-    found = draw(Recipe("case_0000", "", True, (4, 1)), (3.0, 3.0), 0)
+    found = draw(ServoRecipe("case_0000", "", True, (4, 1)), (3.0, 3.0), 0)
     assert found is not None
     inertia = found.runs[0].inertia
     hz = np.sqrt(found.law.stiffness / inertia) / (2 * np.pi)

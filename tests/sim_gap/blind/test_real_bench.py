@@ -5,9 +5,9 @@ import pytest
 from wrong_arms import THREE, Wrong, model, record
 
 from armlink.errors import BadInput
-from sim_gap.blind.real import KNOWN, judge_real, read_cases, run_real, score_real
-from sim_gap.closed_loop.parameters import EFFECTS
+from sim_gap.blind.real_recordings import KNOWN, judge_real, read_cases, run_real, score_real
 from sim_gap.effects.registry import library_without
+from sim_gap.position_gap.parameters import EFFECTS
 
 CASE = {
     "case": "arm",

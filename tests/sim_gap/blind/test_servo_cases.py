@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 
 from armlink.recording.files import load_recording
-from sim_gap.blind.servo.effects import OF_THE_ARM, OF_THE_SERVO
-from sim_gap.blind.servo.make import Recipe, make_cases, recipes
-from sim_gap.blind.servo.score import score_positions
-from sim_gap.closed_loop.training.replay import Simulated, replay_rms
+from sim_gap.blind.position_score import score_positions
+from sim_gap.blind.servo_cases import ServoRecipe, make_cases, recipes
+from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO
+from sim_gap.position_gap.training.replay import Simulated, replay_rms
 
 
 def test_every_effect_comes_in_turn() -> None:
@@ -20,7 +20,7 @@ def test_every_effect_comes_in_turn() -> None:
 def test_the_arm_without_an_effect_moves_as_its_model_does_in_mujoco(tmp_path) -> None:
     """Plant and servo against MuJoCo's own position actuators; with a lower gain both part."""
     make_cases(
-        [Recipe("case_0000", "", True, (9, 1)), Recipe("case_0001", "controller.stiffness", True, (9, 2))],
+        [ServoRecipe("case_0000", "", True, (9, 1)), ServoRecipe("case_0001", "controller.stiffness", True, (9, 2))],
         tmp_path / "cases",
         tmp_path / "labels",
         4.0,

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim_gap.blind.cases import recipe
-from sim_gap.blind.cases.recipe import OTHER_PAIR, Recipe
+from sim_gap.blind import recipe
 from sim_gap.blind.effects import actuator, friction, torque, transmission
-from sim_gap.blind.effects.drawn import Drawn
-from sim_gap.blind.judging.tables import _percent
-from sim_gap.blind.servo.effects import integral
+from sim_gap.blind.effects.drawn_effect import DrawnEffect
+from sim_gap.blind.recipe import OTHER_PAIR, CaseRecipe
+from sim_gap.blind.servo_effects import integral
+from sim_gap.blind.tables import _percent
 
 K = 400
 STEP_S = 0.05
@@ -128,22 +128,22 @@ def hopeless(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
 
 def test_other_pairs_are_drawn_for_arms_that_cannot_show_one(hopeless: list[tuple[str, ...]]) -> None:
     pair = ("torque.gain", "torque.offset")
-    assert recipe.draw(Recipe("case_0000", pair, (3, 1)), 1.0, 1.0) is None
+    assert recipe.draw(CaseRecipe("case_0000", pair, (3, 1)), 1.0, 1.0) is None
     assert set(hopeless[:OTHER_PAIR]) == {pair}
     assert len(set(hopeless)) == 3
     assert all(len(effects) == 2 for effects in hopeless)
 
 
 def test_a_single_effect_is_kept_whatever_arm_is_drawn(hopeless: list[tuple[str, ...]]) -> None:
-    assert recipe.draw(Recipe("case_0000", ("torque.gain",), (3, 1)), 1.0, 1.0) is None
+    assert recipe.draw(CaseRecipe("case_0000", ("torque.gain",), (3, 1)), 1.0, 1.0) is None
     assert set(hopeless) == {("torque.gain",)}
 
 
 def test_of_several_effects_a_payload_counts_as_one_of_the_last_link(monkeypatch: pytest.MonkeyPatch) -> None:
     """Slow motion cannot separate it from a mass moment of that link; it can from one of another link."""
 
-    def drawn(effect: str, joint: str) -> Drawn:
-        return Drawn(effect, {joint: {}}, lambda true: None)
+    def drawn(effect: str, joint: str) -> DrawnEffect:
+        return DrawnEffect(effect, {joint: {}}, lambda true: None)
 
     arm = SimpleNamespace(arm=SimpleNamespace(names=("joint_1", "joint_2")))
     for joint, found in (("joint_2", False), ("joint_1", True)):

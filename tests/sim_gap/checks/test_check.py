@@ -14,7 +14,7 @@ from armlink.recording.recording import Recording, take_joints
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.checks.check import check_recording
 from sim_gap.checks.mapping import find_mapping
-from sim_gap.checks.rigid_fit import Motion
+from sim_gap.checks.rigid_fit import ChannelMotion
 from sim_gap.model.load import load_model
 
 REAL = Wrong(
@@ -243,9 +243,9 @@ def test_a_tool_that_outweighs_the_last_link_is_no_zero_of_its_joint():
     loaded = arm.inertial.copy()
     loaded[-1, :4] += body
     reading = arm.with_inertial(loaded).torque(q, v, a) + 0.2 * np.tanh(v / 0.01)
-    assert find_mapping(arm, Motion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
+    assert find_mapping(arm, ChannelMotion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
     turned_zero = q + np.array([0.0, 0.0, np.pi / 2])
-    (finding,) = find_mapping(arm, Motion(turned_zero, v, a, arm.torque(q, v, a), "tau_motor"), AS_IT_IS)
+    (finding,) = find_mapping(arm, ChannelMotion(turned_zero, v, a, arm.torque(q, v, a), "tau_motor"), AS_IT_IS)
     assert finding.option == "--zero q_3=-1.57080"
 
 
@@ -267,7 +267,7 @@ def test_a_joint_whose_friction_outweighs_the_models_torque_tells_no_zero():
     _, q, v, a = motion(3, 30.0, 100.0, seed=4)
     reading = arm.torque(q, v, a) + np.tanh(v / 0.01)
     reading[:, 2] += 300.0 * arm.torque(q + np.array([0.0, 0.0, np.pi / 2]), v, a)[:, 2]
-    assert find_mapping(arm, Motion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
+    assert find_mapping(arm, ChannelMotion(q, v, a, reading, "tau_motor"), AS_IT_IS) == []
 
 
 def test_friction_tells_the_sign_where_the_model_says_nothing(arm, motor):
@@ -325,7 +325,7 @@ def test_rows_stamped_together_are_put_on_even_times_or_refused(arm, motor):
 def test_torques_exchanged_midway_are_refused(arm, motor):
     exchanged = motor.motor_torque.copy()
     exchanged[motor.t.size // 2 :] = exchanged[motor.t.size // 2 :][:, [0, 2, 1]]
-    with pytest.raises(BadInput, match=r"after 50% of the recording alone .* --map tau_motor_2=tau_motor_3"):
+    with pytest.raises(BadInput, match=r"after 50% of the recording: .* --map tau_motor_2=tau_motor_3"):
         check(arm, replace(motor, motor_torque=exchanged, velocity=None))
 
 
@@ -334,7 +334,7 @@ def test_torques_exchanged_in_a_part_of_the_rows_are_refused_with_its_place(arm,
     rows = (motor.t > motor.t[0] + share * np.ptp(motor.t)) == late
     exchanged = motor.motor_torque.copy()
     exchanged[rows] = exchanged[rows][:, [2, 1, 0]]
-    place = rf"{'after' if late else 'before'} {share:.0%} of the recording alone .* --map tau_motor_1=tau_motor_3"
+    place = rf"{'after' if late else 'before'} {share:.0%} of the recording: .* --map tau_motor_1=tau_motor_3"
     with pytest.raises(BadInput, match=place):
         check(arm, replace(motor, motor_torque=exchanged, velocity=None))
 
@@ -344,7 +344,7 @@ def test_a_link_torque_that_another_column_holds_midway_is_refused():
     made = replace(record(model(), REAL, seconds=30.0, rate=100.0), motor_torque=None)
     torque = made.torque.copy()
     torque[made.t.size // 2 :, 0] = 0.05 * made.position[made.t.size // 2 :, 0]
-    with pytest.raises(BadInput, match=r"tau of joint_1: in the second half of the recording alone .* is not in it"):
+    with pytest.raises(BadInput, match=r"tau of joint_1: only in the second half of the recording: .* not show in it"):
         check(load_model(model()).arm, replace(made, torque=torque))
 
 

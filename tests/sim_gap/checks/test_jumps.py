@@ -8,7 +8,7 @@ from wrong_arms import Wrong, model, record
 
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.rows.jumps import find_jumps, find_seam, unwrapped
+from sim_gap.checks.jumps import find_jumps, find_seam, unwrap
 
 
 def of_position(position: np.ndarray, rate: float) -> Recording:
@@ -40,7 +40,7 @@ def test_poses_put_together_jump():
 def test_positions_wrap_in_radians_and_in_degrees(turn):
     far = turn * np.linspace(-0.7, 1.6, 2000)
     recording = of_position((far + 0.5 * turn) % turn - 0.5 * turn, 100.0)
-    corrected, (finding,) = unwrapped(recording)
+    corrected, (finding,) = unwrap(recording)
     assert (finding.finding, finding.corrected) == ("zero", True)
     np.testing.assert_allclose(np.diff(corrected.position[:, 0]), np.diff(far), atol=1e-9 * turn)
     assert find_jumps(corrected, AS_IT_IS) == []

@@ -6,13 +6,13 @@ from wrong_arms import model
 
 from armlink.recording.corrections import AS_IT_IS
 from sim_gap.checks import mapping
-from sim_gap.checks.rigid_fit import Motion, RigidFit
+from sim_gap.checks.rigid_fit import ChannelMotion, RigidFit
 from sim_gap.model.load import load_model
 
 
 def found(
     monkeypatch: pytest.MonkeyPatch, fall: float, explained: tuple[float, ...], slight: float = 0.0
-) -> list[mapping.Finding]:
+) -> list[mapping.RecordingFinding]:
     """Findings if exchanging joints 2 and 3 lowers the cost by `fall` and explains this much of each joint.
 
     A zero that is slightly off lowers it by `slight`.
@@ -23,11 +23,11 @@ def found(
     exchanged = mapping.Hypothesis(
         "order", ("q",), (1, 2), "is in another order", "--map q_2=q_3", lambda motion: motion
     )
-    answers = [mapping.Change(exchanged, fit, fall, doubted=False), None]
+    answers = [mapping.HypothesisTest(exchanged, fit, fall, doubted=False), None]
     monkeypatch.setattr(mapping, "_as_an_arm", lambda *_: fit)
     monkeypatch.setattr(mapping, "_best", lambda *_: answers.pop(0))
     monkeypatch.setattr(mapping, "least_cost", lambda *_: (float(fit.cost.sum()) - slight, 1, 0.2))
-    return mapping.find_mapping(arm, Motion(rows, rows, rows, rows, "tau"), AS_IT_IS, (), arm)
+    return mapping.find_mapping(arm, ChannelMotion(rows, rows, rows, rows, "tau"), AS_IT_IS, (), arm)
 
 
 def test_a_slight_fall_counts_only_if_every_joint_concerned_is_explained_then(monkeypatch):

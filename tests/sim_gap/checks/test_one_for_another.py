@@ -74,7 +74,7 @@ def test_one_joint_in_another_unit_makes_no_motors_of_link_sensors(arms, joint):
     torque = recording.torque.copy()
     torque[:, joint] *= 10.0
     column = f"tau_{joint + 1}"
-    with pytest.raises(BadInput, match=f"holds friction of .*--units {column}=A:K"):
+    with pytest.raises(BadInput, match=f"contains friction .*--units {column}=A:K"):
         check_recording(arm, replace(recording, torque=torque), "r", AS_IT_IS)
     stated = parse_corrections(units=[f"{column}=N·m"])
     assert check_recording(arm, replace(recording, torque=torque), "r", stated)[1] == []

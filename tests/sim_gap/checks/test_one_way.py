@@ -10,8 +10,7 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.checks.check import check_recording
-from sim_gap.checks.one_way import goes_one_way, unchecked_note
+from sim_gap.checks.check import check_recording, goes_one_way, unchecked_note
 from sim_gap.model.load import load_model
 
 SECONDS, RATE = 8.0, 100.0

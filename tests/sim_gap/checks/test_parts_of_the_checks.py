@@ -9,10 +9,10 @@ import pytest
 from armlink.recording.corrections import Corrections
 from sim_gap.checks import hypotheses
 from sim_gap.checks.joint_range import _degrees
-from sim_gap.checks.rigid_fit import Motion, RigidFit, _partial, fit_models
-from sim_gap.checks.rows.clock import _sample_times
-from sim_gap.checks.torque.delay import REPEATS, SURE, _repeats
-from sim_gap.checks.torque.source import find_unsigned
+from sim_gap.checks.rigid_fit import ChannelMotion, RigidFit, _partial, fit_models
+from sim_gap.checks.sampling import _sample_times
+from sim_gap.checks.torque_delay import REPEATS, SURE, _repeats
+from sim_gap.checks.torque_source import find_unsigned
 
 NOTHING_STATED = Corrections()
 
@@ -56,8 +56,8 @@ def test_a_partial_correlation_is_that_of_what_the_others_leave() -> None:
 def test_every_motion_has_its_own_fit_and_friction_only_where_it_moves() -> None:
     t = np.linspace(0.0, 20.0, 800)[:, None]
     torque, v = 3.0 * np.sin(0.7 * t), 0.5 * np.cos(1.3 * t)
-    turning = Motion(t, v, -0.6 * np.sin(1.3 * t), 2.0 * torque + 0.4 * np.sign(v), "tau_motor")
-    resting = Motion(t, 0.0 * v, 0.0 * v, 2.0 * torque, "tau_motor")
+    turning = ChannelMotion(t, v, -0.6 * np.sin(1.3 * t), 2.0 * torque + 0.4 * np.sign(v), "tau_motor")
+    resting = ChannelMotion(t, 0.0 * v, 0.0 * v, 2.0 * torque, "tau_motor")
     moved, still = fit_models([(torque, turning), (torque, resting)])
     assert moved.scale == pytest.approx([2.0], rel=0.02)
     assert moved.friction == pytest.approx([0.4], rel=0.1)
@@ -79,13 +79,13 @@ def test_a_motor_torque_of_one_sign_that_follows_the_model_is_no_amount(similar:
     v = 0.5 * np.cos(0.9 * t)
     reading = 10.0 + similar * m + np.sqrt(1.0 - similar**2) * other
     arm = SimpleNamespace(n=1, names=("joint_1",), carried=lambda q, v, a: m)
-    found = find_unsigned(arm, Motion(t, v, v, reading, "tau_motor"), NOTHING_STATED)
+    found = find_unsigned(arm, ChannelMotion(t, v, v, reading, "tau_motor"), NOTHING_STATED)
     assert [finding.finding for finding in found] == ["unsigned"] * named
 
 
 def test_degrees_become_radians() -> None:
     turned = np.array([[180.0, -90.0]])
-    found = hypotheses._degrees(Motion(turned, turned, turned, turned, "tau"))
+    found = hypotheses._degrees(ChannelMotion(turned, turned, turned, turned, "tau"))
     for x in (found.q, found.v, found.a):
         np.testing.assert_allclose(x, [[np.pi, -0.5 * np.pi]], rtol=1e-12)
     assert found.reading is turned
@@ -109,7 +109,7 @@ def test_what_friction_holds_at_rest_is_no_part_of_a_motors_fit() -> None:
     v = np.where(t % 5.0 < 1.0, np.sin(2.0 * np.pi * t), 0.0)[:, None]
     model = random.normal(size=(len(t), 1))
     reading = model + np.where(v == 0.0, np.repeat(random.uniform(-3.0, 3.0, 30), 50)[:, None], 3.0 * np.sign(v))
-    moved = Motion(v, v, 0.0 * v, reading, "tau_motor")
+    moved = ChannelMotion(v, v, 0.0 * v, reading, "tau_motor")
     seldom = np.where(t[:, None] < 5.0, v, 0.0)
     fits = fit_models([(model, moved), (model, replace(moved, channel="tau")), (model, replace(moved, v=seldom))])
     explained = [float(fit.explained[0]) for fit in fits]

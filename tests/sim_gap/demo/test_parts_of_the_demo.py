@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim_gap.demo import creep_report
+from sim_gap.demo.bench import ACCELERATION, RANGE_SHARE, SPEED_SHARE, multisine
 from sim_gap.demo.drift import drifting_joint
-from sim_gap.demo.motion import multisine
-from sim_gap.demo.script import ACCELERATION, BY, RANGE_SHARE, SPEED_SHARE
+from sim_gap.demo.result import DemoResult, summary
+from sim_gap.demo.run import BY
 
 
 def motion(low: float, high: float, speeds: tuple[float, float], seed: int) -> tuple[np.ndarray, ...]:
@@ -51,20 +51,26 @@ def test_the_joint_that_drifts_is_the_third_or_the_one_that_gravity_moves_most(s
     assert drifting_joint(calibration, SimpleNamespace(model=model), np.ones(3)) == joint
 
 
-def test_a_summary_sets_what_was_found_beside_the_truth(monkeypatch) -> None:
-    truth = SimpleNamespace(gain=np.array([1.1]), offset=np.array([0.2]), position_offset=np.array([0.01]))
-    fit = SimpleNamespace(value=lambda family: np.array([0.5]), findings=())
-    told = {"gain": 1.12, "offset": 0.21, "zero": 0.012}
-    monkeypatch.setattr(creep_report, "values_told", lambda fit, family: np.array([told[family]]))
-    monkeypatch.setattr(creep_report, "_intervals", lambda result, family: [[0.0, 1.0]])
-    monkeypatch.setattr(creep_report, "missing", lambda fit: {})
-    run = SimpleNamespace(truth=truth, to_json=lambda more: more)
-    found = creep_report.summary(SimpleNamespace(fit=fit, run=run, coulomb=np.array([0.4]), sag=None))["sensors"]
-    assert {name: (each["true"], each["estimated"]) for name, each in found.items()} == {
-        "gain": ([1.1], [1.12]),
-        "offset": ([0.2], [0.21]),
-        "position_offset": ([0.01], [0.012]),
+def test_a_summary_sets_what_was_found_beside_the_truth() -> None:
+    truth = SimpleNamespace(gain=np.array([1.1]), offset=np.array([0.2]), position_gain=np.array([1.01]))
+    found = {"gain": 1.12, "offset": np.nan, "position_gain": 1.012}
+    fit = SimpleNamespace(
+        value=lambda name: np.array([found[name]]),
+        ci95=lambda name: np.array([[found[name] - 0.5, found[name] + 0.5]]),
+        reasons={("elbow", "offset"): "no sweep tells it"},
+    )
+    nothing = SimpleNamespace(**dict.fromkeys(("frames", "missed", "poses"), 0), rate_hz=1.0, load=0.0)
+    nothing.max_torque = nothing.rms_error = nothing.max_abs_error = nothing.rms = nothing.position = np.zeros(1)
+    bench = SimpleNamespace(arm=SimpleNamespace(name="arm"), truth=truth, link=SimpleNamespace(names=("elbow",)))
+    gap = SimpleNamespace(to_json=dict)
+    made = summary(DemoResult(bench, 0, fit, nothing, nothing, gap, nothing, 1.0, 2.0))
+    assert {name: (each["true"], each["estimated"], each["ci95"]) for name, each in made["sensors"].items()} == {
+        "gain": ([1.1], [1.12], [[0.62, 1.62]]),
+        "offset": ([0.2], [None], [None]),
+        "position_gain": ([1.01], [1.012], [[0.512, 1.512]]),
     }
+    assert made["not_identifiable"] == {"elbow.offset": "no sweep tells it"}
+    assert made["drift"] is None
 
 
 def test_its_records_are_signed_with_the_command() -> None:

@@ -5,13 +5,13 @@ import pytest
 
 from sim_gap.effects.drive import _lag
 from sim_gap.effects.effect import added_or_taken_off
-from sim_gap.effects.inertials import point, pseudo_inertia
+from sim_gap.effects.link import point_mass, pseudo_inertia
 from sim_gap.effects.registry import effects
 
 
 @pytest.mark.parametrize("mass", [2.0, -0.5])
 def test_a_point_mass_has_its_inertia_by_the_parallel_axes(mass: float) -> None:
-    inertial = point(mass, mass * np.array([0.1, 0.0, 0.2]))
+    inertial = point_mass(mass, mass * np.array([0.1, 0.0, 0.2]))
     xx, xy, xz, yy, yz, zz = inertial[4:] / mass
     assert (xx, yy, zz) == pytest.approx((0.04, 0.05, 0.01))
     assert (xy, xz, yz) == pytest.approx((0.0, -0.02, 0.0))

@@ -9,9 +9,7 @@ import yaml
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
-from sim_gap.model.arm_joints import hinges_between
-from sim_gap.model.from_arm import ends_of
-from sim_gap.model.load import load_compiled, load_model
+from sim_gap.model.load import ends_of, hinges_between, load_compiled, load_model
 
 ARM4 = Path(__file__).parents[2] / "models" / "arm4.urdf"
 """Four joints, a gripper with a mimic joint, meshes that are not there."""

@@ -8,10 +8,9 @@ import pytest
 from wrong_arms import THREE
 
 from armlink.errors import BadInput
-from sim_gap.effects.inertials import moment_to_inertia
+from sim_gap.effects.link import moment_to_inertia
 from sim_gap.model.load import load_model, rigid_arm
-from sim_gap.model.rigid_body import RigidArm
-from sim_gap.model.torque_slopes import torque_slopes
+from sim_gap.model.rigid_body import RigidArm, torque_slopes
 
 
 def random_arm(n: int, seed: int) -> str:

@@ -8,8 +8,8 @@ from sim_gap.attribution.diagnose import diagnose
 from sim_gap.report import page
 from sim_gap.report.cause_figures import cause_figure
 from sim_gap.report.figures import residual_panels
-from sim_gap.report.over_time import torque_over_time
 from sim_gap.report.page import sections
+from sim_gap.report.time_figures import torque_over_time
 
 WRONG = Wrong(coulomb=np.array([0.0, 0.8, 0.0]), spring=np.array([0.0, 0.0, 2.0]))
 
@@ -61,7 +61,7 @@ def test_every_joint_is_shown_over_time_as_measured_nominal_and_corrected_and_wi
 
 def test_it_begins_with_what_to_do_and_its_headings_are_words(answer):
     shown = sections(answer)
-    assert "writes the corrected model if it is given --out-model" in shown[0].html
+    assert "with --out-model the diagnosis writes the corrected model" in shown[0].html
     assert "Residuals of the torque sensor" in [section.title for section in shown]
     titles = [section.title for section in shown]
     for figure in (figure for section in shown for figure in section.figures):

@@ -7,7 +7,7 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.residuals.disturbances import disturbances, far_off
+from sim_gap.residuals.disturbances import are_far_off, disturbances
 
 RATE = 25.0
 TIME = np.arange(0.0, 40.0, 1.0 / RATE)
@@ -19,7 +19,7 @@ def found(*knocks: tuple[float, float, int]):
     left = np.random.default_rng(1).normal(0.0, 0.1, (TIME.size, 4))
     for start, length, joints in knocks:
         left[(start <= TIME) & (start + length > TIME), :joints] += 5.0
-    far = np.stack([far_off(x, ok, 0.05, 0.3) for x, ok in zip(left.T, JUDGED.T, strict=True)], axis=1)
+    far = np.stack([are_far_off(x, ok, 0.05, 0.3) for x, ok in zip(left.T, JUDGED.T, strict=True)], axis=1)
     return disturbances(TIME, far, JUDGED, left)
 
 
@@ -56,7 +56,7 @@ def test_the_diagnosis_is_that_of_the_rest_and_says_what_it_left_out():
     assert [cause.effect for cause in answer.causes] == ["friction.coulomb"]
     before, after = (made.causes[0].parameters["joint_2"]["torque"].value for made in (clean, answer))
     assert after == pytest.approx(before, rel=0.03)
-    told = [note for note in answer.notes if "several joints are far off at once" in note]
+    told = [note for note in answer.notes if "several joints leave the fit at once" in note]
     assert len(told) == 2
     assert all("at 13." in note or "at 14." in note for note in told)
     assert 0.0 < answer.left_out - clean.left_out < 0.05

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim_gap.residuals.gear_impacts import SHARP, near_impacts
-from sim_gap.residuals.resampling import coverage, thinner
+from sim_gap.residuals.resampling import coverage, decimation
+from sim_gap.residuals.residual_set import SHARP, near_impacts
 
 
 @pytest.mark.parametrize(("hz", "lost"), [(1000.0, 0.03), (10.0, 0.3)])
@@ -21,9 +21,9 @@ def test_a_gap_of_a_few_periods_is_filled_in(hz: float, lost: float) -> None:
 
 def test_rows_at_the_work_rate_stay_as_they_are_and_others_are_smoothed_first() -> None:
     x = np.random.default_rng(1).normal(size=(400, 2))
-    np.testing.assert_array_equal(thinner(100.0, 1)(x), x)
+    np.testing.assert_array_equal(decimation(100.0, 1)(x), x)
     fast = np.sin(2 * np.pi * 45.0 * np.arange(400) / 100.0)[:, None]  # would look like 5 Hz
-    thinned = thinner(100.0, 2)(fast)
+    thinned = decimation(100.0, 2)(fast)
     assert len(thinned) == 200
     assert np.abs(thinned[20:-20]).max() < 0.05
 

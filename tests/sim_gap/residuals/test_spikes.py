@@ -7,7 +7,7 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.residuals.spikes import spikes_of
+from sim_gap.residuals.channel_quality import spikes_of
 
 RATE = 250.0
 T = np.arange(0.0, 40.0, 1.0 / RATE)

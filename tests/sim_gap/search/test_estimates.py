@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from wrong_arms import Wrong, model, record
 
-from sim_gap.effects.inertials import point
+from sim_gap.effects.link import point_mass
 from sim_gap.model.load import load_model
 from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import FLOOR, FLOOR_INNER, ResidualSet
 from sim_gap.search import gauss_newton, model_selection
-from sim_gap.search.about import about
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.estimate import Estimate
-from sim_gap.search.feasible import _closest, _shapes
-from sim_gap.search.model_selection import golden, relinearised_in_place, select_model
+from sim_gap.search.estimate import EffectEstimate
+from sim_gap.search.estimate_signals import signals_about
+from sim_gap.search.feasibility import _closest, _shapes
+from sim_gap.search.model_selection import golden_section, relinearised_in_place, select_model
 from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.term import Term
 
@@ -36,15 +36,17 @@ def test_an_estimate_with_a_payload_has_the_torque_of_the_arm_with_that_mass(dat
     (read,) = data.signals
     c = np.array([0.4, 0.01, 0.02, 0.08])
     inertial = read.arm.inertial.copy()
-    inertial[-1] += point(0.4, c[1:])
+    inertial[-1] += point_mass(0.4, c[1:])
     expected = read.arm.with_inertial(inertial).torque(read.q, read.v, read.a)
-    np.testing.assert_allclose(about(read, data.layout, {PAYLOAD: c}).signals.model, expected, atol=1e-9)
+    np.testing.assert_allclose(signals_about(read, data.layout, {PAYLOAD: c}).signals.model, expected, atol=1e-9)
 
 
 def test_shares_of_springs_and_bodies_add_up_to_the_change_of_the_torque(data: ResidualSet) -> None:
     (read,) = data.signals
     width = next(iter(ColumnStore(data).columns(SPRING).values())).shape[1]
-    found = about(read, data.layout, {SPRING: np.array([5.0, 0.3])[:width], PAYLOAD: np.array([0.4, 0.0, 0.0, 0.1])})
+    found = signals_about(
+        read, data.layout, {SPRING: np.array([5.0, 0.3])[:width], PAYLOAD: np.array([0.4, 0.0, 0.0, 0.1])}
+    )
     total = np.zeros_like(read.q)
     for rows in found.shares.values():
         for (channel, joint), share in rows.items():
@@ -55,7 +57,7 @@ def test_shares_of_springs_and_bodies_add_up_to_the_change_of_the_torque(data: R
 
 def test_the_motor_of_an_estimate_makes_up_for_its_friction(data: ResidualSet) -> None:
     (read,) = data.signals
-    found = about(read, data.layout, {COULOMB: np.array([0.5])})
+    found = signals_about(read, data.layout, {COULOMB: np.array([0.5])})
     share = found.shares[COULOMB][data.layout.motor_side, 1]
     np.testing.assert_allclose(found.signals.motor_model[:, 1] - read.motor_model[:, 1], share, atol=1e-9)
     moving = np.abs(read.v[:, 1]) > 0.2
@@ -101,7 +103,7 @@ def test_between_motor_and_sensor_less_of_a_gap_is_worth_a_parameter(data: Resid
 def test_what_an_effect_needs_is_at_hand_for_its_parameters(data: ResidualSet) -> None:
     """The asymmetry is told as a share of the Coulomb friction fitted beneath it."""
     terms = [COULOMB, Term("friction.asymmetric", 1)]
-    estimate = Estimate(ColumnStore(data), terms)
+    estimate = EffectEstimate(ColumnStore(data), terms)
     asymmetric = next(term for term in estimate.terms if term.effect == "friction.asymmetric")
     (ratio,) = estimate.parameters(asymmetric).values()
     size = float(estimate.of(asymmetric)[0])
@@ -111,7 +113,9 @@ def test_what_an_effect_needs_is_at_hand_for_its_parameters(data: ResidualSet) -
 
 def test_friction_that_is_clearly_there_has_a_narrow_interval(data: ResidualSet) -> None:
     """Sound arms differ by some hundredths of a newton metre, not by all that a joint has."""
-    estimate = Estimate(ColumnStore(data), [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,))])
+    estimate = EffectEstimate(
+        ColumnStore(data), [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,))]
+    )
     (torque,) = estimate.parameters(estimate.terms[0]).values()
     assert torque.low < 0.5 < torque.high
     assert torque.high - torque.low < 1.5
@@ -119,7 +123,7 @@ def test_friction_that_is_clearly_there_has_a_narrow_interval(data: ResidualSet)
 
 def test_what_is_not_there_may_be_nothing_by_its_interval(data: ResidualSet) -> None:
     terms = [COULOMB, Term("friction.viscous", 1), Term("friction.stribeck", 1, (0.1,)), GAIN]
-    estimate = Estimate(ColumnStore(data), terms)
+    estimate = EffectEstimate(ColumnStore(data), terms)
     found = {term.effect: term for term in estimate.terms}
     (gain,) = estimate.parameters(found["actuator.gain"]).values()
     assert gain.low < 1.0 < gain.high
@@ -190,14 +194,14 @@ def test_nonlinear_effects_are_offered_at_the_size_that_they_have_in_place_of_a_
         )
 
     monkeypatch.setattr(model_selection, "NormalEquations", lambda store, terms: None)
-    monkeypatch.setattr(model_selection, "Search", search)
+    monkeypatch.setattr(model_selection, "StepwiseSearch", search)
     assert [term.times for term in relinearised_in_place(None, [chosen], [bent])] == [2]
     assert relinearised_in_place(None, [], [bent]) == [bent]
 
 
 def test_golden_sections_end_at_the_minimum() -> None:
-    assert golden(lambda x: (x - 0.3) ** 2, -1.0, 2.0, 40) == pytest.approx(0.3, abs=1e-6)
-    assert golden(lambda x: (x - 0.3) ** 2, -1.0, 2.0) == pytest.approx(0.3, abs=0.03)
+    assert golden_section(lambda x: (x - 0.3) ** 2, -1.0, 2.0, 40) == pytest.approx(0.3, abs=1e-6)
+    assert golden_section(lambda x: (x - 0.3) ** 2, -1.0, 2.0) == pytest.approx(0.3, abs=0.03)
 
 
 @pytest.mark.parametrize(("score", "kept"), [(1.0, "several"), (3.0, "first")])
@@ -208,7 +212,7 @@ def test_one_body_in_place_of_several_errors_of_links_is_kept_if_it_scores_bette
 
     results = iter([found("first", 2.0), found("several", score)])
     monkeypatch.setattr(model_selection, "first_search", lambda store, library: ([], []))
-    monkeypatch.setattr(model_selection, "searched_again", lambda store, active, offered: next(results))
+    monkeypatch.setattr(model_selection, "search_again", lambda store, active, offered: next(results))
     monkeypatch.setattr(model_selection, "one_body", lambda store, search, offered: [PAYLOAD])
     monkeypatch.setattr(model_selection, "drives_are_off", lambda search: False)
     assert select_model(SimpleNamespace(keep=lambda terms: None), []).name == kept
@@ -226,7 +230,7 @@ def test_what_needs_a_term_that_cannot_exist_is_not_offered_again(monkeypatch) -
         search.run = lambda: setattr(search, "active", [viscous])
         return search
 
-    monkeypatch.setattr(model_selection, "about_itself", about)
+    monkeypatch.setattr(model_selection, "refit_about_itself", about)
     monkeypatch.setattr(model_selection, "refine", lambda _store, terms: terms)
-    model_selection.searched_again(None, [COULOMB], [COULOMB, asymmetric, viscous])
+    model_selection.search_again(None, [COULOMB], [COULOMB, asymmetric, viscous])
     assert given == [[COULOMB, asymmetric, viscous], [viscous]]

@@ -12,9 +12,9 @@ from sim_gap.residuals.layout import layout_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.model_selection import candidates, refine, with_lost, without_doubtful
+from sim_gap.search.model_selection import candidates, refine, replace_doubtful, restore_lost
 from sim_gap.search.normal_equations import NormalEquations, Weighted
-from sim_gap.search.stepwise import Search
+from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
 
@@ -33,10 +33,10 @@ def test_a_term_that_leaves_much_gives_way_to_several_simpler_ones_at_once():
     moved = Wrong(payload=0.5, moved={0: (0.0, 0.0, 0.05)}, offset=np.array([0.4, 0.0, 0.0]))
     normal = normal_equations(moved)
     offset = next(term for term in normal.terms if term.key == ("torque.offset", 0))
-    before = Search(normal, [payload(normal), offset])
+    before = StepwiseSearch(normal, [payload(normal), offset])
     assert payload(normal) in before.active
     assert before.leaves_much(payload(normal))
-    after = without_doubtful(before)
+    after = replace_doubtful(before)
     assert after.score < before.score
     assert {term.key for term in after.active} >= {("link.mass_moment", 0), ("link.mass_moment", 1), offset.key}
     assert payload(normal) not in after.active
@@ -44,14 +44,14 @@ def test_a_term_that_leaves_much_gives_way_to_several_simpler_ones_at_once():
 
 def test_a_term_that_explains_its_rows_stays():
     normal = normal_equations(Wrong(payload=0.5))
-    search = Search(normal, [payload(normal)])
-    assert without_doubtful(search) is search
+    search = StepwiseSearch(normal, [payload(normal)])
+    assert replace_doubtful(search) is search
 
 
 def test_a_step_that_makes_it_worse_is_undone_and_not_tried_again():
     """A term is chosen with the rows weighed by what is left before it, and may turn out to be no better after it."""
     normal = normal_equations(Wrong(payload=0.5))
-    search = Search(normal, [payload(normal)])
+    search = StepwiseSearch(normal, [payload(normal)])
     score = search.score
     useless = next(term for term in normal.terms if term.key == ("torque.offset", 2))
     search.accept([payload(normal), useless])
@@ -64,16 +64,16 @@ def test_a_cheap_effect_is_tried_though_many_dear_ones_would_take_more(monkeypat
     """Twelve limits that each take a little more than the Coulomb friction and do not earn their price."""
     cheap, limits = Term("friction.coulomb", 0), [Term("torque.saturation", joint, (5.0,)) for joint in range(12)]
     screened = [*((5.0, limit) for limit in limits), (4.0, cheap)]
-    search = object.__new__(Search)
+    search = object.__new__(StepwiseSearch)
     search.active, search.added, search.undone, search.usual = [], Counter(), set(), frozenset()
     search.score, search.least = 0.0, 1e-4
     search.normal = SimpleNamespace(
         terms=[*limits, cheap], price=0.02, count=np.full((1, 1), 800.0), freedom=lambda _: 1.0
     )
     search.weighted = SimpleNamespace(screen=lambda _terms, _candidates: screened)
-    monkeypatch.setattr(Search, "judge", lambda _self, terms: -0.01 if cheap in terms else 0.01)
-    monkeypatch.setattr(Search, "reweigh", lambda self: setattr(self, "score", self.judge(self.active)))
-    monkeypatch.setattr(Search, "with_beneath", lambda _self, term, terms: [*terms, term])
+    monkeypatch.setattr(StepwiseSearch, "judge", lambda _self, terms: -0.01 if cheap in terms else 0.01)
+    monkeypatch.setattr(StepwiseSearch, "reweigh", lambda self: setattr(self, "score", self.judge(self.active)))
+    monkeypatch.setattr(StepwiseSearch, "with_beneath", lambda _self, term, terms: [*terms, term])
     assert search.forward()
     assert search.active == [cheap]
 
@@ -86,16 +86,16 @@ def test_a_limit_that_got_lost_comes_back_at_the_level_at_which_it_can_exist():
     signals = prepare(clipped, load_model(model()).arm, "a recording")
     data = ResidualSet((signals,), layout_of([signals]))
     terms = candidates(data, ["torque.saturation"])
-    search = Search(NormalEquations(ColumnStore(data), terms), [])
+    search = StepwiseSearch(NormalEquations(ColumnStore(data), terms), [])
     level = lambda term: abs(term.shape[0] - limit)  # noqa: E731
     search.take_back({("torque.saturation", 1)})
     assert [term.key for term in search.active] == [("torque.saturation", 1)]
     assert search.active[0] == min((term for term in terms if term.place == 1), key=level)
     (refined,) = refine(search.normal.store, search.active)
     assert level(refined) <= level(search.active[0])
-    assert Search(NormalEquations(search.normal.store, [refined]), [refined]).active == [refined]
+    assert StepwiseSearch(NormalEquations(search.normal.store, [refined]), [refined]).active == [refined]
     far = Term("torque.saturation", 1, (1e-3 * limit,))
-    _, kept = with_lost(search.normal.store, [far], search.normal.store, [])
+    _, kept = restore_lost(search.normal.store, [far], search.normal.store, [])
     assert [term.key for term in kept] == [far.key]
     assert level(kept[0]) < 0.05 * limit
 
@@ -107,7 +107,7 @@ def test_breakaway_that_got_lost_comes_back_with_the_friction_that_it_adds_to():
     signals = prepare(recording, load_model(model()).arm, "a recording")
     store = ColumnStore(ResidualSet((signals,), layout_of([signals])))
     lost = [Term("friction.coulomb", 1), Term("friction.stribeck", 1, (0.1,))]
-    _, kept = with_lost(store, lost, store, [])
+    _, kept = restore_lost(store, lost, store, [])
     assert {term.key for term in kept} == {term.key for term in lost}
 
 

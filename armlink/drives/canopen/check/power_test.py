@@ -277,9 +277,9 @@ class PowerTest:
         why = f", emergency {codes[0]:04X}h" if codes else ", no emergency"
         nmt = self.drives.known.node_states.get(joint, objects.OPERATIONAL)
         left = "" if nmt == objects.OPERATIONAL else f", NMT {objects.NMT_STATES.get(nmt, nmt)} (1029h:01)"
-        timing = f"after {seconds * 1e3:.0f} ms (told {limit * 1e3:.0f} ms){why}{left}"
+        timing = f"after {seconds * 1e3:.0f} ms (set to {limit * 1e3:.0f} ms){why}{left}"
         if state is DriveState.ENABLED:
-            self._tell(joint, check, False, f"does nothing within {seconds * 1e3:.0f} ms (told {limit * 1e3:.0f} ms)")
+            self._tell(joint, check, False, f"does nothing within {seconds * 1e3:.0f} ms (set to {limit * 1e3:.0f} ms)")
         elif state is DriveState.QUICK_STOP:
             in_time = seconds <= allowed
             self._tell(joint, check, in_time, f"quick stop {'' if in_time else 'too late, '}{timing}", seconds)

@@ -83,4 +83,6 @@ def scan_report(
     if wrong:
         node, differs = next(iter(wrong.items()))
         raise refused_identity(joints[node], node, differs)
+    if found:
+        show(f"{len(found)} nodes answer")
     return 0

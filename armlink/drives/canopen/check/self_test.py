@@ -87,7 +87,7 @@ class CanopenSelfTest:
         self._add(services.joint, "objects", "failed" if needed else "passed", found or "what the link needs is there")
         self._modes(services)
         if row.name in self.link.uncalibrated:
-            found = "no record in force in the host: torque is what the device takes it for"
+            found = "no calibration record in the host: torque is as the device reports it"
             self._add(services.joint, "calibration", "absent", found)
 
     def _with_power(self, power: bool) -> None:

@@ -59,4 +59,4 @@ def check_fits(name: str, limits: Limits, unit: Units) -> None:
         most = UINT32_MAX * unit.torque
         raise BadInput(f"{name}: max_torque_rate {limits.torque_rate} N·m/s: 6087h carries at most {most:.6g} N·m/s")
     if max(abs(limits.lower), abs(limits.upper)) / unit.position > INT32_MAX:
-        raise BadInput(f"{name}: its range is more than 607Ah carries at {unit.position:.3g} rad a user unit")
+        raise BadInput(f"{name}: 607Ah cannot carry its range at {unit.position:.3g} rad a user unit")

@@ -53,9 +53,9 @@ def test_a_joint_without_a_deadline_is_not_left_without_commands():
 @pytest.mark.parametrize(
     ("state", "seconds", "outcome", "says"),
     [
-        (DriveState.QUICK_STOP, 0.12, "passed", "quick stop after 120 ms (told 100 ms), no emergency"),
-        (DriveState.QUICK_STOP, 0.25, "failed", "quick stop too late, after 250 ms (told 100 ms), no emergency"),
-        (DriveState.ENABLED, 0.3, "failed", "does nothing within 300 ms (told 100 ms)"),
+        (DriveState.QUICK_STOP, 0.12, "passed", "quick stop after 120 ms (set to 100 ms), no emergency"),
+        (DriveState.QUICK_STOP, 0.25, "failed", "quick stop too late, after 250 ms (set to 100 ms), no emergency"),
+        (DriveState.ENABLED, 0.3, "failed", "does nothing within 300 ms (set to 100 ms)"),
     ],
 )
 def test_a_quick_stop_in_time_passes(state, seconds, outcome, says):
@@ -71,7 +71,7 @@ def test_a_joint_that_loses_its_power_is_told_with_its_emergency():
     bench.test._judge(1, "heartbeat of the host", DriveState.SWITCH_ON_DISABLED, 0.1, 0.1)
     ((name, _, outcome, says, seconds),) = bench.told
     assert (name, outcome, seconds) == ("b", "failed", 0.1)
-    assert "expected quick stop, after 100 ms (told 100 ms), emergency 8130h, NMT " in says
+    assert "expected quick stop, after 100 ms (set to 100 ms), emergency 8130h, NMT " in says
     assert objects.NMT_STATES[4] in says
     assert says.endswith(": 6007h has values 2 and 3 the other way round?")
 

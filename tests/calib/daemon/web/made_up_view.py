@@ -7,11 +7,10 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from armlink.arm_file import load_arm
+from calib.daemon.service_view import drawn_arm
 from calib.daemon.view import api_models
-from calib.daemon.view.drawn_arm import drawn_arm
 from calib.daemon.view.fan_out import Client, Hub
-from calib.daemon.view.view import NoSuch, NotPossible
-from calib.daemon.view.window import Window
+from calib.daemon.view.view import NoSuch, NotPossible, Window
 
 NOW = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
 NAMES = tuple(f"joint_{i}" for i in range(1, 8))
@@ -186,7 +185,7 @@ class MadeUpView:
         for place, proposal in enumerate(self.offered):
             if proposal.id == number:
                 if digest not in (None, proposal.hash):
-                    raise NotPossible(f"proposal {number} is not the one of hash {digest}")
+                    raise NotPossible(f"proposal {number} is not that of hash {digest}")
                 if proposal.state != "pending":
                     raise NotPossible(f"proposal {number} is {proposal.state} already")
                 update = {"state": state, "decided_by": by, "decided_at": self.time()}

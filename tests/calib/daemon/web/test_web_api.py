@@ -102,7 +102,7 @@ def test_a_decision_may_name_the_content_and_is_then_of_that_alone(server: Serve
     (shown,) = client.get("/api/proposals").json()
     other = client.post("/api/proposals/1/approve", json={"hash": "0" * 64})
     assert other.status_code == 409
-    assert "is not the one of hash" in other.json()["error"]
+    assert "is not that of hash" in other.json()["error"]
     assert client.post("/api/proposals/1/approve", json={"hash": "1"}).status_code == 422
     assert client.post("/api/proposals/1/approve", json={"hash": shown["hash"], "by": "ann"}).status_code == 200
 

@@ -16,9 +16,8 @@ from served_page import TOKEN, Served, served
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web import linger as linger_module
 from calib.daemon.web import server as server_module
-from calib.daemon.web.guard import HEAD_LIMIT
+from calib.daemon.web.guard import HEAD_LIMIT, RateLimit
 from calib.daemon.web.linger import LINGER_BYTES, LingeringTransport
-from calib.daemon.web.rate import RateLimit
 from calib.daemon.web.server import CLOSING_SECONDS
 
 MUCH = 100_000

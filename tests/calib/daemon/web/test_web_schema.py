@@ -16,7 +16,7 @@ from served_page import TOKEN, Served, served
 from small_arm import small_arm
 
 from calib.daemon.service_view import ServiceView
-from calib.daemon.web.rate import RateLimit
+from calib.daemon.web.guard import RateLimit
 
 CHECKS = [not_a_server_error, content_type_conformance, response_schema_conformance, status_code_conformance]
 EXAMPLES = 8

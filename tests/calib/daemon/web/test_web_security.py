@@ -13,9 +13,8 @@ from served_page import TOKEN, Served, served
 from armlink.errors import BadInput
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web import peer as peer_module
-from calib.daemon.web.guard import BODY_LIMIT, REQUESTS, WRONG_TOKENS, Access, Guard
+from calib.daemon.web.guard import BODY_LIMIT, REQUESTS, WRONG_TOKENS, Access, Rate, RateLimit, RequestGuard
 from calib.daemon.web.peer import PEER, Peer
-from calib.daemon.web.rate import Rate, RateLimit
 from calib.daemon.web.server import serve, unix_socket
 
 
@@ -250,7 +249,7 @@ def guarded(peer: Peer, times: int, headers: list[tuple[bytes, bytes]]) -> list[
         raise AssertionError("there is no body")
 
     async def run() -> None:
-        guard = Guard(app, Access(TOKEN, frozenset({"robot"}), now=lambda: 0.0))
+        guard = RequestGuard(app, Access(TOKEN, frozenset({"robot"}), now=lambda: 0.0))
         scope = {
             "type": "http",
             "method": "GET",

@@ -1,0 +1,40 @@
+"""Work on an arm that ends early: how its joints were left, and the command that goes on from there."""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Stall
+
+HOLD = "the joints hold where they stand, in quick stop"
+PARKED = "the arm was parked or let down before its power went off, unless a line above says otherwise"
+
+
+@dataclass
+class ArmWork:
+    """Work that may end early."""
+
+    enabled: bool = False
+    """Whether the joints may have been enabled: set it just before."""
+
+
+@contextlib.contextmanager
+def early_end(arm: ArmFile, resume: str | None = None) -> Iterator[ArmWork]:
+    """Say both on standard error after Ctrl-C or a stall, once the link inside this context is closed.
+
+    Entered before the link is opened; `resume` is the command that continues the work.
+    """
+    work = ArmWork()
+    try:
+        yield work
+    except (KeyboardInterrupt, Stall):
+        from armlink.commands.plain_console import PlainConsole, suggest
+        from armlink.link.joints.groups import make_groups, traits_of
+
+        if work.enabled:
+            holds = all(each.silence == "holds" for each in traits_of(make_groups(arm)))
+            PlainConsole().print(f"{arm.name}: {HOLD if holds else PARKED}")
+        if resume is not None:
+            suggest(resume)
+        raise

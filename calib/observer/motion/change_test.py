@@ -1,0 +1,187 @@
+"""Which change since the calibration explains rows of motion: a gain, an offset, friction, a payload, or nothing.
+
+Generalised least squares of each candidate's columns, with the belief's own doubt in the covariance; candidates compete
+by BIC, as in the test at rest (docs/theory.md, section 6).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from calib.creep.parameters import family_slices
+from calib.observer.cause_test import Verdict, smallest_noticed_change, solve_whitened, span
+from calib.observer.config import ObserverConfig
+from calib.observer.motion.belief import USUAL_ROWS, MotorBelief
+from calib.observer.motion.passages import Passage
+from gcomp.arm.mass_moments import payload_columns
+from gcomp.arrays import Array
+
+MISFIT = 8.0
+"""χ² above its degrees of freedom, in standard deviations, from which nothing explains the rows: 120 rows then scatter
+by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is far beyond."""
+INEXACT = 0.03
+"""Most that a change's own shape may be off, as a share."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeHypothesis:
+    """A change: its columns (K, p) in the readings, per unit of each parameter."""
+
+    cause: str
+    """gain, offset, friction (a share of it) or payload (mass and first moment of the last link's load)."""
+    joint: int | None
+    columns: Array
+
+    @property
+    def name(self) -> tuple[str, int | None]:
+        """Kind of change."""
+        return self.cause, self.joint
+
+
+@dataclass(frozen=True, eq=False)
+class _ChangeFit:
+    candidate: ChangeHypothesis
+    bic: float
+    chi2: float
+    values: Array
+    covariance: Array
+
+
+class ChangeTest:
+    """The candidates fitted to K rows."""
+
+    def __init__(self, belief: MotorBelief, passages: Sequence[Passage], config: ObserverConfig) -> None:
+        """Rows after those that the belief rests on."""
+        self._config, self._belief, self._passages = config, belief, passages
+        residual, jacobian, covariance = belief.linearised(passages)
+        self._root = np.linalg.cholesky(covariance)
+        joint = np.array([each.joint for each in passages])
+        candidates = _candidates(belief, jacobian, joint)
+        white = self._whitened(np.column_stack([residual, *(each.columns for each in candidates)]))
+        self._white: Array = white[:, 0]
+        ends = np.cumsum([1, *(each.columns.shape[1] for each in candidates)])
+        self._candidates = [
+            replace(each, columns=white[:, begin:end])
+            for each, (begin, end) in zip(candidates, pairwise(ends), strict=True)
+        ]
+        """With whitened columns."""
+        self.chi2 = float(self._white @ self._white)
+
+    def verdict(self) -> Verdict:
+        """The change that explains the rows; cause "none", "unknown" or "ambiguous" where no single one does."""
+        fits = sorted((self._fit(each) for each in self._candidates), key=lambda fit: fit.bic)
+        nothing, config = np.empty(0), self._config
+        none = Verdict("none", None, 1.0, nothing, np.empty((0, 0)), {"misfit": self._misfit(self.chi2, 0)})
+        if not fits or self.chi2 - fits[0].bic < config.evidence:
+            return none if self._misfit(self.chi2, 0) <= MISFIT else _with_cause(none, "unknown")
+        best, others = fits[0], fits[1:]
+        scores = np.array([fit.bic for fit in fits] + [self.chi2])
+        weight = np.exp(-(scores - best.bic) / 2)
+        nearest = others[0].bic - best.bic if others else np.inf
+        evidence = {"none": round(self.chi2 - best.bic, 1), "next": round(float(nearest), 1)}
+        inexact = INEXACT**2 * (self.chi2 - best.chi2)
+        evidence["misfit"] = self._misfit(best.chi2 - inexact, len(best.values))
+        values, covariance = best.values, best.covariance
+        cause, joint = best.candidate.name
+        found = Verdict(cause, joint, float(1 / weight.sum()), values, covariance, evidence)
+        if evidence["misfit"] > MISFIT or (cause == "payload" and values[0] < 0):
+            return _with_cause(found, "unknown")
+        rivals = [fit.candidate for fit in others if fit.bic - best.bic < config.evidence]
+        if rivals:
+            return _with_cause(found, "ambiguous", tuple(each.cause for each in rivals))
+        return found
+
+    def denies(self, cause: str, joint: int | None, values: Array) -> bool:
+        """Whether these rows show that an earlier change of these values is there no more."""
+        own = next((each for each in self._candidates if each.name == (cause, joint)), None)
+        if own is None:
+            return False
+        fit = self._fit(own)
+        known = np.diag(fit.covariance) > 0
+        away = (fit.values - values)[known]
+        apart = float(away @ np.linalg.pinv(fit.covariance[np.ix_(known, known)]) @ away)
+        return bool(apart > self._config.agreement + 2 * known.sum())
+
+    def sensor(self, joint: int) -> tuple[Array, Array]:
+        """Change of a joint's gain and offset (2,) [1, N·m], fitted together, and their covariance (2, 2).
+
+        Drawn towards nothing where the rows tell little.
+        """
+        config = self._config
+        before = np.diag([config.initial_gain_std**-2 * 1e-2, config.initial_offset_std**-2 * 1e-2])
+        columns = [each.columns for each in self._candidates if each.name in (("gain", joint), ("offset", joint))]
+        if not columns:
+            return np.zeros(2), np.linalg.inv(before)
+        white = np.hstack(columns)
+        covariance = np.asarray(np.linalg.inv(white.T @ white + before), dtype=np.float64)
+        change: Array = covariance @ white.T @ self._white
+        return change, covariance
+
+    def noticed(self, cause: str, joint: int) -> float:
+        """Size of a change that is noticed in one case of two by as many rows: over "none", and over every rival."""
+        own = next((each for each in self._candidates if each.name == (cause, joint)), None)
+        if own is None:
+            return float("nan")
+        others = (each.columns for each in self._candidates if each is not own)
+        rivals = ((span(columns), columns.shape[1]) for columns in others)
+        return smallest_noticed_change(own.columns[:, 0], rivals, self._config.evidence)
+
+    def _whitened(self, columns: Array) -> Array:
+        white: Array = np.linalg.solve(self._root, columns)
+        return white
+
+    def _fit(self, candidate: ChangeHypothesis) -> _ChangeFit:
+        if candidate.cause == "payload":
+            return self._fit_payload(candidate)
+        return self._least_squares(candidate, self._white, 0.0)
+
+    def _fit_payload(self, candidate: ChangeHypothesis) -> _ChangeFit:
+        """Linearised again at the load found: friction goes with torque, whose sign a load may turn."""
+        arm, values = self._belief.arm, np.zeros(4)
+        per_unit = np.column_stack(payload_columns(arm))
+        fit = self._least_squares(candidate, self._white, values)
+        for _ in range(2):  # further linearisations
+            values = fit.values
+            residual, jacobian, _ = self._belief.linearised(self._passages, per_unit @ values)
+            columns = jacobian[:, family_slices(arm.n)["beta"]] @ per_unit
+            white = self._whitened(np.column_stack([residual, columns]))
+            fit = self._least_squares(replace(candidate, columns=white[:, 1:]), white[:, 0], values)
+        return fit
+
+    def _least_squares(self, candidate: ChangeHypothesis, target: Array, around: Array | float) -> _ChangeFit:
+        """The candidate's parameters from whitened residuals that it has at values `around`."""
+        found = solve_whitened(candidate.columns, target)
+        bic = found.chi2 + found.shown * float(np.log(len(target)))
+        return _ChangeFit(candidate, bic, found.chi2, around + found.values, found.covariance)
+
+    def _misfit(self, chi2: float, parameters: int) -> float:
+        """χ² above its degrees of freedom, in standard deviations, those of the rows' own scatter included."""
+        free, known = max(len(self._white) - parameters, 1), len(self._belief.learnt) + USUAL_ROWS
+        return round(float((chi2 - free) / np.sqrt(2 * free * (1 + free / known))), 2)
+
+
+def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[ChangeHypothesis]:
+    n, at = belief.arm.n, family_slices(belief.arm.n)
+    found = []
+    coulomb, load = belief.mean[at["coulomb"]], belief.mean[at["load"]]
+    uneven = np.arange(at["uneven"].start, at["uneven"].stop).reshape(n, -1)
+    for j in range(n):
+        if (joint == j).sum() < 6:  # too few rows to tell
+            continue
+        column = {name: jacobian[:, at[name].start + j] for name in ("gain", "offset", "coulomb", "load")}
+        friction = coulomb[j] * column["coulomb"] + load[j] * column["load"]
+        friction = friction + jacobian[:, uneven[j]] @ belief.mean[uneven[j]]
+        for cause, each in (("gain", column["gain"]), ("offset", column["offset"]), ("friction", friction)):
+            if np.abs(each).max() > 1e-9:
+                found.append(ChangeHypothesis(cause, j, each[:, None]))
+    payload = jacobian[:, at["beta"]] @ np.column_stack(payload_columns(belief.arm))
+    if np.abs(payload).max() > 1e-9:
+        found.append(ChangeHypothesis("payload", None, payload))
+    return found
+
+
+def _with_cause(verdict: Verdict, cause: str, rivals: tuple[str, ...] = ()) -> Verdict:
+    joint = verdict.joint if cause == "ambiguous" else None
+    return Verdict(cause, joint, verdict.confidence, verdict.values, verdict.covariance, verdict.evidence, rivals)

@@ -1,0 +1,242 @@
+"""The answer from recordings without a torque channel: causes, verdict and roll-out in radians."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from armlink.recording.recording import Recording
+from gcomp.arrays import Array
+from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
+from sim_gap.attribution.position_notes import notes, running_free
+from sim_gap.attribution.verdict import EXPLAINED
+from sim_gap.checks.finding import RecordingFinding
+from sim_gap.model.load import SimModel
+from sim_gap.position_gap.identify import Identified, columns_of_effect, identify
+from sim_gap.position_gap.judge import LEAST_SHRINK, Stage, groups_of
+from sim_gap.position_gap.parameters import EFFECTS
+from sim_gap.position_gap.search import PRICE
+from sim_gap.position_gap.training.export import WRITTEN
+from sim_gap.position_gap.training.replay import (
+    LONGEST_S,
+    SHORT_S,
+    Simulated,
+    replay_rms,
+    simulated_model,
+    without_groups,
+)
+from sim_gap.position_gap.training.spread import interval, payload_centre
+from sim_gap.residuals.location import Location
+from sim_gap.search.estimate import Value
+
+STRUCTURE = 2.0
+"""Remaining gap, in margins, from which an unknown controller may not be of the kind that was fitted."""
+ALMOST = 0.75
+"""Highest confidence that positions alone give: it is not calibrated on sealed cases, as that from torques is."""
+SEPARATE = {
+    "controller.stiffness": "hold a known load with the joint, or record the motor's current",
+    "controller.dead_zone": "measure the play by hand with the servo holding, or read the motor's encoder",
+    "controller.delay": "command steps and a chirp up to 10 Hz",
+}
+OTHERWISE = "record slow and fast motion of this joint in both directions, with and without a known load"
+
+
+def diagnose_positions(
+    sim: SimModel,
+    train: Sequence[Recording],
+    heldout: Sequence[Recording],
+    labels: Sequence[str],
+    *,
+    withhold: Sequence[str],
+    checks: Sequence[RecordingFinding],
+    heldout_is: str,
+    progress: Callable[[str], None],
+    gains: Sequence[str] = (),
+) -> Diagnosis:
+    """Explain the gap between commanded and measured positions; arguments as of `diagnose.diagnose`."""
+    found = identify(sim, train, heldout, labels, withhold, progress, gains)
+    progress("replaying the corrected model")
+    share = _left(found)
+    made = [_cause(found, stage, share) for stage in found.stages]
+    taken = [(c, stage) for c, stage in zip(made, found.stages, strict=True) if _matters(found, stage)]
+    causes = [c for c, _ in taken]
+    minor = [c for c in made if c not in causes]
+    verdict = _verdict(found, causes, share)
+    if verdict == "no_gap":
+        taken, causes, minor = [], [], [*causes, *minor]
+    rollout = _rollout(found, taken)
+    if verdict != "no_gap" and rollout is not None and rollout.worse:
+        verdict = "unexplained"
+    capped = [_hint(cause) for cause in causes] if verdict == "unexplained" else causes
+    return Diagnosis(
+        verdict=verdict,
+        names=sim.arm.names,
+        where=_where(found),
+        causes=tuple(capped),
+        minor=tuple(minor),
+        noise_floor=found.search.floor,
+        train_before=found.train_before,
+        train_after=found.train_after,
+        heldout_before=found.heldout_before,
+        heldout_after=found.heldout_after,
+        unexplained=share,
+        margin=found.margin,
+        heldout_is=heldout_is,
+        rollout=rollout,
+        notes=(*notes(found), *running_free(found, rollout, gap=verdict != "no_gap")),
+        checks=tuple(checks),
+        band=found.band,
+        left_out=float(np.concatenate(found.heldout_touched).mean()),
+        unit="rad",
+        internals=found,
+    )
+
+
+def _left(found: Identified) -> float:
+    """Share of the squared gap beyond the noise that remains on held-out data."""
+    floor = found.search.floor**2
+    left = np.maximum(found.heldout_after**2 - floor, 0.0).sum()
+    return float(left / max(float(np.maximum(found.heldout_before**2 - floor, 0.0).sum()), 1e-18))
+
+
+def _matters(found: Identified, stage: Stage) -> bool:
+    return _lowers(found, stage) and _differs(found, stage)
+
+
+def _lowers(found: Identified, stage: Stage) -> bool:
+    """Whether it lowers the gap of a joint that has one."""
+    gap = np.maximum(stage.before, found.heldout_before)
+    return bool(((stage.share > LEAST_SHRINK) & (gap > found.margin)).any())
+
+
+def _differs(found: Identified, stage: Stage) -> bool:
+    """Whether some parameter's interval leaves out the nominal value."""
+    effect, joints = stage.group
+    if not joints:
+        places = [(-1, name) for name in columns_of_effect(found, effect)]
+    else:
+        places = [(j, name) for j in joints for name in EFFECTS[effect].parameters]
+    for j, name in places:
+        _, low, high, _ = interval(found.search, found.fit, found.within, j, name)
+        if not low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= high:
+            return True
+    return False
+
+
+def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:
+    if _is_within(found) or (not causes and bool(np.all(found.heldout_before < 2.0 * found.margin))):
+        return "no_gap"
+    near = found.heldout_after < np.maximum(2.0 * found.margin, EXPLAINED * found.heldout_before)
+    if _structure_left(found):
+        return "unexplained"
+    if not causes or np.sqrt(share) > 2.0 * EXPLAINED or not near.any():
+        return "unexplained"
+    if causes[0].confounded_with or causes[0].confidence < HINT:
+        return "ambiguous"
+    return "explained" if np.sqrt(share) <= EXPLAINED or bool(near.all()) else "unexplained"
+
+
+def _is_within(found: Identified) -> bool:
+    """Whether no joint's gap matters, in training and held-out recordings, or is what a sound arm may have."""
+    within = all(bool(np.all(gap < found.margin)) for gap in (found.train_before, found.heldout_before))
+    if found.own is not None:
+        within = within or all(bool(np.all(gap < found.margin)) for gap in (found.own.gaps, found.moved_before))
+    return within or (found.sound is not None and found.sound.explained)
+
+
+def _structure_left(found: Identified) -> bool:
+    """Whether the controller is unknown and some joint keeps a gap: then it may not be of the kind that was fitted."""
+    return found.search.open_controller and bool(np.any(found.heldout_after > STRUCTURE * found.margin))
+
+
+def _cause(found: Identified, stage: Stage, share: float) -> Cause:
+    effect, joints = stage.group
+    names = found.sim.arm.names
+    fall = stage.before - stage.after
+    places = list(joints) or [int(np.argmax(fall))]
+    before, after = (float(np.sqrt(np.mean(x[places] ** 2))) for x in (stage.before, stage.after))
+    name, _, link = effect.partition("@")
+    listed = tuple(names[j] for j in joints) or ((link,) if link else names)
+    evidence = stage.evidence / max(PRICE * _size(effect, found), 1.0)
+    confidence = ALMOST - (ALMOST - HINT) * float(np.exp(-0.35 * max(evidence - 1.0, 0.0)))
+    if stage.rivals:
+        confidence = min(confidence, 0.7)
+    if _structure_left(found):
+        confidence = min(confidence, HINT)
+    return Cause(
+        effect=name,
+        joints=listed,
+        parameters=_parameters(found, stage),
+        gap_before=before,
+        gap_after=after,
+        confidence=confidence,
+        fall=float(fall.max()),
+        signs=Signs(
+            stage.evidence, float((after / max(before, 1e-12)) ** 2), after / float(found.margin[places].max()), share
+        ),
+        confounded_with=stage.rivals,
+        separate_by=SEPARATE.get(effect, OTHERWISE) if stage.rivals else None,
+    )
+
+
+def _size(effect: str, found: Identified) -> int:
+    return len(EFFECTS[effect].parameters) if effect in EFFECTS else len(columns_of_effect(found, effect))
+
+
+def _parameters(found: Identified, stage: Stage) -> dict[str, dict[str, Value]]:
+    effect, joints = stage.group
+    if not joints:
+        columns = columns_of_effect(found, effect)
+        place = effect.partition("@")[2] or "arm"
+        values = {c.partition(".")[2]: Value(*interval(found.search, found.fit, found.spread, -1, c)) for c in columns}
+        if effect == "link.payload" and "mass" in values:
+            centre = {c.partition(".")[2]: Value(*payload_centre(found.fit, found.spread, c)) for c in columns[1:]}
+            values |= centre
+        return {place: values}
+    own = EFFECTS[effect]
+    return {
+        found.sim.arm.names[j]: {
+            called: Value(*interval(found.search, found.fit, found.spread, j, name))
+            for name, called in zip(own.parameters, own.reported, strict=True)
+        }
+        for j in joints
+    }
+
+
+def _hint(cause: Cause) -> Cause:
+    return replace(cause, confidence=min(cause.confidence, HINT))
+
+
+def _where(found: Identified) -> tuple[Location, ...]:
+    """Position gap of each joint of the nominal model, largest first."""
+    total = max(float((found.heldout_before**2).sum()), 1e-18)
+    rows = [
+        Location(name, "q", "other", float(rms), float(noise), float(rms**2 / total))
+        for name, rms, noise in zip(found.sim.arm.names, found.heldout_before, found.search.floor, strict=True)
+    ]
+    return tuple(sorted(rows, key=lambda row: -row.rms))
+
+
+def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout | None:
+    """Free-running replay of the nominal model, of what is exported, with its module if it has one, and of each cause
+    that is in it alone and left out; those whose absence costs most first."""
+    if found.export is None:
+        return None
+    made, groups = found.beside or found.export, groups_of(found.fit, found.search)
+
+    def gap(arm: Simulated, longest: float = LONGEST_S) -> Array:
+        return replay_rms(arm, found.recordings, found.gains, longest, found.heldout_touched)
+
+    after = gap(simulated_model(found.sim, made))
+    longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
+    effects = []
+    for cause, stage in taken:
+        if cause.effect not in WRITTEN or np.isnan(after).all():
+            continue
+        others = [group for group in groups if group != stage.group]
+        alone, without = (
+            gap(without_groups(found.sim, found.search, made, some), SHORT_S) for some in (others, [stage.group])
+        )
+        effects.append(EffectRollout(cause.effect, cause.joints, alone, without))
+    effects.sort(key=lambda each: -float(np.nanmax(each.without)))
+    return Rollout(longest, found.moved_before, after, tuple(effects), closed_loop=True)

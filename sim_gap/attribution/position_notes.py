@@ -1,0 +1,167 @@
+"""Notes of an answer from positions alone: what they leave open, and where the exported model is further off."""
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_gap.attribution.diagnosis import Rollout
+from sim_gap.position_gap.identify import Identified
+from sim_gap.position_gap.training.bands import SHARE
+from sim_gap.position_gap.training.export import Exported, widened_joints
+from sim_gap.position_gap.training.spread import interval, undecided_scale
+from sim_gap.position_gap.training.unreached_limits import describe
+from sim_gap.position_gap.windows import Windows
+
+FAR = 3.0
+"""So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
+NEAR_A_ROW = 0.2
+"""Share of the sampling period within which a time is taken for whole rows."""
+AT_TIMES = 0.01
+"""Share of the held-out samples from which a note says that they are faster than any that was fitted."""
+
+
+def notes(found: Identified) -> list[str]:
+    """Notes on the controller, on limits that were not reached, and on effects that the exported model leaves out."""
+    names = found.sim.arm.names
+    kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
+    out = [f"no torque channel: controller ({kind}) and effects follow from q_cmd and q; the gap is in rad"]
+    if loose := undecided_scale(found.search, found.fit, found.spread):
+        listed = ", ".join(names[j] for j in loose)
+        out.append(
+            f"{listed}: positions show only the ratios of gain, friction and inertia here; their scale is that of the "
+            "model's inertia: hold a known load or record the current to measure it"
+        )
+    if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
+        out.append(
+            "viscous friction, back-EMF and velocity feedback act alike on positions: only their sum is given"
+            + (", as part of the controller" if found.search.open_controller else "")
+        )
+    if found.search.resting:
+        listed = ", ".join(names[j] for j in sorted(found.search.resting))
+        assumed = "a controller that holds it is assumed" if found.search.open_controller else "the model's values stay"
+        out.append(f"{listed}: no training recording commands a motion here, so nothing can be fitted: {assumed}")
+    if limits := describe(found.spread.limits, names):
+        out.append(f"limits that the training motion does not reach: {limits}")
+    out += [*_early(found), *_touching(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
+    if found.export is not None and found.export.lines:
+        module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
+        out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}{module}")
+    return out
+
+
+def _in_module(beside: Exported) -> str:
+    return ", ".join(f"{effect} {joint}" for effect, joint, _ in beside.effects)
+
+
+def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> list[str]:
+    """Notes of a file that is written and leaves more than the nominal model, whether there is a `gap` or not, and of
+    the joints at which it leaves much more of the gap than the fit."""
+    if rollout is None:
+        return []
+    out = []
+    if rollout.worse:
+        before, after = (float(np.sqrt(np.mean(x**2))) for x in (rollout.before, rollout.after))
+        out.append(
+            f"running free, the corrected model leaves a larger gap ({after:.3g} rad) than the nominal one "
+            f"({before:.3g} rad): "
+            + ("do not train with it, and record other motion" if gap else "use the nominal model")
+        )
+    left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
+    far = [
+        f"{found.sim.arm.names[j]} {left[j]:.3g} rad (fit {found.heldout_after[j]:.3g})"
+        for j in np.flatnonzero(left > FAR * least)
+    ]
+    told = "the corrected model, running free in MuJoCo along the held-out commands, leaves more than the fit"
+    return [*out, f"{told}: {', '.join(far)}"] if far else out
+
+
+def _early(found: Identified) -> list[str]:
+    """A note of commands that act before their time, as those of rows with the position of a later row do."""
+    early = {}
+    for j in range(found.sim.n):
+        if "delay" not in found.fit.active[j]:
+            continue
+        value, _, high, _ = interval(found.search, found.fit, found.within, j, "delay")
+        if high < 0.0:
+            early[found.sim.arm.names[j]] = value
+    if not early:
+        return []
+    period, time = found.heldout.period, float(np.median([*early.values()]))
+    rows = round(time / period)
+    time = rows * period if rows and abs(time / period - rows) < NEAR_A_ROW else time
+    listed = ", ".join(f"{name} {value:.3g} s" for name, value in early.items())
+    return [
+        f"commands take effect before the time of their rows ({listed}), which no controller can do: the rows hold "
+        f"the position of a later time, or two clocks differ; state it with --clock q_cmd={time:.3g}"
+    ]
+
+
+def _touching(found: Identified) -> list[str]:
+    """A note of the surface that the arm presses on, and of what is left out for it."""
+    if found.surface is None:
+        return []
+    names = found.sim.arm.names
+    joints = ", ".join(names[j] for j in found.surface.joints)
+    some = [100.0 * float(rows.mean()) for rows in found.touched if rows.any()]
+    part = " to ".join(dict.fromkeys(f"{each:.0f}" for each in (min(some), max(some))))
+    return [
+        f"in {len(some)} of {len(found.touched)} recordings the arm presses on something below it, such as a table: "
+        f"where {names[found.surface.link]} goes below a height of {found.surface.height:.2f} m, {joints} stop short "
+        f"of the command; these moments ({part} % of such a recording) are neither fitted nor judged; if simulated "
+        "motion goes there, add the surface to the model"
+    ]
+
+
+def _ranges(found: Identified) -> list[str]:
+    """A note of joints that go further than the model lets them."""
+    names, own = found.sim.arm.names, found.sim.mujoco_model.jnt_range[list(found.sim.joints)]
+    out = [
+        f"{names[j]} (model {own[j, 0]:.2f} to {own[j, 1]:.2f} rad, corrected {low:.2f} to {high:.2f} rad)"
+        for j in widened_joints(found.sim)
+        for low, high in [found.sim.arm.range[j]]
+    ]
+    return [f"moves beyond the model's joint range, where a simulation would stop: {', '.join(out)}"] if out else []
+
+
+def _beyond(found: Identified) -> list[str]:
+    """A note of the joints that leave the range of the training recordings more often than a band may miss."""
+    out = []
+    for j, name in enumerate(found.sim.arm.names):
+        fitted, other = (d.measured[:, j][d.weight[:, j] > 0.0] for d in (found.search.data, found.heldout))
+        if not (fitted.size and other.size):
+            continue
+        outside = float(np.mean((other < fitted.min()) | (other > fitted.max())))
+        if outside > 1.0 - SHARE:
+            out.append(f"{name}: {outside:.0%} of the held-out motion")
+    told = "moves outside the range of the training recordings, where the band may be too narrow"
+    return [f"{told}: {', '.join(out)}"] if out else []
+
+
+def _faster(found: Identified) -> list[str]:
+    """A note of the joints that are at times faster than in what is fitted of the training."""
+    out = []
+    for j, name in enumerate(found.sim.arm.names):
+        fitted, other = (_speeds(data, j) for data in (found.search.data, found.heldout))
+        if not (fitted.size and other.size):
+            continue
+        if np.mean(other > fitted.max()) > AT_TIMES:
+            out.append(f"{name} up to {other.max():.2g} rad/s (in training {fitted.max():.2g})")
+    told = "the held-out motion is faster than all training motion, so the fit may not hold for it"
+    return [f"{told}: {', '.join(out)}: add faster motion to --train"] if out else []
+
+
+def _released(found: Identified) -> list[str]:
+    """A note of the joints whose servo is off at times in the held-out motion and never in what is fitted."""
+    off = [1.0 - data.served.mean((0, 2)) for data in (found.search.data, found.heldout)]
+    out = [
+        f"{name} for {100.0 * off[1][j]:.0f} % of the time"
+        for j, name in enumerate(found.sim.arm.names)
+        if off[0][j] == 0.0 < off[1][j]
+    ]
+    told = "the servo is off in part of the held-out motion, but never in training, so the fit may not hold there"
+    return [f"{told}: {', '.join(out)}: add such a swing to --train"] if out else []
+
+
+def _speeds(data: Windows, joint: int) -> Array:
+    """Amounts of a joint's velocity at the judged samples [rad/s], (K,)."""
+    speed = np.abs(data.v[data.warm :: data.stride, joint][: len(data.weight)])
+    return np.asarray(speed[data.weight[:, joint][: len(speed)] > 0.0])

@@ -1,1 +1,0 @@
-"""The answer from recordings without a torque channel, in radians."""

@@ -1,0 +1,286 @@
+"""The simulation model corrected by the fitted effects, as far as a MuJoCo model can hold them."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from armlink.errors import BadInput
+from gcomp.arrays import Array
+from sim_gap.effects.base import tilt_gravity
+from sim_gap.effects.link import mount_matrix, pseudo_inertia
+from sim_gap.model.load import SimModel, linear_part, read_spec
+from sim_gap.model.rigid_body import inertial_of
+from sim_gap.residuals.preprocess import ABSENT
+from sim_gap.search.estimate import EffectEstimate
+from sim_gap.search.estimate_signals import inertial_change
+from sim_gap.search.term import Term
+
+
+@dataclass(frozen=True)
+class CoupledMotor:
+    """A motor that turns by q_joint + lever·q_other and so loads both joints."""
+
+    joint: str
+    other: str
+    lever: float
+    inertia: float
+    """[kg·m²]."""
+    coulomb: float
+    """[N·m]."""
+    viscous: float
+    """[N·m·s/rad]."""
+
+
+def coupled_motors(
+    sim: SimModel, estimate: EffectEstimate | None, chosen: Sequence[Term] | None = None
+) -> list[CoupledMotor]:
+    """Motors coupled to two joints, of an estimate or of some of its terms."""
+    every = () if estimate is None else estimate.terms if chosen is None else chosen
+    terms = [term for term in every if term.effect == "transmission.coupling"]
+    names = sim.arm.names
+    return [
+        CoupledMotor(names[t.place], names[int(t.shape[0]) - 1], t.shape[1], *estimate.of(t).tolist())
+        for t in terms
+        if estimate is not None
+    ]
+
+
+def add_to(spec: Any, motors: Sequence[CoupledMotor]) -> None:
+    for number, motor in enumerate(motors, start=1):
+        tendon = spec.add_tendon(name=f"motor_{number}_of_{motor.joint}_and_{motor.other}")
+        tendon.wrap_joint(motor.joint, 1.0)
+        tendon.wrap_joint(motor.other, motor.lever)
+        tendon.armature, tendon.frictionloss = motor.inertia, motor.coulomb
+        tendon.damping[0] = motor.viscous
+
+
+HELD = {
+    "friction.coulomb": "joint frictionloss",
+    "friction.viscous": "joint damping",
+    "actuator.rotor_inertia": "joint armature",
+    "transmission.spring": "joint stiffness and springref",
+    "transmission.coupling": "fixed tendon",
+    "link.mass_moment": "body inertial",
+    "link.inertia": "body inertial",
+    "link.payload": "body inertial",
+    "base.tilt": "option gravity",
+    "position.offset": "joint ref, and range and springref with it",
+}
+"""Effects that a MuJoCo model can hold, and the element that holds them."""
+OF_READING = ("position.gain", "position.eccentricity")
+"""Errors of a reading that a MuJoCo model cannot hold; an offset beside them is left to the module, too."""
+LEFT_KG = 1e-9
+"""Mass and inertia left in a body whose inertials are counted to the body that it is fixed to."""
+
+
+@dataclass(frozen=True)
+class CorrectedModel:
+    model: Any
+    """`mujoco.MjModel`."""
+    held: tuple[Term, ...]
+    not_held: tuple[Term, ...]
+    """Terms that MJCF cannot express."""
+    changed: tuple[str, ...] = ()
+    """Joints whose link is not the one that was fitted, which cannot exist, but one close to it."""
+
+
+def with_effects(
+    sim: SimModel,
+    estimate: EffectEstimate | None,
+    terms: Sequence[Term] | None = None,
+    number: int = 0,
+    mount: float = 0.0,
+) -> CorrectedModel:
+    """A copy of the compiled model with the estimate's effects in it, or with some of its terms.
+
+    A body that only some recordings have is left out, except for the one with this `number`, in which it is turned by
+    `mount` about the last joint's axis [rad].
+    """
+    if estimate is None:
+        return CorrectedModel(copy.copy(sim.mujoco_model), (), ())
+    chosen = estimate.terms if terms is None else tuple(terms)
+    model, coupled = _base(sim, coupled_motors(sim, estimate, chosen))
+    bent = {term.place for term in chosen if term.effect in OF_READING}
+    left_out = {
+        *(term for term in chosen if term.effect == "transmission.coupling" and not coupled),
+        *(term for term in chosen if term.effect == "position.offset" and term.place in bent),
+    }
+    held = tuple(term for term in chosen if term.effect in HELD and in_model(term, number) and term not in left_out)
+    turn = mount_matrix(sim.arm.axis[-1], mount)
+    links = [(term, turn @ estimate.of(term) if term.effect == "link.payload" else estimate.of(term)) for term in held]
+    changed = _set_links(model, sim, links, number)
+    for term in held:
+        c, joint = estimate.of(term), sim.joints[term.place]
+        if term.effect == "base.tilt":
+            model.opt.gravity[:] = tilt_gravity(sim.arm.gravity, c)
+        elif term.effect.split(".")[0] not in ("link", "position") and term.effect != "transmission.coupling":
+            _joint(model, joint, term.effect, c, added=estimate.store.data.layout.motor is not None)
+    for place, offset in offsets(estimate, held).items():
+        _move_zero(model, sim.joints[place], offset)
+    return CorrectedModel(model, held, tuple(term for term in chosen if term not in held), changed)
+
+
+def _set_links(model: Any, sim: SimModel, terms: Sequence[tuple[Term, Array]], number: int) -> tuple[str, ...]:
+    """Put the terms that change links into the model; the joints whose link could not be made as fitted."""
+    inertial = sim.arm.inertial.copy()
+    for term, c in terms:
+        change = inertial_change(term, c, inertial, number)
+        if change is not None:
+            inertial[sim.n - 1 if term.effect == "link.payload" else term.place] += change
+    moved = np.flatnonzero(np.any(inertial != sim.arm.inertial, axis=1)).tolist()
+    exact = [_set_link(model, sim.joints, link, inertial[link] - sim.arm.inertial[link]) for link in moved]
+    return tuple(sim.arm.names[link] for link, fine in zip(moved, exact, strict=True) if not fine)
+
+
+def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> bool:
+    """Add ten parameters to the body that a joint moves, or to it with all that is fixed to it if it alone could not
+    exist (a gripper taken away); whether the result is what was wanted."""
+    joint = joints[link]
+    body, anchor = int(model.jnt_bodyid[joint]), model.jnt_pos[joint]
+    total = body_parameters(model, body, anchor, np.eye(3)) + added
+    if not may_exist(total):
+        fixed = _fixed_to(model, body, joints)
+        whole = total + sum((_seen_from(model, other, body, anchor) for other in fixed), np.zeros(10))
+        if fixed and may_exist(whole):
+            total = whole
+            for other in fixed:
+                model.body_mass[other], model.body_inertia[other] = LEFT_KG, LEFT_KG
+    mass, centre, about = mass_centre_inertia(total)
+    values, axes = np.linalg.eigh(about)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    model.body_mass[body], model.body_ipos[body] = mass, anchor + centre
+    model.body_inertia[body] = closest_possible(values)
+    mujoco_quaternion(model.body_iquat[body], axes)
+    return bool(np.allclose(closest_possible(values), values, rtol=1e-3, atol=1e-9) and mass == total[0])
+
+
+def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
+    """Bodies without a joint of their own among `joints` that are carried by this one without one in between."""
+    moving = {int(model.jnt_bodyid[joint]) for joint in joints}
+    out: list[int] = []
+    for other in range(body + 1, model.nbody):
+        up = int(model.body_parentid[other])
+        if other not in moving and (up == body or up in out):
+            out.append(other)
+    return out
+
+
+def body_parameters(model: Any, body: int, origin: Array, turn: Array) -> Array:
+    """Ten parameters of a body about a point of its frame, in a frame turned by `turn`."""
+    import mujoco
+
+    spin = np.zeros(9)
+    mujoco.mju_quat2Mat(spin, model.body_iquat[body])
+    axes = turn @ spin.reshape(3, 3)
+    inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
+    return inertial_of(float(model.body_mass[body]), turn @ (model.body_ipos[body] - origin), inertia)
+
+
+def _seen_from(model: Any, other: int, body: int, anchor: Array) -> Array:
+    """Ten parameters of a body that is fixed to another, about that one's anchor and in its frame."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    up, own = data.xmat[body].reshape(3, 3), data.xmat[other].reshape(3, 3)
+    turn = up.T @ own
+    place = up.T @ (data.xpos[other] - data.xpos[body]) - anchor
+    return body_parameters(model, other, -turn.T @ place, turn)
+
+
+def mujoco_quaternion(out: Array, axes: Array) -> None:
+    import mujoco
+
+    mujoco.mju_mat2Quat(out, axes.ravel())
+
+
+def may_exist(inertial: Array) -> bool:
+    return bool(inertial[0] > 0.0 and np.linalg.eigvalsh(pseudo_inertia(inertial)).min() > 0.0)
+
+
+def in_model(term: Term, number: int) -> bool:
+    """Whether a term belongs to the arm, or to the recording with this number."""
+    return not (term.bound or (number == ABSENT and term.form.signature.body)) or term.form.signature.present(
+        term.shape, number
+    )
+
+
+def _base(sim: SimModel, motors: list[CoupledMotor]) -> tuple[Any, bool]:
+    """A copy of the nominal model with these motors, and whether it has them (only a model from a file can)."""
+    if not motors or sim.path is None:
+        return copy.copy(sim.mujoco_model), False
+    spec = spec_of(sim)
+    add_to(spec, motors)
+    return spec.compile(), True
+
+
+def spec_of(sim: SimModel) -> Any:
+    """The nominal model's file as a `mujoco.MjSpec`, its elements numbered and its joints named.
+
+    Raises BadInput if the model did not come from a file.
+    """
+    if sim.path is None:
+        raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+    spec = read_spec(sim.path)
+    spec.compile()
+    for name, joint in zip(sim.arm.names, sim.joints, strict=True):
+        spec.joints[joint].name = spec.joints[joint].name or name
+    return spec
+
+
+def compiled_copy(spec: Any) -> Any:
+    """A copy of a `mujoco.MjSpec`, its elements numbered."""
+    own = spec.copy()
+    own.compile()
+    return own
+
+
+def offsets(estimate: EffectEstimate, held: Sequence[Term]) -> dict[int, float]:
+    """Offsets of the position sensors that a model holds, by the joint's place [rad]."""
+    return {term.place: float(estimate.of(term)[0]) for term in held if term.effect == "position.offset"}
+
+
+def _move_zero(model: Any, joint: int, offset: float) -> None:
+    """Count the position of a joint as a sensor with this offset does: stops and spring stay where they are."""
+    adr = model.jnt_qposadr[joint]
+    model.qpos0[adr] -= offset
+    if model.jnt_limited[joint]:
+        model.jnt_range[joint] -= offset
+    if linear_part(model.jnt_stiffness, model.njnt)[joint]:
+        model.qpos_spring[adr] -= offset
+
+
+def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
+    """Give a joint friction, damping, armature or a spring; `added` to what it has of the first three, or if that is
+    the motor's, which a sensor on the link does not read, as much at least."""
+    dof, adr = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
+    terms = {
+        "friction.coulomb": "dof_frictionloss",
+        "friction.viscous": "dof_damping",
+        "actuator.rotor_inertia": "dof_armature",
+    }
+    if effect in terms:
+        values = linear_part(getattr(model, terms[effect]), model.nv)
+        values[dof] = max(values[dof] + c[0], 0.0) if added else max(values[dof], c[0])
+    else:
+        stiffness = linear_part(model.jnt_stiffness, model.njnt)
+        total = stiffness[joint] + c[0]
+        model.qpos_spring[adr] = (stiffness[joint] * model.qpos_spring[adr] - c[1]) / total
+        stiffness[joint] = total
+
+
+def closest_possible(principal: Array) -> Array:
+    """The closest physical principal moments of inertia (none exceeds the sum of the other two), (3,)."""
+    spread = np.maximum(0.5 * principal.sum() - principal, 1e-6)  # kg·m²
+    return np.asarray(spread.sum() - spread)
+
+
+def mass_centre_inertia(inertial: Array) -> tuple[float, Array, Array]:
+    """Mass, centre of mass and inertia about it (3, 3) from ten inertial parameters about the origin."""
+    mass = max(float(inertial[0]), 1e-6)
+    centre = inertial[1:4] / mass
+    about = inertial[4:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    return mass, centre, about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))

@@ -1,0 +1,140 @@
+"""The bench of real arms: recordings of a folder, diagnosed and sealed before what is known of the arms is read.
+
+What is known stands in `real_arms.yaml`, or in a file of the same form that is given: effects that an arm has (`has`),
+of which one has to come first, those that have to be named, and those that nobody knows (`open`), which do not count.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from armlink.arm_file import read_yaml
+from armlink.errors import ArmlinkError, BadInput
+from armlink.recording.files import load_recording
+from armlink.recording.recording import Recording, slice_rows
+from sim_gap.attribution.diagnose import diagnose
+from sim_gap.blind.bench import seal, verify, write_answer
+from sim_gap.blind.judge import CONFIDENT
+from sim_gap.blind.score import WITHHELD, answer_name, share
+
+SCHEMA = "armlink.real-bench/1"
+KNOWN = Path(__file__).with_name("real_arms.yaml")
+RIGHT_FIRST, FALSE = 0.85, 0.05
+"""Required shares: right first, and cases with a false cause above 0.8."""
+Json = dict[str, Any]
+
+
+def run_real(
+    folder: Path,
+    out: Path,
+    known: Path = KNOWN,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> Json:
+    """Diagnose the recordings of `folder`, seal the answers under `out`, then score them.
+
+    Sets whose files are missing are left out and listed. Raises BadInput if none is there, or `out` holds an earlier
+    bench.
+    """
+    if (out / "answers").exists():
+        raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
+    cases = read_cases(known)
+    missing = [case["case"] for case in cases if not all((folder / name).is_file() for name in _files(case))]
+    here = [case for case in cases if case["case"] not in missing]
+    if not here:
+        raise BadInput(f"{folder}: holds none of the recordings of {known}: expected for example {_files(cases[0])[0]}")
+    tasks = [(case, effect) for case in here for effect in ("", *case.get("withhold", ()))]
+    for done, (case, effect) in enumerate(tasks, start=1):
+        write_answer(out / "answers", answer_name(case["case"], effect), _answer(folder, case, effect))
+        progress("diagnosing", done, len(tasks))
+    digest = seal(out / "answers")
+    return {**score_real(verify(out / "answers", digest), here), "sealed": digest, "missing": missing}
+
+
+def read_cases(known: Path) -> list[Json]:
+    """The cases of a file, in the form of `real_arms.yaml`. Raises BadInput if it is not of that form."""
+    try:
+        cases = read_yaml(known)
+    except OSError as error:
+        raise BadInput(f"{known}: cannot be read: {error.strerror}") from None
+    for number, case in enumerate(cases if isinstance(cases, list) else [cases], start=1):
+        lacking = [key for key in ("case", "sim", "train") if not isinstance(case, dict) or key not in case]
+        if isinstance(case, dict) and not case.get("refused"):
+            lacking += [key for key in ("first", "has") if key not in case]
+        if lacking:
+            raise BadInput(f"{known}: entry {number}: {', '.join(lacking)} missing: write it as in {KNOWN.name}")
+    return list(cases)
+
+
+def _files(case: Json) -> list[str]:
+    return [case["sim"], *case["train"], *case.get("heldout", ())]
+
+
+def _answer(folder: Path, case: Json, withheld: str) -> Json:
+    """The answer to one case; refused input is an answer without causes."""
+    try:
+        train, heldout, labels = recordings_of(folder, case)
+        made = diagnose(folder / case["sim"], train, heldout, labels=labels, withhold=[withheld] if withheld else [])
+    except ArmlinkError as error:
+        return {"verdict": "refused", "causes": [], "refused": str(error)}
+    return made.to_json()
+
+
+def recordings_of(folder: Path, case: Json) -> tuple[list[Recording], list[Recording], list[str]]:
+    """Training and held-out recordings of a case, and their labels."""
+    train, heldout = ([load_recording(folder / name) for name in case.get(key, ())] for key in ("train", "heldout"))
+    if "share" in case:
+        train, heldout = _parts(train, case["share"])
+    names = [*case["train"], *(case["heldout"] if "heldout" in case else case["train"])]
+    return train, heldout, [Path(name).name.split(".")[0] for name in names]
+
+
+def _parts(recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
+    cuts = [int(share * len(each.t)) for each in recordings]
+    first = [slice_rows(each, slice(0, cut)) for each, cut in zip(recordings, cuts, strict=True)]
+    return first, [slice_rows(each, slice(cut, None)) for each, cut in zip(recordings, cuts, strict=True)]
+
+
+def score_real(answers: Mapping[str, Mapping[str, Any]], cases: Sequence[Json]) -> Json:
+    """Score answers (by name) against what is known of the arms; shares over no case are None. Pure."""
+    known = {case["case"]: case for case in cases}
+    rows = []
+    for name, answer in answers.items():
+        case, _, withheld = name.partition(WITHHELD)
+        rows.append(judge_real(answer, known[case], withheld))
+    whole = [row for row in rows if not row["withheld"] and row["first_right"] is not None]
+    judged = [row for row in rows if row["verdict"] != "refused"]
+    shares = {
+        "right_first": share([row["first_right"] for row in whole]),
+        "named": share([not row["lacking"] for row in whole]),
+        "false_confident": share([bool(row["false"]) for row in judged]),
+        "refused_as_known": share([row["verdict"] == "refused" for row in rows if row["first_right"] is None]),
+    }
+    met = (shares["right_first"] or 0.0) >= RIGHT_FIRST and (shares["false_confident"] or 0.0) <= FALSE
+    return {"schema": SCHEMA, **shares, "meets": met, "cases": rows}
+
+
+def judge_real(answer: Mapping[str, Any], case: Json, withheld: str = "") -> Json:
+    """One answer against what is known of the arm: the first cause, false ones above 0.8, and what is lacking."""
+    causes = answer["causes"]
+    fine = {*case.get("has", ()), *case.get("open", ())} - {withheld}
+    first = causes[0] if causes else None
+    must = {} if withheld else case.get("must", {})
+    return {
+        "case": case["case"],
+        "withheld": withheld or None,
+        "verdict": answer["verdict"],
+        "first": first["effect"] if first else None,
+        "confidence": first["confidence"] if first else None,
+        "first_right": None if case.get("refused") else bool(first and first["effect"] in case["first"]),
+        "false": [c["effect"] for c in causes if c["confidence"] > CONFIDENT and c["effect"] not in fine],
+        "lacking": [effect for effect, bounds in must.items() if not _named(causes, effect, bounds)],
+    }
+
+
+def _named(causes: Sequence[Mapping[str, Any]], effect: str, bounds: Mapping[str, Sequence[float]]) -> bool:
+    """Whether an effect is among the causes, with parameters within these bounds at some joint."""
+    for cause in causes:
+        if cause["effect"] == effect:
+            values = list(cause["parameters"].values())
+            return all(any(low <= v[name]["value"] <= high for v in values) for name, (low, high) in bounds.items())
+    return False

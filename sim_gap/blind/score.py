@@ -1,0 +1,201 @@
+"""The score of blind checks (docs/formats.md) from judged answers: shares, confusion matrix. Pure functions."""
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from sim_gap.blind.judge import Judgement, judge
+
+SCHEMA = "armlink.blind/1"
+BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
+WITHHELD = "--without--"
+"""Separator of case and effect removed from the library, in an answer's name."""
+
+
+def score(answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Score all answers (by name, see `answer_name`) against the labels (by case)."""
+    judged = []
+    for name, answer in answers.items():
+        case, _, withheld = name.partition(WITHHELD)
+        if not labels[case].get("clear", True):
+            continue  # no arm shows its effects and stays under control
+        judged.append(judge(answer, labels[case], withheld))
+    whole = [j for j in judged if not j.withheld]
+    without = [j for j in judged if j.withheld]
+    parts = {"label_withheld": label_withheld(whole), "effect_withheld": effect_withheld(without)}
+    return {
+        "schema": SCHEMA,
+        **parts,
+        "meets": meets_bounds(parts),
+        "confusion": confusion(whole),
+        "by_effect": by_effect(whole),
+        "calibration": calibration(whole),
+        "cases": [case_row(j) for j in judged],
+    }
+
+
+def answer_name(case: str, withheld: str = "") -> str:
+    return f"{case}{WITHHELD}{withheld}" if withheld else case
+
+
+def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
+    """Shares over the cases with hidden labels: with one effect, with none, with two."""
+    some = [j for j in judged if j.kind != "none"]
+    single, two, none = ([j for j in judged if j.kind == kind] for kind in ("single", "two", "none"))
+    errors = np.array([e.relative for j in some for e in j.errors])
+    inside = [e.inside for j in some for e in j.errors if e.inside is not None]
+    right, wrong, missed = (sum(getattr(j, f"joints_{k}") for j in some) for k in ("right", "wrong", "missed"))
+    precision, recall = _ratio(right, right + wrong), _ratio(right, right + missed)
+    ratios = np.array([j.shrink / j.shrink_true for j in single if np.isfinite(j.shrink) and j.shrink_true > 0])
+    return {
+        "cases": len(judged),
+        "tellable": sum(j.tellable for j in single),
+        "first_right_where_tellable": share([j.first_right for j in single if j.tellable]),
+        "first_right": share([j.first_right for j in single]),
+        "first_or_confounded": share([j.named for j in single]),
+        "extra_confident": share([bool(j.blamed) for j in some]),
+        "joints": {"precision": precision, "recall": recall, "f1": _f1(precision, recall)},
+        "no_effect": {"cases": len(none), "false_alarms": share([j.verdict != "no_gap" for j in none])},
+        "several": score_several([j for j in judged if j.kind == "several"]),
+        "two": {"cases": len(two), "both_found": share([set(j.found) == set(j.truth) for j in two])},
+        "parameters": {
+            "count": len(errors),
+            "median_error": float(np.median(errors)) if len(errors) else None,
+            "within_10_percent": share((errors <= 0.1).tolist()),
+            "inside_ci95": share([bool(x) for x in inside]),
+        },
+        "shrink": {
+            "median_ratio": float(np.median(ratios)) if len(ratios) else None,
+            "at_least_0.95": share((ratios >= 0.95).tolist()),
+        },
+        "verdicts": dict(Counter(j.verdict for j in judged)),
+    }
+
+
+def score_several(judged: Sequence[Judgement]) -> dict[str, Any]:
+    """Shares over the cases with many effects: true effects named, confident causes that are false."""
+    shown, placed = (sum(len(getattr(j, name)) for j in judged) for name in ("shown", "placed"))
+    return {
+        "cases": len(judged),
+        "effects": shown,
+        "named": _ratio(placed, shown),
+        "false_confident": _ratio(sum(len(j.blamed) for j in judged), sum(j.confident for j in judged)),
+        "explained": share([j.verdict == "explained" for j in judged]),
+    }
+
+
+def effect_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
+    """Shares over the cases whose effect was removed from the library: false blames and verdicts."""
+    return {
+        "cases": len(judged),
+        "false_blame": share([bool(j.blamed) for j in judged]),
+        "no_gap": share([j.verdict == "no_gap" for j in judged]),
+        "verdicts": dict(Counter(j.verdict for j in judged)),
+        "blamed": [{"case": j.case, "withheld": j.withheld, "blamed": list(j.blamed)} for j in judged if j.blamed],
+    }
+
+
+def confusion(judged: Sequence[Judgement]) -> dict[str, dict[str, int]]:
+    """Counts of single-effect and no-effect cases: true effect (or `none`) by effect named first (or verdict)."""
+    table: dict[str, Counter[str]] = defaultdict(Counter)
+    for j in judged:
+        if j.kind in ("none", "single"):
+            table[j.truth[0] if j.truth else "none"][j.first or j.verdict] += 1
+    return {true: dict(table[true].most_common()) for true in sorted(table)}
+
+
+def by_effect(judged: Sequence[Judgement]) -> dict[str, dict[str, Any]]:
+    """Single-effect cases per effect: number, right first, named, and the median parameter error."""
+    groups: dict[str, list[Judgement]] = defaultdict(list)
+    for j in judged:
+        if j.kind == "single":
+            groups[j.truth[0]].append(j)
+    out = {}
+    for effect in sorted(groups):
+        errors = [e.relative for j in groups[effect] for e in j.errors]
+        out[effect] = {
+            "cases": len(groups[effect]),
+            "first_right": sum(j.first_right for j in groups[effect]),
+            "named": sum(j.named for j in groups[effect]),
+            "median_error": float(np.median(errors)) if errors else None,
+        }
+    return out
+
+
+def calibration(judged: Sequence[Judgement]) -> list[dict[str, Any]]:
+    """First causes by confidence: number, mean confidence, and the share that was right."""
+    named = [j for j in judged if j.first]
+    out = []
+    for low, high in pairwise(BINS):
+        here = [j for j in named if low <= j.confidence < high or (high == 1.0 and j.confidence == 1.0)]
+        if here:
+            out.append(
+                {
+                    "from": low,
+                    "to": high,
+                    "count": len(here),
+                    "mean_confidence": float(np.mean([j.confidence for j in here])),
+                    "right": share([j.first_right for j in here]),
+                }
+            )
+    return out
+
+
+def case_row(j: Judgement) -> dict[str, Any]:
+    """One case as a row of the table of all cases."""
+    return {
+        "case": j.case,
+        "kind": j.kind,
+        "withheld": j.withheld or None,
+        "truth": list(j.truth),
+        "tellable": j.tellable,
+        "verdict": j.verdict,
+        "first": j.first or None,
+        "confidence": j.confidence,
+        "first_right": j.first_right,
+        "named": j.named,
+        "blamed": list(j.blamed),
+        "errors": {f"{e.effect}.{e.name}": e.relative for e in j.errors},
+        "shrink": _finite(j.shrink),
+        "shrink_true": _finite(j.shrink_true),
+    }
+
+
+def meets_bounds(result: Mapping[str, Any]) -> dict[str, bool]:
+    """Whether the score meets each of the project's bounds (for at least 150 cases); a share over no case does not."""
+    known, blind = result["label_withheld"], result["effect_withheld"]
+    least = {
+        "first_right_where_tellable": (known["first_right_where_tellable"], 0.93),
+        "first_or_confounded": (known["first_or_confounded"], 0.98),
+        "joints_f1": (known["joints"]["f1"], 0.95),
+        "two_both_found": (known["two"]["both_found"], 0.85),
+        "shrink_median_ratio": (known["shrink"]["median_ratio"], 0.95),
+    }
+    most = {
+        "extra_confident": (known["extra_confident"], 0.03),
+        "no_effect_false_alarms": (known["no_effect"]["false_alarms"], 0.02),
+        "parameters_median_error": (known["parameters"]["median_error"], 0.03),
+        "false_blame": (blind["false_blame"], 0.10),
+    }
+    met = {name: value is not None and value >= bound for name, (value, bound) in least.items()}
+    return met | {name: value is not None and value <= bound for name, (value, bound) in most.items()}
+
+
+def share(flags: Sequence[bool]) -> float | None:
+    """Share of what is true; None of nothing."""
+    return sum(flags) / len(flags) if flags else None
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+def _f1(precision: float | None, recall: float | None) -> float | None:
+    return 2 * precision * recall / (precision + recall) if precision and recall else None
+
+
+def _finite(x: float) -> float | None:
+    return x if np.isfinite(x) else None

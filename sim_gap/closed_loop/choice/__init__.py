@@ -1,1 +1,0 @@
-"""Which effects the closed loop has: candidates, competition, removal, rivals, doubt."""

@@ -1,0 +1,240 @@
+"""Excitation that separates effects: planned within the arm file's ranges and speeds, kept as a file, run on the arm.
+
+Pieces move single joints and all together. A file of planned motion is CSV with columns t [s] and q_cmd_1 … q_cmd_n
+[rad]; it is checked against the arm when it is read.
+"""
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from armlink.arm_file import ArmFile
+from armlink.content.atomic_file import open_whole
+from armlink.content.memory_budget import memory_budget
+from armlink.errors import BadInput
+from armlink.link.types import Setpoints
+from armlink.loop.driver import ArmDriver
+from armlink.recording.mcap import RecordingWriter
+from armlink.recording.tables import THREADS
+from calib.arm.kinematics import gcomp_arm
+from calib.motion.trajectory import trajectory
+from gcomp.arrays import Array
+
+MARGIN = 0.12
+"""Distance from each stop, as a share of the range."""
+SPEEDS = (0.03, 0.1, 0.3, 0.6)
+"""Constant speeds, as shares of a joint's max_velocity."""
+PACE = 0.5
+"""Speed on the way to a pose, as a share of max_velocity."""
+ACCELERATION = 1.0
+"""Largest acceleration [rad/s²], for drives with little torque in excess of gravity."""
+LONGEST = 25.0
+"""Longest time for one pass through the range [s]: at creeping speed only a part of it is covered."""
+TONES, BAND = 4, (0.08, 0.6)
+"""Number of sines per joint in the motion of all joints, and their frequency band [Hz]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedMotion:
+    """Position targets of an arm, one per cycle."""
+
+    names: tuple[str, ...]
+    rate: float
+    target: Array
+    """(K, n) [rad]."""
+    pieces: tuple[str, ...]
+    """Description of each part."""
+
+    @property
+    def seconds(self) -> float:
+        return len(self.target) / self.rate
+
+
+def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: int = 0) -> PlannedMotion:
+    """Each joint (or those named) alone, slow and fast in both directions, with the others in `poses` poses; then all.
+
+    Constant speeds from creeping to fast separate the kinds of friction, reversals under two loads separate friction
+    from load-dependent effects and backlash, and the sines of all joints separate inertia, rotor and lag. Raises
+    BadInput for a joint that the arm does not have.
+    """
+    shape = _Shape(arm)
+    names = list(shape.names)
+    for joint in joints:
+        if joint not in names:
+            raise BadInput(f"no joint {joint} in arm {arm.name}: its joints are {', '.join(names)}")
+    chosen = [names.index(joint) for joint in dict.fromkeys(joints)] or list(range(len(names)))
+    random = np.random.default_rng(seed)
+    for pose in range(poses):
+        share = random.uniform(0.15, 0.85, len(names)) if pose else np.full(len(names), 0.5)
+        for number in chosen:
+            shape.turn(number, shape.low + share * (shape.high - shape.low))
+    shape.sines(chosen, random)
+    return shape.motion()
+
+
+class _Shape:
+    """The motion under construction; it starts in the middle of all ranges."""
+
+    def __init__(self, arm: ArmFile) -> None:
+        section, described = arm.require_link(), gcomp_arm(arm)
+        self.names, self.rate = described.names, float(section.rate)
+        room = MARGIN * (described.upper - described.lower)
+        self.low, self.high = described.lower + room, described.upper - room
+        self.fastest = np.array([joint.max_velocity for joint in section.joints])
+        self.here = (self.low + self.high) / 2
+        self.rows: list[Array] = [self.here[None]]
+        self.pieces: list[str] = []
+
+    def go(self, goal: Array, speed: Array) -> None:
+        """Move to a pose (n,) [rad], all joints arriving together, and rest there."""
+        way = trajectory(self.here, goal, speed, np.full(len(goal), ACCELERATION), 1 / self.rate)
+        self.rows += [way, np.repeat(goal[None], round(1.0 * self.rate), axis=0)]
+        self.here = goal
+
+    def turn(self, joint: int, pose: Array) -> None:
+        """Move one joint through its range at each constant speed, both directions, the others at `pose` (n,) [rad]."""
+        for share in SPEEDS:
+            speed = share * self.fastest[joint]
+            middle, half = (self.low[joint] + self.high[joint]) / 2, (self.high[joint] - self.low[joint]) / 2
+            half = min(half, speed * LONGEST / 2)
+            for end in (middle - half, middle + half, middle - half):
+                goal = pose.copy()
+                goal[joint] = end
+                there = np.allclose(np.delete(self.here, joint), np.delete(goal, joint))
+                self.go(goal, np.full(len(goal), speed) if there else PACE * self.fastest)
+        self.pieces.append(
+            f"{self.names[joint]} alone, {len(SPEEDS)} speeds in both directions, others at {np.round(pose, 2)}"
+        )
+
+    def sines(self, joints: list[int], random: np.random.Generator, seconds: float = 60.0) -> None:
+        """Move the joints together, each by its own sum of sines about the middle of its range."""
+        self.go((self.low + self.high) / 2, PACE * self.fastest)
+        t = np.arange(round(seconds * self.rate)) / self.rate
+        fade = np.clip(np.minimum(t, seconds - t) / 2.0, 0.0, 1.0)
+        fade = fade * fade * (3 - 2 * fade)
+        rows = np.repeat(self.here[None], len(t), axis=0)
+        for joint in joints:
+            omega = 2 * np.pi * random.uniform(*BAND, TONES)
+            reach = 0.9 * (self.high[joint] - self.low[joint]) / 2
+            size = np.minimum(np.minimum(reach, PACE * self.fastest[joint] / omega), ACCELERATION / omega**2) / TONES
+            rows[:, joint] += fade * (size * np.sin(np.outer(t, omega) + random.uniform(0, 2 * np.pi, TONES))).sum(1)
+        self.rows.append(rows)
+        self.here = rows[-1]
+        self.pieces.append(f"all joints together, {TONES} sines each, {seconds:g} s")
+
+    def motion(self) -> PlannedMotion:
+        return PlannedMotion(self.names, self.rate, np.concatenate(self.rows), tuple(self.pieces))
+
+
+def joints_in_doubt(answer: Path) -> tuple[list[str], list[str]]:
+    """Undecided joints of a diagnosis, and the motions that it requests, from its JSON; raises BadInput."""
+    try:
+        result: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
+        causes, where = result["causes"], result["where"]
+        open_causes = [cause for cause in causes if cause["confounded_with"]]
+        joints = [joint for cause in open_causes or causes for joint in cause["joints"]]
+        joints = joints or [place["joint"] for place in where]
+        return list(dict.fromkeys(joints)), [cause["separate_by"] for cause in open_causes if cause["separate_by"]]
+    except OSError as error:
+        raise BadInput(f"{answer}: cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError):
+        raise BadInput(f"{answer}: not a result that gap diagnose wrote with --json") from None
+
+
+def save_motion(motion: PlannedMotion, path: Path) -> None:
+    """Write `.csv`; raises BadInput if it cannot be written."""
+    if path.suffix != ".csv":
+        raise BadInput(f"{path}: a motion is written as .csv")
+    columns = {"t": np.arange(len(motion.target)) / motion.rate}
+    columns |= {f"q_cmd_{i + 1}": column for i, column in enumerate(motion.target.T)}
+    try:
+        with open_whole(path) as stream:
+            pa_csv.write_csv(pa.table(columns), stream)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written: {error}") from None
+
+
+def load_motion(path: Path, arm: ArmFile) -> Array:
+    """Targets (K, n) [rad], one per cycle of the arm's rate, from a CSV with columns t and q_cmd_i (others ignored).
+
+    Raises BadInput if the motion does not fit the arm: columns, missing values, time, range, speed.
+    """
+    described, section = gcomp_arm(arm), arm.require_link()
+    t, target = _columns(path, [f"q_cmd_{i + 1}" for i in range(described.n)])
+    even: Array = np.arange(t[0], t[-1], 1.0 / section.rate)
+    rows: Array = np.column_stack([np.interp(even, t, column) for column in target.T])
+    for column, name, low, high, limits in zip(
+        rows.T, described.names, described.lower, described.upper, section.joints, strict=True
+    ):
+        if column.min() < low or column.max() > high:
+            raise BadInput(
+                f"{path}: {name} goes from {column.min():.3f} to {column.max():.3f} rad, beyond its range {low:.3f} to "
+                f"{high:.3f}: plan the motion for this arm: armlink gap plan {arm.argument} --out {path}"
+            )
+        fastest = float(np.abs(np.diff(column)).max()) * section.rate
+        if fastest > 1.05 * limits.max_velocity:  # for the rounding in a file
+            raise BadInput(
+                f"{path}: {name} turns at {fastest:.3f} rad/s, beyond its max_velocity {limits.max_velocity:.3f}: "
+                f"plan the motion for this arm: armlink gap plan {arm.argument} --out {path}"
+            )
+    return rows
+
+
+def _columns(path: Path, names: list[str]) -> tuple[Array, Array]:
+    """Times (K,) and columns (K, n), all finite, times increasing."""
+    try:
+        with memory_budget(path):
+            table = pa_csv.read_csv(path, pa_csv.ReadOptions(use_threads=THREADS))
+    except (pa.ArrowInvalid, OSError) as error:
+        raise BadInput(f"{path}: not a readable CSV file: {str(error).splitlines()[0]}") from None
+    missing = [name for name in ("t", *names) if name not in table.column_names]
+    if missing:
+        raise BadInput(f"{path}: no column {', '.join(missing)}: expected t and q_cmd_1 to {names[-1]}")
+    try:
+        columns = [table.column(name).cast(pa.float64()).to_numpy() for name in ("t", *names)]
+    except pa.ArrowInvalid as error:
+        raise BadInput(f"{path}: {str(error).splitlines()[0]}: expected numbers") from None
+    values = np.column_stack(columns)
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        raise BadInput(f"{path}: row {bad[0][0] + 1}: no value of {('t', *names)[bad[0][1]]}")
+    t = values[:, 0]
+    if len(t) < 2 or not (np.diff(t) > 0).all():
+        raise BadInput(f"{path}: column t does not increase from row to row: expected seconds, at least two rows")
+    return t, values[:, 1:]
+
+
+def collect(
+    link: ArmDriver, target: Array, out: str | Path, progress: Callable[[int, int], None] = lambda k, n: None
+) -> int:
+    """Move to the first target, follow all targets under position control, record each cycle; returns the row count.
+
+    The caller starts and enables the link, which stops the joints safely in every case. A kill loses at most the last
+    second of the recording. Raises BusFault, Refused.
+    """
+    section = link.arm.require_link()
+    speed = PACE * np.array([joint.max_velocity for joint in section.joints])
+    way = trajectory(link.position_sent, target[0], speed, np.full(link.n, ACCELERATION), link.period)
+    for _ in link.play(Setpoints.follow(way)):
+        pass
+    start: float | None = None
+    with RecordingWriter(out, link.names) as writer:
+        for k, sample in enumerate(link.play(Setpoints.follow(target))):
+            start = sample.t if start is None else start
+            channels = {
+                "position": sample.position,
+                "velocity": sample.velocity,
+                "torque": sample.torque,
+                "motor_torque": sample.motor_torque,
+                "torque_command": link.torque_sent,
+                "position_command": target[k],
+            }
+            writer.append(sample.t - start, channels)
+            progress(k + 1, len(target))
+    return len(target)

@@ -1,0 +1,140 @@
+"""Whether a gap is one that a sound arm may have: that of a model whose parameters are known as well as they can be.
+
+Gains, damping, friction, inertia, mass moments and the time of the command of the nominal model are off by a little
+each, with a known standard deviation. Their most probable values given the training recordings say what such errors
+make of the gap; what they leave, and how improbable they are, says whether there is more to it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from gcomp.arrays import Array
+from sim_gap.position_gap.fit import LoopFit, jacobian
+from sim_gap.position_gap.judge import rms_on
+from sim_gap.position_gap.parameters import step_parameter
+from sim_gap.position_gap.search import LoopSearch
+from sim_gap.position_gap.windows import Windows
+
+ERROR = 0.01
+"""Relative standard deviation of gains, damping, friction, inertia and mass moments: as much as is known of a good arm,
+and as much as two arms of one build differ."""
+FRICTION_NM, FRICTION_SHARE = 0.02, 0.15
+"""Standard deviation of Coulomb friction that models leave out, of bearings and seals [N·m]; at most this share of the
+joint's torque."""
+LATE_S, APART_S = 2e-3, 5e-4
+"""Standard deviations of the time at which commands take effect against that of their rows, at all joints alike and at
+each by itself [s]: clocks, cycles of bus and servo, filters of velocity."""
+PROBABLE = 0.99
+"""Share of sound arms whose errors are less improbable."""
+LEAST_SHOWN = 0.5
+"""Least share of its variance by which an error is judged by itself: what shows less takes on what others leave."""
+
+
+@dataclass(frozen=True, eq=False)
+class SoundGap:
+    """The gap of the nominal model beside what small errors of its parameters make, (J,) each [rad]."""
+
+    usual: Array
+    """RMS of the gap that errors of one standard deviation each make together."""
+    left: Array
+    """RMS that remains with the most probable errors, in training or held-out recordings, whichever is more margins."""
+    explained: bool
+    """Whether a sound arm may have these errors, and they leave nothing that matters."""
+
+
+def errors_of(search: LoopSearch) -> list[dict[str, float]]:
+    """Standard deviation of each parameter of a sound arm in its own coordinate, of joints and links."""
+    data, nominal, scales = search.data, search.nominal, search.scales
+    friction = np.minimum(FRICTION_NM, FRICTION_SHARE * scales.torque)
+    deviation = {
+        "viscous": ERROR * nominal["viscous"],
+        "coulomb": np.hypot(ERROR * nominal["coulomb"], friction),
+        "armature": ERROR * (nominal["armature"] + data.inertia.mean((0, 2))),
+        "delay": np.full(data.joints, np.hypot(LATE_S, APART_S)),
+    }
+    own = [
+        {"kp": ERROR, **{name: float(x[j] / scales.of(name)[j]) for name, x in deviation.items() if x[j] > 0.0}}
+        for j in range(data.joints)
+    ]
+    moments = ERROR * np.linalg.norm(data.arm.inertial[:, 1:4], axis=1)
+    links = {f"moment{link}.{axis}": float(moments[link]) for link in range(data.joints) for axis in "xyz"}
+    return [*own, {name: size for name, size in links.items() if name in data.columns}]
+
+
+def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
+    """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
+    sizes = errors_of(search)
+    deviations = np.array([size for each in sizes for size in each.values()])
+    errors, usual = np.zeros(deviations.size), np.zeros(search.data.joints)
+    usually = _correlation(sizes)
+    spread, prior = usually, np.linalg.inv(usually)
+    for step in range(3):
+        gaps, changes = _weighed(search, _fit(search, sizes, errors), sizes, deviations)
+        usual = usual if step else np.array([np.linalg.norm(x) for x in changes])
+        normal, right = prior.copy(), np.zeros(errors.size)
+        for gap, x, samples, least in zip(gaps, changes, search.samples, margin, strict=True):
+            normal += samples / least**2 * x @ x.T
+            right -= samples / least**2 * x @ (gap - errors @ x)
+        spread = np.asarray(np.linalg.inv(normal))
+        errors = spread @ right
+    found, other = _fit(search, sizes, errors), replace(search, data=heldout)
+    pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
+    small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
+    explained = all(small) and probable(errors, usually, spread)
+    return SoundGap(usual, np.maximum(pairs[0][0], pairs[1][0]) * margin, explained)
+
+
+def probable(errors: Array, usually: Array, spread: Array) -> bool:
+    """Whether sound arms have such most probable errors: all of them together, and the largest by itself.
+
+    `usually` is the covariance of errors, `spread` that of what the recordings leave open of them, (K, K).
+    """
+    shown = usually - spread
+    prior = np.linalg.inv(usually)
+    together = float(errors @ prior @ errors) < float(_rare(max(float(np.trace(prior @ shown)), 1.0)))
+    largest = (errors**2 / np.maximum(np.diag(shown), LEAST_SHOWN)).max()
+    return together and bool(largest < chi2.ppf(PROBABLE ** (1.0 / errors.size), 1))
+
+
+def _rare(count: Array | float) -> Array:
+    """Sum of the squares of so many standard normal values that is exceeded by chance in few cases."""
+    return np.asarray(chi2.ppf(PROBABLE, count))
+
+
+def _correlation(sizes: list[dict[str, float]]) -> Array:
+    """Correlation of the errors, (K, K): commands are late at all joints alike."""
+    late = np.array([name == "delay" for each in sizes for name in each], float)
+    share = LATE_S**2 / (LATE_S**2 + APART_S**2)
+    return np.asarray(np.diag(1.0 - share * late) + share * np.outer(late, late))
+
+
+def _fit(search: LoopSearch, sizes: list[dict[str, float]], errors: Array) -> LoopFit:
+    """The nominal model with errors, in standard deviations."""
+    point = {name: values.copy() for name, values in search.nominal.items()}
+    left = iter(errors)
+    for j, own in enumerate(sizes[:-1]):
+        for name, size in own.items():
+            point[name][j] = step_parameter(name, point[name][j], size * next(left), search.scales, j)
+    for name, size in sizes[-1].items():
+        point[name] = point[name] + size * next(left)
+    return LoopFit(point, ((),) * search.data.joints)
+
+
+def _weighed(
+    search: LoopSearch, fit: LoopFit, sizes: list[dict[str, float]], deviations: Array
+) -> tuple[list[Array], list[Array]]:
+    """Of each joint the gap of a fit (N,) and its change by one standard deviation of each parameter (K, N), such that
+    their norms are RMS values [rad]."""
+    data = search.data
+    now, slopes = jacobian(data, fit, search.scales, [tuple(own) for own in sizes[:-1]], tuple(sizes[-1]))
+    starts = np.concatenate([[0], np.cumsum([len(own) for own in sizes])])
+    gaps, changes = [], []
+    for j, slope in enumerate(slopes):
+        count = np.sqrt(max(float(data.weight[:, j].sum()), 1.0))
+        change = np.zeros((deviations.size, now[:, j].size))
+        change[[*range(starts[j], starts[j + 1]), *range(starts[-2], starts[-1])]] = slope.reshape(len(slope), -1)
+        gaps.append(now[:, j].ravel() / count)
+        changes.append(change * deviations[:, None] / count)
+    return gaps, changes

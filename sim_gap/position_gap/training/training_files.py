@@ -1,0 +1,117 @@
+"""Files for training: the corrected model, draws of its parameters, and actuator entries."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from armlink.content.atomic_file import write_whole
+from armlink.errors import BadInput
+from gcomp.arrays import Array
+from sim_gap.better_model.actuator_entries import Row, steps_of, write_entries
+from sim_gap.better_model.effects_module import module_path, module_text
+from sim_gap.better_model.samples import write_rows
+from sim_gap.better_model.urdf import URDF, urdf_of, xml_comment
+from sim_gap.model.load import urdf_behind
+from sim_gap.position_gap.identify import Identified
+from sim_gap.position_gap.search import effect_there
+from sim_gap.position_gap.training.draws import draw
+from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, export_fit, native_fit
+
+
+def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> None:
+    """Write draws of all fitted parameters, one row each, columns `JOINT.PARAMETER` in SI units. Raises BadInput."""
+    write_rows(draw(found.search, found.fit, found.spread, count, seed, found.band.reach), path)
+
+
+def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
+    """Write the corrected model as MJCF, or as URDF if the path ends so; a line per effect that it leaves out.
+
+    If it needs PID actuators, which MuJoCo Warp does not run, `NAME_batch.xml` beside it does without. If it leaves out
+    friction that a module can apply, `NAME_effects.py` is that module, for the model `NAME_effects.xml`. Those of an
+    earlier model are removed where there are none now. URDF has no actuators: theirs are the entries of
+    `--out-actuators`. Raises BadInput.
+    """
+    import mujoco
+
+    if found.export is None:
+        raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+    text, lines = found.export.xml, found.export.lines
+    if path.suffix == URDF:
+        text, told = urdf_of(mujoco.MjModel.from_xml_string(text), urdf_behind(found.sim.path), lines)
+        lines = tuple(told)
+    try:
+        write_whole(path, text)
+        for file, content in ({} if path.suffix == URDF else _beside(found, path)).items():
+            if content is None:
+                file.unlink(missing_ok=True)
+            else:
+                write_whole(file, content)
+    except OSError as error:
+        raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
+    return lines
+
+
+def _beside(found: Identified, path: Path) -> dict[Path, str | None]:
+    """Text of each file that may stand beside the corrected model; None for those that must not."""
+    model, module, other, made = module_model(path), module_path(path), export_batched(found), found.beside
+    out: dict[Path, str | None] = {batch_path(path): None if other is None else other.xml, model: None, module: None}
+    if made is not None:
+        told = [f"{effect} {joint}" for effect, joint, _ in made.effects]
+        out[model] = xml_comment([f"To be used with {module.name}, which applies:", *told]) + made.xml
+        out[module] = module_text(found.sim, made.effects, model.name)
+    return out
+
+
+def export_batched(found: Identified) -> Exported | None:
+    """The corrected model without PID actuators, fitted again without them; None if it has none."""
+    native = found.native
+    if not any(effect_there(native, effect, j) for effect in set(NATIVE) - BATCHED for j in range(found.sim.n)):
+        return None
+    bare = native_fit(found.search, native, BATCHED)
+    return export_fit(found.sim, found.search, found.fit, bare, BATCHED)
+
+
+def batch_path(path: Path) -> Path:
+    """File of the model without PID actuators beside that of the corrected model."""
+    return path.with_name(f"{path.stem}_batch{path.suffix}")
+
+
+def module_model(path: Path) -> Path:
+    """File of the model that the module beside the corrected model belongs to."""
+    return path.with_name(f"{path.stem}_effects.xml")
+
+
+ABOUT = "Friction of other kinds is taken into Coulomb and viscous friction; that joints creep under it is left out."
+
+
+def write_actuators(found: Identified, path: Path, step: float = 0.005) -> None:
+    """Write the entries for Isaac Lab and mjlab; delays are counted in `step` [s]. Raises BadInput."""
+    drawn = draw(found.search, found.fit, found.spread, 400, reach=found.band.reach)
+    rows = {name: _entry(found, j, step, drawn) for j, name in enumerate(found.sim.arm.names)}
+    left = found.export.lines if found.export is not None else ()
+    write_entries(rows, path, step, about=ABOUT, left=left)
+
+
+def _entry(found: Identified, j: int, step: float, drawn: Sequence[Mapping[str, float]]) -> Row:
+    """Values of one joint, as the fit of what a simulator holds has them; None for no limit."""
+    point = {name: float(values[j]) for name, values in found.native.point.items() if len(values) == found.sim.n}
+    limit = point["limit"] if np.isfinite(point["limit"]) else None
+    inside = min(point["kv"], point["viscous"])
+    return {
+        "stiffness": point["kp"] * point["gain"],
+        "damping": inside + point["back_emf"],
+        "armature": point["armature"],
+        "friction": point["coulomb"],
+        "viscous": point["viscous"] - inside,
+        "limit": limit,
+        **steps_of(_delays(found, j, drawn), step),
+    }
+
+
+def _delays(found: Identified, j: int, rows: Sequence[Mapping[str, float]]) -> Array:
+    """Ends of the range of a joint's delay [s], (2,): that of 90 % of its draws, about the exported model's."""
+    name = f"{found.sim.arm.names[j]}.delay"
+    drawn = [row[name] for row in rows if name in row]
+    about = np.quantile(drawn, (0.05, 0.95)) - found.fit.point["delay"][j] if drawn else np.zeros(2)
+    return np.asarray(found.native.point["delay"][j] + about)

@@ -1,0 +1,186 @@
+"""Results on standard output, hints on standard error, whole names at any width, prompts that stay readable."""
+
+import json
+import os
+import pty
+import re
+import shutil
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import pytest
+from wrong_arms import THREE, Wrong, model, record
+
+from armlink import cli
+from armlink.recording.files import save_recording
+
+ROOT = Path(__file__).parents[2]
+LONG = "j2s6s200_joint_"
+"""Begins the names of the joints here: only their last character differs."""
+ON_BUS = ["--bus", "armlink_sim:arm.yaml"]
+COMMANDS = {
+    "new": ["new", "arm.urdf", "--out", "made.yaml", "--force", "--stops", f"{LONG}4:-2.5:2.5"],
+    "doctor": ["doctor", "arm.yaml"],
+    "scan": ["scan", "arm.yaml", *ON_BUS],
+    "monitor": ["monitor", "arm.yaml", *ON_BUS, "--sync", "--cycles", "1"],
+    "check": ["check", "arm.yaml", *ON_BUS],
+    "sweep --plan": ["sweep", "arm.yaml", "--plan"],
+    "torque": ["torque", "arm.yaml", "--q", "poses.csv"],
+    "convert": ["convert", "run.csv", "run.mcap"],
+    "replay": ["replay", "arm.yaml", "run.csv"],
+    "drives": ["drives"],
+    "history": ["history", "arm.yaml", "--store", "records.db"],
+    "gap plan": ["gap", "plan", "arm.yaml", "--out", "motion.csv"],
+    "gap diagnose": ["gap", "diagnose", "--sim", "wrong.xml", "--train", "wrong.csv"],
+}
+WITHOUT_NAMES = {"doctor", "convert", "replay", "drives", "history"}
+NEXT = {"new", "doctor", "scan", "check", "sweep --plan", "history", "gap plan", "gap diagnose"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Models, an arm file and recordings whose joints have long names that end differently."""
+    made = tmp_path_factory.mktemp("output")
+    urdf = (ROOT / "tests" / "models" / "arm4.urdf").read_text()
+    (made / "arm.urdf").write_text(re.sub(r'"j([1-4])"', rf'"{LONG}\1"', urdf))
+    (made / "poses.csv").write_text("q_1,q_2,q_3,q_4\n0,0.5,0.5,0\n")
+    rows = (f"{k / 100},{k / 100},0,0,0,1,2,3,4\n" for k in range(50))
+    (made / "run.csv").write_text("t,q_1,q_2,q_3,q_4,tau_1,tau_2,tau_3,tau_4\n" + "".join(rows))
+    (made / "wrong.xml").write_text(THREE.replace("joint_", LONG))
+    wrong = record(model(), Wrong(coulomb=[0.6, 0.4, 0.02]), seconds=20, noise=0.02, channels=("tau_motor",))
+    save_recording(wrong, made / "wrong.csv")
+    here = Path.cwd()
+    os.chdir(made)
+    try:
+        command = ["new", "arm.urdf", "--out", "arm.yaml", "--stops", f"{LONG}4:-2.5:2.5"]
+        assert cli.run(command) == 0
+    finally:
+        os.chdir(here)
+    return made
+
+
+@pytest.fixture
+def run(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("XDG_STATE_HOME", str(folder / "state"))
+
+    def run(name, *options):
+        capsys.readouterr()
+        assert cli.run([*COMMANDS[name], *options]) == 0
+        return capsys.readouterr()
+
+    return run
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_results_are_on_standard_output_and_hints_on_standard_error(run, name):
+    said = run(name)
+    assert said.out.strip()
+    assert not re.search("[─━│]", said.err), "a table among the hints"
+    assert "next: " not in said.out
+    if name in NEXT:
+        assert said.err.splitlines()[-1].startswith("next: ")
+    if name not in WITHOUT_NAMES:
+        assert f"{LONG}2" in said.out
+    assert said.out.rstrip().splitlines()[-1][0].isalnum(), "ends with a verdict, not with a table"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_json_on_standard_output_is_alone_there(run, name):
+    said = run(name, "--json", "-")
+    assert json.loads(said.out) is not None
+    assert name == "torque" or said.err.strip()
+
+
+@pytest.mark.parametrize("name", ["scan", "monitor", "check", "sweep --plan", "torque", "gap diagnose"])
+def test_names_come_whole_on_a_narrow_terminal(run, monkeypatch, name):
+    monkeypatch.setenv("COLUMNS", "30")
+    said = run(name)
+    for number in (1, 2, 3):
+        assert f"{LONG}{number}" in said.out
+    assert not re.search(r"\w…", said.out), "cut"
+
+
+def test_a_pipe_is_as_wide_as_its_rows(run, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    rows = [line for line in run("monitor").out.splitlines() if LONG in line]
+    assert len(rows) == 4
+    assert all("operational" in row for row in rows)
+
+
+ASKS = """
+import time
+from armlink.commands.plain_console import PlainConsole, ask, results
+with PlainConsole().status("working") as status:
+    time.sleep(0.3)
+    results().print("found: one")
+    time.sleep(0.3)
+    answer = ask("Which one?")
+    time.sleep(0.3)
+results().print(f"verdict: {answer}")
+"""
+
+
+def on_terminal(command, question, answer, stdout=None, columns=60):
+    """What a command writes to a terminal: before its question is shown, while it waits, and after the answer."""
+    master, slave = pty.openpty()
+    termios.tcsetwinsize(slave, (40, columns))
+    environment = {key: value for key, value in os.environ.items() if key != "COLUMNS"} | {"TERM": "xterm"}
+    process = subprocess.Popen(command, stdin=slave, stdout=stdout or slave, stderr=slave, env=environment)
+    os.close(slave)
+    text = read_until(master, question)
+    time.sleep(0.6)
+    os.write(master, f"{answer}\n".encode())
+    waiting = read_until(master, answer)
+    rest = read_until(master, None)
+    os.close(master)
+    assert process.wait(timeout=60) == 0, text + waiting + rest
+    return text, waiting.partition(answer)[0], rest
+
+
+def read_until(master, words):
+    """Text from a terminal until it has these words; to its end if there are none."""
+    text = b""
+    while words is None or words not in text.decode(errors="replace"):
+        try:
+            piece = os.read(master, 4096)
+        except OSError:  # the other side has closed
+            break
+        if not piece:
+            break
+        text += piece
+    return text.decode(errors="replace")
+
+
+def test_a_prompt_is_not_overwritten_by_a_spinner():
+    before, waiting, after = on_terminal([sys.executable, "-c", ASKS], "Which one?", "both")
+    assert "working" in before
+    assert before.count("found: one") == 1
+    assert "\x1b" not in waiting, "nothing is drawn while the question waits"
+    assert "verdict: both" in after
+
+
+def test_a_question_leaves_standard_output_alone(tmp_path):
+    with (tmp_path / "out").open("w") as out:
+        on_terminal([sys.executable, "-c", ASKS], "Which one?", "both", stdout=out)
+    assert (tmp_path / "out").read_text() == "found: one\nverdict: both\n"
+
+
+def test_new_asks_on_a_terminal_for_what_the_model_does_not_state(folder, tmp_path):
+    shutil.copy(folder / "arm.urdf", tmp_path)
+    command = [
+        sys.executable,
+        "-m",
+        "armlink.cli",
+        "new",
+        str(tmp_path / "arm.urdf"),
+        "--out",
+        str(tmp_path / "a.yaml"),
+    ]
+    _, waiting, after = on_terminal(command, "or Enter", "-2.5 2.5", columns=100)
+    assert "\x1b" not in waiting
+    assert "-2.50 +2.50" in after
+    assert f"{LONG}4" in after

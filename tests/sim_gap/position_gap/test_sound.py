@@ -1,0 +1,67 @@
+import mujoco
+import numpy as np
+import pytest
+from servo_arm import model_text, record
+
+from sim_gap.model.load import load_model
+from sim_gap.position_gap.columns import with_columns
+from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
+from sim_gap.position_gap.fit import LoopFit, evaluate
+from sim_gap.position_gap.identify import _margin, noise_floor
+from sim_gap.position_gap.judge import rms_on
+from sim_gap.position_gap.search import LoopSearch
+from sim_gap.position_gap.sound_arm import probable, split_gap
+from sim_gap.position_gap.windows import windows_of
+
+NOMINAL = model_text(kp=40.0, friction=0.05)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model(mujoco.MjModel.from_xml_string(NOMINAL), (), 2)
+
+
+def split(model, real: str):
+    """The gap of the nominal model against an arm, split, with its margin and the RMS that it has [rad]."""
+    train, heldout = (with_columns(windows_of(model.arm, [record(real, seed, 26.0)], ["run"])) for seed in (1, 2))
+    nominal = nominal_point(train, nominal_controller(model))
+    search = LoopSearch(train, scales_of(train), nominal, noise_floor(train))
+    fit = evaluate(train, LoopFit(nominal, ((),) * 2))
+    margin = _margin(search, fit)
+    return split_gap(search, heldout, margin), margin, rms_on(train, fit)
+
+
+def test_errors_of_a_hundredth_are_those_of_a_sound_arm(model) -> None:
+    found, margin, gap = split(model, model_text(kp=40.4, friction=0.06, damping=0.808))
+    assert found.explained
+    assert (gap < 3.0 * np.maximum(found.usual, margin)).all()
+    assert (found.left < 1.3 * margin).all()
+
+
+def test_a_tilt_is_no_error_of_a_sound_arm(model) -> None:
+    """It acts where other poses feel gravity least, as no gain or mass does."""
+    found, margin, _ = split(model, NOMINAL.replace("<option", '<option gravity="2.43 0 -9.5"'))
+    assert not found.explained
+    assert (found.left > margin).any()
+
+
+def test_a_gain_that_is_far_off_is_no_error_of_a_sound_arm(model) -> None:
+    found, _, _ = split(model, model_text(kp=36.0, friction=0.05))
+    assert not found.explained
+
+
+def test_one_large_error_among_many_small_ones_is_no_error_of_a_sound_arm() -> None:
+    """Twenty errors together may have a sum of squares of 37; one by itself may be 3.5 standard deviations large."""
+    usually, spread = np.eye(20), 0.2 * np.eye(20)
+    small = np.linspace(-1.2, 1.2, 20)
+    assert probable(small, usually, spread)
+    assert probable(np.where(np.arange(20) == 3, 2.8, small), usually, spread)
+    assert not probable(np.where(np.arange(20) == 3, 4.0, 0.2 * small), usually, spread)
+
+
+def test_an_error_is_judged_by_as_much_of_it_as_recordings_show() -> None:
+    """Where 0.77 is usual 3 is much; what hardly shows is not judged so, since it takes on what others leave."""
+    errors = np.array([3.0, *np.zeros(19)])
+    assert probable(errors, np.eye(20), 0.1 * np.eye(20))
+    assert not probable(errors, np.eye(20), 0.4 * np.eye(20))
+    assert probable(0.5 * errors, np.eye(20), 0.9 * np.eye(20))
