@@ -38,7 +38,7 @@ def import_record(daemon: FastDaemon, days: int = 1, **values: float) -> Calibra
 @pytest.mark.parametrize(
     ("values", "gate", "said"),
     [
-        ({"gain": 1.95}, "CHANGE", r"joint_3: gain 1.9500 is +95.0% from record"),
+        ({"gain": 1.95}, "CHANGE", r"joint_3: gain 1.9500 differs by +95.0% from record"),
         ({"offset": OFFSET}, "OFFSET", f"joint_3: offset {OFFSET:.3f} N·m is beyond"),
         ({"gain": 1.95, "offset": OFFSET}, "OFFSET", f"joint_3: offset {OFFSET:.3f} N·m is beyond"),
     ],

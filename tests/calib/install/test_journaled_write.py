@@ -160,7 +160,7 @@ def test_a_change_beyond_covariance_and_history_is_refused_unless_the_sensor_was
     past = past_changes(store, ARM)
     check_change(record(joints=(joint("shoulder", 1.1 * 1.08), joint("elbow"))), record(), past, ARM)
     jump = record(joints=(joint("shoulder", 1.1 * 1.12), joint("elbow")))
-    with pytest.raises(Refused, match=r"shoulder: gain 1\.2320 is \+12\.0% from record"):
+    with pytest.raises(Refused, match=r"shoulder: gain 1\.2320 differs by \+12\.0% from record"):
         check_change(jump, record(), past, ARM)
     check_change(jump, record(), past, ARM, replaced=["shoulder"])
     with pytest.raises(Refused, match="of rated torque from record"):

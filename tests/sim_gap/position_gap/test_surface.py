@@ -147,6 +147,6 @@ def test_the_note_says_where_and_how_much() -> None:
     rows = (np.arange(10) < 2, np.arange(10) < 4, np.zeros(10, bool))
     sim = SimpleNamespace(arm=SimpleNamespace(names=("shoulder", "elbow")))
     (note,) = _touching(SimpleNamespace(surface=Surface(1, TIP, HEIGHT, (0, 1)), touched=rows, sim=sim))
-    assert "in 2 of 3 recordings: shoulder, elbow stop short" in note
+    assert "in 2 of 3 recordings the arm presses on something below it" in note
     assert "20 to 40 %" in note
     assert _touching(SimpleNamespace(surface=None)) == []

@@ -97,10 +97,14 @@ def a_drift_appears(page: Page, daemon: Simulated) -> None:
 
 
 def a_proposal_is_approved(page: Page, daemon: Simulated) -> None:
-    record = daemon.do(lambda bench: bench.view.proposals()[0].record)
-    page.click(".proposal button.main")
+    daemon.goes = False  # else a newer proposal takes its place before a busy machine's browser has decided
+    proposal = daemon.do(lambda bench: bench.view.proposals()[0])
+    record = proposal.record
+    page.click(f".proposal[data-proposal='{proposal.id}'] button.main")
     page.fill("#by", "ann")
-    page.click("#decision-yes")
+    with page.expect_response(lambda response: response.request.method == "POST"):
+        page.click("#decision-yes")
+    daemon.goes = True
     expect(page.locator("#decided-list li", has_text="shoulder").first).to_contain_text("applied")
     expect(page.locator("#decided-list li", has_text="shoulder").first).to_contain_text("ann (tcp 127.0.0.1)")
     expect(page.locator("#events li[data-kind=recalibration]").first).to_contain_text("shoulder")
