@@ -27,7 +27,7 @@ def test_sweep_to_apply(tmp_path: Path) -> None:
         armlink(tmp_path, "sweep", "pair.yaml", "--out", "loaded", "--reference-mass", str(MASS), *options)
         pipe.write_text("mass 0\n")
         words = ("calibrate", "unloaded", "loaded", "--apply", "--bus", BUS, "--store", "records.db")
-        found = armlink(tmp_path, *words)
+        found = armlink(tmp_path, *words, tries=5)
     assert found["applied"]
     truth = Truth.draw(load_arm(str(path)), SEED)
     gain, offset = (np.array(found[name]["estimated"]) for name in ("gain", "offset"))
