@@ -31,6 +31,8 @@ FASTEST = 0.8 + 1.0
 """Speed of parking, and what may come on top [rad/s]."""
 CAUGHT = 4.0
 """Where this machine was so busy that the drive missed its host for link.deadline: it let go, and was caught."""
+LATE = 0.05
+"""Steps of the simulated arm this far apart are those of a machine that is too busy for bounds of speed [s]."""
 JOB = """
 import sys
 import numpy as np
@@ -56,13 +58,15 @@ class Pendulum:
 
     def __init__(self, served: serving.Served, path: Path, bus: str) -> None:
         self.served, self.path, self.bus = served, path, bus
-        self.fastest, self.let_go = 0.0, False
+        self.fastest, self.let_go, self.looked = 0.0, False, time.monotonic()
         self.job: subprocess.Popen[str] | None = None
         after_each_step(served.arm.plant, self._look)
 
     def _look(self) -> None:
         self.fastest = max(self.fastest, abs(float(self.served.arm.plant.velocity[0])))
-        self.let_go = self.let_go or (not self.powered and abs(float(self.served.arm.plant.position[0])) > 0.2)
+        before, self.looked = self.looked, time.monotonic()
+        fell = not self.powered and abs(float(self.served.arm.plant.position[0])) > 0.2
+        self.let_go = self.let_go or fell or self.looked - before > LATE
 
     @property
     def powered(self) -> bool:
