@@ -41,8 +41,6 @@ MEMORY = 1.0
 heartbeat too, which they may miss for twice `link.deadline`."""
 BLAME_SHARE = 0.5
 """A host that was late by this share of `link.deadline` explains a watchdog that acts at the whole of it."""
-JUMP = 0.25
-"""A position this far from where its velocities lead has jumped [rad]: half of the following error that is refused."""
 BELIEVED_AGAIN = 0.1
 """A reading this near to where its joint was led last is believed again [rad]."""
 LEAD_SHARE = 0.05
@@ -126,6 +124,8 @@ class Commander:
             if order.refused:
                 refused = True
                 self._doubt(joint, order.refused, held)
+        if refused:
+            self._hold_the_others(seen, others)
         self._commanded, sent = modes, self.loop.synced
         if self.loop.just_woke:
             self._lead += LEAD_SHARE * (min(now - self.loop.woke, self.period / 4) - self._lead)
@@ -142,6 +142,14 @@ class Commander:
         if fault:
             raise fault
         return sample
+
+    def _hold_the_others(self, seen: list[Seen], others: list[Corroboration]) -> None:
+        """In the cycle of a refusal: joints under torque control whose drives let go are held where they stand. Their
+        torques suited the motion of the joint that brakes now, and would throw them."""
+        for joint, order in enumerate(self.passed):
+            drives, drive = self._drives[joint]
+            if order.mode in TORQUE_MODES and not order.refused and drives.traits(drive).silence != "holds":
+                self.passed[joint] = self._kept(joint, seen[joint], others[joint], None) or order
 
     def _integrate(self, modes: list[int], torques: list[float], seen: list[Seen]) -> None:
         """Feed-forward of joints whose drives have no integral term, in place of their target torque."""
@@ -239,7 +247,7 @@ class Commander:
 
     def _doubt(self, joint: int, why: str, held: Order) -> None:
         """A refusal: where no motion explains the reading, the joint is believed to be where it was led before."""
-        jumped = why == FOLLOWING and self.motion.unexplained[joint] > JUMP
+        jumped = why == FOLLOWING and self.motion.unexplained[joint] > self.limits[joint].following / 2
         if why == CONTRADICTION or jumped:
             self._believed.setdefault(joint, held.position if held.mode == POSITION else math.nan)
 

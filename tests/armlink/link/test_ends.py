@@ -11,9 +11,11 @@ import yaml
 from ends_bench import EXTRA_SPEED, FALLING, EndsBench
 
 from armlink.arm_file import bundled_arms, parse_arm
+from armlink.drives.orders import Mode, Power
 from armlink.errors import BadInput, BusFault, HostLate, Refused, Silence, Stall
 from armlink.link.ends import ENDS, EndCause, cause_of
 from armlink.link.guard import Crossed
+from armlink.link.types import Command
 from armlink.termination import Presses, said
 
 ERRORS = {
@@ -64,6 +66,31 @@ def test_a_command_that_the_gate_refuses_leaves_the_arm_held(name):
     assert not any(bench.powered)
     assert bench.away() < 0.1
     assert (bench.peak < 1.5 + EXTRA_SPEED).all(), bench.peak
+
+
+@pytest.mark.sample(2)
+@every_family
+def test_in_the_cycle_of_a_refusal_the_other_joints_under_torque_control_are_held(name, monkeypatch):
+    bench = EndsBench(name)
+    load = bench.sim.gravity_torque(bench.sim.plant.position[None])[0]
+    torque = Command(np.array([Mode.POSITION, *[Mode.TORQUE] * 5], np.int8), load, bench.link.position_sent)
+    for _ in range(5):
+        bench.link.cycle(torque)
+    sent, exchange = [], bench.link.commander.loop.exchange
+    monkeypatch.setattr(
+        bench.link.commander.loop,
+        "exchange",
+        lambda orders, *rest: (sent.append([*orders]), exchange(orders, *rest))[1],
+    )
+    with pytest.raises(Refused, match="shoulder: target torque is nan"):
+        bench.link.cycle(Command(torque.mode, np.array([0.0, np.nan, *load[2:]]), bench.link.position_sent))
+    assert sent[0][1].refused
+    here = bench.sim.plant.position
+    for joint in (0, 2, 3, 4, 5):
+        assert (sent[0][joint].mode, sent[0][joint].power) == (Mode.POSITION, Power.ON)
+        assert sent[0][joint].position == pytest.approx(here[joint], abs=0.02)
+    bench.leave(Refused(""))
+    assert bench.away() < 0.1
 
 
 @pytest.mark.sample(2)
