@@ -114,25 +114,35 @@ def end(link: Ended, cause: EndCause, tell: Tell) -> None:
 
 
 def _stow(link: Ended, tell: Tell) -> None:
-    """Catch what fell, park or let down, and take the power."""
-    why = "the arm file has no link.park"
-    if link.section.park is not None:
-        for _ in range(2):  # a joint that fell and was caught on the way has a new way from there
-            _catch(link)
-            try:
-                park(link, tell)
-                return
-            except Refused as blocked:
-                why = str(blocked)
-            except (Dropped, BusFault):
-                raise
-            except Exception as error:  # an error of this program's own is no reason to drop the arm
-                why = f"{type(error).__name__}: {error}"
-    _catch(link)
-    let_down(link, tell, why)
+    """Park or let down, and take the power."""
+    try:
+        why = _not_parked(link, tell)
+    except (Dropped, BusFault):
+        raise
+    except Exception as error:  # an error of this program's own is no reason to drop the arm
+        why = f"{type(error).__name__}: {error}"
+    if why:
+        _catch(link)
+        let_down(link, tell, why)
+
+
+def _not_parked(link: Ended, tell: Tell) -> str:
+    """Park; why that is not possible, empty where it was."""
+    if link.section.park is None:
+        return "the arm file has no link.park"
+    why = ""
+    for _ in range(2):  # a joint that fell and was caught on the way has a new way from there
+        _catch(link)
+        try:
+            park(link, tell)
+            return ""
+        except Refused as blocked:
+            why = str(blocked)
+    return why
 
 
 def _catch(link: Ended) -> None:
+    """Hold the joints, those included that were let go."""
     for _ in range(cycles(link, CATCH_SECONDS)):
         link.keep()
         if all(link.commander.held):
