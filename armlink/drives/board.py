@@ -78,17 +78,13 @@ class Board:
         self.slow_came = True
         self.on_slow(joint)
 
-    def taken(self) -> None:
-        """What drives that send by their own clock told is in a sample now, and in none after it."""
-        for joint, asked in enumerate(self.asked):
-            if not asked:
-                self.position[joint] = self.sensor[joint] = math.nan
-
-    def drop(self) -> None:
-        """Forget positions and sensor torques that were replies: what comes from now on belongs to the next sample."""
-        if all(self.asked):
+    def drop(self, asked: int = 1) -> None:
+        """Forget positions and sensor torques that were replies (1), since what comes from now on belongs to the next
+        sample; or those of drives that send by their own clock (0), since they are in a sample now."""
+        count = self.asked.count(asked)
+        if count == self.n:
             self.position, self.sensor = [math.nan] * self.n, [math.nan] * self.n
-            return
-        for joint, asked in enumerate(self.asked):
-            if asked:
-                self.position[joint] = self.sensor[joint] = math.nan
+        elif count:
+            for joint, each in enumerate(self.asked):
+                if each == asked:
+                    self.position[joint] = self.sensor[joint] = math.nan

@@ -395,7 +395,7 @@ class Loop:
         else:
             motor, velocity = self._nothing.copy(), self._nothing.copy()
         torque = values.torque(np.array(board.sensor), motor)
-        board.taken()
+        board.drop(asked=0)
         for joint in self._keep(position, self.latest_position):
             self.seen[joint] = now
             self._note_time(joint, board.owed[joint] + 1, self._collected)
