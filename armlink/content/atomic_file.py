@@ -15,6 +15,15 @@ NO_ROOM_BESIDE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
 """Why no file can be made in a folder in which one may be written: such a file is written in place."""
 
 
+def file_identity(path: Path) -> tuple[int, int] | None:
+    """Device and inode of the file of that name, by which one that has taken the name is told; None without one."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
 def part_of(path: Path) -> Path:
     """Path of the file while it is being written."""
     return path.with_name(path.name + ".part")

@@ -20,6 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
 from calib.daemon.environment import Immediate, RunAside
 from calib.daemon.state.history_reader import HistoryReader
@@ -209,7 +210,7 @@ class Journal:
                         f"BEGIN SELECT RAISE(ABORT, '{table} is append-only'); END"
                     )
             self._db.execute(f"PRAGMA user_version={SCHEMA}")
-        self._file = _identity(path)
+        self._file = file_identity(path)
         # [ms] for another program's lock; what cannot be kept now is kept later
         self._db.execute("PRAGMA busy_timeout=50")
         self._read_proposals()
@@ -335,7 +336,7 @@ class Journal:
 
     def _require_same_file(self) -> None:
         """Raise sqlite3.OperationalError where the file that is open has lost its name."""
-        if _identity(self.path) != self._file:
+        if file_identity(self.path) != self._file:
             self._replaced = True
             raise sqlite3.OperationalError(f"{self.path} was moved, or replaced by another file")
 
@@ -501,15 +502,6 @@ def _is_damage(error: Exception) -> bool:
     """Whether a file is none that SQLite can read; UnicodeDecodeError is of its message that quotes the file."""
     words = ("malformed", "not a database", "decode to UTF-8")
     return isinstance(error, UnicodeDecodeError) or any(each in str(error) for each in words)
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Device and inode of the file of that name; None where there is none."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino
 
 
 def _event(row: tuple[Any, ...]) -> EventRecord:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import uvicorn
 
+from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
 from calib.daemon.view.view import DaemonView
 from calib.daemon.web.admission import Admission
@@ -64,11 +65,11 @@ def unix_socket(path: Path) -> Iterator[sockets.socket]:
             path.chmod(SOCKET_MODE)
         except OSError as error:
             raise BadInput(f"--socket {path}: {error.strerror or error}") from None
-        identity = _identity(path)
+        identity = file_identity(path)
         try:
             yield sock
         finally:
-            if _identity(path) == identity:  # not that of another daemon which has replaced ours
+            if file_identity(path) == identity:  # not that of another daemon which has replaced ours
                 path.unlink()
 
 
@@ -108,14 +109,6 @@ def _allow_files() -> None:
     wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    try:
-        found = path.lstat()
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino
 
 
 class _ApiServer(uvicorn.Server):
