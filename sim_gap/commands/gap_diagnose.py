@@ -176,8 +176,9 @@ def _suggest(answer: "Diagnosis", sim: str, json: Path | None, out_model: Path |
 
     if answer.verdict == "ambiguous":
         arm = sim if sim in bundled_arms() or sim.endswith((".yaml", ".yml")) else "ARM.yaml"
-        written = "gap.json" if json is None or str(json) == "-" else json
-        suggest(command_line("gap", "plan", arm, answer=written, out="motion.csv"))
+        kept = json is not None and str(json) != "-"
+        plan = command_line("gap", "plan", arm, answer=json if kept else "gap.json", out="motion.csv")
+        suggest(plan if kept else f"the same command with --json gap.json, then {plan}")
     elif answer.verdict == "explained" and out_model is None:
         PlainConsole().print("next: the same command with --out-model corrected.xml writes the corrected model")
 
