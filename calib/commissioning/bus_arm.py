@@ -11,6 +11,9 @@ from armlink.drives.findings import FoundDrives
 from armlink.errors import BusFault
 from calib.commissioning.drive_match import Ask, Match, moved_node
 
+DEFAULT_VELOCITY = 0.5
+"""`max_velocity` where nothing says how fast the joint may be [rad/s]; a choice."""
+
 
 @dataclass(frozen=True)
 class BusArm:
@@ -89,6 +92,6 @@ def _joint(match: Match) -> dict[str, Any]:
         "rated_torque": float(f"{drive.rated_torque:g}"),
         "max_torque": float(f"{drive.max_torque:g}"),
         "max_torque_rate": float(f"{2.5 * drive.max_torque:.3g}"),
-        "max_velocity": 0.5,  # [rad/s]: nothing says how fast the joint may be; a choice
+        "max_velocity": DEFAULT_VELOCITY,
         "identity": {"vendor": drive.vendor, "product": drive.product},
     }

@@ -13,6 +13,8 @@ from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.errors import GcompError
 
+WIDTH_SHARES = (0.8, 0.65, 0.5, 0.4, 0.3, 0.22, 0.16)
+"""Widths of the range that are tried, as shares of the model's."""
 SKETCH, PROOF = 40, 400
 """Poses at which a range is looked at while choosing and in the end; half of them are corners."""
 
@@ -44,7 +46,7 @@ def find_clear_range(arm_file: ArmFile) -> ClearRange | None:
     generator = np.random.default_rng(0)
     centres = np.concatenate([[(arm.lower + arm.upper) / 2], generator.uniform(arm.lower, arm.upper, (80, arm.n))])
     centres = centres[geometry.free(centres)]
-    for share in (0.8, 0.65, 0.5, 0.4, 0.3, 0.22, 0.16):
+    for share in WIDTH_SHARES:
         boxes = [_box(arm, centre, share) for centre in centres]
         clear = [box for box in boxes if geometry.free(_poses(box, SKETCH, generator)).all()]
         for low, high in clear:

@@ -7,6 +7,12 @@ from armlink.drives.findings import FoundDrive, FoundDrives
 from armlink.errors import BadInput, BusFault
 from calib.commissioning.finding import SetupFinding
 
+LEAST_TURN = 0.1
+"""A joint counts as turned by hand from here on [rad]; a choice, far above the play of a gear."""
+LEAST_MOTION_RATIO = 3.0
+"""The turned joint's drive must read so many times the motion of any other; a choice."""
+SCALE_TOLERANCE = 0.1
+"""Share by which the angle between the stops may read differently: calibration corrects a few per cent; a choice."""
 POLARITY_REMEDY = "turn the direction round in the drive (its polarity), or the axis in the model"
 
 Ask = Callable[[str], None]
@@ -81,12 +87,12 @@ def _require(names: Sequence[str], found: Sequence[FoundDrive], bus: str) -> Non
 def moved_node(joint: str, turned: dict[int, float], bus: str) -> int:
     """The node that moved; raises BusFault where that is not clear."""
     order = sorted(turned, key=lambda node: -abs(turned[node]))
-    if abs(turned[order[0]]) < 0.1:  # [rad]: far above the play of a gear; a choice
+    if abs(turned[order[0]]) < LEAST_TURN:
         raise BusFault(
             f"{bus}: no drive read the motion of {joint}: release its brake and turn it further, or look for its"
             " drive on another bus"
         )
-    if len(order) > 1 and abs(turned[order[0]]) < 3.0 * abs(turned[order[1]]):  # a choice
+    if len(order) > 1 and abs(turned[order[0]]) < LEAST_MOTION_RATIO * abs(turned[order[1]]):
         raise BusFault(
             f"{bus}: nodes {order[0]} and {order[1]} both moved with {joint}: turn one joint at a time and hold the"
             " others"
@@ -101,7 +107,7 @@ def _judge(joint: TurnedJoint, node: int, turned: float) -> list[SetupFinding]:
     if ratio < 0:
         what = f"its position counts the other way: from lower to upper stop it read {turned:+.2f} rad"
         findings.append(SetupFinding("error", what, where, POLARITY_REMEDY))
-    if abs(abs(ratio) - 1) > 0.1:  # calibration corrects a few per cent; a choice
+    if abs(abs(ratio) - 1) > SCALE_TOLERANCE:
         what = f"from stop to stop it read {abs(turned):.2f} rad, the model has {expected:.2f} ({abs(ratio):.3g} times)"
         remedy = f"correct the drive's gear ratio by the factor {abs(ratio):.3g}, or the stops in the arm file"
         findings.append(SetupFinding("error", what, where, remedy))

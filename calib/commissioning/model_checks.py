@@ -11,6 +11,11 @@ from calib.commissioning.finding import SetupFinding
 from calib.plan.sweep_plan import DEAD_LEVER
 from gcomp.gravity.torque import gravity_levers
 
+SMALL_LEVER = 0.2
+"""Γ/g below which the torque gain becomes imprecise; a choice."""
+EARTH_GRAVITY = (9.7, 9.9)
+"""Lowest and highest acceleration of gravity that is usual on Earth [m/s²]."""
+
 
 def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     """Findings about kinematics and model; raises BadInput where the model cannot be used at all."""
@@ -59,7 +64,7 @@ def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
 def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     arm, where = gcomp_arm(arm_file), str(arm_file.path)
     size = float(np.linalg.norm(arm.gravity))
-    if not 9.7 < size < 9.9:  # on Earth
+    if not EARTH_GRAVITY[0] < size < EARTH_GRAVITY[1]:
         remedy = "give kinematics.gravity in m/s² in the base frame, such as [0, 0, -9.81]"
         yield SetupFinding("warning", f"gravity is {size:.3g} m/s², not 9.81", f"{where}: kinematics.gravity", remedy)
         if size < 1e-6:
@@ -77,7 +82,7 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
                 name,
                 "incline the base for the sweeps, or do without its gain",
             )
-        elif lever[joint] < 0.2:  # a choice
+        elif lever[joint] < SMALL_LEVER:
             yield SetupFinding(
                 "hint",
                 f"gravity loads it little (Γ/g at most {lever[joint]:.2f}): its torque gain will be imprecise",

@@ -22,6 +22,8 @@ from calib.plan.sweep_plan import plan_sweep
 from gcomp.arm.load import joint_inertias, place_chain
 from gcomp.gravity.torque import gravity_torque
 
+TORQUE_RESERVE = 1.2
+"""Torque that a drive should have over gravity, as a factor; a choice: friction and acceleration need the rest."""
 LEAST_DAMPING = 0.3
 """Damping ratio of a joint that its drive holds with stiffness and damping alone; below it swings after each move."""
 FASTEST_RATE = 20.0
@@ -75,7 +77,7 @@ def _strength(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
             what = f"by the model, gravity needs up to {need[joint]:.3g} N·m, but max_torque is {most:g}"
             remedy = "check the model's masses and max_torque: the arm would fall"
             yield SetupFinding("error", what, name, remedy)
-        elif 1.2 * need[joint] > most:  # friction and acceleration need the rest; a choice
+        elif TORQUE_RESERVE * need[joint] > most:
             what = f"by the model, gravity needs up to {need[joint]:.3g} N·m of max_torque {most:g}: little is left"
             yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
 

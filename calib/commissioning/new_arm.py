@@ -19,6 +19,9 @@ from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_ha
 from calib.commissioning.finding import SetupFinding
 from calib.commissioning.model_joints import model_joints
 
+RATING_FACTOR = 2.5
+"""A drive whose rated torque differs from the model's effort limit by more is doubted; a choice."""
+
 
 class Questions(Protocol):
     """Questions to a person at a terminal."""
@@ -125,7 +128,7 @@ def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -
         drive = match.drive
         ratio = drive.rated_torque / joint.rated_torque
         from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
-        if from_model and not 1 / 2.5 < ratio < 2.5:  # a choice
+        if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
             made.findings.append(_doubtful_rating(match, joint.rated_torque))
         joint.node, joint.rated_torque = drive.node, drive.rated_torque
         joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque

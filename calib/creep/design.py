@@ -11,6 +11,8 @@ from calib.creep.solve import invert
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 
+SCATTER_SHARE = 0.003
+"""Scatter of a row, as a share of rated torque, that the choice assumes."""
 BINS = 10
 """Rows per direction with which a candidate is judged."""
 
@@ -76,6 +78,6 @@ def _information(arm: Arm, x: Array, one: CreepCandidate, speed: float, mass: fl
         warmest=np.zeros(arm.n),
     )
     _, jacobian = CreepModel(arm, rows).linearised(x)
-    jacobian /= 0.003 * rated[one.joint]  # the scatter that the choice assumes
+    jacobian /= SCATTER_SHARE * rated[one.joint]
     information: Array = jacobian.T @ jacobian
     return information

@@ -23,11 +23,15 @@ from calib.sweep.dataset import SweepData, digests
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 
+SCATTER_ROUNDS = 4
+"""Times that the scatter of the readings is estimated again."""
 SEEN = 0.3
 """A parameter is found if the data leave so much of what was doubted beforehand, as a share of it."""
 LOOSEST = 0.02
 """Largest standard deviation of a gain that is of use, as a share of it."""
 QUANTILE = 1.96
+LEAST_COULOMB = 1e-3
+"""Least friction that scales its unevenness, as a share of rated torque."""
 ASSUMED = 4.0
 """Harmonics for which the doubt of the friction's unevenness counts, beside those that were measured."""
 
@@ -156,10 +160,10 @@ def _fit(
     coulomb, uneven = 0.02 * rated, np.full(HARMONICS, doubt.uneven)
     mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb, uneven)
     x = mean.copy() if start is None else start
-    for _ in range(4):  # each estimates the scatter of the readings again
+    for _ in range(SCATTER_ROUNDS):
         found = solve(model, scattered, mean, std, x)
         x = found.x
-        coulomb = np.maximum(np.abs(x[slices["coulomb"]]), 1e-3 * rated)  # the least that scales the unevenness
+        coulomb = np.maximum(np.abs(x[slices["coulomb"]]), LEAST_COULOMB * rated)
         uneven = _unevenness(found, std, coulomb, doubt)
         mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb, uneven)
         freedom = 1 - _determined_parameters(found, std) / len(rows)

@@ -29,10 +29,14 @@ MASS_SHARE = 0.3
 """Share of max_torque that the reference mass may take at the joint that it loads most."""
 BLIND_SHARE = 0.15
 """The same where no model file tells what the arm itself weighs."""
+WORST_CONSTANT = 1.6
+"""A drive may have to be asked for so many times the true torque."""
 TRAVEL_ACCELERATION = 1.5
 """Largest acceleration from one creep to the next [rad/s²]; a choice: the arm hangs in soft position loops."""
 HAND = 0.12
 """Distance of the mass from the flange that the plan allows for [m]."""
+TRAVEL_SECONDS = 6.0
+"""Rough time from one creep to the next [s]."""
 RAMP = 0.4
 """Time over which a creep reaches its speed, and comes to rest [s]."""
 SETTLE = 0.4
@@ -98,8 +102,7 @@ class CreepGround:
         at_origin, by_point = payload_columns(self.arm)
         each = gravity_regressor(self.arm, one.poses(6))
         torque = np.abs(each @ (self.beta + mass * at_origin)) + mass * HAND * np.linalg.norm(each @ by_point, axis=-1)
-        # a drive may have to be asked for so many times the true torque
-        return bool((1.6 * torque <= self.limits.max_torque).all())
+        return bool((WORST_CONSTANT * torque <= self.limits.max_torque).all())
 
 
 def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
@@ -161,7 +164,7 @@ def creep_seconds(plan: SweepPlan) -> float:
     for sweep in plan.sweeps:
         speed = creep_speed(sweep)
         way = (sweep.steps[-1] - sweep.steps[0]) * (1 + 1 / (len(sweep.steps) - 1)) + 2 * lead_way(speed)
-        total += 2 * way / speed + 6.0  # [s], roughly, from one creep to the next
+        total += 2 * way / speed + TRAVEL_SECONDS
     return total
 
 

@@ -23,6 +23,8 @@ from calib.records.records import (
 )
 from gcomp.arrays import Array, Mask
 
+MOST_ZERO_DOUBT = 0.9
+"""A zero counts as found if the data leave at most so much of its doubt, as a share."""
 Value: TypeAlias = Literal["gain", "offset", "position_offset", "coulomb", "load", "viscous"]
 FAMILY: dict[Parameter, str] = {"gain": "gain", "offset": "offset", "position_offset": "zero"}
 """Parameter of a record → family of the fit."""
@@ -50,7 +52,7 @@ def missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
     """(Joint, parameter) → why the data cannot determine it."""
     reasons: dict[tuple[str, Parameter], str] = {}
     found = {"gain": fit.found("gain"), "offset": fit.found("offset")}
-    zero = fit.std("zero") < 0.9 * fit.prior_std[fit.slices["zero"]]  # the data leave less than all of its doubt
+    zero = fit.std("zero") < MOST_ZERO_DOUBT * fit.prior_std[fit.slices["zero"]]
     loaded = bool((fit.rows.mass > 0).any())
     for joint, name in enumerate(fit.names):
         upright = is_vertical(fit.arm, joint)

@@ -14,6 +14,10 @@ from gcomp.arrays import Array
 
 LEAST_PERIODS = 2.0
 """Periods over the way of a sweep that a ripple has at least: slower ones could be gravity's."""
+OVERSAMPLING = 16
+"""Tried frequencies per reciprocal of the joint's way."""
+LEAST_BINS = 8
+"""Bins of a joint, over all its sweeps, in which a ripple is searched for."""
 CLEAR = 12.0
 """Least power of a line, in twice the variance that is left without it: chance gives it once in 160,000 frequencies."""
 
@@ -23,7 +27,7 @@ def ripple_cycles(rows: CreepRows, residual: Array, n: int) -> Array:
     cycles = np.zeros(n)
     for joint in range(n):
         own = np.flatnonzero(rows.joint == joint)
-        if own.size >= 16:  # eight bins both ways
+        if own.size >= 2 * LEAST_BINS:
             cycles[joint] = _clearest_cycles(rows, residual, joint, own)
     return cycles
 
@@ -38,8 +42,7 @@ def _clearest_cycles(rows: CreepRows, residual: Array, joint: int, own: NDArray[
     if not way:
         return 0.0
     lowest, highest = 2 * np.pi * LEAST_PERIODS / max(way), np.pi / float(np.median(spacing))
-    # frequencies per reciprocal of the joint's way
-    tried = np.arange(lowest, highest, 2 * np.pi / float(np.ptp(position)) / 16)
+    tried = np.arange(lowest, highest, 2 * np.pi / float(np.ptp(position)) / OVERSAMPLING)
     left = residual[own] - residual[own].mean()
     powers = np.array([_explained_power(left, position, each) for each in tried])
     best = int(np.argmax(powers)) if powers.size else 0

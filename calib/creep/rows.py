@@ -12,6 +12,15 @@ from calib.motion.static_reading import StaticReading, stack
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array, Mask
 
+LEAST_SAMPLES = 5
+"""Samples that a bin has at least."""
+STEADY = 0.02
+"""Largest difference of a bin's speed from the middle one of its creep, as a share: beyond, inertia takes torque."""
+ROUGH = 6.0
+"""Where the speeds of a creep scatter more: so many times the middle size of these differences."""
+LEAST_TEMPERATURE_SPREAD = 1.0
+"""Spread of the logged temperatures from which they, and not time, say how warm a drive is [K]."""
+
 
 def bin_readings(
     samples: Sequence[Sample], joint: int, side: int, middles: Array, temperature: Array | None = None
@@ -37,7 +46,7 @@ def _reading(
     position: Array, torque: Array, t: Array, inside: Array, middle: float, width: float, joint: int, side: int,
     temperature: Array | None,
 ) -> StaticReading | None:  # fmt: skip
-    if inside.sum() < 5:  # too few for a mean
+    if inside.sum() < LEAST_SAMPLES:
         return None
     q, v, when = position[inside], torque[inside], t[inside]
     weight = 1 + np.cos(2 * np.pi * (q[:, joint] - middle) / width)
@@ -59,12 +68,6 @@ def _reading(
         speed=abs(speed),
         temperature=temperature,
     )
-
-
-STEADY = 0.02
-"""Largest difference of a bin's speed from the middle one of its creep, as a share: beyond, inertia takes torque."""
-ROUGH = 6.0
-"""Where the speeds of a creep scatter more: so many times the middle size of these differences."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +160,7 @@ def _warmth(
     n = len(passes[0].manifest.names) if passes else 0
     temperature = np.array([each.temperature[j] for each, j in zip(readings, joint, strict=True)])
     known = bool(np.isfinite(temperature).all())
-    if known and np.ptp(temperature) >= 1.0:  # [K]
+    if known and np.ptp(temperature) >= LEAST_TEMPERATURE_SPREAD:
         warm = np.array([temperature[joint == j].max(initial=-np.inf) for j in range(n)])
         return temperature - warm[joint], np.where(np.isfinite(warm), warm, np.nan)
     span = max(float(np.ptp(t)), 1.0) if len(t) else 1.0

@@ -22,6 +22,13 @@ from calib.sweep.run import Progress, SweepPass, new_manifest, sparkline
 from calib.sweep.stalls import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
 
+REST_SECONDS = 0.5
+"""Rest before a creep [s]."""
+MOST_CONTACT_SHARE = 0.3
+"""Share of the sweeps that may end in a contact before the pass is given up."""
+CONTACT_TORQUE = 1.5
+"""Pull of a soft position loop that friction and gravity alone may ask for [N·m]."""
+
 
 def run_creep(
     link: ArmDriver,
@@ -142,12 +149,11 @@ class _CreepPass(SweepPass):
         n = self.mover.link.n
         follow = np.full(n, np.inf)
         stiffness = getattr(self.mover.link.arm.require_link().joints[joint].settings, "kp", None)
-        # a soft loop pulls by 1.5 N·m for friction and gravity alone
-        follow[joint] = max(self._creep.contact_lead, 1.5 / stiffness if stiffness else 0.0)
+        follow[joint] = max(self._creep.contact_lead, CONTACT_TORQUE / stiffness if stiffness else 0.0)
         return ReadingBounds(np.full(n, -np.inf), np.full(n, np.inf), follow)
 
     def _pause(self) -> None:
-        for _ in range(round(0.5 / self.mover.link.period)):
+        for _ in range(round(REST_SECONDS / self.mover.link.period)):
             self.mover.cycle()
 
     def _temperature(self) -> Array | None:
@@ -167,7 +173,7 @@ class _CreepPass(SweepPass):
         line = StallLine(t=mover.seen_at, late_ms=None, reading=sweep.name, reason=text, contact=True)
         self.writer.append(line)
         self.progress(len(self.made), len(self._plan.sweeps), 0.0, text)
-        if self._contacts > 0.3 * len(self._plan.sweeps):  # then the pass is given up
+        if self._contacts > MOST_CONTACT_SHARE * len(self._plan.sweeps):
             raise Refused(
                 f"{text}; {self._contacts} sweeps ended like this: clear the workspace, or narrow lower and upper"
             )

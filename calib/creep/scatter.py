@@ -16,8 +16,12 @@ from numpy.typing import NDArray
 from calib.creep.rows import CreepRows
 from gcomp.arrays import Array
 
+LEAST_STD_SHARE = 1e-4
+"""Least standard deviation of a row, as a share of rated torque: rounding of the sums that the readings are."""
 USUAL_BINS = 5
 """Bins that the usual scatter of a joint's sweeps counts for, beside those of a sweep itself."""
+MOST_INFLATION = 16.0
+"""Most that a variance is multiplied by; a choice, for sweeps of a dozen bins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +61,7 @@ def scatter(
     residual = residual / np.sqrt(max(freedom, 0.2))
     for joint in range(len(rated)):
         pairs = [_row_pairs(rows, joint, sweep) for sweep in np.unique(rows.sweep[rows.joint == joint])]
-        floor = (1e-4 * float(rated[joint])) ** 2 / 2  # rounding of the sums that the readings are
+        floor = (LEAST_STD_SHARE * float(rated[joint])) ** 2 / 2
         alike = _spread([(residual[up] + residual[down]) / 2 for up, down, _ in pairs], floor)
         opposite = _spread([(residual[up] - residual[down]) / 2 for up, down, _ in pairs], floor)
         if not apart:
@@ -110,4 +114,4 @@ def _inflation(series: list[Array]) -> float:
         if alike <= 1 / np.sqrt(count):  # no more than chance makes of independent bins
             break
         total += 2 * alike
-    return min(total, 16.0)  # a choice, for sweeps of a dozen bins
+    return min(total, MOST_INFLATION)

@@ -9,6 +9,11 @@ from calib.creep.model import CreepModel
 from calib.creep.scatter import Scatter
 from gcomp.arrays import Array
 
+MOST_STEPS = 60
+"""Gauss-Newton steps after which the search ends."""
+LEAST_IMPROVEMENT = 1e-9
+"""A step that improves the cost by a smaller share of it ends the search."""
+
 
 @dataclass(frozen=True, eq=False)
 class CreepSolution:
@@ -35,7 +40,7 @@ def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: A
         return float((scatter.whitened(reading - model.predict(at)) ** 2).sum() + (((at - mean) / std) ** 2).sum())
 
     now = cost(x)
-    for _ in range(60):
+    for _ in range(MOST_STEPS):
         predicted, jacobian = model.linearised(x)
         weighted = scatter.whitened(jacobian)
         information = weighted.T @ weighted + np.diag(1 / std**2)
@@ -49,7 +54,7 @@ def solve(model: CreepModel, scatter: Scatter, mean: Array, std: Array, start: A
                 x, now, damping = tried, value, max(damping / 5, 1e-9)
                 break
             damping *= 8
-        if before - now <= 1e-9 * now:  # too little to go on
+        if before - now <= LEAST_IMPROVEMENT * now:
             break
     predicted, jacobian = model.linearised(x)
     weighted = scatter.whitened(jacobian)

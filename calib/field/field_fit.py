@@ -26,6 +26,8 @@ OFFSET_STD = 0.005
 """Likewise of an offset, as a share of rated torque."""
 DRIFT = 0.05
 """Standard deviation allowed for the drift of a gain that these rows do not show, as a ratio."""
+GAUSS_NEWTON_STEPS = 4
+"""Each takes the noise scaled to the residuals' scatter."""
 PAYLOAD_EVIDENCE = 10.0
 """BIC difference up to which a payload that explains the rows worse than new gains and offsets is not excluded."""
 BLOCK = 24
@@ -80,7 +82,7 @@ def fit_field(
     belief = belief.over(rows, q)
     gain, sigma = belief.installed.gain, rows.sigma
     noise, prior = sigma, belief.prior(np.ones(n))
-    for _ in range(4):  # Gauss-Newton steps, each with the noise scaled to the residuals' scatter
+    for _ in range(GAUSS_NEWTON_STEPS):
         columns = field_columns(belief, rows, q, gain)
         solved = solve(columns, rows.torque, noise, prior)
         residual: Array = rows.torque - columns @ solved.value

@@ -21,6 +21,8 @@ from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.parameters import Parameters, Prior
 from gcomp.identify.sensor_model import predict
 
+MOST_EFFECTS = 6
+"""Largest number of effects added one after the other; a choice."""
 OUTLIER = 6.0
 """Robust standard deviations of the deleted residual from which a reading is an outlier (docs/theory.md, 5.4)."""
 MOST_OUTLIERS = 0.15
@@ -77,7 +79,7 @@ def examine(
         return refine(replace(rows, readings=kept), setting, fit, priors, extras)
 
     refined = fitted()
-    for _ in range(6):  # effects at most, one after the other
+    for _ in range(MOST_EFFECTS):
         strange = _outliers(kinematics, refined, rows, [extra for effect in effects for extra in effect.extras])
         if (strange != outliers).any():
             outliers = strange

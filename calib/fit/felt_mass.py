@@ -12,6 +12,8 @@ from gcomp.identify.readings import StaticReadings
 
 LEAST, MOST = 0.4, 2.5
 """A mass that is felt as this share of the stated one is another mass: no sensor gain is so far from 1."""
+MOST_SHARE_STD = 0.15
+"""A joint counts if it tells the share to this standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def felt_mass(arm: Arm, readings: StaticReadings) -> FeltMass | None:
         loaded = np.hstack([load * (rows @ at_origin[2 * joint :, None]), load * (rows @ by_point[2 * joint :])])
         columns = np.hstack([loaded * stated, rows, np.ones((len(rows), 1))])
         found = _first(columns, readings.torque[counts, joint], readings.sigma[counts, joint])
-        if found is not None and found[1] < 0.15:  # else the joint does not tell the share
+        if found is not None and found[1] < MOST_SHARE_STD:
             shares.append(abs(found[0]))
             spreads.append(found[1])
     if not shares:

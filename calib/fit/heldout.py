@@ -23,6 +23,8 @@ WORSE = 1.05
 """Ratio of held-out RMS, new over old, below which it is not worse."""
 FEWEST = 6
 """Readings of a joint below which this is not judged: the standard error would be meaningless."""
+REFIT_GAIN_STD = 0.2
+"""Prior standard deviation of gains in the refit: without a mass it fixes the scale, which no prediction depends on."""
 
 
 def worse_joint(new: Array, old: Array) -> tuple[int, float] | None:
@@ -54,8 +56,7 @@ def heldout_scores(
     doubt = record.discrepancy("level") * np.abs(record.values("gain", 1.0))
     rows = replace(rows, readings=replace(rows.readings, sigma=np.hypot(rows.readings.sigma, doubt)))
     start = sensor_parameters(record, **({} if beta is None else {"beta": beta}))
-    # loose: without a mass it fixes the scale, which no prediction depends on
-    priors = {"gain": Prior(start.gain, 0.2)} if refit else {}
+    priors = {"gain": Prior(start.gain, REFIT_GAIN_STD)} if refit else {}
     fold = _folds(rows)
     unknown = {"rho"} if any(rows.masses) else set[str]()
     unknown |= ({"gain", "offset"} if refit else set()) | ({"beta"} if beta is None else set())

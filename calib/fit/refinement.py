@@ -29,6 +29,8 @@ ROUGHLY, a choice."""
 LEAST_FACTOR = 0.5
 """Least scatter over the samples' noise; it only bounds the search. Less than 1 is by chance, but so is as much more:
 cut off at 1, the intervals of perfect arms were 5 % too wide."""
+GAUSS_NEWTON_STEPS = 4
+"""Each is followed by an update of the noise; the start is the global fit's minimum; a choice."""
 NEGLIGIBLE = 0.1
 """Share of a reading's noise below which rounding is neglected: it adds 0.5 % to the standard deviation."""
 FEWEST = 8.0
@@ -105,7 +107,7 @@ def refine(
     problem = _Problem(rows, setting, fit, priors, extras)
     vector, factor = fit.complete.vector.copy(), np.ones(kinematics.n)
     level = np.ones(len(FAMILIES))
-    for _ in range(4):  # Gauss-Newton steps, each followed by an update of the noise; a choice
+    for _ in range(GAUSS_NEWTON_STEPS):
         step = problem.step(vector, factor, level)
         level = step.levels.level
         vector[problem.free] += step.solution[: step.parameters]

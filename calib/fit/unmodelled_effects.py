@@ -18,8 +18,12 @@ CHANCE = 1e-7
 (docs/theory.md, section 5.4)."""
 MATERIAL = 0.0005
 """RMS of an effect, as a share of rated torque, below which it is not material (docs/theory.md, section 5.4)."""
+KNEE_SHARES = (0.6, 0.7, 0.8, 0.9, 0.95)
+"""Shares of the largest torque tried as the onset of saturation."""
 FEWEST = 6
 """Smallest number of a joint's readings for a search of effects; a choice."""
+LEAST_ECCENTRIC_RANGE = 2.0
+"""Range of a joint from which an error once a turn can be separated from a gain [rad] (docs/theory.md, section 5.2)."""
 OWN_DOUBT, HELD_DOUBT = 0.1, 0.75
 """Standard deviation of a sensor's lag, as a share of its size: along the joint's own sweep; while it holds, with the
 lag anywhere between both ends (0.58 if uniform). Held by the hysteresis case of tests/campaigns/hard_cases.py."""
@@ -107,7 +111,7 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
         )
         largest = float(np.abs(own[here]).max())
         yield _one(kinematics.n, joint, "torque.nonlinearity", here * own * np.abs(own) / max(largest, 1e-9))
-        for share in (0.6, 0.7, 0.8, 0.9, 0.95):  # of the largest torque: the onset of saturation
+        for share in KNEE_SHARES:
             bent = np.where(here, np.sign(own) * np.maximum(np.abs(own) - share * largest, 0.0), 0.0)
             if np.count_nonzero(bent) >= FEWEST // 2:
                 yield _one(
@@ -118,7 +122,7 @@ def _candidates(kinematics: Arm, rows: SweepReadings, refined: Refined) -> Itera
                     share * largest / max(abs(complete.gain[joint]), 1e-9),
                 )
         yield _one(kinematics.n, joint, "torque.drift", here * (rows.time - rows.time.mean()))
-        if float(np.ptp(angle[here])) > 2.0:  # [rad]: else it looks like a gain (docs/theory.md, section 5.2)
+        if float(np.ptp(angle[here])) > LEAST_ECCENTRIC_RANGE:
             turn = (slope[..., joint] * np.sin(angle)[:, None], slope[..., joint] * np.cos(angle)[:, None])
             extras = tuple(Extra(joint, "position.eccentricity", each) for each in turn)
             yield UnmodelledEffect(joint, "position.eccentricity", extras)

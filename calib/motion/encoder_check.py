@@ -13,11 +13,17 @@ FEWEST = 8
 """Distinct positions from which a bit can be judged."""
 CHANCE = 1e-4
 """Probability that a sound bit looks stuck by chance, above which nothing is said."""
+LEAST_SPAN = 1.5
+"""How many times a bit's own step the joint must have moved for it to be judged."""
 AWAY, OFTEN = 6.0, 0.15
 """Counts by which a reading may lie off where the joint was sent; share of readings that must lie a bit's step off."""
 DENSE, TURNS, MOTION = 0.45, 3, 24
 """Of a motion that tells all: the most that targets leave empty, as a share of the bit's weight; times round the
 circle; distinct readings."""
+JUMP_TOLERANCE = 0.2
+"""Share of a bit's weight that a jump may differ from it."""
+MOST_MISSING_SHARE = 0.02
+"""Share of a motion's cycles without timely readings above which nothing is said of its encoders."""
 
 
 def stuck_bits(position: Array, resolution: Array, target: Array) -> Iterator[tuple[int, int, float]]:
@@ -39,7 +45,7 @@ def stuck_bits(position: Array, resolution: Array, target: Array) -> Iterator[tu
 def bit_of(counts: float) -> int | None:
     """The bit whose weight a jump of this many counts is; None: of no bit. The joint may have turned a little."""
     bit = max(round(math.log2(max(counts, 1.0))), 1)
-    return bit if abs(counts / 2.0**bit - 1) < 0.2 else None  # of the bit's weight
+    return bit if abs(counts / 2.0**bit - 1) < JUMP_TOLERANCE else None
 
 
 def _by_target(counts: Array, asked: Array) -> int | None:
@@ -64,7 +70,7 @@ def missing_bit(counts: Array, asked: Array) -> int | None:
     if len(distinct) < FEWEST or len(wanted) < FEWEST:
         return None
     bit = 1
-    while 2**bit * 1.5 < np.ptp(distinct):  # the joint must have moved by more than the bit's step
+    while 2**bit * LEAST_SPAN < np.ptp(distinct):
         weight = 2.0**bit
         gap, points = _largest_gap(distinct, 2 * weight)
         expected, _ = _largest_gap(wanted, 2 * weight)
@@ -137,7 +143,7 @@ class EncoderCheck:
         seen (K, n) is what was read and path (K, n) where the `movable` joints were sent [rad]; `resolution` (n,) is
         the smallest change that was ever read, inf where none was: bits below it are never used.
         """
-        if np.isnan(seen).any(axis=1).mean() > 0.02:  # too many cycles without timely readings
+        if np.isnan(seen).any(axis=1).mean() > MOST_MISSING_SHARE:
             return
         step = np.where(np.isfinite(resolution), resolution, self._step)
         for joint in np.flatnonzero(movable):

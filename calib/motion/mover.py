@@ -38,8 +38,12 @@ BOUNCE = 0.05
 BOUNCE_SECONDS, BOUNCE_LOOK, BOUNCE_STILL = 2.0, 0.15, 0.003
 """Longest time that joints may take to stand on their stops [s]; how long one looks [s]; way in that time of one that
 stands [rad]."""
+PRESS_SECONDS = 0.3
+"""Time over which the torque of a joint at its stop rises to its bias."""
 COAST, COAST_LOOK, COAST_STILL = 5.0, 0.1, 0.002
 """Longest time that joints may take to stop [s]; how often one looks [s]; way in that time of one that stands [rad]."""
+CHECK_CYCLES = 5
+"""Cycles from one look at the settle rule to the next."""
 POSITION, TORQUE = 8, 10
 
 
@@ -203,7 +207,7 @@ class Mover:
         self.pressed = joints.copy()
         self._guard_stops(BOUNCE)
         self.command.mode[joints] = TORQUE
-        cycles = max(int(0.3 / self.link.period), 1)  # [s] in which the torque rises to its bias
+        cycles = max(int(PRESS_SECONDS / self.link.period), 1)
         start = np.where(joints, self._produced, 0.0)
         shares = np.linspace(1 / cycles, 1.0, cycles)[:, None]
         ramp = np.where(joints, start + shares * (bias - start), self.command.torque)
@@ -252,9 +256,7 @@ class Mover:
         while True:
             samples.append(self.cycle())
             count = len(samples)
-            if (
-                not self._lasted(samples, window) or (count - rule.window) % 5
-            ):  # the rule is looked at every fifth cycle
+            if not self._lasted(samples, window) or (count - rule.window) % CHECK_CYCLES:
                 continue
             if begin is None:
                 if self._lasted(samples, timeout):

@@ -6,6 +6,8 @@ from gcomp.arrays import Array
 
 ROUNDING = 0.06
 """Time over which steps in acceleration are spread [s]."""
+GOAL_TOLERANCE = 1e-12
+"""A joint so near its goal is there [rad]."""
 
 
 def trajectory(start: Array, goal: Array, speed: Array, acceleration: Array, period: float) -> Array:
@@ -15,7 +17,7 @@ def trajectory(start: Array, goal: Array, speed: Array, acceleration: Array, per
     is a trapezoid in speed, averaged over `ROUNDING`.
     """
     distance = np.abs(goal - start)
-    moving = distance > 1e-12  # the others are there already
+    moving = distance > GOAL_TOLERANCE
     if not moving.any():
         return np.empty((0, len(start)))
     top = float(np.min(speed[moving] / distance[moving]))  # of the path parameter s from 0 to 1 [1/s]

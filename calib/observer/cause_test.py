@@ -20,6 +20,8 @@ INEXACT = 0.02
 """Most that an effect's own shape may be off, as a share: it is as inexact as the gravity model's torque."""
 LEVEL_ROWS = 10
 """Rows that what was expected of the discrepancy's level counts for beside those it was fitted to."""
+MOST_GAIN_LIMIT = 1.0
+"""A gain whose limit is above this is not observed: gravity hardly loads the joint."""
 
 
 @dataclass(frozen=True)
@@ -320,5 +322,5 @@ def limits(test: CauseTest, config: ObserverConfig, wait: int) -> DetectionLimit
     count, n = test.window.position.shape
     longer = np.sqrt(config.longest_window / count)
     gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) / longer for cause in ("gain", "offset"))
-    gain[~(gain <= 1.0)] = np.nan  # gravity hardly loads the joint
+    gain[~(gain <= MOST_GAIN_LIMIT)] = np.nan
     return DetectionLimits(gain, offset, wait + config.longest_window + 2 * config.window)

@@ -44,8 +44,8 @@ class ObserverConfig:
     initial_offset_std: float = 0.05
     """Standard deviation of an offset just installed [N·m]: likewise."""
     outlier: float = 10.8
-    """A row is rejected by the filter if its squared innovation over the variance is larger: noise exceeds this χ² once
-    in 1000 (§6)."""
+    """A row is rejected by the filter if its squared innovation over the variance is larger: noise exceeds this χ²,
+    with 1 degree of freedom, once in 1000 (§6)."""
     outliers_in_a_row: int = 3
     """This many rejected rows in succession are an event, not outliers (§6)."""
     excitation_std: float = 3e-3
@@ -107,8 +107,8 @@ class ObserverConfig:
     significance: float = 5.0
     """A change is written only if it is this many standard deviations (§6)."""
     agreement: float = 13.8
-    """Two disjoint windows agree if the χ² of their difference (gain, offset) is smaller: noise exceeds it once in 1000
-    (§6)."""
+    """Two disjoint windows agree if the χ² of their difference (gain, offset) is smaller: noise exceeds it, with
+    2 degrees of freedom, once in 1000 (§6)."""
     lever_share: float = 0.3
     """A gain is written only if gravity's lever Γ on the joint reached this share of g in the window (§6)."""
     common_joints: int = 3

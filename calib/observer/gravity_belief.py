@@ -17,6 +17,8 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, as_array
 from gcomp.gravity.torque import gravity_regressor, gravity_stiffness
 
+LEVEL_FIT_ROWS = 120
+"""Most rows that the level is fitted to, evenly chosen: known to 7 % then, in 50 ms."""
 WANDER = 0.5
 """How far a zero may have moved with temperature since the reference, as a share of the discrepancy's level: a sensor
 of class 0.05 moves by 0.1 % of rated torque in 20 K, and an arm of such sensors has a discrepancy of 0.2 to 0.4 %."""
@@ -83,7 +85,8 @@ class GravityBelief:
         """beta (2n,) [kg·m], covariance (2n, 2n) [kg²·m²], with zero rows for what gravity does not determine.
 
         position_std [rad] is that of a position sensor's zero; without a level the model has no other errors. wander
-        (n,) [N·m]: most that zeros move with temperature (standard deviation).
+        (n,) [N·m]: most that zeros move with temperature (standard deviation). first_rows: rows of the
+        first epoch.
         """
         self.arm = arm
         self.beta: Array = np.array(beta, dtype=float)
@@ -183,8 +186,7 @@ class GravityBelief:
     def _fit_level(self, rows: Rows) -> None:
         if not self.level.before.any():
             return
-        # rows at most, evenly chosen: the level is known to 7 % then, in 50 ms
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(120, len(rows))).astype(int))]
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(LEVEL_FIT_ROWS, len(rows))).astype(int))]
         points, n = self.kernel.points(rows.position, rows.side), self.arm.n
         at_origin, by_point = payload_columns(self.arm)
         regressor = gravity_regressor(self.arm, rows.position)

@@ -12,6 +12,8 @@ GAIN_STD = 0.3
 """Standard deviation of an uncalibrated torque gain; tests/calib/drawn_arms.py draws 0.7 to 1.3."""
 MODEL_ERROR = 0.1
 """Standard deviation of a model file's mass moments, as a share of each; a choice."""
+BOUND_DEVIATIONS = 3.0
+"""Standard deviations of the rough model that its bounds include: 99.7 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +35,7 @@ class GravityGuess:
         """Bound of the model's error (…, n) [N·m] at poses q (…, n) [rad]."""
         regressor = gravity_regressor(self.kinematics, q)
         variance = np.einsum("...ip,pq,...iq->...i", regressor, self.covariance, regressor, optimize=True)
-        bound: Array = 3.0 * np.sqrt(np.maximum(variance, 0.0))  # 99.7 %
+        bound: Array = BOUND_DEVIATIONS * np.sqrt(np.maximum(variance, 0.0))
         return bound
 
     def inertia(self) -> Array:

@@ -13,6 +13,8 @@ from armlink.errors import BadInput
 from calib.records.schema import MIGRATIONS
 
 HEAD = MIGRATIONS[-1]
+BUSY_SECONDS = 10
+"""Wait for another writer of an SQLite store [s]."""
 _POSTGRESQL = {
     "connect_timeout": 5,
     "keepalives_idle": 5,
@@ -220,7 +222,7 @@ def _prepare_sqlite(engine: sa.Engine) -> None:
     @sa.event.listens_for(engine, "connect")
     def _on_connect(connection: Any, pooled: Any) -> None:
         connection.isolation_level = None  # pysqlite would begin by itself, and too late
-        connection.execute("PRAGMA busy_timeout=10000")  # [ms] for another writer
+        connection.execute(f"PRAGMA busy_timeout={BUSY_SECONDS * 1000}")
         _to_one_file(connection)
         for pragma in ("synchronous=FULL", "foreign_keys=ON"):
             connection.execute(f"PRAGMA {pragma}")

@@ -11,6 +11,9 @@ from pathlib import Path
 from armlink.bus.arm_hold import program_of
 from armlink.errors import BadInput
 
+RETRY_SECONDS = 0.05
+"""Time from one attempt to the next [s]."""
+
 
 def lock_file(descriptor: int, what: str, patience: float = 0.0) -> None:
     """Lock an open file until it is closed; raises BadInput, with who has it, where that takes longer than `patience`.
@@ -25,7 +28,7 @@ def lock_file(descriptor: int, what: str, patience: float = 0.0) -> None:
         except BlockingIOError:
             if time.monotonic() >= end:
                 raise BadInput(f"{what}: in use by {_holder(descriptor)}: stop that, or choose another") from None
-            time.sleep(0.05)
+            time.sleep(RETRY_SECONDS)
 
 
 @contextmanager

@@ -23,6 +23,10 @@ MISSING, LATE = 0.1, 0.5
 """Shares of readings from which on they are said to be missing, and to be late."""
 LOUD = 0.05
 """Noise of a torque sensor, as a share of rated torque, from which it is not fit for a calibration."""
+SATURATION_RATIO = 1.9
+"""Reading, in rated torques, at which a torque sensor is about to saturate."""
+STOP_SEARCH_DISTANCE = 0.08
+"""Distance from the arm file's stop from which a joint creeps [rad]."""
 HOT = 70.0
 """Temperature of a drive from which no sweep is begun: it would fall or rise while the sensors are read [°C]."""
 
@@ -60,7 +64,7 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     position = np.array([sample.position for sample in samples])
     _check_readings(link.names, before, link.stats, torque, position)
     for joint, name in enumerate(link.names):
-        if np.nanmax(np.abs(torque[:, joint])) > 1.9 * limits.rated[joint]:  # about to saturate
+        if np.nanmax(np.abs(torque[:, joint])) > SATURATION_RATIO * limits.rated[joint]:
             raise Refused(
                 f"{name}: its torque sensor reads {torque[-1, joint]:.3g} N·m at rest, near the end of its range:"
                 " unload the joint, or check the sensor"
@@ -126,7 +130,7 @@ def find_stops(
     for count, joint in enumerate(reversed(range(link.n))):
         for end, side in enumerate((-1, 1)):
             goal = middle.copy()
-            goal[joint] = mover.before_stop(joint, side, 0.08)  # from there it creeps
+            goal[joint] = mover.before_stop(joint, side, STOP_SEARCH_DISTANCE)
             try:
                 mover.travel(goal, 1.0)
                 push = np.zeros(link.n, dtype=np.int64)

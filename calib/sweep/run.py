@@ -24,6 +24,8 @@ from gcomp.arrays import Array
 
 APPROACH = 0.03
 """Each step is approached over at least this way [rad]."""
+STOP_DISTANCE = 0.02
+"""Distance from a stop at which creeping begins [rad]."""
 RETRIES = 3
 """How often a joint that slipped or stalled is tried again before the sweep gives up."""
 
@@ -210,7 +212,7 @@ class _StepPass(SweepPass):
         goal = np.array(sweep.rest)
         stops = np.array(sweep.stops, dtype=np.int64) * ~np.array(sweep.servo)
         for joint in np.flatnonzero(stops):
-            goal[joint] = mover.before_stop(int(joint), int(stops[joint]), 0.02)  # from there it creeps
+            goal[joint] = mover.before_stop(int(joint), int(stops[joint]), STOP_DISTANCE)
         goal[sweep.joint] = target - direction * APPROACH
         mover.travel(goal, self.acceleration)
         if stops.any():

@@ -12,6 +12,8 @@ from calib.motion.static_reading import StaticReading, stack
 from calib.plan.rough_gravity import GravityGuess, guess_gravity
 from calib.plan.types import SweepPlan
 
+SCOUT_ACCELERATION = 1.0
+"""Nothing is known of the arm's weight yet [rad/s²]."""
 SLOWER, SLOWEST = 0.4, 0.15
 """Factor on the acceleration after a joint did not follow, and where that ends [rad/s²]."""
 SCOUT = "scout"
@@ -24,8 +26,7 @@ def run_scout(mover: Mover, plan: SweepPlan, done: Collection[int], save: Callab
     """
     n = mover.link.n
     everything = np.ones(n, dtype=bool)
-    # [rad/s²]: nothing is known of the arm's weight yet
-    acceleration, last, unreached = 1.0, mover.position.copy(), list[Stalled]()
+    acceleration, last, unreached = SCOUT_ACCELERATION, mover.position.copy(), list[Stalled]()
     for index, pose in enumerate(plan.scout):
         if index in done:
             continue

@@ -17,6 +17,8 @@ from gcomp.identify.sensor_model import predict, predict_and_jacobian
 BLOCK_ROWS = 192
 """Rows per update. A factorisation this small stays in the cache and on one thread; from 384 rows LAPACK uses threads,
 which on a busy machine is ten to a hundred times slower."""
+MAX_ITERATIONS = 60
+"""Fits of sweeps take 3 or 4, hardly determined ones some 20."""
 SETTLED, STALLED, EXACT = 1e-7, 1e-5, 1e-16
 """Converged if a step can lower the cost by less than the first share of it (a hundredth of that with fixed weights, as
 convergence is then quadratic), or if no step lowers it and the gain expected is below the second share. The third is
@@ -130,7 +132,7 @@ def solve(problem: LeastSquaresProblem, first: Parameters) -> Outcome:
     vector, damping, converged = first.vector, 0.0, False
     weight = problem.weights(vector)
     cost = problem.cost(vector, weight)
-    for _ in range(60):  # fits of sweeps take 3 or 4, hardly determined ones some 20
+    for _ in range(MAX_ITERATIONS):
         if converged:
             break
         triangle, target = problem.factor(vector, weight)

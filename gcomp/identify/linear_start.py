@@ -16,6 +16,8 @@ SANE_GAIN_RATIO = 5.0
 """Factor to the start beyond which a gain counts as not determined by its readings (docs/theory.md, section 7.2)."""
 FACTORS = (1.0, 0.7, 1.4, 0.5, 2.0, -1.0, -0.7, -1.4, -0.5, -2.0)
 """Common factors tried for such gains: position errors make (L) shrink κ towards zero but keep sign and ratios."""
+SMALLEST_RATIO = 1e-2
+"""Share of its start below which the sign of a κ is not determined either."""
 
 
 def linear_start(
@@ -39,7 +41,7 @@ def linear_start(
         if not lost.any():
             break
         free_gain &= ~lost
-        signed = np.where(ratio < -1e-2, -1.0, 1.0)  # of a smaller one the sign is not determined either
+        signed = np.where(ratio < -SMALLEST_RATIO, -1.0, 1.0)
         tried = [_with_gain(start, np.where(lost, start.gain * signed * factor, start.gain)) for factor in FACTORS]
         costs = [_solve(arm, readings, each, free, free_gain, keep_ratios)[1] for each in tried]
         start = tried[int(np.argmin(costs))]

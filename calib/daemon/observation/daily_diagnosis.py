@@ -19,6 +19,8 @@ from calib.daemon.settings import Configuration, DiagnosisSettings
 from calib.daemon.state.busiest_minute import BusiestMinute
 from calib.daemon.state.event_log import EventLog
 
+MOST_RECORDINGS = 7
+"""Number of diagnosed recordings that are kept to look at: those of a week."""
 LONGEST = 1800.0
 """A diagnosis that takes longer is ended [s]."""
 TOLD, FOUND = "trend.json", "trend.new.json"
@@ -118,7 +120,7 @@ class DailyDiagnosis:
     def _start(self) -> None:
         now = self._environment.wall()
         (self._directory / UNFINISHED).replace(self._directory / f"{now:{STAMP}}.mcap")
-        for old in sorted(self._directory.glob("*.mcap"))[:-7]:  # a week of recordings is kept to look at
+        for old in sorted(self._directory.glob("*.mcap"))[:-MOST_RECORDINGS]:
             old.unlink(missing_ok=True)
         arm = self._configuration.arm.path
         model = arm.parent / self._settings.sim if self._settings.sim else arm

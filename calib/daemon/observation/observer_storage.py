@@ -13,6 +13,10 @@ HISTORY_SECONDS = 60.0
 """Time between points of history [s]; each event adds one too."""
 HISTORY_WHOLE = timedelta(days=30)
 """Points of history older than this are thinned."""
+THINNING_FACTOR = 10
+"""One of this many older points is kept."""
+THINNING_SECONDS = 86400.0
+"""Time between two thinnings [s]."""
 
 
 class ObserverStorage:
@@ -25,8 +29,8 @@ class ObserverStorage:
 
     def tick(self, feed: ObserverFeed | None) -> None:
         now = self._environment.monotonic()
-        if now - self._thinned_at >= 86400.0:  # once a day
-            self._journal.thin_history(self._environment.wall() - HISTORY_WHOLE, 10)  # of ten older points one is kept
+        if now - self._thinned_at >= THINNING_SECONDS:
+            self._journal.thin_history(self._environment.wall() - HISTORY_WHOLE, THINNING_FACTOR)
             self._thinned_at = now
         if feed is None or feed.observer.rows == self._rows or self._journal.waiting:
             return

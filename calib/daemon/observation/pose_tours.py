@@ -10,6 +10,8 @@ from calib.daemon.view.api_models import State
 
 TOUR_POSES = 60
 """As many as the observer's longest window (`ObserverConfig.longest_window`)."""
+TOUR_INTERVAL = 3600.0
+"""Time between two tours that the daemon decides on itself [s]."""
 
 
 class PoseTours:
@@ -41,7 +43,7 @@ class PoseTours:
     def wish(self, why: str) -> None:
         """Begin a tour if the configuration lets the daemon decide on one."""
         allowed = self._configuration.settings.sweep_when_undecided and not self._configuration.listen_only
-        if allowed and self._environment.monotonic() - self._last > 3600.0:  # [s] between two of its own
+        if allowed and self._environment.monotonic() - self._last > TOUR_INTERVAL:
             self.request(why)
 
     def tick(self) -> None:

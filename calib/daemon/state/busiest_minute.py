@@ -16,6 +16,10 @@ from calib.daemon.loop.loop_messages import Batch
 
 SECONDS = 60.0
 """Length of a minute; a pause in the samples ends it before [s]."""
+LONGEST_PAUSE = 1.0
+"""Longest pause in the samples within a minute [s]."""
+ROW_RATE = 250.0
+"""Rows are thinned to about this rate if the bus is faster [Hz]."""
 
 
 Rows = tuple[Array, dict[str, NDArray[np.float32]]]
@@ -48,7 +52,7 @@ class BusiestMinute:
 
     def __init__(self, rate: float) -> None:
         """For samples at `rate` [Hz]."""
-        self._stride = max(1, round(rate / 250.0))  # [Hz]: rows of a faster bus are thinned
+        self._stride = max(1, round(rate / ROW_RATE))
         self._parts: list[Rows] = []
         self._travel = 0.0
         self._at: Array | None = None
@@ -56,7 +60,7 @@ class BusiestMinute:
 
     def append(self, batch: Batch) -> None:
         t = batch.t[:: self._stride].copy()
-        if self._parts and not 0.0 <= t[0] - self._parts[-1][0][-1] <= 1.0:  # [s]: a longer pause ends the minute
+        if self._parts and not 0.0 <= t[0] - self._parts[-1][0][-1] <= LONGEST_PAUSE:
             self._end()
         self._parts.append((t, {name: x[:: self._stride].astype(np.float32) for name, x in batch.channels.items()}))
         at = batch.channels["position"][-1]

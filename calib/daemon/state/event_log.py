@@ -10,6 +10,10 @@ from calib.daemon.state.journal import Journal
 from calib.daemon.view.api_models import EventItem, EventRecord
 from calib.daemon.view.fan_out import Hub
 
+CLOCK_JUMP = 2.0
+"""The wall clock was set if between two ticks it moves by this much more or less than the monotonic clock [s]; what
+NTP slews in a second is below a millisecond."""
+
 log = logging.getLogger("armlink.daemon")
 
 
@@ -47,7 +51,7 @@ class EventLog:
         """Report that the wall clock, which dates the events, was set."""
         before, self._wall_ahead = self._wall_ahead, self.now().timestamp() - self._monotonic()
         jump = self._wall_ahead - before
-        if abs(jump) > 2.0:  # [s]: it was set; what NTP slews in a second is below a millisecond
+        if abs(jump) > CLOCK_JUMP:
             self.say("clock", None, f"the wall clock was set by {jump:+.1f} s", {"seconds": jump})
 
 

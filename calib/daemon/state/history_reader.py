@@ -13,6 +13,8 @@ HistoryRow = tuple[datetime, float, str | None, dict[str, Any]]
 """Time, monotonic time [s], record id, estimates of all joints."""
 PAGE = 100
 """Rows that are in memory at a time, and are made JSON of without letting other threads run."""
+LOCK_SECONDS = 2.0
+"""Wait for another program's lock [s]."""
 
 
 class HistoryReader:
@@ -42,7 +44,7 @@ class HistoryReader:
             yield [row for row in map(_row, self._rows(query, tuple(page))) if row is not None]
 
     def _rows(self, query: str, values: tuple[Any, ...]) -> list[tuple[Any, ...]]:
-        with closing(sqlite3.connect(self._url, uri=True, timeout=2.0)) as db:
+        with closing(sqlite3.connect(self._url, uri=True, timeout=LOCK_SECONDS)) as db:
             return db.execute(query, values).fetchall()
 
 

@@ -31,6 +31,10 @@ from calib.observer.decision import DriftFinding
 R = TypeVar("R")
 
 SCHEMA = 1
+LOCK_SECONDS = 0.05
+"""Wait for another program's lock [s]; what cannot be kept now is kept later."""
+OPEN_SECONDS = 10.0
+"""Likewise at the start [s]."""
 RETRY_SECONDS = 1.0
 """Time from a failure to the next attempt [s]."""
 SILENT_SECONDS = 2.0
@@ -43,6 +47,8 @@ LARGEST_ROW = 2**53 - 1
 """The largest whole number that JSON carries everywhere (RFC 8259, section 6)."""
 MOST_PROPOSALS = 1000
 """Proposals in memory, the newest; of an older one nothing can be decided any more."""
+CACHE_KB = 256
+"""SQLite's page cache: the default 2 MB fills over days, which looks like a memory leak."""
 AGED_EVENTS = 20_000
 """Events whose age is asked for: of a daemon that says 20 faults an hour, those of a month."""
 _TABLES = """
@@ -190,9 +196,8 @@ class Journal:
     def _open(self) -> None:
         path = self.path
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._db = sqlite3.connect(path, isolation_level=None, timeout=10.0, check_same_thread=False)
-        # the default cache of 2 MB fills over days, which looks like a memory leak
-        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "cache_size=-256"):
+        self._db = sqlite3.connect(path, isolation_level=None, timeout=OPEN_SECONDS, check_same_thread=False)
+        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"cache_size=-{CACHE_KB}"):
             self._db.execute(f"PRAGMA {pragma}")
         found = self._db.execute("PRAGMA quick_check(1)").fetchone()[0]
         if found != "ok":
@@ -211,8 +216,7 @@ class Journal:
                     )
             self._db.execute(f"PRAGMA user_version={SCHEMA}")
         self._file = file_identity(path)
-        # [ms] for another program's lock; what cannot be kept now is kept later
-        self._db.execute("PRAGMA busy_timeout=50")
+        self._db.execute(f"PRAGMA busy_timeout={int(LOCK_SECONDS * 1000)}")
         self._read_proposals()
         newest = "SELECT COALESCE(MAX(id), 0) FROM "
         event, proposal = (int(self._db.execute(newest + table).fetchone()[0]) for table in ("events", "proposals"))

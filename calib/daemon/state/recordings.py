@@ -10,6 +10,8 @@ from calib.daemon.loop.loop_messages import Batch
 from calib.daemon.settings import Configuration, RecordingSettings
 
 log = logging.getLogger("armlink.daemon")
+LONGEST_PAUSE = 1.0
+"""A pause in the samples longer than this begins a new file [s]."""
 RETRY_SECONDS = 60.0
 """After a failure nothing is written for this time [s]."""
 MOST_WAITING = 300
@@ -61,8 +63,7 @@ class Recordings:
         if batch.t[-1] - self._failed_at < RETRY_SECONDS:
             return
         try:
-            # a pause of more than 1 s begins a new file
-            if batch.t[0] - self._last > 1.0 or batch.t[0] < self._last or self._old(float(batch.t[0])):
+            if batch.t[0] - self._last > LONGEST_PAUSE or batch.t[0] < self._last or self._old(float(batch.t[0])):
                 self._rotate(float(batch.t[0]))
             self._write(batch)
         except OSError as error:

@@ -14,6 +14,8 @@ SHARES = np.array([0.4, 0.3, 0.2, 0.1])
 """Shares of the parts (`kernel.PARTS`, then the rough one) in the variance, before the first row."""
 SPREAD_SHARES = 0.7
 """Standard deviation of the logarithm of a part, beside that of the whole."""
+LEAST_SINGULAR_VALUE = 1e-6
+"""Singular value of columns of unit length below which one of them depends on the others."""
 STEPS, LONGEST = 6, 0.7
 """Steps of the search by Fisher scoring, and the longest one, in the logarithm of a standard deviation."""
 SPREAD_UNKNOWN, SPREAD_KNOWN = 1.2, 0.4
@@ -108,6 +110,6 @@ def _complement(columns: Array) -> tuple[Array, Array]:
     """
     size = np.linalg.norm(columns, axis=1, keepdims=True)
     vectors, lengths, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0))
-    rank = (lengths > 1e-6).sum(axis=1)  # of unit columns, below which one depends on the others
+    rank = (lengths > LEAST_SINGULAR_VALUE).sum(axis=1)
     told = np.arange(columns.shape[1]) >= rank[:, None]
     return vectors * told[:, None, :], told

@@ -31,6 +31,14 @@ ALIKE = 2.0
 is measured."""
 FITTED = 5
 """Rows of a joint that its own parameters take up."""
+NEIGHBOUR_DISTANCE = 0.2
+"""Rows of a joint are neighbours if it moved less between them [rad]."""
+LEARNING_ROUNDS = 3
+"""Linearisations of learning, each with the scatter found by the one before."""
+UNKNOWN_WARMTH_STD = 0.01
+"""Doubt of a gain where no temperature is known: a drive that warms by 10 K loses a hundredth."""
+KNOWN_WARMTH_STD = 5e-4
+"""Doubt of a gain where it is: drives tell whole kelvins."""
 
 
 class MotorBelief:
@@ -96,8 +104,7 @@ class MotorBelief:
         covariance = jacobian @ self.covariance @ jacobian.T
         covariance[np.diag_indices(len(rows))] += self.sigma[rows.joint] ** 2
         untold = np.array([np.isnan(each.temperature - self.reference_temperature[each.joint]) for each in passages])
-        # a drive that warms by 10 K loses a hundredth; drives tell whole kelvins
-        by_gain = jacobian[:, self._at["gain"]] * np.where(untold, 0.01, 5e-4)[:, None]
+        by_gain = jacobian[:, self._at["gain"]] * np.where(untold, UNKNOWN_WARMTH_STD, KNOWN_WARMTH_STD)[:, None]
         return rows.reading - predicted, jacobian, covariance + by_gain @ by_gain.T
 
     def learn(self, passages: Sequence[Passage]) -> Self:
@@ -108,7 +115,7 @@ class MotorBelief:
         rows = self.rows(belief.learnt)
         model = CreepModel(self.arm, rows)
         belief.mean = first_mean
-        for _ in range(3):  # linearisations, each with the scatter found by the one before
+        for _ in range(LEARNING_ROUNDS):
             predicted, jacobian = model.linearised(belief.mean)
             noise = belief.sigma[rows.joint] ** 2
             target = rows.reading - predicted + jacobian @ (belief.mean - first_mean)
@@ -129,7 +136,7 @@ class MotorBelief:
             own = np.flatnonzero(rows.joint == j)
             square = residual[own] ** 2
             variance = (square.sum() + USUAL_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + USUAL_ROWS)
-            near = np.abs(np.diff(rows.position[own, j])) < 0.2  # [rad]: neighbours
+            near = np.abs(np.diff(rows.position[own, j])) < NEIGHBOUR_DISTANCE
             common = float((residual[own][1:] * residual[own][:-1])[near].sum() / max(square[1:][near].sum(), 1e-12))
             found[j] = np.sqrt(variance * (1 + 2 * min(max(common, 0.0), 1.0)))
         return found

@@ -18,11 +18,15 @@ from calib.observer.motion.passages import Passage
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
 
+LEAST_ROWS = 6
+"""Rows of a joint from which a change of its drive can be told."""
 MISFIT = 8.0
 """χ² above its degrees of freedom, in standard deviations, from which nothing explains the rows: 120 rows then scatter
 by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is far beyond."""
 INEXACT = 0.03
 """Most that a change's own shape may be off, as a share."""
+PAYLOAD_ROUNDS = 2
+"""Further linearisations of a payload."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +146,7 @@ class ChangeTest:
         arm, values = self._belief.arm, np.zeros(4)
         per_unit = np.column_stack(payload_columns(arm))
         fit = self._least_squares(candidate, self._white, values)
-        for _ in range(2):  # further linearisations
+        for _ in range(PAYLOAD_ROUNDS):
             values = fit.values
             residual, jacobian, _ = self._belief.linearised(self._passages, per_unit @ values)
             columns = jacobian[:, family_slices(arm.n)["beta"]] @ per_unit
@@ -168,7 +172,7 @@ def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[Chan
     coulomb, load = belief.mean[at["coulomb"]], belief.mean[at["load"]]
     uneven = np.arange(at["uneven"].start, at["uneven"].stop).reshape(n, -1)
     for j in range(n):
-        if (joint == j).sum() < 6:  # too few rows to tell
+        if (joint == j).sum() < LEAST_ROWS:
             continue
         column = {name: jacobian[:, at[name].start + j] for name in ("gain", "offset", "coulomb", "load")}
         friction = coulomb[j] * column["coulomb"] + load[j] * column["load"]

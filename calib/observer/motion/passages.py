@@ -16,12 +16,16 @@ WIDTH = 0.1
 """A stretch is complete when some joint has moved this far [rad]: two or three periods of a motor's cogging."""
 LEAST_SECONDS, MOST_SECONDS = 0.2, 3.0
 """Shortest and longest stretch [s]: a slower joint creeps below the speeds at which its friction is known."""
+LEAST_SAMPLES = 8
+"""Samples that a stretch has at least."""
 SLOWEST = 0.03
 """Below this speed friction depends on the time at rest [rad/s]: such a joint gives no row."""
 STEADY = 0.15
 """Largest acceleration in a stretch [rad/s²]: 1 kg·m² then takes 0.15 N·m."""
 TURNED = 0.03
 """After a reversal friction has turned round once the joint has moved so far [rad]."""
+LONGEST_GAP = 0.05
+"""A stretch with samples missing for longer starts again [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +76,7 @@ class PassageDetector:
         if not (np.isfinite(position).all() and np.isfinite(torque).all()):
             self._samples.clear()
             return []
-        if self._samples and not 0 < t - self._samples[-1][0] <= 0.05:  # samples are missing
+        if self._samples and not 0 < t - self._samples[-1][0] <= LONGEST_GAP:
             self._samples.clear()
         self._samples.append((t, position.copy(), torque.copy()))
         first = self._samples[0]
@@ -86,7 +90,7 @@ class PassageDetector:
 
     def _rows(self, temperature: Array) -> list[Passage]:
         times, positions, torques = (np.array(column) for column in zip(*self._samples, strict=True))
-        if len(times) < 8:
+        if len(times) < LEAST_SAMPLES:
             return []
         half = len(times) // 2
         early, late = _speed(times[: half + 1], positions[: half + 1]), _speed(times[half:], positions[half:])
