@@ -36,6 +36,10 @@ ACCELERATION = 1.0
 """Largest acceleration [rad/s²], for drives with little torque in excess of gravity."""
 LONGEST = 25.0
 """Longest time for one pass through the range [s]: at creeping speed only a part of it is covered."""
+REST_S = 1.0
+"""Rest between moves [s]."""
+SPEED_TOLERANCE = 1.05
+"""Factor by which the speed between two rows may exceed max_velocity, for the rounding in a file."""
 TONES, BAND = 4, (0.08, 0.6)
 """Number of sines per joint in the motion of all joints, and their frequency band [Hz]."""
 
@@ -94,7 +98,7 @@ class _Shape:
     def go(self, goal: Array, speed: Array) -> None:
         """Move to a pose (n,) [rad], all joints arriving together, and rest there."""
         way = trajectory(self.here, goal, speed, np.full(len(goal), ACCELERATION), 1 / self.rate)
-        self.rows += [way, np.repeat(goal[None], round(1.0 * self.rate), axis=0)]
+        self.rows += [way, np.repeat(goal[None], round(REST_S * self.rate), axis=0)]
         self.here = goal
 
     def turn(self, joint: int, pose: Array) -> None:
@@ -178,7 +182,7 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
                 f"{high:.3f}: plan the motion for this arm: armlink gap plan {arm.argument} --out {path}"
             )
         fastest = float(np.abs(np.diff(column)).max()) * section.rate
-        if fastest > 1.05 * limits.max_velocity:  # for the rounding in a file
+        if fastest > SPEED_TOLERANCE * limits.max_velocity:
             raise BadInput(
                 f"{path}: {name} turns at {fastest:.3f} rad/s, beyond its max_velocity {limits.max_velocity:.3f}: "
                 f"plan the motion for this arm: armlink gap plan {arm.argument} --out {path}"

@@ -17,6 +17,11 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 
 from armlink.errors import ArmlinkError, BadInput, BusFault
 
+CONNECT_SECONDS = 10.0
+"""Longest wait for a scheduler to answer [s]."""
+WORKER_DEATHS = 3
+"""A case at which this number of workers died is given up."""
+
 
 def open_to_all(scheduler: str | None) -> str:
     """A warning of a scheduler whose address is not one of TLS; empty for others."""
@@ -38,10 +43,10 @@ def cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
     from distributed.security import Security
 
     logging.getLogger("distributed").setLevel(logging.ERROR)
-    dask.config.set({"distributed.scheduler.allowed-failures": 3})  # then a case is given up
+    dask.config.set({"distributed.scheduler.allowed-failures": WORKER_DEATHS})
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout=10.0)
+            client = Client(scheduler, timeout=CONNECT_SECONDS)
         except (OSError, ValueError) as error:
             raise BusFault(f"no dask scheduler at {scheduler}: {error}: start one, or omit --scheduler") from None
         with client:

@@ -15,6 +15,9 @@ from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.model_selection import golden_section
 from sim_gap.search.term import Term
 
+STARTING_ANGLES = 12
+"""Number of mounting angles, evenly over a turn, that are tried first."""
+
 
 def groups_of(given: Sequence[str], labels: Sequence[str]) -> list[tuple[str, ...]]:
     """Names of the groups that each recording belongs to, from `NAME=REC[,REC…]` and the recordings' labels (paths).
@@ -102,8 +105,8 @@ def _mounted(estimate: EffectEstimate, s: PreparedSignals, layout: ChannelLayout
     def left(angle: float) -> float:
         return _left(estimate, ResidualSet((replace(s, mount=angle),), layout))
 
-    step = 2.0 * np.pi / 12
-    start = min((step * k for k in range(12)), key=left)
+    step = 2.0 * np.pi / STARTING_ANGLES
+    start = min((step * k for k in range(STARTING_ANGLES)), key=left)
     angle = golden_section(left, start - step, start + step)
     angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
     return left(angle), replace(s, mount=angle)

@@ -24,6 +24,8 @@ LAGS = 3
 """Number of samples by which the command may follow the velocity, from 0."""
 VISCOUS = 3 * LAGS
 """First column of the viscous law."""
+SMOOTHING_SAMPLES = 21
+"""Samples over which the velocity is smoothed."""
 SPEEDS = tuple(0.0025 * 2.0 ** (k / 2) for k in range(15))
 """Speeds at which the compensation has half of its torque [rad/s]."""
 FEWEST, FEWEST_MOVING = 200, 50
@@ -95,7 +97,7 @@ def _law(command: Array, velocity: Array, position: Array) -> tuple[float, float
     if len(command) < FEWEST:
         return None
     best: tuple[float, float, float] | None = None
-    smooth = np.asarray(savgol_filter(velocity, 21, 2, mode="nearest"))
+    smooth = np.asarray(savgol_filter(velocity, SMOOTHING_SAMPLES, 2, mode="nearest"))
     bent = _bent(command)[LAGS - 1 :]
     there = np.flatnonzero(np.isfinite(bent))
     there = there[:: len(there) // 10_000 + 1]  # so many samples are looked at

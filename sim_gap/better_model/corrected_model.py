@@ -18,6 +18,9 @@ from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.estimate_signals import inertial_change
 from sim_gap.search.term import Term
 
+LEAST_SECOND_MOMENT = 1e-6
+"""Least second moment of mass along a principal axis [kg·m²]."""
+
 
 @dataclass(frozen=True)
 class CoupledMotor:
@@ -274,7 +277,7 @@ def _joint(model: Any, joint: int, effect: str, c: Array, added: bool) -> None:
 
 def closest_possible(principal: Array) -> Array:
     """The closest physical principal moments of inertia (none exceeds the sum of the other two), (3,)."""
-    spread = np.maximum(0.5 * principal.sum() - principal, 1e-6)  # kg·m²
+    spread = np.maximum(0.5 * principal.sum() - principal, LEAST_SECOND_MOMENT)
     return np.asarray(spread.sum() - spread)
 
 

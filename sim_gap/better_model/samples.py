@@ -13,6 +13,8 @@ from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
 SUFFIXES = (".csv", ".json", ".parquet")
+LEAST_DRAW_SHARE = 0.01
+"""A draw of a parameter that must be above zero is at least this share of its estimate."""
 
 
 def drawn_parameters(
@@ -47,7 +49,7 @@ def _accepted(effect: str, name: str, value: float, best: float) -> float:
         return value
     least, above = one.domain.least, one.domain.above
     value = value if least is None else max(value, least)
-    return value if above is None else max(value, above + 0.01 * (best - above))
+    return value if above is None else max(value, above + LEAST_DRAW_SHARE * (best - above))
 
 
 def write_rows(rows: Sequence[Mapping[str, float]], path: Path) -> None:

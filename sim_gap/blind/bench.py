@@ -77,6 +77,8 @@ def _hashes(folder: Path) -> dict[str, str]:
     }
 
 
+SERVO_LENGTHS_S = 36.0, 18.0
+"""Training and held-out recordings of arms with servos [s]."""
 MAKER, SERVO_MAKER = "sim_gap.blind.cases", "sim_gap.blind.servo_cases"
 """Modules that make the cases, of arms with torque channels and of arms with servos."""
 MOST_EFFECTS = 10
@@ -110,7 +112,7 @@ def run_bench(
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):
         raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
-    lengths = lengths or ((36.0, 18.0) if positions else (TRAIN_S, HELDOUT_S))
+    lengths = lengths or (SERVO_LENGTHS_S if positions else (TRAIN_S, HELDOUT_S))
     started = time.monotonic()
     progress("making cases", 0, cases)
     maker = SERVO_MAKER if positions else MAKER

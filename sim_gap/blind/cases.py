@@ -19,6 +19,10 @@ from sim_gap.blind.plant.sensors import columns_at, record
 from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, label, recipes
 from sim_gap.blind.true_arm import Log
 
+BAND_HZ = 6.0
+"""Band in which a gap counts [Hz]."""
+REVERSAL_SPEED = 0.02
+"""Speed over which nominal friction changes sign [rad/s]."""
 VISIBLE_RATIO, VISIBLE_LEAST = 3.0, 0.08
 """Least factor on some held-out gap, and least increase of it [N·m], by a visible effect."""
 MOVING = 0.03
@@ -31,13 +35,13 @@ def gap(arm: BenchArm, columns: dict[str, Array]) -> dict[str, list[float]]:
 
     t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RATE)
     even = {k: columns_at(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
-    low = butter(4, 6.0, fs=RATE, output="sos")
+    low = butter(4, BAND_HZ, fs=RATE, output="sos")
     q = sosfiltfilt(butter(4, 15.0, fs=RATE, output="sos"), even["q"], axis=0)
     v = np.gradient(q, 1.0 / RATE, axis=0)
     a = np.gradient(v, 1.0 / RATE, axis=0)
     motor = inverse(compile_arm(arm), q, v, a)
     link = motor - arm.armature * a
-    motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / 0.02)  # rad/s
+    motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / REVERSAL_SPEED)
     out = {}
     for channel, model in (("tau", link), ("tau_motor", motor), ("tau_cmd", motor)):
         rest = sosfiltfilt(low, even[channel] - model, axis=0)[100:-100]

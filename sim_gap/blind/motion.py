@@ -9,6 +9,8 @@ from gcomp.arrays import Array
 RATE = 500.0
 """Rate of the commanded trajectories [Hz]."""
 KINDS = ("sines", "points", "sweeps")
+LONGEST_CHIRP_S = 12.0
+"""Longest chirp [s]; it takes at most a fifth of the motion."""
 SLOWEST, LONGEST_REST_S, NEAREST = 0.4, 0.9, 0.01
 """Moves from point to point: least share of the limits, longest rest between them [s], least distance [rad]."""
 
@@ -37,7 +39,7 @@ def trajectory(kinds: tuple[str, ...], duration: float, limits: MotionLimits, ra
     """Positions (K, n) [rad] at `RATE` over `duration` seconds, equal parts of each kind, at rest at both ends."""
     makers = {"sines": _sines, "points": _points, "sweeps": _sweeps, "chirp": _chirp}
     rows = round(duration * RATE)
-    chirp = round(min(12.0, 0.2 * duration) * RATE) if "chirp" in kinds else 0
+    chirp = round(min(LONGEST_CHIRP_S, 0.2 * duration) * RATE) if "chirp" in kinds else 0
     slow = [kind for kind in kinds if kind != "chirp"]
     ends = np.linspace(0, rows - chirp, len(slow) + 1).astype(int)
     lengths = [*np.diff(ends).tolist(), *([chirp] * bool(chirp))]

@@ -26,6 +26,8 @@ UNKNOWN_SHARE = 0.3
 """Share of cases whose model has no controller."""
 VISIBLE_COUNTS = 2.0
 """Least increase of a joint's gap by an effect that shows, in counts of the encoder."""
+SETTLING_S = 1.0
+"""Time at the start of a run that is not judged [s]."""
 FOLLOWED = 0.6
 """Largest deviation from the command of an arm under control [rad]."""
 
@@ -168,7 +170,7 @@ def recorded(run: ServoRun, log: Log, hz: float, random: np.random.Generator) ->
 
 def judge_drawing(drawing: ServoDrawing, logs: Sequence[Log]) -> tuple[dict[str, Any], bool]:
     """Gap against the nominal model with and without the effect [rad], and whether the case is good."""
-    rows = slice(round(1.0 * RATE), None)
+    rows = slice(round(SETTLING_S * RATE), None)
     real, without, ideal = (log.position[rows] for log in logs)
     gaps = [{"q": np.sqrt(np.mean((each - ideal) ** 2, axis=0)).tolist()} for each in (real, without)]
     steady = all(_steady(run, log) for run, log in zip(drawing.runs[1:], logs, strict=True))

@@ -32,6 +32,8 @@ LEAST_WAY = 1.5
 """Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
 LEAST_RANGE = 0.1
 """Range from which a joint moves [rad]."""
+WAY_STEP_S = 0.1
+"""Time between the positions whose distances make up the way [s]: noise of closer ones would."""
 
 
 def goes_one_way(recording: Recording) -> bool:
@@ -40,7 +42,7 @@ def goes_one_way(recording: Recording) -> bool:
     Then every angle and every torque is one smooth curve over time, and a wrong column, sign or zero may fit such a
     curve as well as the right one does.
     """
-    t = np.arange(recording.t[0], recording.t[-1], 0.1)  # noise of closer positions would make up the way
+    t = np.arange(recording.t[0], recording.t[-1], WAY_STEP_S)
     q = np.column_stack([np.interp(t, recording.t[there := np.isfinite(x)], x[there]) for x in recording.position.T])
     span = np.ptp(q, axis=0)
     moving = span > LEAST_RANGE

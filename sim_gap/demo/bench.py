@@ -28,6 +28,10 @@ from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.narrator import Report
 from sim_gap.model.load import compile_model
 
+TONES, TONE_BAND_HZ = 3, (0.08, 0.3)
+"""Number of sines per joint in the recorded motion, and their frequencies [Hz]."""
+FADE_S = 2.0
+"""Time over which the motion begins [s]."""
 RANGE_SHARE = 0.35
 """Amplitude of the recorded motion at most, as a share of half the joint's range."""
 SPEED_SHARE = 0.6
@@ -86,18 +90,17 @@ def check_gravity(bench: Bench, beta: Array, record: CalibrationRecord, seed: in
 
 def multisine(bench: Bench, seconds: float, seed: int) -> Array:
     """Targets (K, n) [rad], one a cycle: each joint its own sum of sines about the middle of its range."""
-    tones, band, fade_s = 3, (0.08, 0.3), 2.0  # band in Hz
     random = np.random.default_rng(seed)
     limits = bench.arm.require_link().joints
     low, high = bench.described.lower, bench.described.upper
     t = np.arange(int(seconds * bench.link.rate)) * bench.link.period
-    fade = np.clip(t / fade_s, 0.0, 1.0)
+    fade = np.clip(t / FADE_S, 0.0, 1.0)
     fade = fade * fade * (3 - 2 * fade)
     targets = np.empty((len(t), bench.described.n))
     for joint in range(bench.described.n):
-        omega = 2 * np.pi * random.uniform(*band, tones)
-        phase = random.uniform(0, 2 * np.pi, tones)
-        share = 1.0 / tones
+        omega = 2 * np.pi * random.uniform(*TONE_BAND_HZ, TONES)
+        phase = random.uniform(0, 2 * np.pi, TONES)
+        share = 1.0 / TONES
         amplitude = RANGE_SHARE * (high[joint] - low[joint]) / 2 * share
         speed = SPEED_SHARE * limits[joint].max_velocity * share
         size = np.minimum(amplitude, np.minimum(speed / omega, ACCELERATION * share / omega**2))

@@ -9,6 +9,8 @@ from sim_gap.effects.effect import InverseEffect, Plausibility, SearchHints, Sha
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
 
+TILT_DEVIATION = 1.0
+"""Prior standard deviation of an angle of the tilt [rad]: a base may stand on a wall."""
 STEP = 1e-6
 """Step of the differences in a rotation [rad]."""
 LARGE = 0.3
@@ -88,7 +90,7 @@ EFFECTS = (
     InverseEffect(
         "base.tilt",
         Signature(_tilt, whole_arm=True, offset=_beside),
-        Plausibility(prior_std=lambda _signals, _place: np.full(2, 1.0)),  # a base may stand on a wall
+        Plausibility(prior_std=lambda _signals, _place: np.full(2, TILT_DEVIATION)),
         SearchHints(shapes_for=_starts, linearised_at=0, relinearise=lambda c, _shape: (float(c[0]), float(c[1]))),
     ),
 )

@@ -23,6 +23,8 @@ from sim_gap.effects.effect import (
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
 
+LEAST_SECANT = 1e-4
+"""Coefficient, in its own unit, from which its response is a secant; below, it is the derivative."""
 PART_OF_TURN = 2.0
 """Range [rad] from which an error with a period of one turn can be separated from a gain."""
 WORST_GAIN, WORST_ECCENTRICITY = 0.15, 0.2
@@ -37,7 +39,7 @@ def responses(signals: PreparedSignals, layout: ChannelLayout, joint: int, moves
 
     The secant over `size` of the first coefficient, or the derivative if that is zero.
     """
-    if abs(size) > 1e-4:
+    if abs(size) > LEAST_SECANT:
         moved = [x.copy() for x in (signals.q, signals.v, signals.a)]
         for x, move in zip(moved, moves[:, 0].T, strict=True):
             x[:, joint] += size * move

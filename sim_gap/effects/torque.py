@@ -27,6 +27,8 @@ from sim_gap.residuals.preprocess import PreparedSignals
 
 GRADUAL = (0.25, 0.75, 1.25, 1.75)
 """Half widths of the plays of a hysteresis that sets in gradually, as in strain gauges, as shares of their mean."""
+PLAY_HZ = 50.0
+"""Rate at which a play operator is evaluated [Hz]; smooth torques change little from one sample to the next."""
 
 
 def largest_torque(signals: Sequence[PreparedSignals], joint: int, share: float = 0.98) -> float:
@@ -71,7 +73,7 @@ def _abrupt_and_gradual(shape: Shape) -> tuple[Shape, ...]:
 
 def play(x: Array, half: float, rate: float) -> Array:
     """Output of a play (backlash operator) of half width `half` that starts in its middle, (K,)."""
-    step = max(1, int(rate / 50.0))  # smooth torques change little between its samples
+    step = max(1, int(rate / PLAY_HZ))
     coarse = x[::step]
     steps = np.diff(coarse)
     turns = np.concatenate([[0], 1 + np.flatnonzero(steps[1:] * steps[:-1] <= 0.0), [len(coarse) - 1]])

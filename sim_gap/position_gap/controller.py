@@ -15,6 +15,8 @@ from sim_gap.position_gap.search import PRICE, LoopSearch
 from sim_gap.position_gap.selection import Progress
 from sim_gap.position_gap.windows import Windows, thin_moving
 
+STARTING_FRICTIONS = 0.0, 0.4
+"""Least Coulomb friction that is tried with each stiffness, as a share of the gain times the RMS error."""
 RESTS_RAD = 0.002
 """Way of a command over all recordings below which it rests [rad]."""
 HOLDS_HZ = 5.0, 30.0
@@ -194,7 +196,7 @@ def _from_grid(search: LoopSearch, parts: Sequence[str]) -> LoopFit:
     size = asked / np.maximum(np.sqrt(np.mean(e**2, axis=(0, 2))), 1e-6)
     centre = np.maximum(size, search.scales.inertia * 25.0)
     points = []
-    for factor, stuck in product(np.geomspace(0.02, 50.0, 12), (0.0, 0.4)):
+    for factor, stuck in product(np.geomspace(0.02, 50.0, 12), STARTING_FRICTIONS):
         kp = centre * factor
         point = {name: values.copy() for name, values in nominal.items()}
         point["kp"] = kp

@@ -34,6 +34,8 @@ from sim_gap.position_gap.selection import Progress, removable_at, removals, sel
 
 PLAINEST = "plainest"
 PLAIN = "friction.coulomb", "friction.viscous"
+SCALE_SHARES = 0.7, 0.4
+"""Scales at which a fit begins again, as shares of its own."""
 ITERATIONS = 12
 
 
@@ -74,7 +76,7 @@ def fits_at_other_scales(search: LoopSearch, fit: LoopFit) -> Iterator[LoopFit]:
     if not any(free):
         return
     active = tuple((*own, "armature") if loose else own for own, loose in zip(fit.active, free, strict=True))
-    for share in (0.7, 0.4):
+    for share in SCALE_SHARES:
         part = np.where(free, share, 1.0)
         point = {name: values * part if name in WITH_TORQUE else values.copy() for name, values in fit.point.items()}
         point |= {name: share * fit.point[name] for name in fit.shared if UNIT[name.partition(".")[2]] != "rad"}

@@ -39,6 +39,8 @@ from sim_gap.position_gap.windows import Windows, thin, thin_moving, windows_of
 
 SEARCHED, FITTED, JUDGED = 16, 32, 48
 """Most windows of the search, of the final fit and of the judgement."""
+LEAST_FLOOR = 1e-5
+"""Least noise floor of a position gap [rad]."""
 TORQUE_MARGIN, SHARE_MARGIN = 0.08, 0.15
 """Torque that matters [N·m], at most this share of a joint's torque; over the gain it is a gap of position, at most
 this share of the tracking error."""
@@ -241,7 +243,7 @@ def noise_floor(data: Windows) -> Array:
     first = data.warm
     smooth = data.recorded[first :: data.stride][: len(data.measured)]
     rest = (data.measured[: len(smooth)] - smooth) * data.weight[: len(smooth)]
-    return np.asarray(np.maximum(np.sqrt(np.mean(rest**2, axis=(0, 2))), 1e-5))  # rad
+    return np.asarray(np.maximum(np.sqrt(np.mean(rest**2, axis=(0, 2))), LEAST_FLOOR))
 
 
 def _margin(search: LoopSearch, fit: LoopFit) -> Array:

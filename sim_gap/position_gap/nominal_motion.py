@@ -83,6 +83,10 @@ def _clearly_best(search: LoopSearch, scores: Sequence[float]) -> int:
     return best if scores[best] < scores[0] - PRICE * search.data.joints else 0
 
 
+LEAST_ROWS = 20
+"""Least number of rows that tell a gap and its noise."""
+MODEL_NOISE_RAD = 1e-6
+"""Noise of the model's own positions, which no sensor has read [rad]."""
 ROUGHER = 1.5
 """Times the RMS of second differences of the measured positions up to which that of the model's own tells anything:
 one that swings where the arm does not is no such motion."""
@@ -128,7 +132,7 @@ class OwnMotion:
             return np.zeros(self.sim.n)
         data = windows_of(self.sim.arm, some, ["the model's own motion"] * len(some), search.data.dt, scales)
         data = with_columns(thin(data, 8))
-        exact = replace(search, data=data, floor=np.full(self.sim.n, 1e-6))  # nothing was read with noise
+        exact = replace(search, data=data, floor=np.full(self.sim.n, MODEL_NOISE_RAD))
         as_it_moves = nominal_solver(exact, kinds).nominal
         return rms_on(data, LoopFit(as_it_moves, ((),) * data.joints))
 
@@ -148,7 +152,7 @@ def own_motion(
         made.append(replace(slice_rows(recording, part), position=positions))
         period = period_of(recording)
         rows = judged_rows(t, left_out[part]) & np.isfinite(measured).all(axis=1)
-        if rows.sum() * period >= OPENING_S and rows.sum() >= 20:  # rows that tell a gap and its noise
+        if rows.sum() * period >= OPENING_S and rows.sum() >= LEAST_ROWS:
             gap = (positions - measured)[rows]
             smooth, moved = smoothing(period, period), positions[rows]
             own, seen = (np.diff(q, 2, axis=0) for q in (moved, measured[rows]))

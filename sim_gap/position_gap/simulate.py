@@ -17,6 +17,10 @@ from sim_gap.position_gap.windows import Windows
 EXPLICIT = 0.5
 """Square of frequency times step up to which the position gain is taken at the step's start, without the damping that
 an implicit step adds."""
+MOST_CELLS = 6_000
+"""Most joints times windows times hypotheses that are simulated together, for the cache's sake."""
+MOST_CELL_STEPS = 40_000
+"""Most cells times steps for which the quantities that do not depend on the motion are made at once, likewise."""
 TURN = 1.5
 """Largest deviation from the recorded angle for which gravity's torque is continued [rad]."""
 LIGHTEST = 0.01
@@ -34,7 +38,7 @@ def simulate(data: Windows, values: Values) -> Array:
     `values` have shapes (P, J); a parameter that is absent has its neutral value.
     """
     count = max(len(x) for x in values.values())
-    size = max(1, 6_000 // (data.joints * data.count))  # for the cache's sake
+    size = max(1, MOST_CELLS // (data.joints * data.count))
     parts = []
     for first in range(0, count, size):
         some = {name: x[first : first + size] if len(x) > 1 else x for name, x in values.items()}
@@ -155,7 +159,7 @@ def _run(joints: _Joints) -> Array:
     q, v, target = (np.broadcast_to(x, joints.shape).copy() for x in (*data.start, data.command[0]))
     total = joints.integral() if "ki" in active else np.zeros(1)
     out = np.empty((joints.count, len(data.measured), data.joints, data.count))
-    block = max(1, 40_000 // q.size)  # likewise
+    block = max(1, MOST_CELL_STEPS // q.size)
     ahead = (each for k in range(0, steps, block) for each in joints.steps(k, min(k + block, steps)))
     for k, (command, push, power, rest, carried, effective, grip, first, second, third) in enumerate(ahead):
         if k >= data.warm and (k - data.warm) % data.stride == 0:

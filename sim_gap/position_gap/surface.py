@@ -18,6 +18,8 @@ from gcomp.arrays import Array, Mask
 from sim_gap.model.rigid_body import RigidArm, into_frame
 from sim_gap.position_gap.tracks import in_one_order, period_of
 
+SAMPLING_HZ = 10.0
+"""Rate at which recordings are looked at [Hz]."""
 REST = 0.03
 """Speed [rad/s] at which friction has turned over for the most part."""
 JOINTS = 2
@@ -31,11 +33,17 @@ FEWEST = 20
 """Least number of samples that touch: two seconds. With half as many, one of sixty arms without has a surface."""
 ROWS = 200
 """Least number of samples that are looked at."""
+HEIGHT_SHARES = (0.01, 0.03, 0.1, 0.2)
+"""Shares of the samples that are below the heights from which the search starts."""
 NEAR, FIRMLY = 0.12, 0.1
 """Standard deviation of the touching point about the link's centre of mass, as a share of the arm's length, and the
 weight of that beside one sample's error."""
+SHORTEST_ARM_M = 0.01
+"""Length that an arm is taken to have at least [m]: models of bare motors have none."""
 PRESSED = 0.95
 """Share of the samples that are commanded well below the surface whose heights are those of the touch."""
+HEIGHT_TOLERANCE_M = 1e-6
+"""Heights that differ by less are one height [m]: an arm that rests has one position."""
 RELEASE_S = 0.3
 """Time after a touch, and half as long before it, that is left out, too: the servo has to recover [s]."""
 
@@ -56,7 +64,7 @@ class Surface:
     def touched(self, arm: RigidArm, t: Array, q: Array) -> Mask:
         """Times of a recording at which the arm touches or has just been released, (K,); q (K, n) [rad]."""
         origin, up = heights(arm, q, self.link)
-        below = (origin + self.point @ up < self.height + 1e-6).astype(np.uint8)  # an arm that rests has one height
+        below = (origin + self.point @ up < self.height + HEIGHT_TOLERANCE_M).astype(np.uint8)
         rows = max(1, round(RELEASE_S / float(np.median(np.diff(t)))))
         before = maximum_filter1d(below, 2 * (rows // 2) + 1)
         after = maximum_filter1d(below, rows + 1, origin=rows // 2)
@@ -111,7 +119,7 @@ class _Looked:
         for recording in (recordings[number] for number in in_one_order(recordings)):
             assert recording.position_command is not None
             there = np.isfinite(recording.position_command).all(1) & np.isfinite(recording.position).all(1)
-            stride = max(1, round(1.0 / 10.0 / period_of(recording)))
+            stride = max(1, round(1.0 / SAMPLING_HZ / period_of(recording)))
             rows = np.flatnonzero(there)[::stride]
             if len(rows) < 3:
                 continue
@@ -144,12 +152,12 @@ class _Under:
         mass, *moment = arm.inertial[link, :4]
         self.centre = np.array(moment) / mass if mass > 1e-9 else np.zeros(3)
         length = float(np.linalg.norm(arm.offset, axis=1).sum() + np.linalg.norm(self.centre))
-        self.near = NEAR * max(length, 0.01)  # models of bare motors have no length
+        self.near = NEAR * max(length, SHORTEST_ARM_M)
 
     def surface(self) -> tuple[float, Surface] | None:
         """Part of the squared errors that a surface takes, and the surface; None if none is clearly there."""
         scale = [self.near, self.near, self.near, 0.3 * self.near]
-        levels = np.quantile(self.origin + self.centre @ self.up, (0.01, 0.03, 0.1, 0.2))
+        levels = np.quantile(self.origin + self.centre @ self.up, HEIGHT_SHARES)
         starts = [np.append(self.centre, level) for level in levels]
         ends = [np.asarray(least_squares(self._left, x, x_scale=scale, max_nfev=40).x) for x in starts]
         return max((found for x in ends if (found := self._clearly(x))), key=lambda each: each[0], default=None)

@@ -39,11 +39,15 @@ CALM_HZ = 8.0
 """Pass band of the model torque before a play or a clip is evaluated [Hz]."""
 WORK_HZ = 125.0
 """Highest rate at which columns are computed [Hz]; faster recordings are low-passed and decimated to it."""
+PAD_S = 1.0
+"""Length of the reflection at either end of a signal that is filtered [s]."""
 TRIM_S = 0.3
 """Length cut off at both ends after filtering [s]."""
 COLUMNS = 8
 """Number of columns that are filtered at a time."""
 SHORTEST_S = 3.0
+MOST_SAMPLES_PER_ROW = 100.0
+"""Most even samples for each recorded row."""
 ABSENT = -1
 """Number of a recording without the body that training recordings have."""
 CHANNELS = {"tau": "torque", "tau_motor": "motor_torque", "tau_cmd": "torque_command"}
@@ -189,7 +193,7 @@ class PreparedSignals:
 
         As a product of spectra, of the signal extended by its reflection in its ends.
         """
-        trim, pad = max(1, round(TRIM_S * self.rate)), min(round(1.0 * self.rate), len(x) - 1)
+        trim, pad = max(1, round(TRIM_S * self.rate)), min(round(PAD_S * self.rate), len(x) - 1)
         size = next_fast_len(len(x) + 2 * pad, real=True)
         columns = np.reshape(x, (len(x), -1)).T
         out = np.empty((len(columns), len(range(trim, len(x) - trim, self.step))))
@@ -277,7 +281,7 @@ def prepare(
         raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
     raw_step = float(np.median(np.diff(recording.t)))
     span = float(recording.t[-1] - recording.t[0])
-    if span > 100.0 * raw_step * recording.t.size:  # even samples for a row
+    if span > MOST_SAMPLES_PER_ROW * raw_step * recording.t.size:
         raise BadInput(
             f"{label}: {recording.t.size} rows over {span:.3g} s, mostly {raw_step:.2g} s apart: stamped together? "
             "Record the times of sampling"

@@ -12,6 +12,8 @@ from gcomp.arrays import Array
 SLOW_HZ = 60.0
 """Below this rate [Hz] the recorded velocity is used; above, the position is differentiated, for drives report velocity
 late."""
+STEP_RATIO = 3.5
+"""Largest ratio of a step between readings to the median step for interpolation by splines."""
 
 
 def interpolate_even(t: Array, values: Array, even: Array, label: str, column: str) -> Array:
@@ -29,7 +31,7 @@ def interpolate_even(t: Array, values: Array, even: Array, label: str, column: s
             )
         own = t[there]
         steps, usual = np.diff(own), float(np.median(np.diff(own)))
-        even_enough = steps.max() < 3.5 * usual and steps.min() > usual / 3.5 and usual > 1.0 / SLOW_HZ
+        even_enough = steps.max() < STEP_RATIO * usual and steps.min() > usual / STEP_RATIO and usual > 1.0 / SLOW_HZ
         curve = CubicSpline(own, values[there, j]) if even_enough else None
         inside = np.clip(even, own[0], own[-1])
         out[:, j] = np.interp(inside, own, values[there, j]) if curve is None else curve(inside)

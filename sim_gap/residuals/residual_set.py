@@ -58,6 +58,8 @@ RELEVANT, RELEVANT_INNER, RELEVANT_COMMAND = 0.016, 0.007, 0.001
 against motor."""
 QUIET = 0.5
 """Share of the relevant gap below which there is nothing to search for."""
+FOLDS = 6
+"""Number of folds for cross-validation, of all recordings together."""
 MOVING_SHARE = 0.95
 """A sample of the motor row counts if the joint moves during this share of the filter's window."""
 SETTLE_S, SETTLED_LEAST = 0.08, 0.4
@@ -198,7 +200,7 @@ class ResidualSet:
         """
         total, out, first = sum(self.lengths), [], 0
         for length in self.lengths:
-            count = max(min(2, len(self.lengths)), round(6 * length / total))
+            count = max(min(2, len(self.lengths)), round(FOLDS * length / total))
             out.append(first + np.minimum(np.arange(length) * count // length, count - 1))
             first += count
         return np.concatenate(out)

@@ -20,6 +20,10 @@ from sim_gap.search.torque_constants import shares_a_factor
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
 """Undetected error of the nominal mass moments of all links, relative: NOMINAL, or WORSE times the largest error found
 at a link, up to WORST."""
+SHAPE_STEP = 1e-2
+"""Step of the differences in a shape, as a share of it."""
+LEAST_LEVER_M = 0.01
+"""Least distance of a link's centre of mass from its joint's axis [m] for judging errors of its moment."""
 SYSTEMATIC = 0.3
 """Share of a row's residual and of its relevance floor that can mimic an effect, independent of the recording's
 length."""
@@ -79,7 +83,7 @@ class EffectEstimate:
         return [term for term in self.terms if term.free is not None]
 
     def _shape_slope(self, term: Term, i: int, row: Row) -> Array:
-        step = 1e-2 * abs(term.shape[i])
+        step = SHAPE_STEP * abs(term.shape[i])
         sides = []
         for sign in (1.0, -1.0):
             shape = tuple(s + sign * step * (k == i) for k, s in enumerate(term.shape))
@@ -142,7 +146,7 @@ class EffectEstimate:
         """
         arm = self.store.data.signals[0].arm
         found = {term.place: self.of(term) for term in self.terms if term.effect == "link.mass_moment"}
-        usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), 0.01 * arm.inertial[:, 0])
+        usual = np.maximum(np.linalg.norm(arm.inertial[:, 1:4], axis=1), LEAST_LEVER_M * arm.inertial[:, 0])
         wrong = max((float(np.linalg.norm(found[link]) / usual[link]) for link in found), default=0.0)
         share = min(max(NOMINAL, WORSE * wrong), WORST)
         open_links = np.repeat([link not in found for link in range(arm.n)], 3)

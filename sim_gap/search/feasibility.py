@@ -17,6 +17,15 @@ from sim_gap.search.estimate_signals import inertial_change
 from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
 
+BARRIER_WEIGHTS = (1e-1, 1e-2, 1e-3, 1e-4)
+"""Weights of −log det in turn, in units of the squares that the constraint costs at the start."""
+NEWTON_STEPS = 25
+"""Most Newton steps at each weight."""
+SLOPE_STEP = 1e-6
+"""Step of the differences in a coefficient, as a share of it."""
+LEAST_EIGENVALUE = 1e-6
+"""Least eigenvalue of a pseudo-inertia, as a share of its trace."""
+
 Matrix = Callable[[Array], Array]
 Places = NDArray[np.intp]
 
@@ -72,7 +81,7 @@ def _change(term: Term, c: Array, inertial: Array) -> Array:
 
 
 def _positive(matrix: Array) -> bool:
-    return bool(np.linalg.eigvalsh(matrix).min() > 1e-6 * max(float(np.trace(matrix)), 0.0))
+    return bool(np.linalg.eigvalsh(matrix).min() > LEAST_EIGENVALUE * max(float(np.trace(matrix)), 0.0))
 
 
 def _alone(search: StepwiseSearch, index: Places, at: Places) -> Array:
@@ -99,11 +108,11 @@ def _closest(wanted: Array, curvature: Array, matrix: Matrix) -> Array:
         barrier = weight * float(np.linalg.slogdet(matrix(at))[1])
         return 0.5 * float((at - wanted) @ curvature @ (at - wanted)) - barrier
 
-    for barrier in (1e-1, 1e-2, 1e-3, 1e-4):  # in units of the squares that the constraint costs
+    for barrier in BARRIER_WEIGHTS:
         weight = barrier * max(cost, 1e-12)
-        for _ in range(25):
+        for _ in range(NEWTON_STEPS):
             inverse = np.linalg.inv(matrix(x))
-            steps = 1e-6 * np.maximum(np.abs(x), 1e-3)
+            steps = SLOPE_STEP * np.maximum(np.abs(x), 1e-3)
             parts = [
                 inverse @ (matrix(x + d) - matrix(x - d)) / (2 * s) for s, d in zip(steps, np.diag(steps), strict=True)
             ]

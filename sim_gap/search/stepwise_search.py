@@ -14,6 +14,8 @@ from sim_gap.search.term import Term
 Scored = tuple[float, list[Term]]
 """Score of a set of terms, lower is better, and the terms."""
 
+MOST_TERMS = 60
+"""Largest number of terms of a fit."""
 TRIES = 3
 """How often one effect at one place may be added during a search."""
 OWED = 0.06
@@ -141,7 +143,7 @@ class StepwiseSearch:
             tried = {term.key for term in first}
             lists = [[pair for pair in each if pair[1].key not in tried] for each in lists]
         chosen = self._best(judged, self.score - self.least)
-        return chosen is not None and len(chosen) <= 60 and self.accept(chosen)
+        return chosen is not None and len(chosen) <= MOST_TERMS and self.accept(chosen)
 
     def backward(self) -> bool:
         """Drop the term that is missed least, if the rest scores better without it."""

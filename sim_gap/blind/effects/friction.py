@@ -10,6 +10,9 @@ from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, add_to_entry, 
 from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.true_arm import TrueArm
 
+LEAST_SPEED = 0.02
+"""Speed [rad/s] below which friction does not show in the readings."""
+
 
 def _known_coulomb(
     joint: int, torque: float, known: bool
@@ -44,7 +47,7 @@ def stribeck(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """More friction at low speed, in addition to Coulomb friction."""
     j = int(random.integers(scene.arm.n))
     level, speed = float(motor_level(scene, random)[j]), np.abs(scene.motion[1][:, j])
-    moving = speed[speed > 0.02]  # below, friction does not show
+    moving = speed[speed > LEAST_SPEED]
     velocity = float(np.clip(np.quantile(moving, random.uniform(0.25, 0.5)), 0.05, 0.35))
     breakaway = float(1.2 * level / rms(np.exp(-((moving / velocity) ** 2))))
     base = breakaway * random.uniform(0.8, 1.6)

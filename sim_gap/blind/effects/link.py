@@ -12,6 +12,8 @@ from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.true_arm import TrueArm
 
 XYZ = ("x", "y", "z")
+LEAST_WEIGHT_SHARE = 0.1
+"""Share of a moved mass's torque that is its weight, below which it shows as an inertia alone."""
 UPRIGHT = "the axis is upright: a moved mass shows by its inertia alone"
 INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
 
@@ -33,7 +35,8 @@ def mass_moment(scene: Scene, random: np.random.Generator) -> DrawnEffect | None
         if np.linalg.norm(moment) / arm.mass[link] > shift:
             continue
         moved = arm.with_moved(link, moment)
-        weighs = float(rms(scene.change_at_rest(moved))[link]) > 0.1 * float(rms(scene.change(moved))[link])
+        weight, whole = (float(rms(change)[link]) for change in (scene.change_at_rest(moved), scene.change(moved)))
+        weighs = weight > LEAST_WEIGHT_SHARE * whole
 
         def apply(true: TrueArm, link: int = link, moment: Array = moment) -> None:
             true.arm = true.arm.with_moved(link, moment)

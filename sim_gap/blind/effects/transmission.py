@@ -21,6 +21,9 @@ from sim_gap.blind.plant.plant import STEP
 from sim_gap.blind.scene import Scene, rms
 from sim_gap.blind.true_arm import SharedMotor, TrueArm
 
+LEAST_ELASTIC_NM = 0.25
+"""Least RMS torque caused by the deflection of an elastic joint [N·m]."""
+
 
 def ripple(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Torque lost to the meshing gear: amplitude·sin(cycles·θ + phase), slow enough to pass a 6 Hz filter."""
@@ -63,7 +66,7 @@ def elasticity(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     stiffness_of = rms(scene.torque) / random.uniform(0.015, 0.04)  # from the RMS deflection [rad]
     resonance, stiffest = (2 * np.pi * 4.0) ** 2 * scene.inertia, _stiffest(scene)
     shown = _turn_felt(scene, scene.torque / stiffness_of)
-    fit = (shown > 0.25) & (stiffness_of > resonance) & (stiffness_of < stiffest)  # N·m of deflection
+    fit = (shown > LEAST_ELASTIC_NM) & (stiffness_of > resonance) & (stiffness_of < stiffest)
     if not fit.any():
         return None
     j = int(random.choice(np.flatnonzero(fit)))

@@ -14,6 +14,10 @@ from sim_gap.blind.plant.drive import pad_rows
 from sim_gap.blind.true_arm import PlantRun
 
 BLOCK = 256
+VELOCITY_HZ, SERVO_VELOCITY_HZ = 40.0, 200.0
+"""Low pass of the velocity in a PID controller, and in a servo [Hz]."""
+INTEGRAL_S = 1.5
+"""Stiffness over integral gain [s]."""
 DAMPING_RATIO = 0.9
 
 
@@ -26,10 +30,10 @@ class PidControllers:
         inertia = pad_rows([run.inertia for run in runs], width)
         omega = pad_rows([run.truth.bandwidth for run in runs], width)
         self.stiffness, self.damping = inertia * omega**2, 2 * DAMPING_RATIO * inertia * omega
-        self.integral = self.stiffness / 1.5  # s
+        self.integral = self.stiffness / INTEGRAL_S
         self.resolution = np.array([[run.truth.encoder_step] for run in runs])
         self.random = [np.random.default_rng([run.seed, 1]) for run in runs]
-        self.smooth = 1.0 - np.exp(-2 * np.pi * 40.0 / RATE)  # low pass of the velocity [Hz]
+        self.smooth = 1.0 - np.exp(-2 * np.pi * VELOCITY_HZ / RATE)
         self.before = reading.copy()
         self.velocity, self.error_sum = np.zeros_like(reading), np.zeros_like(reading)
         self.position, self.speed, self.feed, self.noise = (np.zeros((BLOCK, len(runs), width)) for _ in range(4))
@@ -98,7 +102,7 @@ class Servos:
         )
         self.step = pad_rows([law.slew for law in laws], width, np.inf) / RATE
         self.late = pad_rows([law.delay for law in laws], width) * RATE
-        self.smooth = 1.0 - np.exp(-2 * np.pi * 200.0 / RATE)  # low pass of the velocity [Hz]
+        self.smooth = 1.0 - np.exp(-2 * np.pi * SERVO_VELOCITY_HZ / RATE)
         self.before, self.target = reading.copy(), reading.copy()
         self.velocity, self.error_sum = np.zeros_like(reading), np.zeros_like(reading)
 

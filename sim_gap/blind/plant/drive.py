@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 from gcomp.arrays import Array, Mask
 from sim_gap.blind.true_arm import TrueArm
 
+ELASTIC_SHARE = 0.7
+"""Deflection of the bristles, as a share of z_ss, up to which α is 0."""
+SPRING_DAMPING_RATIO = 0.04
+"""Damping ratio of an elastic transmission."""
 STIFFEST = 0.05
 """σ₀ h²/(inertia) is at most this, for a stable step."""
 
@@ -48,7 +52,7 @@ class Bristles:
         longest = level / self.bristle[:k] + 1e-12
         z = self.bend[:k]
         ratio = z * np.sign(v) / longest
-        slip = np.clip((ratio - 0.7) / (1.0 - 0.7), 0.0, 1.0)
+        slip = np.clip((ratio - ELASTIC_SHARE) / (1.0 - ELASTIC_SHARE), 0.0, 1.0)
         slip *= slip * (3.0 - 2.0 * slip)
         rate = v * (1.0 - slip * np.abs(ratio))
         z += self.step * rate
@@ -106,7 +110,7 @@ class PlantDrives:
         self.stiffness = np.array([truths[b].stiffness[j] for b, j in rows])
         self.half_play = np.array([0.5 * truths[b].backlash[j] for b, j in rows])
         self.rotor = np.array([truths[b].arm.armature[j] for b, j in rows])
-        self.spring_damping = 2.0 * 0.04 * np.sqrt(self.stiffness * self.rotor)  # damping ratio 0.04
+        self.spring_damping = 2.0 * SPRING_DAMPING_RATIO * np.sqrt(self.stiffness * self.rotor)
         torque = self.current[self.soft.all]
         self.motor_angle = angle[self.soft.all] + torque / self.stiffness + self.half_play * np.sign(torque)
         self.motor_half, self.motor_speed, self.motor_push = (np.zeros(len(rows)) for _ in range(3))

@@ -9,6 +9,10 @@ from sim_gap.blind.motion import RATE
 from sim_gap.blind.true_arm import Log, TrueArm
 
 JITTER_S = 4e-4
+LATE_SHARE, LOST_SHARE = 0.003, 0.001
+"""Share of rows that are late by a good part of a period, and share of rows that are lost."""
+SENSOR_BITS = 16
+"""Resolution of a torque sensor, over its range of twice the rated torque either way."""
 HALVES, SHARES = (0.4, 1.0, 1.8), (0.35, 0.4, 0.25)
 """Half widths of the plays of a hysteresis, as shares of its width, and their weights before normalisation."""
 
@@ -25,7 +29,7 @@ def record(
         shape
     )
     limit = truth.torque_limit
-    resolution = 4.0 * truth.rated / 2**16  # bits over four times the rated torque
+    resolution = 4.0 * truth.rated / 2**SENSOR_BITS
     motor = columns_at(t, clock, log.motor) + truth.motor_noise * random.standard_normal(shape)
     position = columns_at(t, clock, log.position) / step + 0.4 * random.standard_normal(shape)
     last = (t * RATE + 1e-9).astype(int)  # rows end before the log does
@@ -48,9 +52,9 @@ def _times(duration: float, rate: float, random: np.random.Generator) -> Array:
     """Uneven times: jitter on every row, some rows late, a few lost."""
     t = np.arange(0.0, duration - 2.0 / rate, 1.0 / rate)
     t[1:] += np.clip(JITTER_S * random.standard_normal(len(t) - 1), -0.4 / rate, 0.4 / rate)
-    late = random.random(len(t)) < 0.003  # by a good part of a period
+    late = random.random(len(t)) < LATE_SHARE
     t[late] += random.uniform(0.1, 0.3, int(late.sum())) / rate
-    kept = random.random(len(t)) >= 0.001  # lost rows
+    kept = random.random(len(t)) >= LOST_SHARE
     kept[0] = True
     return np.asarray(np.sort(t)[kept])
 

@@ -17,6 +17,8 @@ from sim_gap.position_gap.windows import Windows, choose_windows
 
 ALONE = 0.03
 """Share of the information about a direction that the others are taken to have at least, without a group."""
+LEAST_INFORMATION = 1e-12
+"""Information that every direction has, as a share of that about a parameter by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,7 @@ def jackknifed(terms: Terms, known: Array, groups: NDArray[np.intp]) -> Array:
     """
     squares, scores = terms.squares.sum(0) + known, terms.scores.sum(0)
     scale = 1.0 / np.sqrt(np.diag(squares))
-    least = 1e-12 * np.eye(len(known))
+    least = LEAST_INFORMATION * np.eye(len(known))
     whole = squares * scale * scale[:, None] + least
     steps = []
     for own in (groups == label for label in np.unique(groups)):

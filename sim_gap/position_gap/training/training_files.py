@@ -18,6 +18,11 @@ from sim_gap.position_gap.search import effect_there
 from sim_gap.position_gap.training.draws import draw
 from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, export_fit, native_fit
 
+DELAY_DRAWS = 400
+"""Draws of the parameters from which the range of a delay is taken."""
+DELAY_QUANTILES = 0.05, 0.95
+"""Quantiles of these draws that are the ends of the range."""
+
 
 def write_samples(found: Identified, count: int, path: Path, seed: int = 0) -> None:
     """Write draws of all fitted parameters, one row each, columns `JOINT.PARAMETER` in SI units. Raises BadInput."""
@@ -87,7 +92,7 @@ ABOUT = "Friction of other kinds is taken into Coulomb and viscous friction; tha
 
 def write_actuators(found: Identified, path: Path, step: float = 0.005) -> None:
     """Write the entries for Isaac Lab and mjlab; delays are counted in `step` [s]. Raises BadInput."""
-    drawn = draw(found.search, found.fit, found.spread, 400, reach=found.band.reach)
+    drawn = draw(found.search, found.fit, found.spread, DELAY_DRAWS, reach=found.band.reach)
     rows = {name: _entry(found, j, step, drawn) for j, name in enumerate(found.sim.arm.names)}
     left = found.export.lines if found.export is not None else ()
     write_entries(rows, path, step, about=ABOUT, left=left)
@@ -113,5 +118,5 @@ def _delays(found: Identified, j: int, rows: Sequence[Mapping[str, float]]) -> A
     """Ends of the range of a joint's delay [s], (2,): that of 90 % of its draws, about the exported model's."""
     name = f"{found.sim.arm.names[j]}.delay"
     drawn = [row[name] for row in rows if name in row]
-    about = np.quantile(drawn, (0.05, 0.95)) - found.fit.point["delay"][j] if drawn else np.zeros(2)
+    about = np.quantile(drawn, DELAY_QUANTILES) - found.fit.point["delay"][j] if drawn else np.zeros(2)
     return np.asarray(found.native.point["delay"][j] + about)
