@@ -53,7 +53,7 @@ def guess_of_model(kinematics: Arm, beta: Array) -> GravityGuess:
 
 def reach(kinematics: Arm, hand: float = 0.15) -> Array:
     """Largest distance (n,) [m] from each joint to the far side of a hand of size `hand` [m]."""
-    return np.hypot(kinematics.a, kinematics.d)[::-1].cumsum()[::-1] + hand
+    return np.linalg.norm(kinematics.span, axis=1)[::-1].cumsum()[::-1] + hand
 
 
 def guess_gravity(
