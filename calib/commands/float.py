@@ -80,6 +80,7 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
 
     from armlink.errors import BadInput
     from calib.arm.kinematics import model_arm
+    from calib.commissioning.model_judgement import refuse_impossible_model
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore, no_record
 
@@ -87,6 +88,7 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
     calibration = records.current(CalibrationRecord, arm_file)
     kept = records.current(GravityRecord, arm_file) if record is None else records.usable(record, arm_file)
     if kept is None and arm_file.model_path is not None:
+        refuse_impossible_model(arm_file)
         return model_arm(arm_file).beta, calibration, f"the inertials of {arm_file.model_path.name}"
     if kept is None:
         raise no_record(arm_file, "gravity")

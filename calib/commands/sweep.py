@@ -69,9 +69,11 @@ def sweep(
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, warn_late
+    from calib.commissioning.model_judgement import refuse_impossible_model
     from calib.sweep.dataset import require_vacant
 
     arm_file = with_hold(load_arm(arm), hold)
+    refuse_impossible_model(arm_file)
     if plan:
         write_json(json_file, _plan(arm_file, seed, picture, results(json_file)))
         suggest(command_line("sweep", arm, out="unloaded", bus=bus, hold=hold))

@@ -6,8 +6,9 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.model_file import read_model
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.commissioning.finding import SetupFinding
+from calib.commissioning.model_judgement import NO_MASS
 from calib.plan.sweep_plan import DEAD_LEVER
 from gcomp.gravity.torque import gravity_levers
 
@@ -33,7 +34,17 @@ def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         )
     else:
         yield from _file_findings(arm_file)
+        yield from _massless_links(arm_file)
     yield from _lever_findings(arm_file)
+
+
+def _massless_links(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    model = model_arm(arm_file)
+    lacking = [name for name, mass in zip(model.arm.names, model.mass, strict=True) if mass < NO_MASS]
+    if lacking:
+        what = f"the model states no mass for what turns with {', '.join(lacking)}"
+        remedy = "give these links their masses and centres of mass: until then demo and torque lack them"
+        yield SetupFinding("warning", what, str(arm_file.model_path), remedy)
 
 
 def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:

@@ -17,7 +17,7 @@ from calib.plan.bias_torque import (
 from calib.plan.plan_limits import SERVO_GAP
 from calib.plan.poses import Poses, scout_poses, sweep_range
 from calib.plan.predicted_precision import predicted_gain_std, worst_gain_std
-from calib.plan.rough_gravity import GravityGuess, reach
+from calib.plan.rough_gravity import HAND, GravityGuess, reach
 from calib.plan.stop_selection import Candidates, choose_stops, guessed_moments
 from calib.plan.sweep_options import PlannedArm, sweep_options
 from calib.plan.types import Sweep, SweepPlan
@@ -31,8 +31,6 @@ MASS_SHARES = (0.3, 0.5, 0.7)
 ASSUMED_GRAVITY = 0.6
 """Share of max_torque that gravity is assumed to take before any measurement: drives have 1.5 to 2.2 times gravity in
 tests/calib/drawn_arms.py."""
-HAND = 0.15
-"""Largest distance of the reference mass from the flange [m], as in tests/calib/drawn_arms.py."""
 DEAD_LEVER = 0.005
 """Γ/g below which a joint is swept at one combination, for its offset alone (docs/theory.md, section 4.4)."""
 MORE_POSES = 2

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gcomp.arrays import Array, as_array, frozen
 from gcomp.errors import BadArray
@@ -33,17 +34,16 @@ class Arm:
     """Lower joint limit (n,) [rad]; -inf for none."""
     upper: Array
     """Upper joint limit (n,) [rad]; +inf for none."""
-    b: Array | None = None
-    """Offsets of the origins along ȳ of the bar frames (n,) [m]; None for zero, as Denavit-Hartenberg form has it."""
+    b: ArrayLike = 0.0
+    """Offsets of the origins along ȳ of the bar frames (n,) [m]; zero in Denavit-Hartenberg form."""
 
     def __post_init__(self) -> None:
         n = len(self.names)
         if n == 0 or len(set(self.names)) != n:
             raise BadArray(f"joint names are {list(self.names)}, expected at least one, each different")
-        if self.b is None:
-            object.__setattr__(self, "b", np.zeros(n))
-        for key in ("alpha", "a", "b", "d", "theta_offset"):
+        for key in ("alpha", "a", "d", "theta_offset"):
             frozen(self, **{key: as_array(key, getattr(self, key), (n,))})
+        frozen(self, b=as_array("b", np.full(n, self.b) if np.ndim(self.b) == 0 else self.b, (n,)))
         frozen(self, names=tuple(self.names), gravity=as_array("gravity", self.gravity, (3,)))
         for key in ("lower", "upper"):
             frozen(self, **{key: as_array(key, getattr(self, key), (n,), finite=False)})
@@ -59,7 +59,7 @@ class Arm:
     @property
     def span(self) -> Array:
         """From each joint's origin to the next one's, in its bar frame (n, 3) [m]."""
-        return np.column_stack([self.a, as_array("b", self.b, (self.n,)), self.d])
+        return np.stack([self.a, as_array("b", self.b, (self.n,)), self.d], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

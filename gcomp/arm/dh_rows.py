@@ -44,10 +44,8 @@ def axes_to_arm(
         next_origin = _next_origin(origin, axis, points[i + 1], following) if i + 1 < n else origin
         normal = np.cross(axis, following)
         across = next_origin - origin - ((next_origin - origin) @ axis) * axis
-        if np.linalg.norm(normal) > ROUNDING:
-            next_x = normal
-        else:
-            next_x = across if np.linalg.norm(across) > 1e-12 else x
+        parallel, along_one_line = np.linalg.norm(normal) < ROUNDING, np.linalg.norm(across) < 1e-12
+        next_x = normal if not parallel else x if along_one_line else across
         next_x = next_x - (next_x @ axis) * axis
         next_x /= np.linalg.norm(next_x)
         bar[i] = np.stack([next_x, np.cross(axis, next_x), axis], axis=1)

@@ -35,6 +35,8 @@ class ModelArm:
     arm: Arm
     beta: Array
     """Mass moments (2n,) of the model's inertials [kg·m]."""
+    mass: Array
+    """Masses (n,) of the links [kg]."""
 
 
 def load_model(
@@ -210,7 +212,7 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None,
         mass[link] += model.body_mass[body]
         first_moment[link] += model.body_mass[body] * geometry.bar[link].T @ (data.xipos[body] - geometry.origins[link])
         bodies[link].append(body)
-    arm = ModelArm(geometry.arm, base_parameters(geometry.arm, mass, first_moment))
+    arm = ModelArm(geometry.arm, base_parameters(geometry.arm, mass, first_moment), mass)
     return PlacedChain(model, data, arm, geometry, data.xanchor[chain], reference, tuple(map(tuple, bodies)))
 
 
