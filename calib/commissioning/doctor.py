@@ -35,8 +35,9 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
     except ArmlinkError as error:
         yield SetupFinding("error", str(error), arm, "correct the arm file, or make one of a model: armlink new --help")
         return
+    impossible = list[SetupFinding]()
     try:
-        impossible = list(model_errors(arm_file))
+        impossible += model_errors(arm_file)
         yield from impossible
         if not impossible:
             yield from model_findings(arm_file)
@@ -50,7 +51,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
     else:
         yield from _serial(arm_file)
         yield from turn_findings(arm_file)
-        if not offline:
+        if not offline and not impossible:
             yield from bus_findings(arm_file, bus)
     yield from _assumed(arm, arm_file)
 

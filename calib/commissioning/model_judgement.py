@@ -40,8 +40,8 @@ def model_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:
     try:
         try_limits(arm_file)
     except BadInput as error:
-        remedy = "correct this limit, or take drives whose protocol carries it"
-        yield SetupFinding("error", str(error), f"{arm_file.path}: link.joints", remedy)
+        what, _, remedy = str(error).rpartition(": ")
+        yield SetupFinding("error", what, f"{arm_file.path}: link.joints", remedy)
         return
     if model is not None:
         yield from _strength_errors(arm_file, model)

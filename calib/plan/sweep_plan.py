@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits
 from calib.plan.bias_torque import (
     bias_and_acceleration,
@@ -37,6 +38,8 @@ MORE_POSES = 2
 """Stop combinations per joint that may be added to reach the gains' precision; a choice: each takes minutes."""
 FINEST = 3.0
 """Largest factor of precision by averaging longer: nine times the samples; a choice."""
+GRAMS = 100.0
+"""Reference mass from which grams may be meant [kg]."""
 ENOUGH = 1.2
 """Factor by which the gains may be less precise than asked without a note; a choice."""
 
@@ -85,6 +88,31 @@ def plan_sweep(
         gain_std=None if gain_std is None else gain_std / finer,
         notes=tuple(notes),
     )
+
+
+def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess | None) -> None:
+    """Raise BadInput where a reference mass [kg] is more than a joint's drive, or another's, can hold while it sweeps.
+
+    `guess` is of the arm alone; without one, gravity counts as nothing. Where the mass hangs beyond the flange is not
+    known and counts as nothing, too.
+    """
+    planned = PlannedArm.of(arm_file, guess)
+    at_origin, by_point = payload_columns(planned.kinematics)
+    column = at_origin + by_point @ planned.kinematics.span[-1]
+    most = {}
+    for options in sweep_options(planned)[0]:
+        regressor = gravity_regressor(planned.kinematics, options.poses)
+        own = 0.0 if guess is None else np.abs(regressor @ guess.beta)
+        room = planned.limits.max_torque - own
+        bearable = (room / np.maximum(np.abs(regressor @ column), 1e-9)).min(axis=(1, 2))
+        most[planned.kinematics.names[options.joint]] = max(float(bearable.max()), 0.0)
+    name = min(most, key=lambda joint: most[joint])
+    if mass > most[name]:
+        unit = f"; is it {mass / 1000:g} kg?" if mass >= GRAMS and mass / 1000 < most[name] else ""
+        raise BadInput(
+            f"--reference-mass {mass:g}: with it no sweep of {name} stays within max_torque: attach at most "
+            f"{float(f'{most[name]:.2g}'):g} kg{unit}"
+        )
 
 
 def _choose(

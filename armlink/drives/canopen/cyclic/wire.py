@@ -51,7 +51,10 @@ def check_fits(name: str, limits: Limits, unit: Units, record: bool = False) -> 
     """Raise BadInput where limits fit no frame and no object, our torque record 2100h included."""
     if record and limits.max_torque / TORQUE_PER_MICRO > INT32_MAX:
         most = INT32_MAX * TORQUE_PER_MICRO
-        raise BadInput(f"{name}: max_torque {limits.max_torque} N·m: the readings of 2100h end at {most:.4g} N·m")
+        raise BadInput(
+            f"{name}: max_torque {limits.max_torque} N·m: the readings of 2100h end at {most:.4g} N·m: lower it, or "
+            "take a drive whose protocol carries more"
+        )
     if limits.max_torque / unit.torque > INT16_MAX:
         most = INT16_MAX * unit.torque
         raise BadInput(f"{name}: max_torque {limits.max_torque} N·m: 6071h carries at most {most:.6g} N·m")
