@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.model_file import read_model
+from armlink.model_file import NOT_FOUND, UNFETCHED, read_model
 from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.commissioning.finding import SetupFinding
 from calib.commissioning.model_judgement import NO_MASS
@@ -59,9 +59,14 @@ def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             "correct the inertia of these links: until then their torque under acceleration is not modelled",
         )
     if model.left_out:
-        remedy = "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)"
-        if not model.absent:
-            remedy = "convert them to binary STL or OBJ, or keep the workspace clear"
+        reasons = {reason for _, reason in model.unused_meshes}
+        remedy = "convert them to binary STL or OBJ, or keep the workspace clear"
+        if NOT_FOUND in reasons:
+            remedy = (
+                "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)"
+            )
+        elif UNFETCHED in reasons:
+            remedy = "run git lfs pull where the model was cloned"
         yield SetupFinding("warning", f"collision geometry incomplete: {model.left_out}", where, remedy)
     elif not model.shapes:
         yield SetupFinding(

@@ -70,7 +70,7 @@ def test_a_mesh_in_the_text_form_of_stl_costs_its_shape_alone(tmp_path):
     path = urdf(tmp_path)
     (tmp_path / "l1.stl").write_text("solid l1\nendsolid l1\n")
     found = read_model(path)
-    assert (found.absent, found.unreadable) == ((), ("l1.stl",))
+    assert [file for file, _ in found.unused_meshes] == ["l1.stl"]
     assert found.left_out == "1 mesh not binary STL, OBJ or MSH, which MuJoCo reads, such as l1.stl"
     assert compile_model(path).ngeom == 0
 
@@ -78,7 +78,41 @@ def test_a_mesh_in_the_text_form_of_stl_costs_its_shape_alone(tmp_path):
 def test_an_stl_file_without_faces_costs_its_shape_alone(tmp_path):
     path = urdf(tmp_path)
     binary_stl(tmp_path / "l1.stl", [])
-    assert read_model(path).unreadable == ("l1.stl",)
+    assert [file for file, _ in read_model(path).unused_meshes] == ["l1.stl"]
+    assert compile_model(path).ngeom == 0
+
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n"
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:abab\nsize 12345\n"
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl"])
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (POINTER, "not fetched (git lfs pull)"),
+        ("", "without volume"),
+        (SQUARE, "without volume"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "without volume"),
+        ("v 0 0 x\n", "without volume"),
+    ],
+)
+def test_a_mesh_of_no_use_costs_its_shape_alone(tmp_path, suffix, content, reason):
+    """A pointer of Git LFS, an empty file, a flat one: whatever the format is."""
+    path = urdf(tmp_path)
+    path.write_text(path.read_text().replace("l1.stl", f"l1.{suffix}"))
+    (tmp_path / f"l1.{suffix}").write_text(content)
+    if suffix == "stl" and content != POINTER:
+        reason = "not binary STL, OBJ or MSH, which MuJoCo reads"
+    assert read_model(path).unused_meshes == ((f"l1.{suffix}", reason),)
+    assert compile_model(path).ngeom == 0
+
+
+def test_a_flat_stl_costs_its_shape_alone(tmp_path):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype=float)
+    path = urdf(tmp_path)
+    binary_stl(tmp_path / "l1.stl", corners[[[0, 1, 2], [1, 3, 2]]])
+    assert read_model(path).unused_meshes == (("l1.stl", "without volume"),)
     assert compile_model(path).ngeom == 0
 
 
