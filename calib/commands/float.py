@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import StoreUrl
+from calib.commands.options import StoreUrl, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -22,6 +22,7 @@ def hold_afloat(
         str | None, typer.Option(help="Id of a gravity record; default: the current one, else the model's inertials.")
     ] = None,
     store: StoreUrl = None,
+    yes: WithoutAsking = False,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write a summary here; - is standard output.")
     ] = None,
@@ -40,12 +41,14 @@ def hold_afloat(
     from armlink.commands.plain_console import PlainConsole, command_line, results
     from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
-    from calib.commands.screen import warn_late
+    from calib.commands.screen import confirm, warn_late
     from calib.floating.run import run_float
 
     arm_file = load_arm(arm)
     beta, calibration, source = _model(arm_file, record, store)
     screen = PlainConsole()
+    if not yes:
+        confirm(f"{arm_file.name} will be held by its gravity model alone. Is a hand on it?")
     resume = command_line("float", arm, bus=bus, record=record, store=store)
     with early_end(arm_file, resume) as work, open_arm(arm_file, bus) as link:
         link.start()

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import KeepGoing
+from calib.commands.options import KeepGoing, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -50,7 +50,7 @@ def sweep(
         ),
     ] = False,
     keep_going: KeepGoing = 0,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.", rich_help_panel="Run")] = False,
+    yes: WithoutAsking = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.", rich_help_panel="Plan")] = 0,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write plan or outcome here; - is standard output.")
