@@ -8,6 +8,7 @@ from os.path import isfile
 from pathlib import Path
 from typing import Any
 
+from armlink.content.atomic_file import write_whole
 from armlink.content.memory_budget import memory_budget
 from armlink.content.model_sizes import MOST_TEXT, model_budget
 from armlink.errors import BadInput
@@ -136,6 +137,23 @@ def read_model(path: Path) -> ModelFile:
         spec.strippath = False  # the meshes' paths are absolute by now
     unphysical = _negative_inertias_removed(spec) if kind == "URDF" else ()
     return ModelFile(spec, tuple(unused), unphysical, kind)
+
+
+def expanded(path: Path, out: Path) -> Path:
+    """The URDF of a xacro file, written to `out`; raises BadInput where xacro is missing or cannot expand it."""
+    try:
+        import xacro
+    except ModuleNotFoundError:
+        raise BadInput(
+            f"{path}: is a xacro file: pip install xacro, or expand it yourself: xacro {path} > {out}"
+        ) from None
+    try:
+        text = xacro.process_file(str(path)).toxml()
+    except Exception as error:  # of many kinds: of XML, of expressions, of packages that are not found
+        what = f"{path}: xacro cannot expand it: {one_line(error)}"
+        raise BadInput(f"{what}: $(find PACKAGE) and arguments need ROS: xacro {path} > {out} there") from None
+    write_whole(out, text)
+    return out
 
 
 def compile_model(path: Path, beside: Sequence[Beside] = ()) -> Any:

@@ -1,13 +1,14 @@
 """Model files that cannot be used are refused in one line."""
 
 import struct
+import sys
 import warnings
 
 import numpy as np
 import pytest
 
 from armlink.errors import BadInput
-from armlink.model_file import compile_model, read_model
+from armlink.model_file import compile_model, expanded, read_model
 
 MODEL = """<mujoco><asset>{mesh}</asset><worldbody>{geom}<body name="arm">
 <joint name="hinge" axis="0 1 0"/></body></worldbody></mujoco>"""
@@ -164,3 +165,23 @@ def test_numbers_that_are_none_are_refused_by_name(tmp_path, key, value, of):
     (tmp_path / "arm.xml").write_text(NUMBERS.format(**SOUND | {key: value}))
     with pytest.raises(BadInput, match=f"arm.xml: {of}"):
         compile_model(tmp_path / "arm.xml")
+
+
+XACRO = """<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="length" value="0.4"/>
+<xacro:macro name="arm_link" params="name mass"><link name="${name}"><inertial><origin xyz="${length / 2} 0 0"/>
+<mass value="${mass}"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link></xacro:macro>
+<link name="base"/><xacro:arm_link name="l1" mass="2"/><joint name="j1" type="revolute"><parent link="base"/>
+<child link="l1"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="20" velocity="1"/></joint></robot>"""
+
+
+def test_a_xacro_file_is_expanded(tmp_path, monkeypatch):
+    (tmp_path / "two.xacro").write_text(XACRO)
+    model = compile_model(expanded(tmp_path / "two.xacro", tmp_path / "two.urdf"))
+    assert model.body_mass[model.body("l1").id] == 2.0
+    assert model.body_ipos[model.body("l1").id] == pytest.approx([0.2, 0, 0])
+    (tmp_path / "two.xacro").write_text(XACRO.replace("0.4", "$(find somewhere)"))
+    with pytest.raises(BadInput, match=r"xacro cannot expand it: .* need ROS: xacro .*two.xacro > "):
+        expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    with pytest.raises(BadInput, match=r"is a xacro file: pip install xacro, or expand it yourself"):
+        expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")

@@ -78,6 +78,7 @@ def new(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.errors import BadInput
+    from armlink.model_file import expanded
     from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
     from calib.commands.setup.terminal import Terminal, hand, parse_ratings, parse_stops
     from calib.commissioning.new_arm import new_arm
@@ -105,10 +106,14 @@ def new(
     if is_arm_file and (base or tip or stops or rated_torque or name):
         options = "--base, --tip, --stops, --rated-torque and --name"
         raise BadInput(f"{model}: {options} are for a model: change the arm file itself")
-    if not is_arm_file and model.suffix.lower() not in MODEL_SUFFIXES:
-        raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)}), or an arm file (.yaml)")
-    out = out or Path(f"{model.stem}.yaml")
+    is_xacro = model.suffix.lower() == ".xacro"
+    if not is_arm_file and not is_xacro and model.suffix.lower() not in MODEL_SUFFIXES:
+        suffixes = ", ".join((*MODEL_SUFFIXES, ".xacro"))
+        raise BadInput(f"{model}: expected a URDF or MJCF model ({suffixes}), or an arm file (.yaml)")
+    out = out or Path(f"{Path(model.stem).stem if is_xacro else model.stem}.yaml")
     _require_free(out, force, interactive)
+    if is_xacro:
+        model = expanded(model, out.with_suffix(".urdf"))
     if is_arm_file:
         found = bundled or model
         if drives_by_ids(found):
