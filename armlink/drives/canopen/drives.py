@@ -90,6 +90,7 @@ class CanopenDrives:
             bounds=tuple(bound for entry, bound in bounds if profile.has(entry)),  # type: ignore[misc]
             cadence="sync",
             frame="11",
+            torque_cycles=STATUS_DECIMATION if profile.reading is None else 1,
         )
 
     def routes(self) -> Mapping[int, int]:
