@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armlink.errors import BadInput
-from armlink.recording.corrections import Corrections, parse_corrections
+from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.column_order import find_changed_order
 from sim_gap.checks.finding import RecordingFinding
@@ -22,11 +22,18 @@ from sim_gap.checks.rigid_fit import ChannelMotion, fit_beside_slow_torques, fit
 from sim_gap.checks.sampling import drop_held, drop_repeats, even_times, find_dropped, find_time_unit
 from sim_gap.checks.small_zero import find_small_zero
 from sim_gap.checks.torque_delay import find_delay, find_short_delay
-from sim_gap.checks.torque_source import find_gain_command, find_same, find_source, find_unsigned
+from sim_gap.checks.torque_source import (
+    find_gain_command,
+    find_same,
+    find_source,
+    find_unsigned,
+    find_without_gravity,
+    with_gravity,
+)
 from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import TRIM_S, PreparedSignals, prepare
+from sim_gap.residuals.preprocess import CHANNELS, TRIM_S, PreparedSignals, prepare
 
 LEAST_WAY = 1.5
 """Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
@@ -97,29 +104,32 @@ def check_recording(
     recording, jitter = even_times(recording, stated)
     same = find_same(recording, stated)
     for finding in same:
-        recording = _corrected(recording, finding, label)
+        recording = _corrected(recording, finding, label, arm)
     if same and (law := find_gain_command(recording, stated)):
         same, recording = [*same, *law], replace(recording, torque_command=None)
+    if stated.without_gravity:
+        recording = with_gravity(arm, recording, tuple(CHANNELS))
     found = [*wrapped, *repeated, *held, *jitter, *([] if repeated else find_dropped(recording)), *same]
     s = _prepared(recording, arm, label, stated)
     for channel in s.channels:
         view = _view(arm, s, channel, recording, stated)
-        for look in (_unsigned, _mapping, _source):
+        for look in (_gravity, _unsigned, _mapping, _source):
             findings = look(view)
             found += findings
             certain = [finding for finding in findings if finding.corrected]
             if len(certain) < len(findings):  # what looks on would see the same fault again
                 break
             for finding in certain:
-                recording = _corrected(recording, finding, label)
+                recording = _corrected(recording, finding, label, arm)
             if not certain:
                 continue
             s = _prepared(recording, arm, label, stated)
             if channel not in s.channels:  # taken for another one
                 break
             view = _view(arm, s, channel, recording, stated)
-    for finding in find_beyond_range(arm, recording, stated):
-        raise BadInput(f"{label}: {finding.sentence()}")
+    beyond = find_beyond_range(arm, recording, stated)
+    if beyond and all(finding.corrected for finding in found):  # else it is what the doubt is about
+        raise BadInput(f"{label}: {beyond[0].sentence()}")
     recording, velocity = sound_velocity(recording, stated)
     for finding in find_seam(recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
@@ -149,13 +159,18 @@ class _ChannelView:
 
     def in_time(self, delay: RecordingFinding) -> ChannelMotion:
         """The motion with a delay of its channel taken off."""
-        corrected = _corrected(self.recording, delay, self.s.label)
+        corrected = _corrected(self.recording, delay, self.s.label, self.arm)
         return motion_of(_prepared(corrected, self.arm, self.s.label, self.stated), self.motion.channel)
 
 
 def _view(arm: RigidArm, s: PreparedSignals, channel: str, recording: Recording, stated: Corrections) -> _ChannelView:
     motion = motion_of(s, channel)
     return _ChannelView(arm, find_mounting(arm, motion), s, motion, recording, stated)
+
+
+def _gravity(view: _ChannelView) -> list[RecordingFinding]:
+    """A channel from which gravity was subtracted."""
+    return [] if goes_one_way(view.recording) else find_without_gravity(view.arm, view.motion, view.stated)
 
 
 def _unsigned(view: _ChannelView) -> list[RecordingFinding]:
@@ -199,10 +214,12 @@ def _source(view: _ChannelView) -> list[RecordingFinding]:
     return [*scale, *find_source(fit, view.s, motion, stated)]
 
 
-def _corrected(recording: Recording, finding: RecordingFinding, label: str) -> Recording:
+def _corrected(recording: Recording, finding: RecordingFinding, label: str, arm: RigidArm) -> Recording:
     """The recording after the correction that a finding's option makes."""
     name, _, value = finding.option.partition(" ")
     keys = {"--sign": "sign", "--units": "units", "--zero": "zero", "--clock": "clock", "--map": "columns"}
+    if value == WITHOUT_GRAVITY:
+        return with_gravity(arm, recording, [finding.channel])
     if name == "--effort-is":
         return parse_corrections(effort=value).apply(recording, label)
     made = parse_corrections(**{keys[name]: [value]})  # type: ignore[arg-type]
