@@ -37,6 +37,8 @@ from sim_gap.residuals.preprocess import CHANNELS, TRIM_S, PreparedSignals, prep
 
 LEAST_WAY = 1.5
 """Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
+SIGNAL = 2.0
+"""Standard deviation of a reading over that of its noise from which it holds a signal."""
 LEAST_RANGE = 0.1
 """Range from which a joint moves [rad]."""
 WAY_STEP_S = 0.1
@@ -82,11 +84,17 @@ def check_recordings(
     Returns the corrected recordings and the findings of all. What is not certain is left as recorded and among the
     findings. Raises BadInput for times, counts and angles that no arm can have.
     """
-    checked, found = [], []
+    checked, found = list[Recording](), list[RecordingFinding]()
     for recording, label in zip(recordings, labels, strict=True):
         corrected, findings = check_recording(arm, recording, label, stated)
         checked.append(corrected)
-        found += [finding for finding in findings if finding not in found]
+        asked = {(each.channel, each.joint, each.option) for each in found if not each.corrected}
+        found += [
+            finding
+            for finding in findings
+            if finding not in found
+            and (finding.corrected or (finding.channel, finding.joint, finding.option) not in asked)
+        ]
     return checked, found
 
 
@@ -113,6 +121,8 @@ def check_recording(
     s = _prepared(recording, arm, label, stated)
     for channel in s.channels:
         view = _view(arm, s, channel, recording, stated)
+        if view.silent:
+            continue
         for look in (_gravity, _unsigned, _mapping, _source):
             findings = look(view)
             found += findings
@@ -156,6 +166,11 @@ class _ChannelView:
     def rate(self) -> float:
         """Rows per second."""
         return float((len(self.motion.q) - 1) / max(self.s.t[-1] - 2.0 * TRIM_S, 1e-9))
+
+    @property
+    def silent(self) -> bool:
+        """Whether the channel holds noise alone, as of an arm that swings with its drives off: nothing has a place."""
+        return bool((self.motion.reading.std(0) < SIGNAL * self.s.noise[self.motion.channel]).all())
 
     def in_time(self, delay: RecordingFinding) -> ChannelMotion:
         """The motion with a delay of its channel taken off."""
