@@ -66,11 +66,14 @@ def sweep(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
+    from armlink.extras import require_extra
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, warn_late
     from calib.sweep.dataset import require_vacant
 
+    if picture is not None:
+        require_extra("--picture", "reports")
     arm_file = with_hold(load_arm(arm), hold)
     if plan:
         write_json(json_file, _plan(arm_file, seed, picture, results(json_file)))
