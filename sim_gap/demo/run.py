@@ -22,6 +22,7 @@ from armlink.extras import require_extra
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.arm.sweep_section import CreepSection, sweep_section
+from calib.commissioning.model_judgement import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
 from calib.creep.choice import sweep_motion
 from calib.creep.fit import fit_creep
@@ -65,6 +66,7 @@ def run_demo(
     if realism is not None:
         arm = with_realism(arm, realism, seed)
     arm.require_link()
+    refuse_impossible_model(arm)
     data_folder = _fresh(out)
     teller.say(f"arm {arm.name}, hidden truth of seed {seed}, results in {out}")
     creeping = sweep_motion(arm) == "creep"
