@@ -346,4 +346,4 @@ def test_the_package_states_its_pythons():
     assert stated["Requires-Python"] == ">=3.11"
     pythons = [each for each in stated.get_all("Classifier") if each.startswith("Programming Language")]
     assert [each[-4:] for each in pythons] == ["3.11", "3.12", "3.13"]
-    assert {"all", "daemon", "gap", "simulator"} <= set(stated.get_all("Provides-Extra"))
+    assert {"all", "daemon", "cluster", "simulator"} <= set(stated.get_all("Provides-Extra"))
