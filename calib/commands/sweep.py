@@ -67,12 +67,15 @@ def sweep(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
+    from armlink.extras import require_extra
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, warn_late
     from calib.commissioning.model_judgement import refuse_impossible_model
     from calib.sweep.dataset import require_vacant
 
+    if picture is not None:
+        require_extra("--picture", "reports")
     arm_file = with_hold(load_arm(arm), hold)
     refuse_impossible_model(arm_file)
     if reference_mass:

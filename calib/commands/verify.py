@@ -36,6 +36,7 @@ def verify(
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
+    from armlink.extras import require_extra
     from armlink.loop.open import open_arm
     from calib.commands.screen import SweepScreen, confirm
     from calib.creep.choice import sweep_motion
@@ -43,6 +44,8 @@ def verify(
     from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify
 
+    if report is not None:
+        require_extra("--report", "reports")
     arm_file = load_arm(arm)
     if not yes:
         confirm(f"{arm_file.name} will drive to {poses} poses all over its range. Is it clear?")

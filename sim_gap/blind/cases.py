@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from armlink.recording.csv_text import write_numbers
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm, compile_arm, inverse, mjcf
 from sim_gap.blind.plant.plant import simulate
@@ -169,16 +170,12 @@ def _chosen(columns: dict[str, Values], wanted: dict[str, bool]) -> dict[str, Va
 
 def write_csv(path: Path, columns: dict[str, Array]) -> None:
     """Write columns as in docs/formats.md: `t`, then `name_1` … `name_n` of each channel."""
-    import pyarrow as pa
-    from pyarrow.csv import WriteOptions, write_csv
-
     flat: dict[str, Array] = {}
     for name, values in columns.items():
         rounded = np.round(values, DECIMALS.get(name, 5)) + 0.0
         flat |= {name: rounded} if values.ndim == 1 else {f"{name}_{j + 1}": x for j, x in enumerate(rounded.T)}
     with path.open("wb") as file:
-        file.write((",".join(flat) + "\n").encode())  # pyarrow would quote the names
-        write_csv(pa.table(flat), file, WriteOptions(include_header=False))
+        write_numbers(file, flat)
 
 
 Make = Callable[[Sequence[Any], Path, Path, float, float], None]

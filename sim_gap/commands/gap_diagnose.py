@@ -107,6 +107,7 @@ def diagnose(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
+    from armlink.extras import require_extra
     from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
@@ -118,6 +119,10 @@ def diagnose(
     for target in (None if str(json) == "-" else json, report, out_model, out_samples, out_actuators):
         if target is not None and not target.resolve().parent.is_dir():
             raise BadInput(f"{target}: its folder does not exist: create it first")
+    if report is not None:
+        require_extra("--report", "reports")
+    if out_samples is not None and out_samples.suffix == ".parquet":
+        require_extra("--out-samples", "parquet")
     stated = parse_corrections(
         columns=columns or (),
         sign=sign or (),

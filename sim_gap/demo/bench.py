@@ -8,6 +8,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.drives.orders import Mode
+from armlink.extras import has_extra
 from armlink.link.link import Link
 from armlink.link.types import Command, Sample
 from armlink.recording.files import save_recording
@@ -128,7 +129,7 @@ def record_pair(
 ) -> tuple[Recording, Recording]:
     """Two different motions to learn and to judge from, every cycle, positions as the calibration corrects them.
 
-    They are kept as MCAP too; `motor_only`: without joint torque. Raises BusFault.
+    They are kept as MCAP too, or as CSV without the extra for it; `motor_only`: without joint torque. Raises BusFault.
     """
     link, found = bench.link, []
     scale, zero = calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0)
@@ -147,7 +148,7 @@ def record_pair(
             position_command=targets * scale + zero,
             names=link.names,
         ).check("recording of the simulated arm")
-        save_recording(recording, folder / f"{name}.mcap")
+        save_recording(recording, folder / f"{name}{'.mcap' if has_extra('bags') else '.csv.gz'}")
         found.append(recording)
     return found[0], found[1]
 

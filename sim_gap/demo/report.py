@@ -1,87 +1,24 @@
-"""The demo for people: tables in the terminal, and the report as one self-contained HTML page."""
+"""The demo's report as one self-contained HTML page."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
-from rich.table import Table
 
 from calib.creep.fit import CreepFit
-from calib.creep.record import HEADINGS, determined_joints
+from calib.creep.record import HEADINGS
 from calib.fit.sensor_fit import SensorFit
-from calib.records.records import Parameter
 from calib.report.figures import COLOURS, GREY, PANEL, add_sweeps, verify_figure
 from calib.report.page import ReportSection as Section
 from calib.report.page import ReportTable, bullets, paragraph, paragraphs, render
-from calib.sweep.verify import Verification
 from gcomp.arrays import Array
-from sim_gap.demo.bench import Bench, GravityCheck
 from sim_gap.demo.drift import DriftCourse
 from sim_gap.demo.result import DemoResult
+from sim_gap.demo.tables import ABSENT, CREEP_DIGITS, SENSOR_DIGITS, creep_cell
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
-
-SENSOR_DIGITS: dict[Parameter, int] = {"gain": 4, "offset": 3, "position_gain": 5}
-"""Sensor parameters that the demo draws and finds, with the digits to show."""
-CREEP_DIGITS = {"gain": 4, "offset": 3, "zero": 4, "coulomb": 3, "load": 3, "viscous": 3}
-"""Families of the creep fit to show, with digits."""
-ABSENT = "not observable"
-
-
-def calibration_table(bench: Bench, fit: SensorFit) -> Table:
-    """Estimates with 95 % intervals beside the truth, which was opened only for this table."""
-
-    def cell(parameter: Parameter, digits: int, joint: int) -> str:
-        value, true = fit.value(parameter)[joint], getattr(bench.truth, parameter)[joint]
-        half = value - fit.ci95(parameter)[joint][0]
-        estimate = ABSENT if np.isnan(value) else f"{value:.{digits}f} ± {half:.{digits}f}"
-        return f"{estimate} ({true:.{digits}f})"
-
-    rows = [[name, *(cell(*each, j) for each in SENSOR_DIGITS.items())] for j, name in enumerate(bench.link.names)]
-    heads = ("joint", "torque gain", "torque offset [N·m]", "position gain")
-    return _table("torque and position sensors: estimated ± 95 % (true)", heads, rows)
-
-
-def creep_table(result: DemoResult, fit: CreepFit) -> Table:
-    """The same of an arm without torque sensors."""
-    truth = result.truth
-    truths = {"gain": truth.gain, "zero": truth.position_offset, "coulomb": result.bench.simulated.true_friction}
-    rows = [
-        [name, *(f"{_creep_cell(fit, family, j)} ({true[j]:.3f})" for family, true in truths.items())]
-        for j, name in enumerate(result.names)
-    ]
-    heads = ("joint", *(HEADINGS[family] for family in truths))
-    return _table("torque constants, zeros and friction: estimated ± 95 % (true)", heads, rows)
-
-
-def verify_table(names: tuple[str, ...], check: Verification, gravity: GravityCheck) -> Table:
-    """Model against sensor, and model against the plant's own gravity."""
-    rows = []
-    for j, name in enumerate(names):
-        rms, largest = gravity.rms_error[j], gravity.max_torque[j]
-        share = f"{rms / largest:.2%}" if largest > 1e-6 else "-"
-        rows.append([name, f"{check.rms[j]:.4f}", f"{rms:.4f}", f"{largest:.2f}", share])
-    title = f"gravity model: at {len(check.position)} poses of the arm; at {gravity.poses} against the truth"
-    return _table(title, ("joint", "RMS to sensor [N·m]", "RMS to truth [N·m]", "largest torque [N·m]", "share"), rows)
-
-
-def _table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    table = Table(title=title)
-    for column, head in enumerate(heads):
-        table.add_column(head, justify="right" if column else "left")
-    for row in rows:
-        table.add_row(*row)
-    return table
-
-
-def _creep_cell(fit: CreepFit, family: str, joint: int) -> str:
-    if not determined_joints(fit, family)[joint]:
-        return ABSENT
-    digits = CREEP_DIGITS[family]
-    return f"{fit.value(family)[joint]:.{digits}f} ± {1.96 * fit.std(family)[joint]:.{digits}f}"
 
 
 def write_report(result: DemoResult, path: Path) -> None:
@@ -157,7 +94,7 @@ def _sensor_calibration(result: DemoResult, fit: SensorFit) -> Section:
 
 def _drive_calibration(result: DemoResult, fit: CreepFit) -> Section:
     rows = [
-        [name, f"{result.truth.gain[j]:.4f}", *(_creep_cell(fit, family, j) for family in CREEP_DIGITS)]
+        [name, f"{result.truth.gain[j]:.4f}", *(creep_cell(fit, family, j) for family in CREEP_DIGITS)]
         for j, name in enumerate(result.names)
     ]
     header = ("joint", "true reading per N·m", *(HEADINGS[family] for family in CREEP_DIGITS))

@@ -18,6 +18,7 @@ from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
 from armlink.commands.output import write_json
 from armlink.commands.plain_console import results
 from armlink.errors import BadInput
+from armlink.extras import require_extra
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.arm.sweep_section import CreepSection, sweep_section
@@ -45,8 +46,8 @@ from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.demo.bench import Bench, Sag, check_gravity, diagnose_recordings, mean_sag, record_pair, sag_poses
 from sim_gap.demo.drift import run_drift
 from sim_gap.demo.narrator import Narrator
-from sim_gap.demo.report import calibration_table, creep_table, verify_table, write_report
 from sim_gap.demo.result import DemoResult, summary
+from sim_gap.demo.tables import calibration_table, creep_table, verify_table
 from sim_gap.report.effect_text import sentence
 
 BY = "armlink demo"
@@ -79,12 +80,24 @@ def run_demo(
         store.close()
     if result.creep is not None:
         teller.results.print(creep_table(result, result.creep))
-    write_report(result, out / "report.html")
+    shown = _report(result, out / "report.html")
     content = summary(result)
     write_json(out / "summary.json", content)
     write_json(json_path, content)
-    teller.find(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}")
+    teller.find(f"done: {shown}; numbers in {out / 'summary.json'}")
     return result
+
+
+def _report(result: DemoResult, path: Path) -> str:
+    """Write the report, and say what to open; without the packages that draw it, how they are installed."""
+    try:
+        require_extra(f"no {path}", "reports")
+    except BadInput as missing:
+        return str(missing)
+    from sim_gap.demo.report import write_report
+
+    write_report(result, path)
+    return f"open {path}"
 
 
 def quick(arm: ArmFile) -> ArmFile:
