@@ -112,7 +112,7 @@ def sweep(
     """
     arm_file = arm.arm if _is_link(arm) else _arm(arm)
     run = run_creep if sweep_motion(arm_file) == "creep" else run_sweep
-    with _enabled("sweep", arm, bus, simulated, reference_mass if simulated else 0.0) as link:
+    with _enabled(arm, bus, simulated, reference_mass if simulated else 0.0) as link:
         return run(
             link, arm_file, Path(out), reference_mass=reference_mass, resume=resume, seed=seed, progress=progress
         )
@@ -187,7 +187,7 @@ def verify(
     creeping = sweep_motion(arm_file) == "creep"
     if creeping and calibration is None:
         raise BadInput("verify: sensors: the drives of this arm keep no calibration: give what calibrate found")
-    with _enabled("verify", arm, bus, simulated) as link:
+    with _enabled(arm, bus, simulated) as link:
         if creeping and calibration is not None:
             return verify_creeping(link, arm_file, model, calibration, poses=poses, seed=seed, progress=progress)
         return run_verify(link, arm_file, model, calibration, poses=poses, seed=seed, progress=progress)
@@ -236,19 +236,17 @@ def _is_link(arm: object) -> TypeGuard[ArmDriver]:
 
 
 @contextmanager
-def _enabled(
-    function: str, arm: ArmLike | ArmDriver, bus: str | None, simulated: bool, load: float = 0.0
-) -> Iterator[ArmDriver]:
+def _enabled(arm: ArmLike | ArmDriver, bus: str | None, simulated: bool, load: float = 0.0) -> Iterator[ArmDriver]:
     """The link to the arm: the one given, or one that is opened, started and enabled for this."""
-    if _is_link(arm):
-        if bus is not None or simulated:
-            raise BadInput(f"{function}: the link given is open already: leave bus and simulated out")
+    if not _is_link(arm):
+        with open_link(_arm(arm), bus, simulated=simulated, load=load) as link:
+            link.start()
+            link.enable()
+            yield link
+    elif bus is not None or simulated:
+        raise BadInput("bus, simulated: the link given is open already: leave both out")
+    else:
         yield arm
-        return
-    with open_link(_arm(arm), bus, simulated=simulated, load=load) as link:
-        link.start()
-        link.enable()
-        yield link
 
 
 def _loaded(given: object, kind: type[T], load: Callable[[str | Path], T], expected: str) -> T:

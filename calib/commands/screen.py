@@ -25,15 +25,13 @@ if TYPE_CHECKING:
 
 _CONSOLE = PlainConsole()
 """For progress and warnings."""
-LINE_PERIOD_S = 5.0
-"""Least time between two lines of progress where there is no terminal [s]; a choice."""
 
 
 class SweepScreen:
     """A progress bar with readings done, time left and what is being done; a context manager."""
 
-    def __init__(self, title: str) -> None:
-        """With `title` before the bar, or above it on a narrow terminal."""
+    def __init__(self, title: str, line_period: float = 5.0) -> None:
+        """With `title` before the bar, or above it on a narrow terminal; elsewhere a line in so many seconds."""
         above = bool(title) and _CONSOLE.width < 100  # title, bar and reading do not fit in a line
         if above:
             _CONSOLE.print(title)
@@ -44,13 +42,12 @@ class SweepScreen:
             PlainColumn("{task.fields[left]}  {task.fields[text]}"),
         )
         self._progress = Progress(*columns, console=_CONSOLE, transient=False, disable=not _CONSOLE.is_terminal)
-        self._title, self._told = title, time.monotonic()
+        self._title, self._told, self._period = title, time.monotonic(), line_period
         self._task = self._progress.add_task("" if above else title, total=1, left="", text="connecting")
 
     def update(self, done: int, total: int, seconds_left: float, text: str) -> None:
         """As run_sweep's progress."""
-        left = f"{int(seconds_left) // 60}:{int(seconds_left) % 60:02d}"
-        self._update(done, total, f"{left} left", text)
+        self._update(done, total, f"{int(seconds_left) // 60}:{int(seconds_left) % 60:02d} left", text)
 
     def count(self, done: int, total: int) -> None:
         """As run_verify's progress."""
@@ -59,7 +56,7 @@ class SweepScreen:
     def _update(self, done: int, total: int, left: str, text: str) -> None:
         """On the bar; where there is no terminal, a line now and then."""
         self._progress.update(self._task, completed=done, total=total, left=left, text=text)
-        if self._progress.disable and time.monotonic() - self._told >= LINE_PERIOD_S:
+        if self._progress.disable and time.monotonic() - self._told >= self._period:
             self._told = time.monotonic()
             _CONSOLE.print("  ".join(part for part in (self._title, f"{done}/{total}", left, text) if part))
 

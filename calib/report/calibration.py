@@ -20,7 +20,7 @@ from calib.report.page import (
     ReportSection,
     ReportTable,
     html_of,
-    interval_text,
+    interval_table,
     paragraph,
     paragraphs,
     render,
@@ -112,17 +112,12 @@ def _advice(done: Calibrated, broken: list[str]) -> Markup:
 
 def _sensors(done: Calibrated) -> ReportSection:
     fit = done.fit
-    header = [
-        "joint",
-        *(f"{title} [{unit}]" for _, title, unit in PARAMETERS),
-        "residual RMS [N·m]",
-        "hysteresis [N·m]",
-    ]
-    rows = []
-    for j, name in enumerate(fit.names):
-        cells = [interval_text(fit.value(key)[j], fit.half95(key)[j]) for key, _, _ in PARAMETERS]
-        rows.append([name, *cells, f"{fit.residual_rms[j]:.4f}", f"{fit.hysteresis[j]:.4f}"])
-    table = ReportTable(header, rows, "Estimates ± half of the 95 % interval; reading = gain · torque + offset.")
+    columns = {f"{title} [{unit}]": (fit.value(key), fit.half95(key)) for key, title, unit in PARAMETERS}
+    columns |= {"residual RMS [N·m]": (fit.residual_rms, 0 * fit.residual_rms)}
+    columns |= {"hysteresis [N·m]": (fit.hysteresis, 0 * fit.hysteresis)}
+    table = interval_table(
+        fit.names, columns, "Estimates ± half of the 95 % interval; reading = gain · torque + offset."
+    )
     reasons = [f"{joint}, {parameter.replace('_', ' ')}: {why}." for (joint, parameter), why in fit.reasons.items()]
     reasons += [f"{why}." for why in fit.imprecise.values()]
     if fit.attachment is not None:

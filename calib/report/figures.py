@@ -1,6 +1,5 @@
 """Figures of the calibration reports: sweeps with their fits, before and after, and the paper's Figure 6."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ from plotly.subplots import make_subplots
 
 from calib.creep.fit import CreepFit
 from calib.fit.sensor_fit import SensorFit
-from calib.observer.watch_loop import WatchHistory
 from calib.sweep.verify import Verification
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
@@ -39,8 +37,7 @@ def sweep_rows(fit: SensorFit, joint: int, sweep: str) -> Indices:
 
 
 def joint_figure(arm: Arm, fit: SensorFit, joint: int) -> Any:
-    """One joint's sweeps, up (▸) and down (◂): readings over position with the fitted curve, and residuals with their
-    95 % intervals."""
+    """One joint's sweeps, up (▸) and down (◂): readings with the fitted curve, and residuals with 95 % intervals."""
     titles, readings = ("sensor reading [N·m]", "reading minus fit [N·m]"), fit.rows.readings
     figure = make_subplots(rows=1, cols=2, column_widths=[0.58, 0.42], subplot_titles=titles, horizontal_spacing=0.1)
     for colour, sweep in enumerate(sweeps_of(fit, joint)):
@@ -84,9 +81,8 @@ def creep_figure(fit: CreepFit) -> Any:
                 at = own[(rows.sweep[own] == sweep) & (rows.side[own] == side)]
                 at = at[np.argsort(rows.position[at, joint])]
                 x, y, marker = rows.position[at, joint], rows.reading[at], {"symbol": symbol, "color": paint}
-                line = {"color": GREY, "width": 1}
                 figure.add_scatter(x=x, y=y, mode="markers", marker=marker, **place)
-                figure.add_scatter(x=x, y=y - fit.solution.residual[at], mode="lines", line=line, **place)
+                figure.add_scatter(x=x, y=y - fit.solution.residual[at], mode="lines", line={"color": GREY}, **place)
     figure.update_xaxes(title_text="position reading [rad]", row=n)
     return figure.update_layout(height=PANEL * n + 80)
 
@@ -120,31 +116,6 @@ def verify_figure(check: Verification) -> Any:
         [(check.model[:, j], check.sensor[:, j]) for j in range(len(check.names))],
         "pose number",
     )
-
-
-def watch_figure(
-    history: WatchHistory, joint: int, truth: tuple[Sequence[float], Array], marks: Sequence[tuple[float, str]]
-) -> Any:
-    """The observer's gain and offset of a joint over time with 95 % bands, and what happened when.
-
-    `truth` is times (K,) and true values (2, K).
-    """
-    t, figure = np.array(history.t), make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.08)
-    for row, (name, title) in enumerate((("gain", "gain"), ("offset", "offset [N·m]"))):
-        value, std = (np.array(getattr(history, key))[:, joint] for key in (name, f"{name}_std"))
-        place = {"showlegend": row == 0, "row": row + 1, "col": 1}
-        band = np.concatenate([value + 1.96 * std, (value - 1.96 * std)[::-1]])
-        paint = {"fill": "toself", "fillcolor": "rgba(31,95,168,0.18)", "line": {"width": 0}, "hoverinfo": "skip"}
-        figure.add_scatter(x=np.concatenate([t, t[::-1]]), y=band, name="95 % interval", **paint, **place)
-        figure.add_scatter(x=t, y=value, name="observer", line={"color": COLOURS[0]}, **place)
-        figure.add_scatter(x=truth[0], y=truth[1][row], name="truth", line={"color": GREY, "dash": "dot"}, **place)
-        figure.update_yaxes(title_text=title, row=row + 1, col=1)
-    anchor = {"showarrow": False, "xanchor": "left", "yanchor": "bottom", "y": 1.0, "yref": "y domain"}
-    for when, text in marks:
-        figure.add_vline(x=when, line={"color": COLOURS[6], "width": 1}, row="all", col=1)
-        figure.add_annotation(x=when, text=text, **anchor)
-    figure.update_xaxes(title_text="link time [s]", row=2)
-    return figure.update_layout(height=520, legend={"orientation": "h", "y": 1.1, "x": 0})
 
 
 def _panels(titles: list[str], pairs: list[tuple[Array, Array]], along: str) -> Any:

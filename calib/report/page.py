@@ -53,10 +53,7 @@ def interval_text(value: float, half: float) -> str:
 
 def interval_table(names: Sequence[str], columns: Mapping[str, tuple[Any, Any]], caption: str = "") -> ReportTable:
     """A row a joint; `columns` maps heading to (value, half of its 95 % interval), (n,) each."""
-    rows = [
-        [name, *(interval_text(value[joint], half[joint]) for value, half in columns.values())]
-        for joint, name in enumerate(names)
-    ]
+    rows = [[name, *(interval_text(v[j], half[j]) for v, half in columns.values())] for j, name in enumerate(names)]
     return ReportTable(("joint", *columns), rows, caption)
 
 

@@ -99,7 +99,7 @@ class Bench:
         for pose in sag_poses(plan):
             self.travel(link.position_sent, home)
             self.travel(home, pose)
-            sample, held = link.cycle(Command.hold(pose)), list[Array]()
+            sample, held = link.cycle(link.last or Command.hold(pose)), list[Array]()
             while len(held) < seconds * link.rate:
                 sample = link.cycle(weak_hold(sample, model, zero, pose, kp, kd))
                 held.append(sample.position)

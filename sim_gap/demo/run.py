@@ -28,7 +28,7 @@ from calib.plan.types import SweepPlan
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.report import calibration
-from calib.report.figures import creep_figure, verify_figure, watch_figure
+from calib.report.figures import creep_figure, verify_figure
 from calib.report.page import ReportSection, paragraph, paragraphs
 from calib.sweep.dataset import SweepData
 from calib.sweep.verify import Verification
@@ -39,6 +39,7 @@ from sim_gap.demo.account import Account
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
+from sim_gap.report.time_figures import watch_figure
 
 BY = "armlink demo"
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
@@ -142,10 +143,7 @@ class Demo:
         account.find(f"{traffic}, {bus.load:.0%} bus load, {bus.missed} missed")
 
     def _passes(self) -> list[SweepData]:
-        """All passes of sweeps; between them the operator bolts the reference mass on, somewhere the fit is not told.
-
-        The third tells what changes as drives without sensors warm up from the mass; one sweep a joint is enough.
-        """
+        """Without, with and, of drives that warm up, again without the mass, which hangs where the fit is not told."""
         bench, passes = self.bench, list[SweepData]()
         steps = "sweeping each joint, tip to base, the others pressed on their stops"
         motion = "creeping through each joint's range both ways" if bench.creeping else steps
