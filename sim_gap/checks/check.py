@@ -72,7 +72,8 @@ def check_recordings(
         labels: their names for messages.
         stated: corrections that the user stated, already made; those are not looked into again.
 
-    Returns the corrected recordings and the findings of all. Raises BadInput for a finding that is not certain.
+    Returns the corrected recordings and the findings of all. What is not certain is left as recorded and among the
+    findings. Raises BadInput for times, counts and angles that no arm can have.
     """
     checked, found = [], []
     for recording, label in zip(recordings, labels, strict=True):
@@ -85,7 +86,7 @@ def check_recordings(
 def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections
 ) -> tuple[Recording, list[RecordingFinding]]:
-    """Check and correct one recording. Raises BadInput for a finding that is not certain."""
+    """Check and correct one recording, as `check_recordings`."""
     for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, wrapped = unwrap(recording)
@@ -106,11 +107,12 @@ def check_recording(
         for look in (_unsigned, _mapping, _source):
             findings = look(view)
             found += findings
-            for finding in findings:
-                if not finding.corrected:
-                    raise BadInput(f"{label}: {finding.sentence()}")
+            certain = [finding for finding in findings if finding.corrected]
+            if len(certain) < len(findings):  # what looks on would see the same fault again
+                break
+            for finding in certain:
                 recording = _corrected(recording, finding, label)
-            if not findings:
+            if not certain:
                 continue
             s = _prepared(recording, arm, label, stated)
             if channel not in s.channels:  # taken for another one

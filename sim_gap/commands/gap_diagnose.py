@@ -170,11 +170,14 @@ def diagnose(
 
 
 def _suggest(answer: "Diagnosis", sim: str, json: Path | None, out_model: Path | None) -> None:
-    """The next command after an ambiguous or explained gap."""
+    """The next command after an ambiguous or explained gap, or with what settles a doubt about the recordings."""
     from armlink.arm_file import bundled_arms
     from armlink.commands.plain_console import PlainConsole, command_line, suggest
 
-    if answer.verdict == "ambiguous":
+    if answer.doubts:
+        options = dict.fromkeys(finding.option for finding in answer.doubts)
+        PlainConsole().print(f"next: the same command with {', or '.join(options)}")
+    elif answer.verdict == "ambiguous":
         arm = sim if sim in bundled_arms() or sim.endswith((".yaml", ".yml")) else "ARM.yaml"
         kept = json is not None and str(json) != "-"
         plan = command_line("gap", "plan", arm, answer=json if kept else "gap.json", out="motion.csv")

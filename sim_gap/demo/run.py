@@ -14,6 +14,7 @@ from armlink.link.types import Sample
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_section
+from calib.commissioning.model_judgement import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
 from calib.creep.choice import sweep_motion
 from calib.creep.record import CreepCalibration
@@ -64,6 +65,7 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
     arm = load_arm(arm_name)
     if realism is not None:
         arm = with_realism(arm, realism, seed)
+    refuse_impossible_model(arm)
     bench, data = Bench(quick(arm), seed), _fresh(out)
     account.say(f"arm {arm.name}, hidden truth of seed {seed}, results in {out}")
     account.note(arm=arm.name, seed=seed, joints=arm.joint_names)
