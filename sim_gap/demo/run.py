@@ -38,6 +38,7 @@ from sim_bus.sim_section import with_realism
 from sim_bus.truth import Truth
 from sim_gap.demo.account import Account
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
+from sim_gap.model.load import compile_model
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
 from sim_gap.report.time_figures import watch_figure
@@ -49,9 +50,7 @@ DRIFT_GAIN, DRIFT_OFFSET, DRIFT_OFFSET_SHARE = 1.03, 0.3, 0.05
 """Factor on the sensor's readings; offset added to them [N·m], at most this share of rated torque."""
 QUIET_SECONDS, WORK_SECONDS, WATCHED_SECONDS = 30.0, 300.0, 15.0
 """Ordinary work before the drift begins, at most, and after a recalibration [s]."""
-WATCHED = (
-    "The observer compares gravity with the sensors at every stop. Estimates: against the calibration then in force."
-)
+WATCHED = "At every stop the observer compares gravity and sensors. Estimates: against the calibration then in force."
 
 
 def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, realism: float | None = None) -> None:
@@ -133,7 +132,7 @@ class Demo:
             if not bench.creeping:
                 self._drift(record, model, check)
             account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
-            gap, bus = diagnose(arm.path, *recordings), link.stats
+            gap, bus = diagnose(compile_model(arm.path), *recordings), link.stats
             link.disable()
         self.store.close()
         account.find(sentence(gap))
