@@ -120,10 +120,8 @@ def _show(result: "Verification", console: "PlainConsole") -> None:
 
     title = f"Model against sensor at {len(result.sensor)} poses [N·m]"
     table = Table("joint", "RMS", "largest", "allowed RMS", title=title)
-    for joint, name in enumerate(result.names):
-        table.add_row(
-            name, f"{result.rms[joint]:.3f}", f"{result.max_error[joint]:.3f}", f"{result.tolerance[joint]:.3f}"
-        )
+    for name, *torques in zip(result.names, result.rms, result.max_error, result.tolerance, strict=True):
+        table.add_row(name, *(f"{torque:.3f}" for torque in torques))
     console.print(table)
     beyond = [name for name, off in zip(result.names, result.rms > result.tolerance, strict=True) if off]
     agree = "passed: model and sensor agree at every joint within its allowed RMS"
