@@ -15,9 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from armlink.errors import ArmlinkError, BadInput, Refused
-from sim_gap.blind.cases import HELDOUT_S, TRAIN_S
-from sim_gap.blind.position_score import score_positions
-from sim_gap.blind.score import answer_name, score
+from sim_gap.blind.score import answer_name, score, score_positions
 
 MANIFEST = "manifest.json"
 SCHEMA = "armlink.blind-seal/1"
@@ -77,10 +75,8 @@ def _hashes(folder: Path) -> dict[str, str]:
     }
 
 
-SERVO_LENGTHS_S = 36.0, 18.0
-"""Training and held-out recordings of arms with servos [s]."""
-MAKER, SERVO_MAKER = "sim_gap.blind.cases", "sim_gap.blind.servo_cases"
-"""Modules that make the cases, of arms with torque channels and of arms with servos."""
+LENGTHS_S, SERVO_LENGTHS_S = (120.0, 40.0), (36.0, 18.0)
+"""Training and held-out recordings, and those of arms with servos [s]."""
 MOST_EFFECTS = 10
 """Largest number of effects in one case."""
 Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], dict[str, Any]]
@@ -112,11 +108,10 @@ def run_bench(
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):
         raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
-    lengths = lengths or (SERVO_LENGTHS_S if positions else (TRAIN_S, HELDOUT_S))
+    lengths = lengths or (SERVO_LENGTHS_S if positions else LENGTHS_S)
     started = time.monotonic()
     progress("making cases", 0, cases)
-    maker = SERVO_MAKER if positions else MAKER
-    for done in make_apart(out, seed, cases, workers, lengths, effects, maker):
+    for done in make_apart(out, seed, cases, workers, lengths, effects, positions):
         progress("making cases", done, cases)
     made = time.monotonic()
     todo = tasks(out)
@@ -141,12 +136,19 @@ def _require_range(effects: str) -> None:
 
 
 def make_apart(
-    out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float], effects: str = "", maker: str = MAKER
+    out: Path,
+    seed: int,
+    cases: int,
+    workers: int,
+    lengths: tuple[float, float],
+    effects: str = "",
+    positions: bool = False,
 ) -> Iterator[int]:
     """Make the cases in a separate process and yield their number from time to time. Raises Refused if it fails."""
-    command = [sys.executable, "-m", maker, "--seed", str(seed), "--cases", str(cases)]
+    command = [sys.executable, "-m", "sim_gap.blind.cases", "--seed", str(seed), "--cases", str(cases)]
     command += ["--out", str(out / "cases"), "--labels", str(out / "labels"), "--workers", str(workers)]
     command += ["--train-s", str(lengths[0]), "--heldout-s", str(lengths[1]), "--effects", effects]
+    command += ["--positions"] * positions
     (out / "cases").mkdir(parents=True)
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         while True:

@@ -7,20 +7,39 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.arms import BenchArm, compile_arm, controlled_inertia, inverse
+from sim_gap.blind.arms import BenchArm, compile_arm, controlled_inertia, inverse, mass_matrices
 from sim_gap.blind.motion import RATE, derivatives
 
 THIN = 25
 """Magnitudes are judged on every 25th row of the trajectory."""
+THINNED_S = THIN / RATE
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
+class ServoLaw:
+    """u = stiffness·e − damping·q̇ + integral·∫e of a command that is late, slew-limited and has a dead zone; (n,) each.
+
+    SI units; the motor's torque limit and back-EMF belong to the arm.
+    """
+
+    stiffness: Array
+    damping: Array
+    integral: Array
+    delay: Array
+    slew: Array
+    dead_zone: Array
+    """Half width [rad]."""
+
+
+@dataclass(eq=False)
 class Scene:
     """A nominal arm and its commanded training motion."""
 
     arm: BenchArm
     command: Array
     """(K, n) [rad] at `motion.RATE`."""
+    law: ServoLaw | None = None
+    """Of an arm with position servos."""
 
     @property
     def seconds(self) -> float:
@@ -61,6 +80,12 @@ class Scene:
     def inertia(self) -> Array:
         """Inertia of each joint for the controller [kg·m²], (n,)."""
         return controlled_inertia(self.model, self.command[:: len(self.command) // 16 + 1])
+
+    @cached_property
+    def link_inertia(self) -> Array:
+        """Inertia of each joint in the middle of all ranges without its rotor [kg·m²], (n,)."""
+        middle = 0.5 * (self.arm.lower + self.arm.upper)[None]
+        return np.asarray(np.diag(mass_matrices(self.model, middle)[0]) - self.arm.armature)
 
     @cached_property
     def slope(self) -> Array:

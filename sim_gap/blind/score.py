@@ -9,30 +9,64 @@ import numpy as np
 
 from sim_gap.blind.judge import Judgement, judge
 
-SCHEMA = "armlink.blind/1"
+SCHEMA, POSITIONS_SCHEMA = "armlink.blind/1", "armlink.blind-positions/1"
+NAMED_SHARE, FALSE_SHARE = 0.85, 0.03
+"""Of positions alone: required share of first causes that are right or named as confounded, and of answers with a false
+cause above 0.8."""
+Answers = Mapping[str, Mapping[str, Any]]
+"""Answers or labels by name."""
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
 WITHHELD = "--without--"
 """Separator of case and effect removed from the library, in an answer's name."""
 
 
-def score(answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def score(answers: Answers, labels: Answers) -> dict[str, Any]:
     """Score all answers (by name, see `answer_name`) against the labels (by case)."""
-    judged = []
-    for name, answer in answers.items():
-        case, _, withheld = name.partition(WITHHELD)
-        if not labels[case].get("clear", True):
-            continue  # no arm shows its effects and stays under control
-        judged.append(judge(answer, labels[case], withheld))
+    judged = judge_all(answers, labels)
     whole = [j for j in judged if not j.withheld]
-    without = [j for j in judged if j.withheld]
-    parts = {"label_withheld": label_withheld(whole), "effect_withheld": effect_withheld(without)}
+    parts = {
+        "label_withheld": label_withheld(whole),
+        "effect_withheld": effect_withheld([j for j in judged if j.withheld]),
+    }
+    return {"schema": SCHEMA, **parts, "meets": meets_bounds(parts), **_tables(judged, calibrated=whole)}
+
+
+def score_positions(answers: Answers, labels: Answers) -> dict[str, Any]:
+    """Score the answers of positions alone, as `score` does; shares over no case are None."""
+    judged = judge_all(answers, labels)
+    whole = [j for j in judged if not j.withheld]
+    told = [j for j in whole if j.tellable and j.kind == "single"]
+    named, false = share([j.named for j in told]), share([bool(j.blamed) for j in judged])
+    met = {
+        "named_where_tellable": named is not None and named >= NAMED_SHARE,
+        "false_confident": false is not None and false <= FALSE_SHARE,
+    }
     return {
-        "schema": SCHEMA,
-        **parts,
-        "meets": meets_bounds(parts),
+        "schema": POSITIONS_SCHEMA,
+        "answers": len(judged),
+        "tellable": len(told),
+        "named_where_tellable": named,
+        "false_confident": false,
+        "label_withheld": label_withheld(whole),
+        "meets": met,
+        **_tables(judged, calibrated=judged),
+    }
+
+
+def judge_all(answers: Answers, labels: Answers) -> list[Judgement]:
+    """Judgements of the answers whose case counts: some arm shows its effects and stays under control."""
+    named = [(*name.partition(WITHHELD)[::2], answer) for name, answer in answers.items()]
+    return [
+        judge(answer, labels[case], withheld) for case, withheld, answer in named if labels[case].get("clear", True)
+    ]
+
+
+def _tables(judged: Sequence[Judgement], calibrated: Sequence[Judgement]) -> dict[str, Any]:
+    whole = [j for j in judged if not j.withheld]
+    return {
         "confusion": confusion(whole),
         "by_effect": by_effect(whole),
-        "calibration": calibration(whole),
+        "calibration": calibration(calibrated),
         "cases": [case_row(j) for j in judged],
     }
 
