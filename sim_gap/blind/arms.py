@@ -122,24 +122,15 @@ def mjcf(arm: BenchArm, more: Sequence[str] = ()) -> str:
     ]
     for k, name in enumerate(arm.names):
         inertia = arm.inertia[k][[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        span = _text([arm.lower[k], arm.upper[k]])
+        span, axes = _text([arm.lower[k], arm.upper[k]]), _text(arm.rotation[k][:, :2].T.ravel())
         lines += [
-            f'<body name="link_{k + 1}" pos="{_text(arm.offset[k])}" quat="{_text(quaternion(arm.rotation[k]))}">',
+            f'<body name="link_{k + 1}" pos="{_text(arm.offset[k])}" xyaxes="{axes}">',
             f'<joint name="{name}" type="hinge" axis="{_text(arm.axis[k])}" range="{span}"'
             f' limited="true" armature="{arm.armature[k]:.12g}" damping="{arm.damping[k]:.12g}"'
             f' frictionloss="{arm.frictionloss[k]:.12g}"/>',
             f'<inertial pos="{_text(arm.com[k])}" mass="{arm.mass[k]:.12g}" fullinertia="{_text(inertia)}"/>',
         ]
     return "\n".join([*lines, *["</body>"] * arm.n, "</worldbody>", *more, "</mujoco>", ""])
-
-
-def quaternion(rotation: Array) -> Array:
-    """Unit quaternion (w, x, y, z) of a rotation matrix."""
-    import mujoco
-
-    out = np.empty(4)
-    mujoco.mju_mat2Quat(out, np.ascontiguousarray(rotation).ravel())
-    return out
 
 
 def _text(values: Array | list[float]) -> str:

@@ -111,7 +111,8 @@ def run_bench(
     lengths = lengths or (SERVO_LENGTHS_S if positions else LENGTHS_S)
     started = time.monotonic()
     progress("making cases", 0, cases)
-    for done in make_apart(out, seed, cases, workers, lengths, effects, positions):
+    given = {"seed": seed, "cases": cases, "workers": workers, "lengths": lengths}
+    for done in make_apart(out, **given, effects=effects, positions=positions):
         progress("making cases", done, cases)
     made = time.monotonic()
     todo = tasks(out)
@@ -135,21 +136,12 @@ def _require_range(effects: str) -> None:
         raise BadInput(f"--effects {effects}: expected LOW-HIGH from 1 to {MOST_EFFECTS}, such as 5-8")
 
 
-def make_apart(
-    out: Path,
-    seed: int,
-    cases: int,
-    workers: int,
-    lengths: tuple[float, float],
-    effects: str = "",
-    positions: bool = False,
-) -> Iterator[int]:
-    """Make the cases in a separate process and yield their number from time to time. Raises Refused if it fails."""
-    command = [sys.executable, "-m", "sim_gap.blind.cases", "--seed", str(seed), "--cases", str(cases)]
-    command += ["--out", str(out / "cases"), "--labels", str(out / "labels"), "--workers", str(workers)]
-    command += ["--train-s", str(lengths[0]), "--heldout-s", str(lengths[1]), "--effects", effects]
-    command += ["--positions"] * positions
+def make_apart(out: Path, **given: Any) -> Iterator[int]:
+    """Make the cases in a separate process and yield their number from time to time; `given` are arguments of
+    `sim_gap.blind.cases.make_cases`. Raises Refused if it fails."""
     (out / "cases").mkdir(parents=True)
+    (out / "labels").mkdir()
+    command = [sys.executable, "-m", "sim_gap.blind.cases", json.dumps({"out": str(out), **given})]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         while True:
             try:
@@ -168,10 +160,9 @@ def tasks(out: Path) -> list[tuple[str, str]]:
 
     The effects to withhold are listed in `labels/withhold.txt`; no label is opened for them.
     """
-    names = sorted(path.name for path in (out / "cases").iterdir())
     lines = (out / "labels" / "withhold.txt").read_text(encoding="utf-8").splitlines()
     withheld = [(case, effect) for case, effect in (line.split() for line in lines)]
-    return [*((name, "") for name in names), *withheld]
+    return [*((path.name, "") for path in sorted((out / "cases").iterdir())), *withheld]
 
 
 def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], exclude: Sequence[str]) -> dict[str, Any]:
@@ -206,13 +197,11 @@ def _answers(
     diagnose: Diagnose, cases: Path, todo: Sequence[tuple[str, str]], workers: int
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     if workers <= 1:
-        for case, withheld in todo:
-            yield answer_case(diagnose, cases, case, withheld)
+        yield from (answer_case(diagnose, cases, *each) for each in todo)
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = [pool.submit(answer_case, diagnose, cases, case, withheld) for case, withheld in todo]
+        jobs = [pool.submit(answer_case, diagnose, cases, *each) for each in todo]
         try:
-            for job in as_completed(jobs):
-                yield job.result()
+            yield from (job.result() for job in as_completed(jobs))
         finally:  # after a failure, pending cases are not diagnosed
             pool.shutdown(cancel_futures=True)

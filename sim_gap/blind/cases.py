@@ -1,9 +1,9 @@
-"""Makes blind-check cases in a process of its own: `python -m sim_gap.blind.cases --out DIR --labels DIR`."""
+"""Makes blind-check cases in a process of its own: `python -m sim_gap.blind.cases '{"out": …}'`, see `make_cases`."""
 
-import argparse
 import json
 import os
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -283,30 +283,25 @@ def write_csv(path: Path, columns: dict[str, Array]) -> None:
         write_csv(pa.table(flat), file, WriteOptions(include_header=False))
 
 
-def make_all(wanted: Sequence[CaseRecipe], make: Callable[[CaseRecipe], None], workers: int) -> None:
+def make_cases(
+    out: str,
+    seed: int,
+    cases: int,
+    workers: int,
+    lengths: Sequence[float],
+    effects: str = "",
+    positions: bool = False,
+) -> None:
+    """Make all cases of a check in folders below `out`, in parallel."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    low, _, high = effects.partition("-")
+    wanted = recipes(seed, cases, (int(low), int(high)) if high else None)
+    labels, train_s, heldout_s = Path(out) / "labels", *lengths
+    make = partial(make_case, out=Path(out) / "cases", labels=labels, train_s=train_s, heldout_s=heldout_s)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for _ in pool.map(make, wanted):
-            pass
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    for name, kind in (("seed", int), ("cases", int), ("workers", int), ("train-s", float), ("heldout-s", float)):
-        parser.add_argument(f"--{name}", type=kind, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--labels", type=Path, required=True)
-    parser.add_argument("--effects", default="")
-    parser.add_argument("--positions", action="store_true")
-    given = parser.parse_args()
-    low, _, high = given.effects.partition("-")
-    wanted = recipes(given.seed, given.cases, (int(low), int(high)) if high else None)
-    if given.positions:
-        wanted = servo_recipes(given.seed, given.cases)
-    lengths = {"train_s": given.train_s, "heldout_s": given.heldout_s}
-    make_all(wanted, partial(make_case, out=given.out, labels=given.labels, **lengths), given.workers)
-    withheld = draw_withheld(given.labels, 1)[::3] if given.positions else draw_withheld(given.labels)
-    (given.labels / "withhold.txt").write_text("\n".join(withheld), encoding="utf-8")
+        list(pool.map(make, servo_recipes(seed, cases) if positions else wanted))
+    withheld = draw_withheld(labels, 1)[::3] if positions else draw_withheld(labels)
+    (labels / "withhold.txt").write_text("\n".join(withheld), encoding="utf-8")
 
 
 def draw_withheld(labels: Path, each: int = 2) -> list[str]:
@@ -322,4 +317,4 @@ def draw_withheld(labels: Path, each: int = 2) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    make_cases(**json.loads(sys.argv[1]))

@@ -81,7 +81,7 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
     single, two, none = ([j for j in judged if j.kind == kind] for kind in ("single", "two", "none"))
     errors = np.array([e.relative for j in some for e in j.errors])
     inside = [e.inside for j in some for e in j.errors if e.inside is not None]
-    right, wrong, missed = (sum(getattr(j, f"joints_{k}") for j in some) for k in ("right", "wrong", "missed"))
+    right, wrong, missed = (sum(j.joints[k] for j in some) for k in range(3))
     precision, recall = _ratio(right, right + wrong), _ratio(right, right + missed)
     ratios = np.array([j.shrink / j.shrink_true for j in single if np.isfinite(j.shrink) and j.shrink_true > 0])
     return {

@@ -1,7 +1,5 @@
 """Errors of position servos, and which effects of the arm positions alone show."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, any_joint, pick, sign
@@ -72,14 +70,13 @@ def integral(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     return _servo(scene, "integral", "ki", [j], float(_law(scene).stiffness[j] * random.uniform(0.5, 2.0)))
 
 
-_DRAWN: tuple[Callable[[Scene, np.random.Generator], DrawnEffect | None], ...] = (
-    stiffness,
-    delay,
-    slew,
-    dead_zone,
-    integral,
-)
-DRAWS: dict[str, Draw] = {f"controller.{draw.__name__}": draw for draw in _DRAWN}
+DRAWS: dict[str, Draw] = {
+    "controller.stiffness": stiffness,
+    "controller.delay": delay,
+    "controller.slew": slew,
+    "controller.dead_zone": dead_zone,
+    "controller.integral": integral,
+}
 UNKNOWN = (
     "controller.slew",
     "controller.dead_zone",
