@@ -140,7 +140,6 @@ def make_apart(out: Path, **given: Any) -> Iterator[int]:
     """Make the cases in a separate process and yield their number from time to time; `given` are arguments of
     `sim_gap.blind.cases.make_cases`. Raises Refused if it fails."""
     (out / "cases").mkdir(parents=True)
-    (out / "labels").mkdir()
     command = [sys.executable, "-m", "sim_gap.blind.cases", json.dumps({"out": str(out), **given})]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         while True:
@@ -150,9 +149,8 @@ def make_apart(out: Path, **given: Any) -> Iterator[int]:
             except subprocess.TimeoutExpired:
                 yield len(list((out / "cases").glob("*/heldout.csv")))
     if process.returncode:
-        raise Refused(
-            f"the cases could not be made: {complaint.strip().splitlines()[-1] if complaint else process.returncode}"
-        )
+        why = complaint.strip().splitlines()[-1] if complaint else process.returncode
+        raise Refused(f"the cases could not be made: {why}")
 
 
 def tasks(out: Path) -> list[tuple[str, str]]:
@@ -170,20 +168,16 @@ def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], ex
     from armlink.recording.files import load_recording
     from sim_gap.attribution.diagnose import diagnose
 
-    answer = diagnose(
-        sim, [load_recording(path) for path in train], [load_recording(path) for path in heldout], withhold=exclude
-    )
-    return answer.to_json()
+    parts = ([load_recording(path) for path in paths] for paths in (train, heldout))
+    return diagnose(sim, *parts, withhold=exclude).to_json()
 
 
 def answer_case(diagnose: Diagnose, cases: Path, case: str, withheld: str) -> tuple[str, dict[str, Any]]:
     """Name and answer of one diagnosis; refused input is an answer without causes."""
-    folder = cases / case
-    started = time.monotonic()
+    folder, started = cases / case, time.monotonic()
+    less = [withheld] if withheld else []
     try:
-        answer = diagnose(
-            folder / "sim.xml", [folder / "train.csv"], [folder / "heldout.csv"], [withheld] if withheld else []
-        )
+        answer = diagnose(folder / "sim.xml", [folder / "train.csv"], [folder / "heldout.csv"], less)
     except ArmlinkError as error:
         nothing: dict[str, Any] = {"before": [], "after": []}
         answer = {"verdict": "unexplained", "causes": [], "gap": {"heldout": nothing}, "refused": str(error)}

@@ -284,19 +284,14 @@ def write_csv(path: Path, columns: dict[str, Array]) -> None:
 
 
 def make_cases(
-    out: str,
-    seed: int,
-    cases: int,
-    workers: int,
-    lengths: Sequence[float],
-    effects: str = "",
-    positions: bool = False,
+    out: str, seed: int, cases: int, workers: int, lengths: Sequence[float], effects: str = "", positions: bool = False
 ) -> None:
     """Make all cases of a check in folders below `out`, in parallel."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     low, _, high = effects.partition("-")
     wanted = recipes(seed, cases, (int(low), int(high)) if high else None)
     labels, train_s, heldout_s = Path(out) / "labels", *lengths
+    labels.mkdir(parents=True, exist_ok=True)
     make = partial(make_case, out=Path(out) / "cases", labels=labels, train_s=train_s, heldout_s=heldout_s)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         list(pool.map(make, servo_recipes(seed, cases) if positions else wanted))

@@ -29,6 +29,9 @@ INDISTINCT = (
     {"position.gain", "position.eccentricity"},
 )
 """Effects not drawn together at one joint (or at the last one and the tip): slow motion cannot separate them."""
+REWRITING = {f"transmission.{name}" for name in ("coupling", "elasticity", "backlash")}
+REWRITING |= {"friction.stribeck", "friction.asymmetric"}
+"""Effects that are not drawn together with another one at one joint."""
 
 
 @dataclass(frozen=True)
@@ -159,17 +162,6 @@ def _several(count: int, scene: Scene, random: np.random.Generator) -> tuple[Dra
     return None
 
 
-def _distinct(first: DrawnEffect, second: DrawnEffect, tip: str) -> bool:
-    """Whether slow motion can separate two effects of one arm: a payload counts as one of the last joint, a tilt as one
-    of any."""
-    if {first.effect, second.effect} not in INDISTINCT:
-        return True
-    if "base.tilt" in (first.effect, second.effect):
-        return False
-    places = [{tip} if each.effect == "link.payload" else set(each.joints) for each in (first, second)]
-    return not places[0] & places[1]
-
-
 def _limits(arm: BenchArm, servos: bool, random: np.random.Generator) -> MotionLimits:
     if servos:
         velocity = np.linspace(random.uniform(1.0, 1.8), random.uniform(2.0, 3.0), arm.n)
@@ -188,7 +180,12 @@ def _servo_law(scene: Scene, random: np.random.Generator) -> ServoLaw:
 
 def _compatible(first: DrawnEffect, second: DrawnEffect) -> bool:
     """Whether two effects can be combined: on a common joint, neither may overwrite the other."""
-    same = set(first.joints) & set(second.joints)
-    rewriting = {"transmission.coupling", "friction.stribeck", "friction.asymmetric", "transmission.elasticity"}
-    rewriting |= {"transmission.backlash"}
-    return not (same and (first.effect in rewriting or second.effect in rewriting))
+    return not (set(first.joints) & set(second.joints) and {first.effect, second.effect} & REWRITING)
+
+
+def _distinct(first: DrawnEffect, second: DrawnEffect, tip: str) -> bool:
+    """Whether slow motion can separate two effects of one arm: a payload counts as one of the last joint, a tilt as one
+    of any."""
+    effects = {first.effect, second.effect}
+    places = [{tip} if each.effect == "link.payload" else set(each.joints) for each in (first, second)]
+    return effects not in INDISTINCT or not ("base.tilt" in effects or places[0] & places[1])

@@ -10,6 +10,10 @@ from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm, compile_arm, controlled_inertia, inverse, mass_matrices
 from sim_gap.blind.motion import RATE, derivatives
 
+SENSOR_LEAST, MOTOR_LEAST = 0.12, 0.3
+"""Least RMS that an effect causes in its channel [N·m], for every torque."""
+SHARES = (0.06, 0.14)
+"""RMS that an effect causes, as a share of the joint's RMS torque: several times that of small background errors."""
 THIN = 25
 """Magnitudes are judged on every 25th row of the trajectory."""
 THINNED_S = THIN / RATE
@@ -106,6 +110,18 @@ class Scene:
         """Change of the gravity torque with another arm in place of this one, (K', n)."""
         still = np.zeros_like(self.motion[0])
         return inverse(compile_arm(other), self.motion[0], still, still) - self.gravity
+
+    def sensor_level(self, random: np.random.Generator) -> Array:
+        """RMS that an effect should cause in `tau` − model, (n,) [N·m]."""
+        return np.maximum(SENSOR_LEAST, random.uniform(*SHARES) * rms(self.torque))
+
+    def motor_level(self, random: np.random.Generator) -> Array:
+        """RMS that an effect should cause in `tau_motor` − model, (n,) [N·m]."""
+        return np.maximum(MOTOR_LEAST, random.uniform(*SHARES) * rms(self.torque + self.rotor_torque))
+
+    def turn_felt(self, error: Array) -> Array:
+        """RMS torque at joint i (first axis) caused by an angle error (K', n) of joint j, (n, n) [N·m]."""
+        return np.stack([rms(self.slope[:, :, j] * error[:, j, None]) for j in range(self.arm.n)], axis=1)
 
     def feed_forward(self, command: Array) -> Array:
         """Nominal torque along a trajectory at `motion.RATE`, rotors included (K, n)."""

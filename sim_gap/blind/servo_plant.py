@@ -78,7 +78,7 @@ class Bristles:
         return np.asarray(self.bristle * self._bend + self._bristle_damping * rate + state.viscous * v)
 
 
-class Servo:
+class ServoController:
     """Torque commands of one arm at `motion.RATE`."""
 
     def __init__(self, law: ServoLaw, command: Array) -> None:
@@ -114,7 +114,7 @@ def simulate_servos(run: ServoRun) -> Array:
     rotor, soft = arm.armature + state.rotor_inertia, state.backlash > 0.0
     model = compile_arm(replace(arm, armature=np.where(soft, 0.0, rotor)))
     data = mujoco.MjData(model)
-    bristles, servo = Bristles(state, np.maximum(rotor, LEAST_INERTIA), STEP), Servo(run.law, run.command)
+    bristles, servo = Bristles(state, np.maximum(rotor, LEAST_INERTIA), STEP), ServoController(run.law, run.command)
     stiffness = SPRING_SHARE * rotor / STEP**2
     damping, half_play = 2.0 * SPRING_DAMPING_RATIO * np.sqrt(stiffness * rotor), 0.5 * state.backlash
     spring, rest = state.spring.T

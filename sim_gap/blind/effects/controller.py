@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, any_joint, pick, sign
+from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, pick, sign
 from sim_gap.blind.scene import Scene, ServoLaw, rms
 
 OF_THE_ARM = (
@@ -39,7 +39,7 @@ def _servo(scene: Scene, name: str, parameter: str, joints: list[int], value: fl
 
 
 def stiffness(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    j = any_joint(scene, random)
+    j = int(random.integers(scene.arm.n))
     factor = float(np.exp(sign(random) * random.uniform(0.25, 0.6)))
     return _servo(scene, "stiffness", "kp", [j], float(_law(scene).stiffness[j] * factor))
 
@@ -51,7 +51,7 @@ def delay(scene: Scene, random: np.random.Generator) -> DrawnEffect:
 
 def slew(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     """A command whose rate is limited below the fastest motion."""
-    j = any_joint(scene, random)
+    j = int(random.integers(scene.arm.n))
     limit = float(np.quantile(np.abs(scene.motion[1][:, j]), random.uniform(0.8, 0.95)))
     return _servo(scene, "slew", "limit", [j], limit)
 
@@ -66,7 +66,7 @@ def dead_zone(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
 
 def integral(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     """An integral part that the model's actuator has not."""
-    j = any_joint(scene, random)
+    j = int(random.integers(scene.arm.n))
     return _servo(scene, "integral", "ki", [j], float(_law(scene).stiffness[j] * random.uniform(0.5, 2.0)))
 
 

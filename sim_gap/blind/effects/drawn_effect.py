@@ -9,20 +9,15 @@ import numpy as np
 from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array, Mask
 from sim_gap.blind.arms import BenchArm
-from sim_gap.blind.scene import Scene, ServoLaw, rms
+from sim_gap.blind.scene import Scene, ServoLaw
 
-SENSOR_LEAST = 0.12
-MOTOR_LEAST = 0.3
-"""Least RMS that an effect causes in its channel [N·m], for every torque."""
-SHARES = (0.06, 0.14)
-"""RMS that an effect causes, as a share of the joint's RMS torque: several times that of small background errors."""
 OFTEN = 0.08
 """Torque reversals per second from which effects at a reversal show."""
 
 Values = dict[str, float]
 
 
-class Setting(NamedTuple):
+class ArmSetting(NamedTuple):
     """An entry of `sim.effects` in an arm file: how the simulated arm gets the effect."""
 
     effect: str
@@ -35,7 +30,7 @@ class DrawnEffect:
     effect: str
     parameters: dict[str, Values]
     """By joint name (`arm` for the whole arm); named as a diagnosis reports them."""
-    settings: tuple[Setting, ...] = ()
+    settings: tuple[ArmSetting, ...] = ()
     """Puts it into joints, drives and sensors of the true arm."""
     links: Callable[[BenchArm], BenchArm] = lambda arm: arm
     """Puts it into the true links and base."""
@@ -71,17 +66,7 @@ Draw = Callable[[Scene, np.random.Generator], DrawnEffect | None]
 def on_joint(scene: Scene, joint: int, effect: str, values: Values, **more: Any) -> DrawnEffect:
     """An effect of one joint that the simulated arm gets by the same parameters; `more` are fields of DrawnEffect."""
     name = scene.arm.names[joint]
-    return DrawnEffect(effect, {name: values}, **{"settings": (Setting(effect, name, values),), **more})
-
-
-def sensor_level(scene: Scene, random: np.random.Generator) -> Array:
-    """RMS that an effect should cause in `tau` − model, (n,) [N·m]."""
-    return np.maximum(SENSOR_LEAST, random.uniform(*SHARES) * rms(scene.torque))
-
-
-def motor_level(scene: Scene, random: np.random.Generator) -> Array:
-    """RMS that an effect should cause in `tau_motor` − model, (n,) [N·m]."""
-    return np.maximum(MOTOR_LEAST, random.uniform(*SHARES) * rms(scene.torque + scene.rotor_torque))
+    return DrawnEffect(effect, {name: values}, **{"settings": (ArmSetting(effect, name, values),), **more})
 
 
 def pick(wanted: Array, cap: float | Array, random: np.random.Generator, allowed: Mask | None = None) -> int | None:
@@ -92,10 +77,6 @@ def pick(wanted: Array, cap: float | Array, random: np.random.Generator, allowed
     return int(random.choice(np.flatnonzero(fit))) if fit.any() else None
 
 
-def any_joint(scene: Scene, random: np.random.Generator) -> int:
-    return int(random.integers(scene.arm.n))
-
-
 def sign(random: np.random.Generator) -> float:
     return float(random.choice([-1.0, 1.0]))
 
@@ -104,8 +85,3 @@ def reversals(x: Array, width: Array) -> Array:
     """How often each column passes from beyond +width to beyond −width or back, (n,)."""
     beyond = (np.sign(column[np.abs(column) > limit]) for column, limit in zip(x.T, width, strict=True))
     return np.array([np.count_nonzero(np.diff(signs)) for signs in beyond], float)
-
-
-def turn_felt(scene: Scene, error: Array) -> Array:
-    """RMS torque at joint i (first axis) caused by an angle error (K', n) of joint j, (n, n) [N·m]."""
-    return np.stack([rms(scene.slope[:, :, j] * error[:, j, None]) for j in range(scene.arm.n)], axis=1)

@@ -1,12 +1,13 @@
 """Links, payload and base that differ from the nominal model."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm
-from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, sensor_level
+from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect
 from sim_gap.blind.scene import Scene, rms
 
 XYZ = ("x", "y", "z")
@@ -23,12 +24,12 @@ def _felt(scene: Scene, other: BenchArm, joint: int) -> float:
 
 def _scale(scene: Scene, other: BenchArm, random: np.random.Generator) -> float:
     """Factor on a change at which it shows at the most sensitive joint."""
-    return float(1.0 / (rms(scene.change(other)) / sensor_level(scene, random)).max())
+    return float(1.0 / (rms(scene.change(other)) / scene.sensor_level(random)).max())
 
 
 def mass_moment(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """A shifted centre of mass, across the link's own axis, so that its own joint shows it."""
-    arm, level = scene.arm, sensor_level(scene, random)
+    arm, level = scene.arm, scene.sensor_level(random)
     shift = random.uniform(0.15, 0.3)
     for link in random.permutation(arm.n).tolist():
         across = np.cross(arm.axis[link], random.standard_normal(3))
@@ -39,32 +40,23 @@ def mass_moment(scene: Scene, random: np.random.Generator) -> DrawnEffect | None
         moved = arm.with_moved(link, moment)
         weighs = rms(scene.change_at_rest(moved))[link] > LEAST_WEIGHT_SHARE * _felt(scene, moved, link)
         why, others = ("", ()) if weighs else (UPRIGHT, ("link.inertia",))
-        return DrawnEffect(
-            "link.mass_moment",
-            {arm.names[link]: dict(zip(XYZ, moment.tolist(), strict=True))},
-            links=lambda true, link=link, moment=moment: true.with_moved(link, moment),  # type: ignore[misc]
-            undecided=why,
-            confused_with=others,
-        )
+        values = {arm.names[link]: dict(zip(XYZ, moment.tolist(), strict=True))}
+        moves = partial(BenchArm.with_moved, link=link, moment=moment)
+        return DrawnEffect("link.mass_moment", values, links=moves, undecided=why, confused_with=others)
     return None
 
 
 def inertia(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Additional inertia, mostly about the joint's own axis, that no shift of mass explains."""
-    arm, level = scene.arm, 1.3 * sensor_level(scene, random)
+    arm, level, nothing = scene.arm, 1.3 * scene.sensor_level(random), np.zeros(3)
     for link in random.permutation(arm.n).tolist():
         unit = 0.01 * (0.55 * np.eye(3) + 0.45 * np.outer(arm.axis[link], arm.axis[link]))
-        wanted = level[link] / _felt(scene, arm.with_entry("inertia", link, arm.inertia[link] + unit), link)
-        if 0.01 * wanted > 0.12 + 0.03 * float(arm.mass[link:].sum()):
-            continue
-        added = unit * wanted
-        return DrawnEffect(
-            "link.inertia",
-            {arm.names[link]: {name: float(added[r, c]) for name, r, c in INERTIA}},
-            links=lambda true, link=link, added=added: true.with_entry(  # type: ignore[misc]
-                "inertia", link, true.inertia[link] + added
-            ),
-        )
+        wanted = level[link] / _felt(scene, arm.with_added(link, 0.0, nothing, unit), link)
+        if 0.01 * wanted <= 0.12 + 0.03 * float(arm.mass[link:].sum()):
+            added = unit * wanted
+            values = {arm.names[link]: {name: float(added[r, c]) for name, r, c in INERTIA}}
+            adds = partial(BenchArm.with_added, link=link, mass=0.0, moment=nothing, inertia=added)
+            return DrawnEffect("link.inertia", values, links=adds)
     return None
 
 

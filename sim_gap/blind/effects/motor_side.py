@@ -7,20 +7,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.blind.arms import BenchArm
-from sim_gap.blind.effects.drawn_effect import (
-    OFTEN,
-    Draw,
-    DrawnEffect,
-    Setting,
-    any_joint,
-    motor_level,
-    on_joint,
-    pick,
-    reversals,
-    sensor_level,
-    sign,
-    turn_felt,
-)
+from sim_gap.blind.effects.drawn_effect import OFTEN, ArmSetting, Draw, DrawnEffect, on_joint, pick, reversals, sign
 from sim_gap.blind.scene import THINNED_S, Scene, rms
 
 LEAST_SPEED = 0.02
@@ -35,15 +22,15 @@ SLOW = "needs steps, a chirp or faster logging"
 
 
 def coulomb(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    j = any_joint(scene, random)
+    j = int(random.integers(scene.arm.n))
     return on_joint(
-        scene, j, "friction.coulomb", {"torque": float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0))}
+        scene, j, "friction.coulomb", {"torque": float(scene.motor_level(random)[j] * random.uniform(1.0, 2.0))}
     )
 
 
 def viscous(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    j = any_joint(scene, random)
-    damping = float(motor_level(scene, random)[j] * random.uniform(1.0, 2.0) / rms(scene.motion[1])[j])
+    j = int(random.integers(scene.arm.n))
+    damping = float(scene.motor_level(random)[j] * random.uniform(1.0, 2.0) / rms(scene.motion[1])[j])
     return on_joint(scene, j, "friction.viscous", {"damping": damping})
 
 
@@ -52,7 +39,7 @@ def _on_coulomb(
 ) -> DrawnEffect:
     """An effect on top of Coulomb friction [N·m], which the nominal model has, or which is implied."""
     name = scene.arm.names[j]
-    settings = Setting("friction.coulomb", name, {"torque": torque}), Setting(effect, name, values)
+    settings = ArmSetting("friction.coulomb", name, {"torque": torque}), ArmSetting(effect, name, values)
     if random.random() < 0.5:
         return on_joint(scene, j, effect, values, nominal=lambda arm: arm.with_entry("frictionloss", j, torque))
     return on_joint(scene, j, effect, values, settings=settings, implied=("friction.coulomb",))
@@ -60,8 +47,8 @@ def _on_coulomb(
 
 def stribeck(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     """More friction at low speed, in addition to Coulomb friction."""
-    j = any_joint(scene, random)
-    level, speed = float(motor_level(scene, random)[j]), np.abs(scene.motion[1][:, j])
+    j = int(random.integers(scene.arm.n))
+    level, speed = float(scene.motor_level(random)[j]), np.abs(scene.motion[1][:, j])
     moving = speed[speed > LEAST_SPEED]
     velocity = float(np.clip(np.quantile(moving, random.uniform(0.25, 0.5)), 0.05, 0.35))
     breakaway = float(1.2 * level / rms(np.exp(-((moving / velocity) ** 2))))
@@ -70,9 +57,9 @@ def stribeck(scene: Scene, random: np.random.Generator) -> DrawnEffect:
 
 
 def asymmetric(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    j = any_joint(scene, random)
+    j = int(random.integers(scene.arm.n))
     ratio = sign(random) * random.uniform(0.25, 0.6)
-    base = float(1.5 * motor_level(scene, random)[j] / abs(ratio))
+    base = float(1.5 * scene.motor_level(random)[j] / abs(ratio))
     return _on_coulomb(scene, random, j, base, "friction.asymmetric", {"ratio": ratio})
 
 
@@ -80,18 +67,18 @@ def load(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Friction proportional to the transmitted torque, on a joint whose torque varies."""
     size = np.abs(scene.torque)
     varies = size.std(0) > 0.4 * size.mean(0)
-    wanted = 1.5 * motor_level(scene, random) / rms(size)
+    wanted = 1.5 * scene.motor_level(random) / rms(size)
     j = pick(wanted, 0.35, random, varies & (rms(size) > 3.0))
     return None if j is None else on_joint(scene, j, "friction.load", {"coefficient": float(wanted[j])})
 
 
 def ripple(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     """Torque lost to the meshing gear: amplitude·sin(cycles·θ + phase), slow enough to pass a 6 Hz filter."""
-    j = any_joint(scene, random)
+    j = int(random.integers(scene.arm.n))
     fastest = float(np.quantile(np.abs(scene.motion[1][:, j]), 0.9))
     most = max(8.0, min(30.0, 2 * np.pi * 4.0 / max(fastest, 0.1)))
     values = {
-        "amplitude": float(1.5 * motor_level(scene, random)[j]),
+        "amplitude": float(1.5 * scene.motor_level(random)[j]),
         "cycles": float(random.uniform(6.0, most)),
         "phase": float(random.uniform(-np.pi, np.pi)),
     }
@@ -100,9 +87,9 @@ def ripple(scene: Scene, random: np.random.Generator) -> DrawnEffect:
 
 def spring(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     """A cable bundle across the joint: −stiffness·(θ − rest) on the link."""
-    j = any_joint(scene, random)
+    j = int(random.integers(scene.arm.n))
     q = scene.motion[0][:, j]
-    stiffness = float(1.3 * max(sensor_level(scene, random)[j], 0.2) / q.std())
+    stiffness = float(1.3 * max(scene.sensor_level(random)[j], 0.2) / q.std())
     rest = float(q.mean() + random.uniform(-0.5, 0.5) * q.std())
     return on_joint(scene, j, "transmission.spring", {"stiffness": stiffness, "rest": rest})
 
@@ -117,7 +104,7 @@ def _heavy_rotor(scene: Scene, j: int) -> dict[str, Any]:
 def elasticity(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Rotor and link with a spring between them; the position sensor is at the rotor."""
     stiffness = rms(scene.torque) / random.uniform(0.015, 0.04)  # from the RMS deflection [rad]
-    shown = turn_felt(scene, scene.torque / stiffness).max(0) > LEAST_ELASTIC_NM
+    shown = scene.turn_felt(scene.torque / stiffness).max(0) > LEAST_ELASTIC_NM
     j = pick((2 * np.pi * 4.0) ** 2 * scene.inertia, stiffness, random, shown)  # resonance above 4 Hz
     if j is None:
         return None
@@ -127,8 +114,8 @@ def elasticity(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
 
 def backlash(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Backlash between rotor and link, on a joint whose torque changes sign often."""
-    level = np.maximum(sensor_level(scene, random), 0.2)
-    wanted = 2.2 * level / np.maximum(turn_felt(scene, np.ones_like(scene.torque)).max(0), 1e-9)
+    level = np.maximum(scene.sensor_level(random), 0.2)
+    wanted = 2.2 * level / np.maximum(scene.turn_felt(np.ones_like(scene.torque)).max(0), 1e-9)
     often = reversals(scene.torque, 0.1 * rms(scene.torque)) >= OFTEN * scene.seconds
     j = pick(wanted, 0.07, random, often)
     if j is None:
@@ -144,13 +131,13 @@ def coupling(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     k = j - 1 if j == n - 1 or random.random() < 0.7 else j + 1
     coefficient = sign(random) * (1.0 if random.random() < 0.6 else float(random.uniform(0.5, 0.9)))
     speed, push = (x[:, j] + coefficient * x[:, k] for x in scene.motion[1:])
-    level = float(motor_level(scene, random)[[j, k]].max())
+    level = float(scene.motor_level(random)[[j, k]].max())
     rotor, coulomb, viscous = 0.5 * level / float(rms(push)), 1.5 * level, 0.8 * level / float(rms(speed))
     settings = (
-        Setting("transmission.coupling", names[j], {"coefficient": coefficient, "source": names[k]}),
-        Setting("actuator.rotor_inertia", names[j], {"inertia": rotor}),
-        Setting("friction.coulomb", names[j], {"torque": coulomb}),
-        Setting("friction.viscous", names[j], {"damping": viscous}),
+        ArmSetting("transmission.coupling", names[j], {"coefficient": coefficient, "source": names[k]}),
+        ArmSetting("actuator.rotor_inertia", names[j], {"inertia": rotor}),
+        ArmSetting("friction.coulomb", names[j], {"torque": coulomb}),
+        ArmSetting("friction.viscous", names[j], {"damping": viscous}),
     )
 
     def without_motor(arm: BenchArm) -> BenchArm:
@@ -165,14 +152,14 @@ def coupling(scene: Scene, random: np.random.Generator) -> DrawnEffect:
 
 
 def gain(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
-    wanted = np.maximum(1.3 * motor_level(scene, random) / rms(scene.torque + scene.rotor_torque), 0.07)
+    wanted = np.maximum(1.3 * scene.motor_level(random) / rms(scene.torque + scene.rotor_torque), 0.07)
     j = pick(wanted, 0.3, random)
     return None if j is None else on_joint(scene, j, "actuator.gain", {"gain": 1.0 + sign(random) * float(wanted[j])})
 
 
 def rotor_inertia(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """A rotor inertia larger than the nominal model's."""
-    wanted = motor_level(scene, random) / rms(scene.motion[2])
+    wanted = scene.motor_level(random) / rms(scene.motion[2])
     j = pick(wanted, 2.0, random)
     return None if j is None else on_joint(scene, j, "actuator.rotor_inertia", {"inertia": float(wanted[j])})
 

@@ -3,19 +3,7 @@
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.effects.drawn_effect import (
-    OFTEN,
-    Draw,
-    DrawnEffect,
-    Setting,
-    any_joint,
-    on_joint,
-    pick,
-    reversals,
-    sensor_level,
-    sign,
-    turn_felt,
-)
+from sim_gap.blind.effects.drawn_effect import OFTEN, ArmSetting, Draw, DrawnEffect, on_joint, pick, reversals, sign
 from sim_gap.blind.scene import THINNED_S, Scene, rms
 
 PERIOD_S = 0.004
@@ -23,21 +11,21 @@ PERIOD_S = 0.004
 
 
 def torque_offset(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    j = any_joint(scene, random)
-    value = sign(random) * float(sensor_level(scene, random)[j] * random.uniform(1.0, 2.0))
+    j = int(random.integers(scene.arm.n))
+    value = sign(random) * float(scene.sensor_level(random)[j] * random.uniform(1.0, 2.0))
     return on_joint(scene, j, "torque.offset", {"offset": value})
 
 
 def torque_gain(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
-    wanted = np.maximum(sensor_level(scene, random) / rms(scene.torque), 0.06)
+    wanted = np.maximum(scene.sensor_level(random) / rms(scene.torque), 0.06)
     j = pick(wanted, 0.25, random)
     return None if j is None else on_joint(scene, j, "torque.gain", {"gain": 1.0 + sign(random) * float(wanted[j])})
 
 
 def drift(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     """An offset that grows with time, from zero at the start of a recording."""
-    j = any_joint(scene, random)
-    rate = sign(random) * float(2.5 * sensor_level(scene, random)[j] / scene.seconds)
+    j = int(random.integers(scene.arm.n))
+    rate = sign(random) * float(2.5 * scene.sensor_level(random)[j] / scene.seconds)
     return on_joint(scene, j, "torque.drift", {"rate": rate})
 
 
@@ -45,18 +33,18 @@ def crosstalk(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """The reading also follows another joint's torque."""
     size = np.std(scene.torque, axis=0)
     source = int(random.choice(np.flatnonzero(size > 0.4 * size.max())))
-    wanted = sensor_level(scene, random) / rms(scene.torque)[source]
+    wanted = scene.sensor_level(random) / rms(scene.torque)[source]
     j = pick(wanted, 0.2, random, np.arange(scene.arm.n) != source)
     if j is None:
         return None
     values = {"coefficient": sign(random) * float(wanted[j]), "source": float(source + 1)}
-    put = Setting("torque.crosstalk", scene.arm.names[j], {**values, "source": scene.arm.names[source]})
+    put = ArmSetting("torque.crosstalk", scene.arm.names[j], {**values, "source": scene.arm.names[source]})
     return on_joint(scene, j, "torque.crosstalk", values, settings=(put,))
 
 
 def hysteresis(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """The reading lags behind the torque by up to `width`; drawn for a torque that swings far beyond it."""
-    widths = 1.4 * sensor_level(scene, random)
+    widths = 1.4 * scene.sensor_level(random)
     swing = np.quantile(scene.torque, 0.95, axis=0) - np.quantile(scene.torque, 0.05, axis=0)
     j = pick(widths, 0.2 * swing, random)
     return None if j is None else on_joint(scene, j, "torque.hysteresis", {"width": float(widths[j])})
@@ -64,7 +52,7 @@ def hysteresis(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
 
 def deadband(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """Zero within ±width, and width less beyond; drawn for a torque that changes sign often."""
-    widths = 1.3 * sensor_level(scene, random)
+    widths = 1.3 * scene.sensor_level(random)
     often = reversals(scene.torque, widths) >= OFTEN * scene.seconds
     j = pick(widths, 0.4 * rms(scene.torque), random, often)
     return None if j is None else on_joint(scene, j, "torque.deadband", {"width": float(widths[j])})
@@ -72,7 +60,7 @@ def deadband(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
 
 def saturation(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """The reading clipped at the level that causes the wanted RMS."""
-    level, size = sensor_level(scene, random), np.abs(scene.torque)
+    level, size = scene.sensor_level(random), np.abs(scene.torque)
     limits = np.array([np.quantile(size, q, axis=0) for q in np.linspace(0.98, 0.6, 20)])
     enough = np.greater([rms(np.maximum(size - limit, 0.0)) for limit in limits], level)
     j = pick(np.zeros(scene.arm.n), 0.0, random, np.asarray(enough.any(0)))
@@ -83,7 +71,7 @@ def saturation(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
 
 def _felt(scene: Scene, random: np.random.Generator, error: Array) -> Array:
     """Factor (n,) on a joint's position error (K', n) at which some joint's torque shows it."""
-    shown = turn_felt(scene, error) / sensor_level(scene, random)[:, None]
+    shown = scene.turn_felt(error) / scene.sensor_level(random)[:, None]
     return np.asarray(1.0 / np.maximum(shown.max(0), 1e-9))
 
 
@@ -123,13 +111,13 @@ def eccentricity(scene: Scene, random: np.random.Generator) -> DrawnEffect | Non
 def delay(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
     """The torque sensor's reading delayed against the position, on one joint or on all."""
     change = np.gradient(scene.torque, THINNED_S, axis=0)
-    wanted = np.maximum(sensor_level(scene, random) / rms(change), 2.0 * PERIOD_S)
+    wanted = np.maximum(scene.sensor_level(random) / rms(change), 2.0 * PERIOD_S)
     j = pick(wanted, 0.04, random)
     if j is None:
         return None
     names = scene.arm.names if random.random() < 0.25 else (scene.arm.names[j],)
     values = {"delay": float(wanted[j])}
-    settings = tuple(Setting("timing.delay", name, values) for name in names)
+    settings = tuple(ArmSetting("timing.delay", name, values) for name in names)
     return DrawnEffect("timing.delay", dict.fromkeys(names, values), settings)
 
 
