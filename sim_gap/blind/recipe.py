@@ -69,7 +69,7 @@ class CaseDrawing:
     attempt: int
     """Number of this drawing of the recipe."""
     random: np.random.Generator
-    """What else is drawn for the case comes from here."""
+    """Source of everything else that is drawn for the case."""
 
     @property
     def nominal(self) -> BenchArm:
