@@ -159,6 +159,7 @@ def test_the_answer_lists_the_findings(motor):
     assert {cause.effect for cause in answer.causes} >= {"friction.coulomb"}
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("folder", "file"),
     [("ur10e", "train_a"), ("tx40", "recording"), ("ur10", "recording"), ("panda", "recording"), ("lwr4", "other")],
@@ -200,6 +201,7 @@ def test_counts_are_refused_with_the_option(arm, motor):
         check(arm, counts)
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(
     ("run", "model_of"),
     [

@@ -1,6 +1,7 @@
 """One fault is not told as another one that changes a recording of a real arm alike."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,21 +14,28 @@ from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
 from sim_gap.model.load import load_model
 
+FILES = {
+    "ur10e": ("ur10e", "train_a.csv.gz"),
+    "panda": ("panda", "recording.csv.gz"),
+    "lwr4": ("lwr4", "train.csv.gz"),
+    "pendulum": ("double_pendulum", "designc_a.csv.gz", "sim_design_c.xml"),
+}
+
 
 @pytest.fixture(scope="module")
 def arms(realdata: Path):
     """Nominal arm and recording of real arms, by the folder of their recordings."""
 
+    @cache  # those that a run asks for, once
     def loaded(folder: str, file: str, sim: str = "sim.xml"):
         recording = load_recording(realdata / folder / file)
         return load_model(realdata / folder / sim, (), recording.n).arm, recording
 
-    return {
-        "ur10e": loaded("ur10e", "train_a.csv.gz"),
-        "panda": loaded("panda", "recording.csv.gz"),
-        "lwr4": loaded("lwr4", "train.csv.gz"),
-        "pendulum": loaded("double_pendulum", "designc_a.csv.gz", "sim_design_c.xml"),
-    }
+    class Arms:
+        def __getitem__(self, name: str):
+            return loaded(*FILES[name])
+
+    return Arms()
 
 
 def moved(recording: Recording, joint: int, angle: float) -> Recording:
