@@ -162,7 +162,7 @@ def test_the_answer_lists_the_findings(motor):
 @pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("folder", "file"),
-    [("ur10e", "train_a"), ("tx40", "recording"), ("ur10", "recording"), ("panda", "recording"), ("lwr4", "other")],
+    [("panda", "recording"), ("ur10e", "train_a"), ("tx40", "recording"), ("ur10", "recording"), ("lwr4", "other")],
 )
 def test_real_arms_as_recorded_are_no_finding(realdata, folder, file):
     recording = load_recording(realdata / folder / f"{file}.csv.gz")
