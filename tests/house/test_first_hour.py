@@ -59,7 +59,7 @@ def small_arm(folder: Path) -> Path:
     """An arm file of two joints with friction; a cycle of theirs takes little, and there are few."""
     path = describe(folder, rate=50, bus={"interface": "armlink_sim", "channel": "pair.yaml"})
     content = yaml.safe_load(path.read_text())
-    friction = zip(("j1", "j2"), (1.5, 0.8), strict=True)
+    friction = zip(("j1", "j2"), (0.6, 0.3), strict=True)
     content["sim"]["effects"] = [{"effect": "friction.coulomb", "joint": j, "torque": t} for j, t in friction]
     path.write_text(yaml.safe_dump(content))
     return path

@@ -12,7 +12,7 @@ from calib.sweep.dataset import load_data
 SEED = {"range": 1, "slip": 7, "vertical": 3}
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("case", SEED)
 def test_a_hard_case_is_named_or_stays_within_its_intervals(case: str, tmp_path: Path) -> None:
     arm, simulated = hard_arm(case, SEED[case], 2, steps=5, poses=1, max_samples=30, gain_std=0.5)
