@@ -38,8 +38,8 @@ format: .venv/.dev ## Put the code in shape
 bench: .venv/.dev ## Measure side by side with peers; writes benchmarks/latest.json
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python benchmarks/run.py
 
-long: .venv/.dev ## The tests that make test leaves out: more arms, cases and draws of what it samples (ARGS goes to pytest)
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 -m long $(ARGS)
+long: .venv/.dev ## The tests that make test leaves out, on real SocketCAN too: more arms, cases and draws (ARGS goes to pytest)
+	scripts/run-tests --long $(ARGS)
 
 soak: .venv/.dev ## Long campaigns outside make test: kills, faults, simulated days, random arms (CAMPAIGNS="kill_host web", ARGS)
 	@status=0; for name in $(CAMPAIGNS); do \

@@ -16,6 +16,8 @@ ROOT = Path(__file__).parent.parent
 NO_REALDATA, NO_RERUN = "no real recordings", "rerun-sdk is not installed"
 """The reasons to skip that hold in CI too: recordings are no part of this repository, and a package of 500 MB for one
 option of one command is not asked of everybody who runs the tests."""
+PATIENCE = 3600.0
+"""A browser that has not shown a page by then hangs, on a busy machine too [s]."""
 IN_CI = os.environ.get("CI", "").lower() == "true"
 
 HEARD = {
@@ -96,7 +98,7 @@ def look(tmp_path: Path) -> Callable[..., Look]:
         picture, profile = (tmp_path / f"{page.stem}-{width}-{height}.{kind}" for kind in ("png", "profile"))
         options = [f"--window-size={width},{height}", f"--screenshot={picture}", "--dump-dom"]
         complete = [*command, f"--user-data-dir={profile}", *options, page.resolve().as_uri()]
-        done = subprocess.run(complete, capture_output=True, text=True, timeout=300, check=True)
+        done = subprocess.run(complete, capture_output=True, text=True, timeout=PATIENCE, check=True)
         return Look(picture, done.stdout, tuple(re.findall(r"CONSOLE[^\]]*\] (.*)", done.stderr)))
 
     return open_page

@@ -9,7 +9,14 @@ import pytest
 ROOT = Path(__file__).parent.parent.parent
 
 
-@pytest.mark.parametrize("options", [["--tries", "3"], ["--tries", "1", "--stop"]], ids=["SIGKILL", "SIGSTOP"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param(["--tries", "1"], id="SIGKILL"),
+        pytest.param(["--tries", "3"], id="SIGKILL again", marks=pytest.mark.long),
+        pytest.param(["--tries", "1", "--stop"], id="SIGSTOP", marks=pytest.mark.long),
+    ],
+)
 def test_a_host_that_dies_under_a_bias_torque_leaves_every_joint_safe(options: list[str]) -> None:
     campaign = ROOT / "tests" / "campaigns" / "kill_host.py"
     run = subprocess.run(

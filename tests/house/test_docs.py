@@ -10,6 +10,7 @@ import re
 import shlex
 import subprocess
 import sys
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -36,19 +37,31 @@ INFO = re.compile(r"""(\w*( title="[^"]*")?|\{( \.\w+)+ \})""")
 """What the site takes as the first line of a block; any other makes text of the block and of what follows."""
 
 
+@cache
+def text_of(page: Path) -> str:
+    return page.read_text()
+
+
+@cache
+def prose_of(page: Path) -> str:
+    """A page without its blocks."""
+    return FENCE.sub("", text_of(page))
+
+
 def blocks(page: Path, info: str) -> list[str]:
-    return [found["text"] for found in FENCE.finditer(page.read_text()) if found["info"].strip() == info]
+    return [found["text"] for found in FENCE.finditer(text_of(page)) if found["info"].strip() == info]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_every_block_opens_as_the_site_wants_it(page):
-    for found in FENCE.finditer(page.read_text()):
+    for found in FENCE.finditer(text_of(page)):
         assert INFO.fullmatch(found["info"].strip()), found["info"]
 
 
+@cache
 def anchors(page: Path) -> set[str]:
     """What GitHub makes of a page's headings."""
-    headings = re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text()), re.MULTILINE)
+    headings = re.findall(r"^#+ (.*)$", prose_of(page), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
@@ -69,7 +82,7 @@ def shell_lines() -> list[tuple[str, list[str]]]:
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_links_lead_somewhere(page):
-    for found in LINK.finditer(FENCE.sub("", page.read_text())):
+    for found in LINK.finditer(prose_of(page)):
         target, _, anchor = found["target"].partition("#")
         if "://" in target or target.startswith("mailto:"):
             continue
@@ -80,26 +93,31 @@ def test_links_lead_somewhere(page):
             assert anchor in anchors(other), f"{name(page)}: {target}#{anchor}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_a_page_is_reached_from_the_readme(page):
+@cache
+def pages_reached_from_the_readme() -> frozenset[Path]:
     reached, queue = set(), [ROOT / "README.md"]
     while queue:
         here = queue.pop()
         if here in reached:
             continue
         reached.add(here)
-        for found in LINK.finditer(here.read_text()):
+        for found in LINK.finditer(text_of(here)):
             there = (here.parent / found["target"].partition("#")[0]).resolve()
             if there.suffix == ".md" and there.is_file():
                 queue.append(there)
-    assert page in reached
+    return frozenset(reached)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_a_page_is_reached_from_the_readme(page):
+    assert page in pages_reached_from_the_readme()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_a_list_or_table_follows_an_empty_line_or_a_heading(page):
     """GitHub does not ask for it, but the site would show the rows as one paragraph."""
     before, inside = "", False
-    for line in FENCE.sub("", page.read_text()).splitlines():
+    for line in prose_of(page).splitlines():
         starts = re.match(r"[-*] |\d+\. |\|.*\|$", line)
         assert not starts or inside or not before.strip() or before.startswith("#"), f"{name(page)}: {line}"
         inside = bool(starts) or (inside and bool(line.strip()))

@@ -29,6 +29,7 @@ def test_an_example_has_at_most_30_lines(script):
     assert len((EXAMPLES / script).read_text().splitlines()) <= 30
 
 
+@pytest.mark.long
 def test_calibrate_and_identify_finds_the_hidden_gains(tmp_path):
     printed = printed_by("calibrate_and_identify.py", tmp_path)
     gains = [tuple(map(float, row)) for row in re.findall(r"gain (\S+) to (\S+) \(95 %\), true (\S+)", printed)]
@@ -46,6 +47,7 @@ def test_observe_a_drift_names_the_joint_and_its_size(tmp_path):
     assert float(offset) == pytest.approx(0.3, abs=0.05)
 
 
+@pytest.mark.long
 def test_diagnose_a_gap_names_the_causes(tmp_path):
     printed = printed_by("diagnose_a_gap.py", tmp_path)
     assert printed.startswith("explained\n")

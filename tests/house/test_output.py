@@ -95,7 +95,8 @@ def test_json_on_standard_output_is_alone_there(run, name):
     assert name == "torque" or said.err.strip()
 
 
-@pytest.mark.parametrize("name", ["scan", "monitor", "check", "sweep --plan", "torque", "gap diagnose"])
+@pytest.mark.sample(3)
+@pytest.mark.parametrize("name", ["scan", "gap diagnose", "monitor", "check", "sweep --plan", "torque"])
 def test_names_come_whole_on_a_narrow_terminal(run, monkeypatch, name):
     monkeypatch.setenv("COLUMNS", "30")
     said = run(name)

@@ -1,4 +1,7 @@
-"""The documentation site builds without a warning, and is viewed and searched without a network."""
+"""The documentation site builds without a warning, and is viewed and searched without a network.
+
+One page of it here, by the same settings; the whole site, which takes half a minute, in `make long` and `make docs`.
+"""
 
 import os
 import re
@@ -54,6 +57,7 @@ def test_a_link_that_leads_nowhere_fails_the_build(tmp_path):
     page.write_text("# One page\n\nWith a link to [itself](index.md).\n", encoding="utf-8")
     done = build(tmp_path, tmp_path / "site")
     assert done.returncode == 0, done.stdout + done.stderr
+    require_nothing_from_elsewhere(tmp_path / "site")
     with page.open("a", encoding="utf-8") as text:
         text.write("\n[nowhere](nowhere.md)\n")
     done = build(tmp_path, tmp_path / "site")
@@ -61,7 +65,7 @@ def test_a_link_that_leads_nowhere_fails_the_build(tmp_path):
     assert "nowhere.md" in done.stderr
 
 
-def test_no_page_loads_anything_from_elsewhere(site):
+def require_nothing_from_elsewhere(site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
     assert pages
     for page in pages:
@@ -72,11 +76,18 @@ def test_no_page_loads_anything_from_elsewhere(site):
         assert not re.search(r"url\([\"']?(?:https?:)?//", style.read_text(encoding="utf-8")), style.name
 
 
+@pytest.mark.long
+def test_no_page_loads_anything_from_elsewhere(site):
+    require_nothing_from_elsewhere(site)
+
+
+@pytest.mark.long
 def test_files_outside_the_docs_are_there(site):
     for name in ("CHANGELOG.html", "CONTRIBUTING.html", "examples/planar3.yaml", "packaging/armlink@.service"):
         assert (site / name).is_file(), name
 
 
+@pytest.mark.long
 def test_the_reference_has_names_and_commands(site):
     api = (site / "reference" / "gcomp.html").read_text(encoding="utf-8")
     assert "gravity_torque" in api
@@ -85,6 +96,7 @@ def test_the_reference_has_names_and_commands(site):
     assert "--reference-mass" in commands
 
 
+@pytest.mark.long
 def test_the_landing_page_shows(site, look):
     seen = look(site / "index.html")
     assert seen.console == ()
@@ -92,6 +104,7 @@ def test_the_landing_page_shows(site, look):
     assert seen.colours() > 100
 
 
+@pytest.mark.long
 def test_the_search_finds_from_disk(site, look):
     page = site / "search.html"
     page.write_text('<meta http-equiv="refresh" content="0; url=index.html?q=payload">')

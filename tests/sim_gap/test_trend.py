@@ -89,6 +89,7 @@ def test_the_newest_is_that_of_the_latest_date(folder: Path) -> None:
     assert json.loads(out.read_text())["newest"]["case"] == "a-2026-11-17.mcap"
 
 
+@pytest.mark.long
 def test_by_the_daemon(folder: Path) -> None:
     """What wears is an event, once."""
     said: list[tuple[Any, ...]] = []

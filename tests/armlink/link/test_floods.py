@@ -79,7 +79,7 @@ def flooded(family: str, kind: str, count: int) -> tuple[FloodedBus, ArmlinkErro
 
 
 @pytest.mark.parametrize(("family", "kind", "count"), ROWS)
-@pytest.mark.sample(4)
+@pytest.mark.sample(2)
 def test_a_flood_drops_no_arm(family: str, kind: str, count: int) -> None:
     bus, error = flooded(family, kind, count)
     assert isinstance(error, BusFault)
@@ -96,7 +96,7 @@ def test_a_flood_drops_no_arm(family: str, kind: str, count: int) -> None:
         ("the drives' own", "readings of "),
     ],
 )
-@pytest.mark.parametrize("count", [200, 1100])
+@pytest.mark.parametrize("count", [200, pytest.param(1100, marks=pytest.mark.long)])
 def test_what_a_flood_is_made_of_is_named(kind: str, named: str, count: int) -> None:
     said = str(flooded("cia402", kind, count)[1])
     if kind == "the drives' own" and count == 200:

@@ -27,6 +27,11 @@ from armlink.link.types import Command, Sample, Setpoints
 from armlink.loop.remote_link import RemoteLink
 
 ARMLINK = Path(sys.executable).parent / "armlink"
+SHARED = os.getpid() % 100 + 1
+OWN = SHARED + 100
+"""Multicast groups of this process: of the arm that most tests share, and of those that have one of their own."""
+PATIENCE = 300.0
+"""A simulated arm is given this time to begin on a busy machine [s]."""
 CONTENT = {
     "name": "pair",
     "kinematics": {
@@ -62,7 +67,7 @@ def simulated(tmp_path: Path, group: int) -> Iterator[tuple[ArmFile, str, subpro
     bus = f"udp_multicast:239.74.171.{group}"
     arm = subprocess.Popen([ARMLINK, "sim", path, "--bus", bus, "--control", pipe], stderr=subprocess.DEVNULL)
     try:
-        end = time.monotonic() + 60
+        end = time.monotonic() + PATIENCE
         while not pipe.exists():
             assert time.monotonic() < end
             assert arm.poll() is None, "the simulated arm has ended"
@@ -74,13 +79,24 @@ def simulated(tmp_path: Path, group: int) -> Iterator[tuple[ArmFile, str, subpro
         arm.wait(20)
 
 
-@pytest.fixture
-def started(tmp_path: Path) -> Iterator[tuple[RemoteLink, subprocess.Popen[bytes]]]:
-    """An enabled arm behind a loop process, and the arm's own process."""
-    with simulated(tmp_path, os.getpid() % 200 + 1) as (arm, bus, process), RemoteLink(arm, bus) as link:
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RemoteLink, subprocess.Popen[bytes]]]:
+    """An arm behind a loop process, and the arm's own process, for the whole file."""
+    with simulated(tmp_path_factory.mktemp("pair"), SHARED) as (arm, bus, process), RemoteLink(arm, bus) as link:
         link.start()
         link.enable()
         yield link, process
+
+
+@pytest.fixture
+def started(running: tuple[RemoteLink, subprocess.Popen[bytes]]) -> tuple[RemoteLink, subprocess.Popen[bytes]]:
+    """The same, enabled and standing where it was at first, whatever the test before has done to it."""
+    link, _ = running
+    here = link.recover().position
+    for _ in link.play(Setpoints.follow(np.linspace(here, np.zeros(2), 100))):
+        pass
+    link.catch_up()
+    return running
 
 
 def rows(link: RemoteLink, seconds: float, way: float) -> np.ndarray:
@@ -203,7 +219,7 @@ def test_an_arm_that_stands_still_is_not_called_broken(
 
 @pytest.mark.parametrize("who", ["job", "loop"])
 def test_the_joints_stop_when_job_or_loop_is_killed(tmp_path: Path, who: str) -> None:
-    with simulated(tmp_path, os.getpid() % 200 + 1) as (arm, bus, _):
+    with simulated(tmp_path, OWN) as (arm, bus, _):
         job = subprocess.Popen(
             [sys.executable, "-c", JOB, str(arm.path), bus],
             stdout=subprocess.PIPE,
@@ -242,7 +258,7 @@ def test_a_function_runs_in_the_loop_until_it_ends_or_ctrl_c(tmp_path: Path) -> 
         raise KeyboardInterrupt
 
     told: list[str] = []
-    with simulated(tmp_path, os.getpid() % 200 + 1) as (arm, bus, _):
+    with simulated(tmp_path, OWN) as (arm, bus, _):
         with RemoteLink(arm, bus) as link:
             assert link.inside(dawdle, told.append, 0.2) == link.pid
             assert told == ["holding"] * 20

@@ -14,6 +14,7 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(4))
 def test_a_gain_and_an_offset_drift_at_once_are_found_and_put_right(sarcos, sarcos_beta, seed) -> None:
     bench = Bench(sarcos, sarcos_beta, seed)
@@ -41,6 +42,7 @@ def test_the_proposal_comes_two_windows_after_the_alarm(sarcos, sarcos_beta) -> 
     assert proposal.evidence["offset"] == pytest.approx(0.3, abs=0.05)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("joint", range(7))
 def test_an_offset_drift_of_any_joint_is_put_right(sarcos, sarcos_beta, joint) -> None:
     bench = Bench(sarcos, sarcos_beta, 10 + joint)

@@ -191,6 +191,7 @@ def test_work_stays_inside_the_range_at_the_speed_allowed() -> None:
     assert 1.0 < 20_000 * 0.004 / len(stops) < 2.5  # a pose about every two seconds
 
 
+@pytest.mark.long
 def test_on_the_simulated_arm_a_drift_is_found_and_put_right(tmp_path: Path) -> None:
     """Frames, physics, friction, quantisation and noise as the simulated arm has them."""
     arm, seed = arm_file(), 1

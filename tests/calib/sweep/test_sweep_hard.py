@@ -12,7 +12,7 @@ from calib.sweep.dataset import load_data
 SEED = {"range": 1, "slip": 7, "vertical": 3}
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("case", SEED)
 def test_a_hard_case_is_named_or_stays_within_its_intervals(case: str, tmp_path: Path) -> None:
     arm, simulated = hard_arm(case, SEED[case], 2, steps=5, poses=1, max_samples=30, gain_std=0.5)
@@ -24,7 +24,8 @@ def test_a_hard_case_is_named_or_stays_within_its_intervals(case: str, tmp_path:
     _CHECKS[case](outcome, swept.slips)
 
 
-@pytest.mark.parametrize("bit", [2, 5, 8])
+@pytest.mark.sample(1)
+@pytest.mark.parametrize("bit", [8, 2, 5])
 def test_a_stuck_bit_ends_the_sweep_before_anything_is_pressed(bit: int, tmp_path: Path) -> None:
     arm, simulated = hard_arm("sound", 1, 2, steps=5, poses=1, max_samples=30, gain_std=0.5)
     stick(simulated, bit)

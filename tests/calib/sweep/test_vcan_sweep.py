@@ -1,30 +1,54 @@
-"""Real SocketCAN, real time: a small arm is swept without and with a mass, calibrated, and its controllers written."""
+"""Real SocketCAN, real time: a small arm is swept; in the long test with a mass too, and controllers are written."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from small_pair import MASS, SEED, armlink, describe, simulated
 
 from armlink.arm_file import load_arm
+from calib.sweep.dataset import load_data
 from sim_bus.truth import Truth
 
 pytestmark = [pytest.mark.vcan, pytest.mark.sweep]
 
 BUS = "socketcan:vcan0"
+OPTIONS = ("--bus", BUS, "--yes", "--keep-going", "5", "--no-check-stops")
 LOWEST, HIGHEST = 25.0, 100.0
 """Rates that are tried [Hz]: one emulated processor makes the cycles, simulates the arm and does the job."""
 
 
+def described(folder: Path, **sweep: int) -> Path:
+    """The arm at a rate that this machine keeps."""
+    describe(folder, rate=HIGHEST)
+    host = armlink(folder, "check", "pair.yaml", "--host", "--seconds", "2", ok=(0, 1))
+    path = describe(folder, rate=float(np.clip(host["holds_hz"], LOWEST, HIGHEST)))
+    content = yaml.safe_load(path.read_text())
+    content["sweep"] |= sweep
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def test_a_short_sweep_is_complete_and_true(tmp_path: Path) -> None:
+    path = described(tmp_path, steps=3)
+    with simulated(tmp_path, BUS):
+        armlink(tmp_path, "sweep", "pair.yaml", "--out", "unloaded", *OPTIONS)
+    data, truth = load_data(tmp_path / "unloaded"), Truth.draw(load_arm(str(path)), SEED)
+    assert data.complete
+    at = np.array([reading.position for reading in data.readings]) * truth.position_gain
+    assert np.all((at > [0.95, -0.65]) & (at < [2.25, 0.65])), "readings lie between the stops"
+    found = armlink(tmp_path, "calibrate", "unloaded", "--store", "records.db")
+    assert found["gain"]["estimated"] == [None, None], "without a mass there are ratios alone"
+
+
+@pytest.mark.long
 def test_sweep_to_apply(tmp_path: Path) -> None:
-    describe(tmp_path, rate=HIGHEST)
-    host = armlink(tmp_path, "check", "pair.yaml", "--host", "--seconds", "2", ok=(0, 1))
-    path = describe(tmp_path, rate=float(np.clip(host["holds_hz"], LOWEST, HIGHEST)))
-    options = ("--bus", BUS, "--yes", "--keep-going", "5", "--no-check-stops")
+    path = described(tmp_path)
     with simulated(tmp_path, BUS) as (pipe, _):
-        armlink(tmp_path, "sweep", "pair.yaml", "--out", "unloaded", *options)
+        armlink(tmp_path, "sweep", "pair.yaml", "--out", "unloaded", *OPTIONS)
         pipe.write_text(f"mass {MASS}\n")
-        armlink(tmp_path, "sweep", "pair.yaml", "--out", "loaded", "--reference-mass", str(MASS), *options)
+        armlink(tmp_path, "sweep", "pair.yaml", "--out", "loaded", "--reference-mass", str(MASS), *OPTIONS)
         pipe.write_text("mass 0\n")
         words = ("calibrate", "unloaded", "loaded", "--apply", "--bus", BUS, "--store", "records.db")
         found = armlink(tmp_path, *words, tries=5)

@@ -126,6 +126,7 @@ RECURSIVE = {
 }
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("poses", RECURSIVE)
 def test_recursive_identification_with_gains_known(poses: int) -> None:
     arm = make_sarcos()
@@ -152,7 +153,7 @@ def test_separate_fits_averaged_are_far_worse_than_stacked_ones() -> None:
     assert torque_rms(found) == pytest.approx(expected, rel=0.2)
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(
     ("poses", "sensors", "weighted", "expected"),
     [
@@ -191,6 +192,7 @@ def calibrations(poses: int, count: int):
         yield true, make_readings(arm, true, positions, marks, loads=(0.0, 2.0), sigma=SIGMA, rng=rng)
 
 
+@pytest.mark.long
 def test_recursion_that_takes_gains_and_positions_for_right() -> None:
     found = []
     for _, rows in calibrations(2, 200):
@@ -201,7 +203,7 @@ def test_recursion_that_takes_gains_and_positions_for_right() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("poses", "expected", "gain_rms"),
     [
@@ -228,6 +230,7 @@ def test_gains_offsets_and_position_offsets_unknown_with_a_mass_of_two_kilograms
     assert np.mean(np.abs(scores) < 1.96) == pytest.approx(0.95, abs=0.012)
 
 
+@pytest.mark.long
 def test_equation_l_that_takes_positions_for_right() -> None:
     free, found, gains = free_mask(7, ("gain", "offset", "beta", "rho")), [], []
     for true, rows in calibrations(2, 200):

@@ -55,6 +55,7 @@ def test_a_force_from_outside_is_blamed_on_nothing(force):
     assert any(note.startswith("joint_2: ") and "remain (noise" in note for note in answer.notes)
 
 
+@pytest.mark.long
 def test_a_hum_below_the_pass_band_is_blamed_on_nothing():
     hum = lambda r: replace(r, torque=r.torque + np.sin(2 * np.pi * 2.1 * r.t)[:, None] * [0, 1, 0])  # noqa: E731
     answer = diagnosed(hum)
@@ -62,6 +63,7 @@ def test_a_hum_below_the_pass_band_is_blamed_on_nothing():
     assert not answer.causes
 
 
+@pytest.mark.long
 def test_mains_hum_above_the_pass_band_is_a_band_and_blames_nothing():
     hum = lambda r: replace(r, torque=r.torque + np.sin(2 * np.pi * 18.7 * r.t)[:, None] * [0, 1, 0])  # noqa: E731
     answer = diagnosed(hum)
@@ -106,6 +108,7 @@ def test_the_motor_of_a_joint_that_is_held_may_repeat_one_number_its_sensor_may_
     assert [(one.channel, one.joint) for one in signals.stuck] == [(channel, 1) for channel in channels]
 
 
+@pytest.mark.long
 def test_beside_a_stuck_sensor_other_joints_are_still_read():
     answer = diagnosed(dead, Wrong(coulomb=np.array([0.8, 0.0, 0.0])))
     assert answer.causes[0].effect == "friction.coulomb"
@@ -113,6 +116,7 @@ def test_beside_a_stuck_sensor_other_joints_are_still_read():
     assert answer.causes[0].confidence <= 0.5
 
 
+@pytest.mark.long
 def test_friction_that_the_library_has_not_is_no_viscous_friction_for_sure():
     def drag(recording: Recording) -> Recording:
         v = np.gradient(recording.position, recording.t, axis=0)

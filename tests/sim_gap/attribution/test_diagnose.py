@@ -45,7 +45,7 @@ SINGLE = [
 ]
 
 
-@pytest.mark.sample(6)
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("effect", "place", "name", "truth", "wrong", "channels"), SINGLE)
 def test_one_effect_is_named_first_with_its_joint_and_size(effect, place, name, truth, wrong, channels):
     answer = diagnosed(wrong, channels)
@@ -57,6 +57,7 @@ def test_one_effect_is_named_first_with_its_joint_and_size(effect, place, name, 
     assert answer.unexplained < 0.02
 
 
+@pytest.mark.long
 def test_the_same_effect_on_several_joints_is_one_cause():
     answer = diagnosed(Wrong(coulomb=np.array([0.5, 0.6, 0.7])))
     assert [cause.effect for cause in answer.causes] == ["friction.coulomb"]
@@ -68,6 +69,7 @@ def test_two_effects_on_different_sides_are_both_found():
     assert {cause.effect for cause in answer.causes if cause.confidence > 0.8} == {"friction.coulomb", "torque.gain"}
 
 
+@pytest.mark.long
 def test_ripple_of_many_teeth_is_found_where_the_joint_turns_slowly_enough():
     """A harmonic drive of ratio 100: two waves a turn of the motor, 32 a radian of the joint."""
     answer = diagnosed(Wrong(ripple=at(1, 0.6), cycles=100 / np.pi))
@@ -76,6 +78,7 @@ def test_ripple_of_many_teeth_is_found_where_the_joint_turns_slowly_enough():
     assert value(answer, "joint_2", "amplitude") == pytest.approx(0.6, rel=0.1)
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("channels", [BOTH, MOTOR])
 def test_a_true_model_has_no_gap(channels):
     answer = diagnosed(Wrong(), channels)
@@ -97,6 +100,7 @@ def test_noise_in_the_motion_that_no_effect_makes_is_unexplained():
     assert diagnose(model(), recordings[:1], recordings[1:]).verdict == "unexplained"
 
 
+@pytest.mark.long
 def test_a_slow_channel_between_the_rows_of_a_fast_one_is_used():
     def thin(recording: Recording) -> Recording:
         motor = recording.motor_torque.copy()
@@ -110,6 +114,7 @@ def test_a_slow_channel_between_the_rows_of_a_fast_one_is_used():
     assert len(answer.causes[0].joints) == 3
 
 
+@pytest.mark.long
 def test_without_other_motion_the_end_of_the_recording_is_kept_for_judging():
     answer = diagnose(model(), [record(model(), Wrong(coulomb=at(1, 0.8)), seconds=60)])
     assert answer.causes[0].effect == "friction.coulomb"
@@ -137,6 +142,7 @@ def test_the_json_has_the_documented_keys():
     assert answer["where"][0]["regime"] == "velocity"
 
 
+@pytest.mark.long
 def test_an_offset_of_the_last_joints_angle_is_not_passed_off_as_its_mass_moment():
     """Both make the same torque but for the motion's dynamics; at 0.12 rad the offset's tangent is not the offset."""
     wrong = Wrong(position_offset=np.array([0.0, 0.0, 0.12]))
@@ -145,6 +151,7 @@ def test_an_offset_of_the_last_joints_angle_is_not_passed_off_as_its_mass_moment
     assert "position.offset" in {first.effect, *first.confounded_with}
 
 
+@pytest.mark.long
 def test_where_the_sensors_drown_in_noise_the_command_is_compared_with_the_model():
     def noisy(seed: int) -> Recording:
         clean = record(model(), Wrong(coulomb=np.array([0.0, 0.8, 0.0])), seed=seed, seconds=40, rate=50.0)

@@ -60,6 +60,7 @@ def test_a_channel_that_lacks_it():
     assert [each["recording"] for each in answer.to_json()["friction_compensation"]] == ["on", "on"]
 
 
+@pytest.mark.long
 def test_which_runs_of_the_double_pendulum_had_it(realdata):
     """On in on_c alone; on_c_feedforward is the same run without the compensating part of its command."""
     folder = realdata / "double_pendulum"

@@ -33,6 +33,7 @@ def test_a_payload_and_friction_that_grows_with_the_load_it_adds():
     assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(3.0, rel=0.03)
 
 
+@pytest.mark.long
 def test_a_sensors_gain_and_a_payload():
     wrong = Wrong(payload=2.0, gain=np.array([1.2, 1.0, 1.0]))
     train, other = (record(model(), wrong, seed=s, seconds=40) for s in (1, 2))
@@ -90,6 +91,7 @@ def test_slopes_of_a_point_mass_are_those_of_differences():
         np.testing.assert_allclose(slopes[:, k], (up - down) / (2 * step), atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_body_of_the_model_that_the_arm_lacks_is_a_payload_of_negative_mass():
     loaded = mujoco.MjModel.from_xml_string(THREE)
     loaded.body_mass[-1], loaded.body_inertia[-1] = 2.5, [0.02, 0.02, 0.01]
@@ -116,6 +118,7 @@ def test_a_payload_of_one_training_and_of_the_held_out_recording(groups):
     assert np.all(answer.heldout_after < 0.1)
 
 
+@pytest.mark.long
 def test_a_hum_above_the_band_is_no_true_model():
     def hums(seed: int):
         clean = record(model(), Wrong(), seed=seed, seconds=30, rate=250.0)
@@ -169,6 +172,7 @@ def test_loaded_recordings_judged_on_one_without_the_body():
     assert "second half" in answer.heldout_is
 
 
+@pytest.mark.long
 def test_a_light_payload_is_not_taken_for_mass_moments_of_all_links():
     """Before it is fitted about itself it lacks its inertia, and three mass moments fit a little better."""
     wrong = Wrong(coulomb=np.array([0.2, 0.3, 0.1]), viscous=np.array([0.5, 0.2, 0.1]), payload=0.4)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.signal import lfilter
 from wrong_arms import Wrong, model, record
 
@@ -15,10 +16,11 @@ from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
 
-TRIALS = 60
+FEW, TRIALS = 6, 60
 
 
-def test_coverage(monkeypatch):
+@pytest.mark.parametrize("trials", [FEW, pytest.param(TRIALS, marks=pytest.mark.long)])
+def test_coverage(trials, monkeypatch):
     """Coverage of the statistical part alone, without systematic errors of the arm."""
     for name in ("SYSTEMATIC", "NOMINAL"):
         monkeypatch.setattr(f"sim_gap.search.estimate.{name}", 0.0)
@@ -30,7 +32,7 @@ def test_coverage(monkeypatch):
     nominal = load_model(model())
     clean = record(model(), wrong, seconds=60, rate=50, noise=0.0, channels=("tau_motor",))
     held, widths = [], []
-    for trial in range(TRIALS):
+    for trial in range(trials):
         random = np.random.default_rng(trial)
         noise = lfilter([0.3], [1.0, -0.95], random.normal(size=clean.position.shape), axis=0)  # 0.4 s long
         signals = prepare(replace(clean, motor_torque=clean.motor_torque + 0.2 * noise), nominal.arm)
@@ -41,14 +43,16 @@ def test_coverage(monkeypatch):
             (value,) = estimate.parameters(term).values()
             held.append(value.low <= (0.5 if term.effect == "friction.coulomb" else 0.8) <= value.high)
             widths.append(value.high - value.low)
-    assert 0.88 <= np.mean(held) <= 0.99
+    assert np.mean(held) >= 0.88
+    assert np.mean(held) <= 0.99 or trials == FEW  # each of a few may hold the truth
     assert np.median(widths) < 0.3
 
 
-def test_an_arm_that_is_a_little_wrong_everywhere_is_allowed_for():
+@pytest.mark.parametrize("trials", [3, pytest.param(10, marks=pytest.mark.long)])
+def test_an_arm_that_is_a_little_wrong_everywhere_is_allowed_for(trials):
     """Mass moments 1 % off, a few hundredths of friction and offset per joint: the effect's own size is covered."""
     nominal, held = load_model(model()), []
-    for trial in range(10):
+    for trial in range(trials):
         random = np.random.default_rng(trial)
         wrong = Wrong(
             coulomb=np.array([0.0, 0.8, 0.0]) + random.uniform(0.01, 0.04, 3),

@@ -55,6 +55,7 @@ def test_a_lag_far_below_the_noise_of_sensor_and_estimate_is_told_from_the_comma
     assert any("joint_2" in note and "the command is compared with the model" in note for note in answer.notes)
 
 
+@pytest.mark.long
 def test_a_lag_within_the_margin_of_its_channel_is_told_where_it_shows_throughout():
     answer = diagnosed(lag=0.03, noise=(0.0, 0.4))
     first = answer.causes[0]
@@ -99,6 +100,7 @@ def test_a_noisy_reading_does_not_explain_itself_as_what_bends_a_gear():
     assert np.sqrt(np.mean((clear[1] - clear[0])[inner] ** 2)) < 0.2
 
 
+@pytest.mark.long
 def test_a_limit_reached_in_one_stretch_of_the_training_alone_is_told():
     """Without that interval in the fit it is still predicted: above its limit a drive adds no torque."""
     train, heldout = commanded(7), commanded(1)

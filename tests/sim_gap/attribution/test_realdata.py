@@ -28,6 +28,7 @@ def joints(answer: Diagnosis, effect: str) -> set[str]:
     return {joint for cause in answer.causes if cause.effect == effect for joint in cause.joints}
 
 
+@pytest.mark.long
 def test_ur10e(realdata):
     folder = realdata / "ur10e"
     load = lambda name: thinned(folder / f"{name}.csv.gz", 2)  # noqa: E731
@@ -42,6 +43,7 @@ def test_ur10e(realdata):
     assert not joints(answer, "link.payload")
 
 
+@pytest.mark.long
 def test_the_payload_of_one_recording_is_found_beside_what_is_wrong_with_the_arm(realdata):
     folder = realdata / "ur10e"
     load = lambda name: thinned(folder / f"{name}.csv.gz", 2)  # noqa: E731

@@ -68,6 +68,7 @@ def test_laws_are_written_as_the_module_reads_them(answer):
         assert len(law["at"]) == len(law["torque"])
 
 
+@pytest.mark.long
 def test_a_motor_that_sticks_in_creep_follows_no_law():
     """There it may hold any torque up to its friction: that it holds less is nothing unknown."""
     made = []

@@ -43,6 +43,7 @@ def test_the_written_model_has_no_gap_any_more(tmp_path, name):
     assert answer.rollout.after.max() < 0.2 * answer.rollout.before.max()
 
 
+@pytest.mark.long
 def test_a_spring_is_read_by_a_sensor_on_the_link(tmp_path):
     """It acts beside motor and sensor: the model that has it leaves no gap in `tau`, rest and all."""
     text = THREE.replace('<joint name="joint_2"', '<joint name="joint_2" stiffness="2" springref="{}"')

@@ -1,6 +1,7 @@
 """One fault is not told as another one that changes a recording of a real arm alike."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,21 +14,28 @@ from armlink.recording.recording import Recording
 from sim_gap.checks.check import check_recording
 from sim_gap.model.load import load_model
 
+FILES = {
+    "ur10e": ("ur10e", "train_a.csv.gz"),
+    "panda": ("panda", "recording.csv.gz"),
+    "lwr4": ("lwr4", "train.csv.gz"),
+    "pendulum": ("double_pendulum", "designc_a.csv.gz", "sim_design_c.xml"),
+}
+
 
 @pytest.fixture(scope="module")
 def arms(realdata: Path):
     """Nominal arm and recording of real arms, by the folder of their recordings."""
 
+    @cache  # those that a run asks for, once
     def loaded(folder: str, file: str, sim: str = "sim.xml"):
         recording = load_recording(realdata / folder / file)
         return load_model(realdata / folder / sim, (), recording.n).arm, recording
 
-    return {
-        "ur10e": loaded("ur10e", "train_a.csv.gz"),
-        "panda": loaded("panda", "recording.csv.gz"),
-        "lwr4": loaded("lwr4", "train.csv.gz"),
-        "pendulum": loaded("double_pendulum", "designc_a.csv.gz", "sim_design_c.xml"),
-    }
+    class Arms:
+        def __getitem__(self, name: str):
+            return loaded(*FILES[name])
+
+    return Arms()
 
 
 def moved(recording: Recording, joint: int, angle: float) -> Recording:
@@ -36,7 +44,7 @@ def moved(recording: Recording, joint: int, angle: float) -> Recording:
     return replace(recording, position=position)
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(
     ("folder", "joint", "angle"),
     [("ur10e", 1, -0.2), ("ur10e", 2, 0.28), ("panda", 1, 0.2), ("lwr4", 1, 0.2), ("lwr4", 3, -0.2)],
@@ -51,6 +59,7 @@ def test_a_zero_is_no_order_no_delay_and_no_tilt(arms, folder, joint, angle):
     assert told == pytest.approx(-angle, abs=0.03)
 
 
+@pytest.mark.long
 def test_velocities_of_other_joints_are_no_other_order_of_the_positions(arms):
     arm, recording = arms["panda"]
     checked, found = check_recording(arm, replace(recording, velocity=recording.velocity[:, ::-1]), "r", AS_IT_IS)
@@ -58,7 +67,7 @@ def test_velocities_of_other_joints_are_no_other_order_of_the_positions(arms):
     np.testing.assert_array_equal(checked.position, recording.position)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize(("folder", "by_s"), [("panda", -1.2), ("lwr4", 0.6), ("lwr4", -0.9)])
 def test_a_delay_is_no_unsigned_joint_and_no_order_that_changes(arms, folder, by_s):
     arm, recording = arms[folder]
@@ -69,6 +78,7 @@ def test_a_delay_is_no_unsigned_joint_and_no_order_that_changes(arms, folder, by
     assert float(finding.option.partition("=")[2]) == pytest.approx(-by_s, abs=0.08)
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("joint", [4, 6])
 def test_one_joint_in_another_unit_makes_no_motors_of_link_sensors(arms, joint):
     arm, recording = arms["panda"]

@@ -45,6 +45,7 @@ def test_the_width_is_found_however_it_sets_in(halves):
     assert found.low < WIDTH < found.high
 
 
+@pytest.mark.long
 def test_a_dead_band_gets_what_the_hysteresis_passes_on():
     width, band = 0.8, 0.5
 

@@ -52,6 +52,7 @@ def test_a_recording_too_short_to_move_along_says_nothing() -> None:
     np.testing.assert_array_equal(own.missed(search, solvers(sim, search)), 0.0)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_rows_with_the_position_of_the_next_are_told_with_their_remedy(tmp_path) -> None:
     made = []

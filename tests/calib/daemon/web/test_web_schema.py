@@ -19,7 +19,7 @@ from calib.daemon.service_view import ServiceView
 from calib.daemon.web.guard import RateLimit
 
 CHECKS = [not_a_server_error, content_type_conformance, response_schema_conformance, status_code_conformance]
-EXAMPLES = 8
+EXAMPLES = 3
 """Generated requests of each kind, valid and not, to each route; tests/campaigns/web.py sends many more."""
 SETTINGS = settings(
     max_examples=EXAMPLES,

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from soft_links import soft_arm
 
 from armlink.link.link import Link
@@ -23,6 +24,7 @@ LOAD = 0.3
 """[kg]"""
 
 
+@pytest.mark.long
 def test_a_load_is_told_while_the_arm_carries_it(tmp_path: Path) -> None:
     arm = soft_arm()
     simulated, plan, random = SimulatedArm(arm, Truth.draw(arm, 3), 3), plan_creep(arm), np.random.default_rng(0)

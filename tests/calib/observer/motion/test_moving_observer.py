@@ -2,6 +2,7 @@
 
 import json
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,9 @@ from calib.creep.fit import fit_rows
 from calib.creep.plan import plan_creep
 from calib.creep.record import calibration_record, gravity_record
 from calib.daemon.view.event_text import describe
+from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
+from calib.observer.motion.change_test import ChangeHypothesis, ChangeTest
 from calib.observer.motion.observer import MovingObserver
 from calib.observer.observer import Observer, observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -79,6 +82,17 @@ def test_a_change_is_told_as_what_it_is(change: Change, joint: str | None, cause
     if cause == "gain":
         estimate = watching.estimate()
         assert abs(estimate.gain[1] - 1.05) < 4 * estimate.gain_std[1]
+
+
+@pytest.mark.parametrize(("size", "cause"), [(0.0, "none"), (5.0, "gain")])
+def test_a_change_that_hardly_explains_the_rows_is_none(size: float, cause: str) -> None:
+    """Fifty rows of whitened noise, and a gain's column in them."""
+    random, test = np.random.default_rng(6), ChangeTest.__new__(ChangeTest)
+    gain = ChangeHypothesis("gain", 0, random.standard_normal((50, 1)))
+    test._config, test._belief, test._candidates = ObserverConfig(), SimpleNamespace(learnt=range(100)), [gain]  # type: ignore[assignment]
+    test._white = random.standard_normal(50) + size * gain.columns[:, 0]
+    test.chi2 = float(test._white @ test._white)
+    assert test.verdict().cause == cause
 
 
 def test_work_without_a_change_is_no_event_and_tells_what_would_be_noticed() -> None:
