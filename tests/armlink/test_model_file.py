@@ -169,7 +169,8 @@ def test_numbers_that_are_none_are_refused_by_name(tmp_path, key, value, of):
 
 XACRO = """<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="length" value="0.4"/>
 <xacro:macro name="arm_link" params="name mass"><link name="${name}"><inertial><origin xyz="${length / 2} 0 0"/>
-<mass value="${mass}"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link></xacro:macro>
+<mass value="${mass}"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</xacro:macro>
 <link name="base"/><xacro:arm_link name="l1" mass="2"/><joint name="j1" type="revolute"><parent link="base"/>
 <child link="l1"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="20" velocity="1"/></joint></robot>"""
 
