@@ -66,6 +66,9 @@ ASK_AGAIN = 0.25
 """A request that shows in no heartbeat is sent again after this time [s]."""
 PATIENCE = 0.5
 """Longest wait for heartbeat, estimates and torques at the start [s]."""
+MODE_FRAMES = 5
+"""Cycles in which a change of the control mode is told. Nothing that the drive sends shows its mode: one frame that is
+lost, or that an interruption keeps from leaving, would leave it under torque control while it is sent positions."""
 LARGEST_POSITION = 1e5
 """No motor's position is larger [rev]; a larger one is no reading."""
 
@@ -84,6 +87,8 @@ class _ODriveState:
     """Messages that have come."""
     mode: int = 0
     """Control mode that it was last told; 0: none."""
+    mode_frames: int = 0
+    """How often it is still to be told."""
     asked: tuple[int, float] = (0, -math.inf)
     """Message or state that was last asked for, and when [s]."""
     sent: Order | None = None
@@ -257,9 +262,11 @@ class ODriveDrives(BasicDrives):
     def _controlled(self, joint: int, control: int, message: Message, data: bytes) -> list[Frame]:
         """An input, after its control mode where that changes."""
         known, frame = self._known[joint], (identifier(self._settings[joint].node, message), data)
-        if known.mode == control:
+        if known.mode != control:
+            known.mode, known.mode_frames = control, MODE_FRAMES
+        if not known.mode_frames:
             return [frame]
-        known.mode = control
+        known.mode_frames -= 1
         return [self._message(joint, Message.CONTROLLER_MODE, control, PASSTHROUGH), frame]
 
     def _message(self, joint: int, message: Message, *values: int) -> Frame:

@@ -62,6 +62,29 @@ def test_whatever_ends_the_job_the_arm_is_parked(name, end):
     assert (bench.peak < speed + EXTRA_SPEED).all(), bench.peak
 
 
+@every_family
+def test_an_arm_afloat_is_held_although_the_frames_of_one_cycle_are_lost(name):
+    """Those that tell drives of their new mode, too: no drive may go on with torque while it is sent positions."""
+    bench = EndsBench(name)
+    limits = np.array([joint.max_torque for joint in bench.arm.link.joints])
+    for _ in range(50):
+        here = bench.link.latest_position
+        torque = np.clip(bench.sim.gravity_torque(here[None])[0], -limits, limits)
+        bench.link.cycle(Command(np.full(6, Mode.TORQUE, np.int8), torque, here))
+    port = bench.link.commander.loop._port
+    send_all = port.send_all
+
+    def lost(frames):
+        port.send_all = send_all
+
+    port.send_all = lost
+    bench.peak[:] = 0.0
+    bench.leave(None)
+    assert not any(bench.powered)
+    assert bench.away() < 0.1
+    assert (bench.peak < bench.arm.link.park.speed + EXTRA_SPEED).all(), bench.peak
+
+
 @pytest.mark.sample(1)
 @every_family
 def test_a_command_that_the_gate_refuses_leaves_the_arm_held(name):
