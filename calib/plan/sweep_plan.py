@@ -38,6 +38,10 @@ MORE_POSES = 2
 """Stop combinations per joint that may be added to reach the gains' precision; a choice: each takes minutes."""
 FINEST = 3.0
 """Largest factor of precision by averaging longer: nine times the samples; a choice."""
+HOLDING_RESERVE = 1.1
+"""Torque that the drives keep over gravity with the mass on, as a factor: friction and acceleration need the rest."""
+TRAVEL_POSES = 400
+"""Random poses at which it is looked whether the mass can be held on the way from one sweep to the next."""
 GRAMS = 100.0
 """Reference mass from which grams may be meant [kg]."""
 ENOUGH = 1.2
@@ -210,4 +214,16 @@ def reference_masses(
     room = np.maximum(limits.max_torque - gravity, 0.05 * limits.max_torque)
     most = float(np.min(room / np.maximum(per_kg.max(axis=0), 1e-9)))
     most = min(most, 2 * float(limits.rated.max()) / (9.81 * float(reach(kinematics)[0])))
-    return [float(f"{share * most:.2g}") for share in MASS_SHARES]
+    anywhere = np.inf if guess is None else _bearable_anywhere(kinematics, limits, guess, most)
+    return [float(f"{min(share * most, anywhere):.2g}") for share in MASS_SHARES]
+
+
+def _bearable_anywhere(kinematics: Arm, limits: DriveLimits, guess: GravityGuess, most: float) -> float:
+    """Mass [kg] that the drives hold with `HOLDING_RESERVE` wherever the arm may travel from one sweep to the next."""
+    random = np.random.default_rng(0)
+    regressor = gravity_regressor(kinematics, random.uniform(limits.lower, limits.upper, (TRAVEL_POSES, kinematics.n)))
+    at_origin, by_point = payload_columns(kinematics)
+    per_kg = np.abs(regressor @ (at_origin + by_point @ kinematics.span[-1]))
+    per_kg += HAND * np.linalg.norm(regressor @ by_point, axis=-1)
+    room = limits.max_torque / HOLDING_RESERVE - np.abs(regressor @ guess.beta)
+    return max(float(np.min(room / np.maximum(per_kg, 1e-9))), MASS_SHARES[0] * 0.1 * most)
