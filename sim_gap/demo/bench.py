@@ -59,10 +59,7 @@ class Bench:
     def gravity_errors(
         self, truth: Truth, beta: Array, record: CalibrationRecord, seed: int, poses: int = 500
     ) -> dict[str, Any]:
-        """The identified model against the plant's own gravity torque at random true poses, (n,) [N·m].
-
-        The model is asked at the angles that the calibrated position sensors report.
-        """
+        """The model, at angles as calibrated sensors report them, against the truth at random poses, (n,) [N·m]."""
         described = self.described
         angles = np.random.default_rng(seed).uniform(described.lower, described.upper, (poses, described.n))
         reported = record.angle((angles - truth.position_offset) / truth.position_gain)
