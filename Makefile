@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= ends false_readings demo_seeds random_arms hard_cases kill_sweep kill_records kill_host random_kills daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fuzz_files fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: long elsewhere surfaces mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
+.PHONY: long published elsewhere surfaces mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -86,6 +86,10 @@ servopeer: .venv/.dev ## Long campaign outside make test: positions alone, besid
 
 repeats: .venv/.dev ## Long campaign outside make test: positions alone, bands of motion and two recordings of one arm (ARGS="--arms 4", "--sim M --recordings R … --parts 5 --others 1")
 	$(BIN)/python tests/campaigns/servo_repeats.py $(ARGS)
+
+published: .venv/.dev ## Long campaign outside make test: published arm models through new, doctor and demo (ARGS="--only panda ur5 --out table.md")
+	test -d .published || $(BIN)/python -m pip install -q --no-deps --target .published example-robot-data rtb-data openarm-mujoco gym-aloha
+	$(BIN)/python tests/campaigns/published_models.py .published $(ARGS)
 
 elsewhere: .venv/.dev ## Long campaign outside make test: arms that MuJoCo simulates with its defaults (ARGS="--cases 24 --seed 1 --rate 30 --torques")
 	$(BIN)/python tests/campaigns/simulated_elsewhere.py $(ARGS)
