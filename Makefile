@@ -10,15 +10,15 @@ CAMPAIGNS ?= ends false_readings demo_seeds random_arms hard_cases kill_sweep ki
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
 
-.venv/.runtime: pyproject.toml constraints.txt scripts/make-venv
-	@scripts/make-venv runtime
+.venv/.demo: pyproject.toml constraints.txt scripts/make-venv
+	@scripts/make-venv demo
 
-.venv/.dev: .venv/.runtime
+.venv/.dev: .venv/.demo
 	@scripts/make-venv dev
 
 venv: .venv/.dev ## Make .venv with the package and everything needed to work on it
 
-demo: .venv/.runtime ## The whole job on a simulated arm; writes armlink-demo/report.html (ARGS="--seed 3" goes to armlink demo)
+demo: .venv/.demo ## The whole job on a simulated arm; writes armlink-demo/report.html (ARGS="--seed 3" goes to armlink demo)
 	$(BIN)/armlink demo $(ARGS)
 
 test: .venv/.dev ## Run every test but the long ones, those on real SocketCAN included (ARGS goes to pytest)

@@ -5,7 +5,7 @@ import importlib.util
 import os
 import re
 import sys
-from importlib.metadata import EntryPoint, requires, version
+from importlib.metadata import EntryPoint, version
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,6 @@ from armlink.termination import terminate_as_interrupt
 PURPOSE = "Calibrates, watches and diagnoses robot arms, with and without torque sensors in their joints."
 USAGE_STATUS = 2
 INTERRUPTED_STATUS = 130
-COLLECTIONS = ("all", "dev")
-"""Extras that only collect others."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment of the linear algebra, set before numpy is imported: our matrices are small, and threads that wait for
 one another on a busy machine cost up to a hundred times the arithmetic."""
@@ -87,10 +85,12 @@ def _call(point: EntryPoint, arguments: list[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except ModuleNotFoundError as error:
-        extra = _extra_with(error.name or "")
-        if extra is None:
+        from armlink.extras import missing_extra
+
+        said = missing_extra(point.name, error.name or "")
+        if said is None:
             raise
-        return _fail(f"{point.name}: {error.name} is not installed: pip install 'armlink[{extra}]'", USAGE_STATUS)
+        return _fail(said, USAGE_STATUS)
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error: unknown option, missing argument, bad value
             return _fail(f"{point.name}: {_usage(error)} (see armlink {point.name} --help)", USAGE_STATUS)
@@ -100,17 +100,6 @@ def _call(point: EntryPoint, arguments: list[str]) -> int:
         if status is None:
             raise
         return _fail(str(error), int(status))
-
-
-def _extra_with(module: str) -> str | None:
-    """The extra of this package that brings a module; None where it is none of ours."""
-    wanted = module.partition(".")[0].replace("_", "-").lower()
-    for requirement in requires("armlink") or []:
-        name, _, extra = requirement.replace("'", "").replace('"', "").partition("extra == ")
-        known = re.split(r"[^A-Za-z0-9-]", name, maxsplit=1)[0].lower()
-        if extra not in ("", *COLLECTIONS) and known.removesuffix("-sdk") == wanted:
-            return extra.strip()
-    return None
 
 
 def _usage(error: Any) -> str:

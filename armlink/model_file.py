@@ -8,6 +8,7 @@ from os.path import isfile
 from pathlib import Path
 from typing import Any
 
+from armlink.content.atomic_file import write_whole
 from armlink.content.memory_budget import memory_budget
 from armlink.content.model_sizes import MOST_TEXT, model_budget
 from armlink.errors import BadInput
@@ -19,6 +20,13 @@ STL_HEADER, STL_FACE = 84, 50
 STL_FACES = range(1, 200_001)
 """Numbers of faces that MuJoCo reads."""
 PACKAGE = "package://"
+POINTER = b"version https://git-lfs"
+"""Beginning of what Git leaves in place of a large file that was not fetched."""
+NOT_FOUND, UNFETCHED = "not found", "not fetched (git lfs pull)"
+UNREAD, FLAT = "not binary STL, OBJ or MSH, which MuJoCo reads", "without volume"
+"""Why a mesh is of no use."""
+FLATNESS = 1e-7
+"""Thickness of a mesh over its size below which MuJoCo finds no volume, as STL's single precision has it."""
 FINITE = {
     "body_": ("mass", "inertia", "pos", "quat", "ipos", "iquat"),
     "geom_": ("pos", "quat", "size"),
@@ -51,10 +59,8 @@ class ModelFile:
 
     spec: Any
     """`mujoco.MjSpec`, without the shapes whose meshes are absent."""
-    absent: tuple[str, ...]
-    """Mesh files that the model names and that are not there."""
-    unreadable: tuple[str, ...]
-    """Mesh files that are there, in a format that MuJoCo does not read."""
+    unused_meshes: tuple[tuple[str, str], ...]
+    """Mesh files that the model names and that are left out, each with its reason."""
     unphysical: tuple[str, ...]
     """Bodies of a URDF whose inertia has a negative principal moment; it is taken as negligible."""
     kind: str
@@ -63,11 +69,12 @@ class ModelFile:
     @property
     def left_out(self) -> str:
         """The meshes that are left out, with the reason; nothing if none is."""
-        reasons = {"not found": self.absent, "not binary STL, OBJ or MSH, which MuJoCo reads": self.unreadable}
+        by_reason: dict[str, list[str]] = {}
+        for file, reason in self.unused_meshes:
+            by_reason.setdefault(reason, []).append(file)
         return " and ".join(
             f"{len(files)} {'mesh' if len(files) == 1 else 'meshes'} {reason}, such as {files[0]}"
-            for reason, files in reasons.items()
-            if files
+            for reason, files in by_reason.items()
         )
 
     @property
@@ -104,23 +111,22 @@ def read_model(path: Path) -> ModelFile:
         compiler.boundmass = compiler.boundinertia = NEGLIGIBLE
         compiler.balanceinertia, compiler.fusestatic = True, False
     folder = path.resolve().parent
-    absent: list[str] = []
-    unreadable: list[str] = []
+    unused: list[tuple[str, str]] = []
     for mesh in list(spec.meshes):
         if not mesh.file:
             continue
         file = _find(mesh.file, folder, folder / spec.compiler.meshdir)
         weighed = [geom.parent.name for geom in spec.geoms if geom.meshname == mesh.name and not _has_inertial(geom)]
-        if file is not None and (mesh.content_type or _is_readable(file)):
+        reason = NOT_FOUND if file is None else "" if mesh.content_type else _why_useless(file)
+        if not reason:
             mesh.file = str(file)
             if kind == "URDF" and not weighed:
                 mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # some enclose hardly any volume
             continue
-        (absent if file is None else unreadable).append(mesh.file)
+        unused.append((mesh.file, reason))
         if weighed and kind == "MJCF":
-            trouble = "is not there" if file is None else "is too large, or in a format that MuJoCo does not read"
             raise BadInput(
-                f"{path}: mesh {mesh.file} {trouble}, and body {weighed[0]!r} has its mass from it alone: put a mesh "
+                f"{path}: mesh {mesh.file} is {reason}, and body {weighed[0]!r} has its mass from it alone: put a mesh "
                 "that MuJoCo reads beside the model, or give the body an inertial"
             )
         _drop(spec, mesh)
@@ -130,7 +136,24 @@ def read_model(path: Path) -> ModelFile:
     if kind == "URDF":
         spec.strippath = False  # the meshes' paths are absolute by now
     unphysical = _negative_inertias_removed(spec) if kind == "URDF" else ()
-    return ModelFile(spec, tuple(absent), tuple(unreadable), unphysical, kind)
+    return ModelFile(spec, tuple(unused), unphysical, kind)
+
+
+def expanded(path: Path, out: Path) -> Path:
+    """The URDF of a xacro file, written to `out`; raises BadInput where xacro is missing or cannot expand it."""
+    try:
+        import xacro
+    except ModuleNotFoundError:
+        raise BadInput(
+            f"{path}: is a xacro file: pip install xacro, or expand it yourself: xacro {path} > {out}"
+        ) from None
+    try:
+        text = xacro.process_file(str(path)).toxml()
+    except Exception as error:  # of many kinds: of XML, of expressions, of packages that are not found
+        what = f"{path}: xacro cannot expand it: {one_line(error)}"
+        raise BadInput(f"{what}: $(find PACKAGE) and arguments need ROS: xacro {path} > {out} there") from None
+    write_whole(out, text)
+    return out
 
 
 def compile_model(path: Path, beside: Sequence[Beside] = ()) -> Any:
@@ -218,17 +241,51 @@ def _find(name: str, *folders: Path) -> Path | None:
     return next((each for each in tries if isfile(each)), None)
 
 
-def _is_readable(mesh: Path) -> bool:
-    """Whether MuJoCo reads this mesh: not the text form of STL, which exporters write under the same suffix."""
+def _why_useless(mesh: Path) -> str:
+    """Why MuJoCo makes no shape of a mesh file, empty where it does.
+
+    STL has a text form under the same suffix; a file may be another one's pointer, or have no volume.
+    """
     suffix = mesh.suffix.lower()
     try:
-        if suffix != ".stl":
-            return suffix in READABLE_MESHES and mesh.stat().st_size <= MOST_TEXT
         with mesh.open("rb") as file:
-            faces = int.from_bytes(file.read(STL_HEADER)[STL_HEADER - 4 :], "little")
-        return faces in STL_FACES and mesh.stat().st_size == STL_HEADER + STL_FACE * faces
+            head = file.read(STL_HEADER)
+        if head.startswith(POINTER):
+            return UNFETCHED
+        size = mesh.stat().st_size
+        if suffix == ".stl":
+            faces = int.from_bytes(head[STL_HEADER - 4 :], "little")
+            if faces not in STL_FACES or size != STL_HEADER + STL_FACE * faces:
+                return UNREAD
+        elif suffix not in READABLE_MESHES or size > MOST_TEXT:
+            return UNREAD
+        return FLAT if suffix != ".msh" and _is_flat(_vertices(mesh)) else ""
     except OSError:
-        return False
+        return UNREAD
+
+
+def _vertices(mesh: Path) -> Any:
+    """Vertices (K, 3) of a binary STL or an OBJ file; of one that cannot be parsed none."""
+    import numpy as np
+
+    if mesh.suffix.lower() == ".stl":
+        face = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        return np.fromfile(mesh, face, offset=STL_HEADER)["corners"].reshape(-1, 3).astype(float)
+    rows = [line.split()[1:4] for line in mesh.read_bytes().splitlines() if line.startswith(b"v ")]
+    try:
+        return np.array(rows, dtype=float).reshape(-1, 3)
+    except ValueError:
+        return np.empty((0, 3))
+
+
+def _is_flat(vertices: Any) -> bool:
+    import numpy as np
+
+    if len(vertices) < 4:
+        return True
+    spread = vertices - vertices.mean(axis=0)
+    sizes = np.linalg.eigvalsh(spread.T @ spread)
+    return not sizes[0] > FLATNESS**2 * sizes[-1]
 
 
 def _negative_inertias_removed(spec: Any) -> tuple[str, ...]:

@@ -4,10 +4,11 @@ Arms and data are given as objects or as paths; every function raises armlink.Ar
 is wrong and how to put it right.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias, TypeGuard, TypeVar
 
 from armlink.arm_file import SIMULATED, ArmFile, Bus, load_arm
 from armlink.errors import BadInput
@@ -85,7 +86,7 @@ def open_link(arm: ArmLike, bus: str | None = None, *, simulated: bool = False, 
 
 
 def sweep(
-    arm: ArmLike,
+    arm: ArmLike | ArmDriver,
     out: str | Path,
     *,
     bus: str | None = None,
@@ -98,7 +99,7 @@ def sweep(
     """Sweep every joint, tip to base, into the folder `out`. **The arm moves through its whole range.**
 
     Args:
-        arm: arm file, its path, or a bundled arm's name.
+        arm: arm file, its path, or a bundled arm's name; or its link, enabled, which stays open.
         out: folder for the data set; each reading is on disk before the next is made.
         bus: INTERFACE:CHANNEL[@BITRATE] instead of the arm file's.
         simulated: sweep the simulated arm of the arm file's `sim` section.
@@ -109,11 +110,9 @@ def sweep(
 
     Raises BadInput, Refused where the arm cannot be swept, BusFault.
     """
-    arm_file = _arm(arm)
+    arm_file = arm.arm if _is_link(arm) else _arm(arm)
     run = run_creep if sweep_motion(arm_file) == "creep" else run_sweep
-    with open_link(arm_file, bus, simulated=simulated, load=reference_mass if simulated else 0.0) as link:
-        link.start()
-        link.enable()
+    with _enabled(arm, bus, simulated, reference_mass if simulated else 0.0) as link:
         return run(
             link, arm_file, Path(out), reference_mass=reference_mass, resume=resume, seed=seed, progress=progress
         )
@@ -157,7 +156,7 @@ def identify(*sweeps: SweepLike, arm: ArmLike | None = None, sensors: Calibrated
 
 
 def verify(
-    arm: ArmLike,
+    arm: ArmLike | ArmDriver,
     gravity: GravityFit | GravityRecord,
     sensors: Calibrated | CalibrationRecord | None = None,
     *,
@@ -165,11 +164,12 @@ def verify(
     simulated: bool = False,
     poses: int = 24,
     seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Verification:
     """Compare model and sensors at random poses that no fit has seen. **The arm moves through its whole range.**
 
     Args:
-        arm: arm file, its path, or a bundled arm's name.
+        arm: arm file, its path, or a bundled arm's name; or its link, enabled, which stays open.
         gravity: what `identify` found, or a gravity record.
         sensors: what `calibrate` found, or a calibration record; by default what the controllers hold. Arms without
             torque sensors need it.
@@ -177,21 +177,20 @@ def verify(
         simulated: the simulated arm of the arm file's `sim` section.
         poses: how many.
         seed: draws other poses.
+        progress: called with (poses done, poses in all).
 
     Raises BadInput, Refused, BusFault.
     """
-    arm_file = _arm(arm)
+    arm_file = arm.arm if _is_link(arm) else _arm(arm)
     calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepCalibration) else sensors
     model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity
     creeping = sweep_motion(arm_file) == "creep"
     if creeping and calibration is None:
         raise BadInput("verify: sensors: the drives of this arm keep no calibration: give what calibrate found")
-    with open_link(arm_file, bus, simulated=simulated) as link:
-        link.start()
-        link.enable()
+    with _enabled(arm, bus, simulated) as link:
         if creeping and calibration is not None:
-            return verify_creeping(link, arm_file, model, calibration, poses=poses, seed=seed)
-        return run_verify(link, arm_file, model, calibration, poses=poses, seed=seed)
+            return verify_creeping(link, arm_file, model, calibration, poses=poses, seed=seed, progress=progress)
+        return run_verify(link, arm_file, model, calibration, poses=poses, seed=seed, progress=progress)
 
 
 def observe(
@@ -230,6 +229,24 @@ def observe(
         events += observer.handle(float(t), position, torque)
     found = observer.estimate()
     return Observation(names, events, found.gain, found.gain_std, found.offset, found.offset_std, observer.rows)
+
+
+def _is_link(arm: object) -> TypeGuard[ArmDriver]:
+    return isinstance(getattr(arm, "arm", None), ArmFile)
+
+
+@contextmanager
+def _enabled(arm: ArmLike | ArmDriver, bus: str | None, simulated: bool, load: float = 0.0) -> Iterator[ArmDriver]:
+    """The link to the arm: the one given, or one that is opened, started and enabled for this."""
+    if not _is_link(arm):
+        with open_link(_arm(arm), bus, simulated=simulated, load=load) as link:
+            link.start()
+            link.enable()
+            yield link
+    elif bus is not None or simulated:
+        raise BadInput("bus, simulated: the link given is open already: leave both out")
+    else:
+        yield arm
 
 
 def _loaded(given: object, kind: type[T], load: Callable[[str | Path], T], expected: str) -> T:

@@ -11,17 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv as pa_csv
 
 from armlink.arm_file import ArmFile
 from armlink.content.atomic_file import open_whole
 from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
+from armlink.extras import require_extra
 from armlink.link.types import Setpoints
 from armlink.loop.driver import ArmDriver
-from armlink.recording.mcap import RecordingWriter
-from armlink.recording.tables import THREADS
+from armlink.recording.csv_text import layout_of, read_numbers, write_numbers
 from calib.arm.kinematics import gcomp_arm
 from calib.motion.trajectory import trajectory
 from gcomp.arrays import Array
@@ -159,7 +157,7 @@ def save_motion(motion: PlannedMotion, path: Path) -> None:
     columns |= {f"q_cmd_{i + 1}": column for i, column in enumerate(motion.target.T)}
     try:
         with open_whole(path) as stream:
-            pa_csv.write_csv(pa.table(columns), stream)
+            write_numbers(stream, columns)
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error}") from None
 
@@ -193,18 +191,16 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
 def _columns(path: Path, names: list[str]) -> tuple[Array, Array]:
     """Times (K,) and columns (K, n), all finite, times increasing."""
     try:
-        with memory_budget(path):
-            table = pa_csv.read_csv(path, pa_csv.ReadOptions(use_threads=THREADS))
-    except (pa.ArrowInvalid, OSError) as error:
-        raise BadInput(f"{path}: not a readable CSV file: {str(error).splitlines()[0]}") from None
-    missing = [name for name in ("t", *names) if name not in table.column_names]
-    if missing:
-        raise BadInput(f"{path}: no column {', '.join(missing)}: expected t and q_cmd_1 to {names[-1]}")
-    try:
-        columns = [table.column(name).cast(pa.float64()).to_numpy() for name in ("t", *names)]
-    except pa.ArrowInvalid as error:
-        raise BadInput(f"{path}: {str(error).splitlines()[0]}: expected numbers") from None
-    values = np.column_stack(columns)
+        content = path.read_bytes()
+    except OSError as error:
+        raise BadInput(f"{path}: not a readable CSV file: {error.strerror}") from None
+    with memory_budget(path):
+        layout = layout_of(content, str(path))
+        missing = [name for name in ("t", *names) if name not in layout.header]
+        if missing:
+            raise BadInput(f"{path}: no column {', '.join(missing)}: expected t and q_cmd_1 to {names[-1]}")
+        places = {name: layout.header.index(name) for name in ("t", *names)}
+        values = np.column_stack(list(read_numbers(content, layout, places, str(path)).values()))
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
         raise BadInput(f"{path}: row {bad[0][0] + 1}: no value of {('t', *names)[bad[0][1]]}")
@@ -222,6 +218,9 @@ def collect(
     The caller starts and enables the link, which stops the joints safely in every case. A kill loses at most the last
     second of the recording. Raises BusFault, Refused.
     """
+    require_extra(str(out), "bags")
+    from armlink.recording.mcap import RecordingWriter
+
     section = link.arm.require_link()
     speed = PACE * np.array([joint.max_velocity for joint in section.joints])
     way = trajectory(link.position_sent, target[0], speed, np.full(link.n, ACCELERATION), link.period)

@@ -7,6 +7,7 @@ from armlink.bus.bus_group import BusGroup
 from armlink.bus.can_bus import MessageBus
 from armlink.bus.port import interface_fault
 from armlink.errors import BadInput
+from armlink.extras import require_extra
 
 VIRTUAL_INTERFACES = ("virtual", "udp_multicast")
 FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0 or socketcan:can0@1000000"
@@ -57,7 +58,7 @@ def open_bus(spec: str | None, section: Bus) -> MessageBus:
         return adapt(can.Bus(interface=bus.interface, channel=bus.channel, **options, **bus.options), name)
     except CanInterfaceNotImplementedError as error:
         if "msgpack" in str(error):  # python-can finds the interface, which lacks what it is made of
-            raise BadInput(f"bus {name}: msgpack is not installed: pip install 'armlink[simulator]'") from None
+            require_extra(f"bus {name}", "simulator")
         known = bus.interface in can.VALID_INTERFACES
         hint = "is its driver installed?" if known else "unknown interface of python-can"
         raise BadInput(f"bus {name}: {error}: {hint}") from None

@@ -41,6 +41,11 @@ def convert(
         joints=joints,
         topic=topic,
     )
+    if stated.without_gravity:
+        raise BadInput(
+            f"--effort-is {effort_is}: gravity is added by the arm's model, which convert has not: state it to "
+            "armlink gap diagnose"
+        )
     recording = load_recording(source, stated)
     try:
         save_recording(recording, target)

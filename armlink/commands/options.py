@@ -26,7 +26,7 @@ Units = Annotated[list[str] | None, _of_reading(f"Unit of a channel: {UNITS}.")]
 Sign = Annotated[list[str] | None, _of_reading("Sign of a channel or column: tau_3=-1.")]
 Zero = Annotated[list[str] | None, _of_reading("Angle to add to a position [rad]: q_2=1.5708.")]
 Clock = Annotated[list[str] | None, _of_reading("Time to add to a channel [s]: tau=-0.02.")]
-EffortIs = Annotated[str, _of_reading("Source of a bag's efforts: motor or link (sensor).")]
+EffortIs = Annotated[str, _of_reading("The efforts are: motor, link (sensor), without-gravity (or both).")]
 Topic = Annotated[str, _of_reading("Topic of a bag that holds the joint states.")]
 
 

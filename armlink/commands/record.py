@@ -40,7 +40,7 @@ def record(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
     from armlink.errors import BadInput, BusFault
-    from armlink.recording.mcap import RecordingWriter
+    from armlink.extras import require_extra
     from armlink.recording.recorder import Recorder
 
     arm_file = load_arm(arm)
@@ -49,6 +49,9 @@ def record(
     if out is not None and out.suffix != SUFFIX:
         first = out.with_suffix(SUFFIX)
         raise BadInput(f"{out}: recordings are written as {SUFFIX}: record {first}, then armlink convert {first} {out}")
+    if out is not None:
+        require_extra(str(out), "bags")
+        from armlink.recording.mcap import RecordingWriter
     rows, last = 0, 0.0
     with contextlib.ExitStack() as stack:
         log = stack.enter_context(FrameLog(frames)) if frames else None

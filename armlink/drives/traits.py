@@ -27,7 +27,11 @@ class Traits:
     """When a reading comes: after SYNC, as the reply to a command, or by the drive's own clock."""
     frame: FrameKind
     """Identifiers of 11 or 29 bits on classical CAN, or CAN FD."""
+    torque_cycles: int = 1
+    """Cycles from one torque reading to the next."""
 
     def as_json(self) -> dict[str, Any]:
         """By name, as `armlink drives --json` has them."""
-        return {**asdict(self), "bounds": list(self.bounds)}
+        shown = {**asdict(self), "bounds": list(self.bounds)}
+        del shown["torque_cycles"]
+        return shown

@@ -8,10 +8,9 @@ from typing import Any, Self
 import numpy as np
 
 from armlink.errors import BadInput
+from armlink.extras import require_extra
 from armlink.link.types import Sample
 from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, joint_state_encoder
-
-MISSING = "--foxglove: foxglove-sdk is not installed: pip install 'armlink[foxglove]'"
 
 
 class FoxgloveStream:
@@ -19,10 +18,9 @@ class FoxgloveStream:
 
     def __init__(self, name: str, names: tuple[str, ...], port: int, host: str = "127.0.0.1") -> None:
         """Serve joints with these names; port 0 takes a free one. Raises BadInput without the package or the port."""
-        try:
-            import foxglove
-        except ImportError:
-            raise BadInput(MISSING) from None
+        require_extra("--foxglove", "foxglove")
+        import foxglove
+
         self._context = context = foxglove.Context()  # channels close with it
         schema = foxglove.Schema(name=SCHEMA_NAME, encoding="ros2msg", data=SCHEMA.encode())
         self._states, self._motors = (

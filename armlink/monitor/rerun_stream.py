@@ -9,9 +9,9 @@ from typing import Any, Self
 import numpy as np
 
 from armlink.errors import BadInput
+from armlink.extras import require_extra
 from armlink.link.types import Sample
 
-MISSING = "--rerun: rerun-sdk is not installed: pip install 'armlink[rerun]'"
 QUANTITIES = {"position": "rad", "velocity": "rad_per_s", "torque": "newton_metres", "motor_torque": "newton_metres"}
 """Reading → its unit, as a folder in the viewer."""
 PATIENCE = 2.0
@@ -23,10 +23,8 @@ class RerunStream:
 
     def __init__(self, name: str, names: tuple[str, ...], port: int) -> None:
         """Send joints with these names to the viewer at `port`. Raises BadInput without the package or a viewer."""
-        try:
-            rerun: Any = import_module("rerun")
-        except ImportError:
-            raise BadInput(MISSING) from None
+        require_extra("--rerun", "rerun")
+        rerun: Any = import_module("rerun")
         try:
             socket.create_connection(("127.0.0.1", port), PATIENCE).close()
         except OSError as error:

@@ -38,6 +38,8 @@ class Corrections:
     """Time to add to the stamps of a channel [s]."""
     effort: str = ""
     """`motor` or `link`: source of the efforts, if it is stated."""
+    without_gravity: bool = False
+    """Whether gravity was taken off the efforts before they were recorded; the model's is added again."""
     joints: tuple[str, ...] = ()
     """Names of the joints to take, base to tip."""
     topic: str = ""
@@ -83,6 +85,8 @@ class Corrections:
 
 
 AS_IT_IS = Corrections()
+WITHOUT_GRAVITY = "without-gravity"
+"""Efforts from which the controller's model of gravity was subtracted, as some drivers publish them."""
 
 
 def parse_corrections(
@@ -102,8 +106,11 @@ def parse_corrections(
     [N·m/A]), `q=counts:N` (counts a turn) and `q=percent:D` (100 is an angle of D degrees, as LeRobot's normalised
     ranges have it); a unit of one joint goes before that of its channel. Raises BadInput for anything else.
     """
-    if effort not in ("", "motor", "link"):
-        raise BadInput(f"--effort-is {effort}: expected motor or link")
+    *source, gravity = effort.split(",") if "," in effort else ("", effort)
+    if gravity != WITHOUT_GRAVITY:
+        source, gravity = [effort], ""
+    if source[0] not in ("", "motor", "link") or len(source) > 1:
+        raise BadInput(f"--effort-is {effort}: expected motor, link, {WITHOUT_GRAVITY}, or motor,{WITHOUT_GRAVITY}")
     mapped = _pairs("--map", columns)
     return Corrections(
         columns={column: other for column, other in mapped if channel_column(other) is None},
@@ -112,7 +119,8 @@ def parse_corrections(
         units={column: _factors(column, text) for column, text in _pairs("--units", units)},
         zero={column: _number("--zero", column, text) for column, text in _pairs("--zero", zero)},
         clock={column: _number("--clock", column, text) for column, text in _pairs("--clock", clock)},
-        effort=effort,
+        effort=source[0],
+        without_gravity=bool(gravity),
         joints=tuple(name.strip() for name in joints.split(",") if name.strip()),
         topic=topic,
     )

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
+from armlink.extras import require_extra
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, take_joints
 
@@ -40,10 +41,12 @@ def load_recordings(path: str | Path, stated: Corrections | None = None) -> dict
 def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
     """The recordings of a path as they stand in it, but for their columns' names."""
     if (path / "meta" / "info.json").is_file():
+        require_extra(str(path), "parquet")
         from armlink.recording.lerobot import load_lerobot
 
         return load_lerobot(path)
     if (path / "metadata.yaml").is_file() or path.suffix == ".db3":
+        require_extra(str(path), "bags")
         from armlink.recording.ros_bag import load_bag
 
         return {str(path): load_bag(path, stated.topic)}
@@ -55,6 +58,7 @@ def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
     if not path.is_file():
         raise BadInput(f"no recording {path}: give a {', '.join(SUFFIXES)} file")
     if suffix == ".mcap":
+        require_extra(str(path), "bags")
         from armlink.recording.mcap import has_our_topics, load_mcap
 
         if not stated.topic and has_our_topics(path):
@@ -62,9 +66,14 @@ def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
         from armlink.recording.ros_bag import load_bag
 
         return {str(path): load_bag(path, stated.topic)}
-    from armlink.recording.tables import load_csv, load_parquet
+    if suffix == ".parquet":
+        require_extra(str(path), "parquet")
+        from armlink.recording.parquet import load_parquet
 
-    return {str(path): (load_parquet if suffix == ".parquet" else load_csv)(path, stated.columns)}
+        return {str(path): load_parquet(path, stated.columns)}
+    from armlink.recording.tables import load_csv
+
+    return {str(path): load_csv(path, stated.columns)}
 
 
 def _of_folder(path: Path, stated: Corrections) -> dict[str, Recording]:
@@ -76,6 +85,7 @@ def _of_folder(path: Path, stated: Corrections) -> dict[str, Recording]:
         raise BadInput(
             f"{path}: neither the folder of a ROS 2 bag (.mcap or .db3 files) nor a LeRobot data set (meta/info.json)"
         )
+    require_extra(str(path), "bags")
     from armlink.recording.ros_bag import load_bag
 
     return {str(path): load_bag(files, stated.topic)}
@@ -100,13 +110,19 @@ def save_recording(recording: Recording, path: str | Path) -> None:
     suffix = _suffix(path)
     recording.check(str(path))
     if suffix == ".mcap":
+        require_extra(str(path), "bags")
         from armlink.recording.mcap import save_mcap
 
         save_mcap(recording, path)
-        return
-    from armlink.recording.tables import save_csv, save_parquet
+    elif suffix == ".parquet":
+        require_extra(str(path), "parquet")
+        from armlink.recording.parquet import save_parquet
 
-    (save_parquet if suffix == ".parquet" else save_csv)(recording, path)
+        save_parquet(recording, path)
+    else:
+        from armlink.recording.tables import save_csv
+
+        save_csv(recording, path)
 
 
 def _suffix(path: Path) -> str:

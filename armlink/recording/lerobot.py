@@ -16,8 +16,8 @@ import pyarrow.parquet as pa_parquet
 from armlink.arrays import Array
 from armlink.content.file_content import MOST_JSON, read_whole
 from armlink.errors import BadInput
+from armlink.recording.parquet import THREADS, has_lists, numbers, require_numbers
 from armlink.recording.recording import MOST_JOINTS, Recording, require_size
-from armlink.recording.tables import THREADS, has_lists, numbers, require_numbers
 
 STATE, ACTION = "observation.state", "action"
 _COLUMNS = ("episode_index", "timestamp", STATE, ACTION)

@@ -1,9 +1,9 @@
-"""ROS 2 serialisation of `sensor_msgs/msg/JointState`: CDR, little endian, doubles aligned to eight bytes."""
+"""ROS 2 serialisation of `sensor_msgs/msg/JointState` in CDR: read by rosbags, written and read again by layout."""
 
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 SCHEMA_NAME = "sensor_msgs/msg/JointState"
 SCHEMA = """std_msgs/Header header
@@ -22,6 +22,8 @@ uint32 nanosec
 """
 """Message definition as rosbag2 stores it (encoding `ros2msg`)."""
 
+LITTLE_ENDIAN = b"\0\1\0\0"
+"""Encapsulation of a message in this order of bytes."""
 _HEADER = 4  # encapsulation; alignment counts from its end
 _STAMPED = 12  # encapsulation and stamp
 _NANO = 1_000_000_000
@@ -38,50 +40,37 @@ class JointState(NamedTuple):
     effort: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class _Reader:
-    """Position in a CDR stream whose byte order is known."""
-
-    data: bytes
-    order: str
-
-    def number(self, at: int) -> tuple[int, int]:
-        at = _aligned(at, 4)
-        return struct.unpack_from(self.order + "I", self.data, at)[0], at + 4
-
-    def text(self, at: int) -> tuple[str, int]:
-        length, at = self.number(at)
-        return self.data[at : at + length].rstrip(b"\0").decode(), at + length
-
-    def doubles(self, at: int) -> tuple[tuple[float, ...], int]:
-        count, at = self.number(at)
-        if not count:
-            return (), at
-        at = _aligned(at, 8)
-        return struct.unpack_from(f"{self.order}{count}d", self.data, at), at + 8 * count
-
-
 def decode_joint_state(data: bytes) -> JointState:
     """Decode one message; raises ValueError if the bytes are malformed."""
+    return _decoded(data)[0]
+
+
+def _decoded(data: bytes) -> tuple[JointState, str]:
+    """A message, and the frame in its header."""
+    from rosbags.serde import SerdeError
+
     try:
-        reader = _Reader(data, "<" if data[1] & 1 else ">")
-        seconds, nanoseconds = struct.unpack_from(reader.order + "iI", data, _HEADER)
-        _, at = reader.text(_HEADER + 8)
-        count, at = reader.number(at)
-        names = []
-        for _ in range(count):
-            name, at = reader.text(at)
-            names.append(name)
-        position, at = reader.doubles(at)
-        velocity, at = reader.doubles(at)
-        effort, at = reader.doubles(at)
-    except (struct.error, IndexError, UnicodeDecodeError) as error:
+        message: Any = _type_store().deserialize_cdr(data, SCHEMA_NAME)
+    except (SerdeError, ValueError) as error:
         raise ValueError(f"not a JointState message: {error}") from None
-    return JointState(seconds * _NANO + nanoseconds, tuple(names), position, velocity, effort)
+    stamp = message.header.stamp
+    lists = (tuple(values.tolist()) for values in (message.position, message.velocity, message.effort))
+    return JointState(stamp.sec * _NANO + stamp.nanosec, tuple(message.name), *lists), message.header.frame_id
+
+
+@cache
+def _type_store() -> Any:
+    from rosbags.typesys import Stores, get_typestore  # an extra, which writing does without
+
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 class JointStateDecoder:
-    """Decodes a stream of messages; a message with the layout of an earlier one takes a single compiled unpack."""
+    """Decodes a stream of messages.
+
+    A message with the layout of an earlier one takes a single compiled unpack, an eighth of the time that rosbags takes
+    (5 of 38 µs, seven joints): an hour of an arm has millions of them.
+    """
 
     def __init__(self) -> None:
         self._known: dict[int, tuple[bytes, bytes, tuple[str, ...], struct.Struct, tuple[int, int, int]]] = {}
@@ -102,20 +91,16 @@ class JointStateDecoder:
                     at += 1 + count
                 else:
                     return JointState(seconds * _NANO + nanoseconds, names, *lists)
-        state = decode_joint_state(data)
-        self._learn(data, state)
+        state, frame = _decoded(data)
+        self._learn(data, state, frame)
         return state
 
-    def _learn(self, data: bytes, state: JointState) -> None:
+    def _learn(self, data: bytes, state: JointState, frame: str) -> None:
         lists = (state.position, state.velocity, state.effort)
         if not data[1] & 1 or any(len(values) not in (0, len(state.names)) for values in lists):
             return
         there = (bool(lists[0]), bool(lists[1]), bool(lists[2]))
-        reader = _Reader(data, "<")
-        _, at = reader.text(_STAMPED)
-        at = reader.number(at)[1]
-        for _ in state.names:
-            at = reader.text(at)[1]
+        at = _STAMPED + len(_head(state.names, frame))
         body, end = _body(at, len(state.names), there)
         if end != len(data):
             return
@@ -131,16 +116,10 @@ def joint_state_encoder(
 
     It takes the stamp [ns] and the numbers of those lists one after the other, len(names) each.
     """
-    head = bytearray(b"\0\1\0\0") + bytes(8) + struct.pack("<IB", 1, 0)  # stamp, empty frame_id
-    head += bytes(_aligned(len(head), 4) - len(head)) + struct.pack("<I", len(names))
-    for name in names:
-        head += bytes(_aligned(len(head), 4) - len(head))
-        text = name.encode() + b"\0"
-        head += struct.pack("<I", len(text)) + text
-    body = struct.Struct("<" + _body(len(head), len(names), lists)[0])
+    rest = _head(names)
+    body = struct.Struct("<" + _body(_STAMPED + len(rest), len(names), lists)[0])
     counts = [len(names) if there else 0 for there in lists]
     stamped = struct.Struct("<4siI")
-    encapsulation, rest = bytes(head[:_HEADER]), bytes(head[stamped.size :])
     n = len(names)
 
     def encode(stamp: int, numbers: Sequence[float]) -> bytes:
@@ -152,9 +131,24 @@ def joint_state_encoder(
             taken += count
         if taken != len(numbers):
             raise ValueError(f"{len(numbers)} numbers for {sum(counts)} of {n} joints")
-        return stamped.pack(encapsulation, *divmod(stamp, _NANO)) + rest + body.pack(*values)
+        return stamped.pack(LITTLE_ENDIAN, *divmod(stamp, _NANO)) + rest + body.pack(*values)
 
     return encode
+
+
+def _head(names: Sequence[str], frame: str = "") -> bytes:
+    """What stands between the stamp and the lists: the frame, and the names with their number."""
+    head = bytearray(_STAMPED)
+
+    def add(text: str) -> None:
+        content = text.encode() + b"\0"
+        head.extend(bytes(_aligned(len(head), 4) - len(head)) + struct.pack("<I", len(content)) + content)
+
+    add(frame)
+    head += bytes(_aligned(len(head), 4) - len(head)) + struct.pack("<I", len(names))
+    for name in names:
+        add(name)
+    return bytes(head[_STAMPED:])
 
 
 def _body(at: int, n: int, lists: tuple[bool, bool, bool]) -> tuple[str, int]:

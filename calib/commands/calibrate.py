@@ -41,6 +41,7 @@ def calibrate(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput, Refused
+    from armlink.extras import require_extra
     from calib.arm.kinematics import gcomp_arm
     from calib.commands.creep_fits import calibrate_creep
     from calib.commands.options import load_sweeps
@@ -52,6 +53,8 @@ def calibrate(
     from calib.records.store import RecordStore
     from calib.sweep.dataset import drives_of
 
+    if report is not None:
+        require_extra("--report", "reports")
     data, arm_file = load_sweeps("calibrate", directories, arm)
     if all_creep(data):
         if apply:

@@ -66,9 +66,7 @@ def _fit(data: list[SweepData], arm_file: ArmFile) -> CreepFit:
 
 def _show(fit: CreepFit, data: list[SweepData], console: PlainConsole) -> None:
     reasons = missing(fit)
-    columns = {}
-    for family, heading in HEADINGS.items():
-        columns[heading] = (determined_values(fit, family), QUANTILE * fit.std(family))
+    columns = {title: (determined_values(fit, key), QUANTILE * fit.std(key)) for key, title in HEADINGS.items()}
     print_intervals("Drives, ± half of the 95 % interval", fit.names, columns, console)
     print_lines([f"{joint} {parameter}: {reason}" for (joint, parameter), reason in reasons.items()], console=console)
     print_lines([*(each.reason for one in data for each in contacts(one)), *fit.findings], "yellow", console)
@@ -92,10 +90,7 @@ def _answer(fit: CreepFit, data: list[SweepData]) -> dict[str, Any]:
             {"joint": joint, "parameter": parameter, "reason": reason}
             for (joint, parameter), reason in missing(fit).items()
         ],
-        "disturbed": [
-            *(each.reason for one in data for each in contacts(one)),
-            *fit.findings,
-        ],
+        "disturbed": [*(each.reason for one in data for each in contacts(one)), *fit.findings],
         "residual_rms": fit.residual_rms.tolist(),
         "temperature": [None if np.isnan(each) else each for each in fit.rows.warmest.tolist()],
     }

@@ -1,7 +1,6 @@
 """Runs the service that watches the arm, keeps its torque sensors true, and serves a page and an API."""
 
 from enum import StrEnum
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -64,12 +63,13 @@ def daemon(
     from armlink.arm_file import load_arm
     from armlink.bus.open import resolve_bus
     from armlink.errors import BadInput
+    from armlink.extras import require_extra
     from calib.daemon.logs import log_as_json
     from calib.daemon.loop.loop_process import LoopProcess
     from calib.daemon.options import Options, state_directory
     from calib.records.file_lock import locked_directory
 
-    _require_service()
+    require_extra("daemon", "daemon")  # they are imported later
     described = load_arm(arm)
     resolve_bus(bus, described.require_link().bus)
     directory = state_directory(state, described)
@@ -97,13 +97,6 @@ def daemon(
 
         run_daemon(options, described, directory, host)
     return 0
-
-
-def _require_service() -> None:
-    """Raise ModuleNotFoundError, by which the extra is named, before anything is begun; they are imported later."""
-    for module in ("fastapi", "uvicorn", "prometheus_client"):
-        if find_spec(module) is None:
-            raise ModuleNotFoundError(f"No module named {module!r}", name=module)
 
 
 def _token(path: Path | None) -> str | None:

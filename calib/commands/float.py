@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import StoreUrl
+from calib.commands.options import StoreUrl, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -22,6 +22,7 @@ def hold_afloat(
         str | None, typer.Option(help="Id of a gravity record; default: the current one, else the model's inertials.")
     ] = None,
     store: StoreUrl = None,
+    yes: WithoutAsking = False,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write a summary here; - is standard output.")
     ] = None,
@@ -40,12 +41,14 @@ def hold_afloat(
     from armlink.commands.plain_console import PlainConsole, command_line, results
     from armlink.errors import ArmlinkError
     from armlink.loop.open import open_arm
-    from calib.commands.screen import warn_late
+    from calib.commands.screen import confirm, warn_late
     from calib.floating.run import run_float
 
     arm_file = load_arm(arm)
     beta, calibration, source = _model(arm_file, record, store)
     screen = PlainConsole()
+    if not yes:
+        confirm(f"{arm_file.name} will be held by its gravity model alone. Is a hand on it?")
     resume = command_line("float", arm, bus=bus, record=record, store=store)
     with early_end(arm_file, resume) as work, open_arm(arm_file, bus) as link:
         link.start()
@@ -80,6 +83,7 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
 
     from armlink.errors import BadInput
     from calib.arm.kinematics import model_arm
+    from calib.commissioning.model_judgement import refuse_impossible_model
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore, no_record
 
@@ -87,6 +91,7 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
     calibration = records.current(CalibrationRecord, arm_file)
     kept = records.current(GravityRecord, arm_file) if record is None else records.usable(record, arm_file)
     if kept is None and arm_file.model_path is not None:
+        refuse_impossible_model(arm_file)
         return model_arm(arm_file).beta, calibration, f"the inertials of {arm_file.model_path.name}"
     if kept is None:
         raise no_record(arm_file, "gravity")

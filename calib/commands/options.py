@@ -42,6 +42,7 @@ KeepGoing = Annotated[
         rich_help_panel="Run",
     ),
 ]
+WithoutAsking = Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.", rich_help_panel="Run")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")]
 
 

@@ -1,6 +1,7 @@
 """Terminal output of the sweep commands: progress with time left, plans and results as tables."""
 
 import sys
+import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -16,6 +17,7 @@ from armlink.commands.plain_console import confirm as ask_to_confirm
 from armlink.errors import Stall
 from armlink.link.lateness import Lateness
 from calib.plan.types import SweepPlan
+from calib.report.page import interval_table
 
 if TYPE_CHECKING:
     from calib.sweep.dataset import SweepData
@@ -28,28 +30,35 @@ _CONSOLE = PlainConsole()
 class SweepScreen:
     """A progress bar with readings done, time left and what is being done; a context manager."""
 
-    def __init__(self, title: str) -> None:
-        """With `title` before the bar, or above it on a narrow terminal."""
-        above = _CONSOLE.width < 100  # title, bar and reading do not fit in a line
+    def __init__(self, title: str, line_period: float = 5.0) -> None:
+        """With `title` before the bar, or above it on a narrow terminal; elsewhere a line in so many seconds."""
+        above = bool(title) and _CONSOLE.width < 100  # title, bar and reading do not fit in a line
         if above:
             _CONSOLE.print(title)
         columns = (
             PlainColumn("{task.description}"),
             BarColumn(bar_width=min(40, _CONSOLE.width // 5)),
             PlainColumn("{task.completed:.0f}/{task.total:.0f}"),
-            PlainColumn("{task.fields[left]} left  {task.fields[text]}"),
+            PlainColumn("{task.fields[left]}  {task.fields[text]}"),
         )
-        self._progress = Progress(*columns, console=_CONSOLE, transient=False)
-        self._task = self._progress.add_task("" if above else title, total=1, left="?", text="connecting")
+        self._progress = Progress(*columns, console=_CONSOLE, transient=False, disable=not _CONSOLE.is_terminal)
+        self._title, self._told, self._period = title, time.monotonic(), line_period
+        self._task = self._progress.add_task("" if above else title, total=1, left="", text="connecting")
 
     def update(self, done: int, total: int, seconds_left: float, text: str) -> None:
         """As run_sweep's progress."""
-        left = f"{int(seconds_left) // 60}:{int(seconds_left) % 60:02d}"
-        self._progress.update(self._task, completed=done, total=total, left=left, text=text)
+        self._update(done, total, f"{int(seconds_left) // 60}:{int(seconds_left) % 60:02d} left", text)
 
     def count(self, done: int, total: int) -> None:
         """As run_verify's progress."""
-        self._progress.update(self._task, completed=done, total=total, left="", text="poses")
+        self._update(done, total, "", "poses")
+
+    def _update(self, done: int, total: int, left: str, text: str) -> None:
+        """On the bar; where there is no terminal, a line now and then."""
+        self._progress.update(self._task, completed=done, total=total, left=left, text=text)
+        if self._progress.disable and time.monotonic() - self._told >= self._period:
+            self._told = time.monotonic()
+            _CONSOLE.print("  ".join(part for part in (self._title, f"{done}/{total}", left, text) if part))
 
     def on_stall(self, keep_going: int) -> Callable[[Stall], bool]:
         """An OnStall that goes on by itself so often, then asks; without a terminal it then gives up."""
@@ -173,9 +182,10 @@ def print_intervals(
     title: str, names: tuple[str, ...], columns: dict[str, tuple[np.ndarray, np.ndarray]], console: PlainConsole
 ) -> None:
     """Values with the half width of their 95 % interval, a row a joint; `columns` maps heading to (value, half)."""
-    table = Table("joint", *columns, title=title)
-    for joint, name in enumerate(names):
-        table.add_row(name, *(_interval(value[joint], half[joint]) for value, half in columns.values()))
+    made = interval_table(names, columns)
+    table = Table(*made.header, title=title)
+    for row in made.rows:
+        table.add_row(*(cell.replace("\u00a0", " ") for cell in row))
     console.print(table)
 
 
@@ -183,9 +193,3 @@ def print_lines(lines: list[str], style: str | None = None, console: PlainConsol
     """Plain lines, or in a style of rich's such as `yellow`; by default on standard error."""
     for line in lines:
         console.print(line, style=style)
-
-
-def _interval(value: float, half: float) -> str:
-    if np.isnan(value):
-        return "not observable"
-    return f"{value:.4f} ± {half:.4f}" if half > 0 else f"{value:.4f}"

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import KeepGoing
+from calib.commands.options import KeepGoing, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
     from armlink.commands.plain_console import PlainConsole
     from armlink.loop.driver import ArmDriver
     from calib.commands.screen import SweepScreen
+    from calib.plan.rough_gravity import GravityGuess
     from calib.sweep.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
@@ -49,7 +50,7 @@ def sweep(
         ),
     ] = False,
     keep_going: KeepGoing = 0,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.", rich_help_panel="Run")] = False,
+    yes: WithoutAsking = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.", rich_help_panel="Plan")] = 0,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write plan or outcome here; - is standard output.")
@@ -66,15 +67,32 @@ def sweep(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
+    from armlink.extras import require_extra
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, warn_late
+    from calib.commissioning.model_judgement import refuse_impossible_model
     from calib.sweep.dataset import require_vacant
 
+    if picture is not None:
+        require_extra("--picture", "reports")
     arm_file = with_hold(load_arm(arm), hold)
+    refuse_impossible_model(arm_file)
+    if reference_mass:
+        _judge_mass(arm_file, reference_mass)
     if plan:
-        write_json(json_file, _plan(arm_file, seed, picture, results(json_file)))
-        suggest(command_line("sweep", arm, out="unloaded", bus=bus, hold=hold))
+        write_json(json_file, _plan(arm_file, seed, reference_mass, picture, results(json_file)))
+        folder = "loaded" if reference_mass else "unloaded"
+        suggest(
+            command_line(
+                "sweep",
+                arm,
+                out=folder,
+                reference_mass=f"{reference_mass:g}" if reference_mass else None,
+                bus=bus,
+                hold=hold,
+            )
+        )
         return
     if out is None:
         raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
@@ -106,15 +124,35 @@ def sweep(
     write_json(json_file, {**_answer(arm_file, data), "late_ms": lateness.in_ms()})
 
 
-def _plan(arm_file: "ArmFile", seed: int, picture: Path | None, console: "PlainConsole") -> dict[str, Any]:
-    """Print and check the plan, and draw it if asked to; the answer for machines."""
+def _judge_mass(arm_file: "ArmFile", mass: float) -> None:
+    """Raise BadInput where the drives cannot hold a reference mass [kg] in any sweep."""
+    from calib.creep.choice import sweep_motion
+    from calib.creep.plan import refuse_unbearable_creeps
+    from calib.plan.sweep_plan import refuse_unbearable_mass
+
+    if sweep_motion(arm_file) == "creep":
+        refuse_unbearable_creeps(arm_file, mass)
+    else:
+        refuse_unbearable_mass(arm_file, mass, _model_guess(arm_file))
+
+
+def _model_guess(arm_file: "ArmFile") -> "GravityGuess | None":
     from calib.arm.kinematics import model_arm
+    from calib.plan.rough_gravity import guess_of_model
+
+    model = None if arm_file.model_path is None else model_arm(arm_file)
+    return None if model is None else guess_of_model(model.arm, model.beta)
+
+
+def _plan(
+    arm_file: "ArmFile", seed: int, reference_mass: float, picture: Path | None, console: "PlainConsole"
+) -> dict[str, Any]:
+    """Print and check the plan, and draw it if asked to; the answer for machines."""
     from calib.commands.screen import print_plan
     from calib.creep.choice import sweep_motion
     from calib.creep.plan import creep_seconds, plan_creep
     from calib.plan.collisions import check_plan
     from calib.plan.drawing import draw_plan, pass_seconds, stops_seconds
-    from calib.plan.rough_gravity import guess_of_model
     from calib.plan.sweep_plan import plan_sweep
 
     if sweep_motion(arm_file) == "creep":
@@ -123,8 +161,7 @@ def _plan(arm_file: "ArmFile", seed: int, picture: Path | None, console: "PlainC
         took = creep_seconds(planned)
         console.print(f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass")
         return {**planned.model_dump(mode="json"), "seconds": took, "picture": None}
-    model = None if arm_file.model_path is None else model_arm(arm_file)
-    planned = plan_sweep(arm_file, None if model is None else guess_of_model(model.arm, model.beta), seed=seed)
+    planned = plan_sweep(arm_file, _model_guess(arm_file), seed=seed, reference_mass=reference_mass)
     print_plan(arm_file, planned, console)
     drawn = ""
     if picture is not None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import JsonFile, KeepGoing, StoreUrl
+from calib.commands.options import JsonFile, KeepGoing, StoreUrl, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
@@ -24,6 +24,7 @@ def verify(
     poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the poses.")] = 0,
     keep_going: KeepGoing = 0,
+    yes: WithoutAsking = False,
     report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
     json_file: JsonFile = None,
 ) -> int:
@@ -35,14 +36,19 @@ def verify(
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
+    from armlink.extras import require_extra
     from armlink.loop.open import open_arm
-    from calib.commands.screen import SweepScreen
+    from calib.commands.screen import SweepScreen, confirm
     from calib.creep.choice import sweep_motion
     from calib.creep.verify import verify_creeping
     from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify
 
+    if report is not None:
+        require_extra("--report", "reports")
     arm_file = load_arm(arm)
+    if not yes:
+        confirm(f"{arm_file.name} will drive to {poses} poses all over its range. Is it clear?")
     with (
         early_end(arm_file, command_line("verify", arm, bus=bus, store=store)) as work,
         open_arm(arm_file, bus) as link,
@@ -114,10 +120,8 @@ def _show(result: "Verification", console: "PlainConsole") -> None:
 
     title = f"Model against sensor at {len(result.sensor)} poses [N·m]"
     table = Table("joint", "RMS", "largest", "allowed RMS", title=title)
-    for joint, name in enumerate(result.names):
-        table.add_row(
-            name, f"{result.rms[joint]:.3f}", f"{result.max_error[joint]:.3f}", f"{result.tolerance[joint]:.3f}"
-        )
+    for name, *torques in zip(result.names, result.rms, result.max_error, result.tolerance, strict=True):
+        table.add_row(name, *(f"{torque:.3f}" for torque in torques))
     console.print(table)
     beyond = [name for name, off in zip(result.names, result.rms > result.tolerance, strict=True) if off]
     agree = "passed: model and sensor agree at every joint within its allowed RMS"

@@ -35,7 +35,7 @@ def arm_text(draft: Draft, out: Path) -> str:
         lines += ["sweep:", yaml_entry("hold", "servo", 2), yaml_comment(f"assumed: {draft.servo}", 2)]
     lines += [
         "sim:  # the simulated arm, for the command demo: masses are the model's",
-        f"  effects:  # assumed: friction of {FRICTION:.0%} of rated torque",
+        f"  effects:  # assumed: friction of {FRICTION:.0%} of the torque that its drives need",
     ]
     lines += [yaml_item(_friction(joint), 4) for joint in draft.joints]
     lines += [yaml_comment(note) for note in draft.notes]
@@ -64,5 +64,4 @@ def _joint(joint: JointDraft) -> dict[str, Any]:
 
 
 def _friction(joint: JointDraft) -> dict[str, Any]:
-    torque = float(f"{FRICTION * joint.rated_torque:.4g}")
-    return {"effect": "friction.coulomb", "joint": joint.name, "torque": torque}
+    return {"effect": "friction.coulomb", "joint": joint.name, "torque": joint.friction}

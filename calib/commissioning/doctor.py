@@ -8,6 +8,7 @@ from armlink.errors import ArmlinkError
 from calib.commissioning.bus_checks import bus_findings, turn_findings
 from calib.commissioning.finding import ORDER, SetupFinding
 from calib.commissioning.model_checks import model_findings
+from calib.commissioning.model_judgement import model_errors
 from calib.commissioning.motion_checks import motion_findings
 from gcomp.errors import GcompError
 
@@ -34,9 +35,13 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
     except ArmlinkError as error:
         yield SetupFinding("error", str(error), arm, "correct the arm file, or make one of a model: armlink new --help")
         return
+    impossible = list[SetupFinding]()
     try:
-        yield from model_findings(arm_file)
-        yield from motion_findings(arm_file)
+        impossible += model_errors(arm_file)
+        yield from impossible
+        if not impossible:
+            yield from model_findings(arm_file)
+            yield from motion_findings(arm_file)
     except (ArmlinkError, GcompError) as error:  # what later checks rest upon
         yield _as_finding(error, arm_file)
     if arm_file.link is None:
@@ -46,7 +51,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
     else:
         yield from _serial(arm_file)
         yield from turn_findings(arm_file)
-        if not offline:
+        if not offline and not impossible:
             yield from bus_findings(arm_file, bus)
     yield from _assumed(arm, arm_file)
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -28,8 +29,13 @@ ACCELERATION = 1.0
 """Acceleration that this need includes, beside gravity [rad/s²]; assumed."""
 LEAST_TORQUE = 2.0
 """Least such rated torque [N·m], on a small arm that of its strongest joint; assumed."""
+LEAST_RATING = 1e-3
+"""Smallest rated torque that is written [N·m]: a model without masses needs none."""
+MOST_RESERVE = 10.0
+"""Effort limit over the load, at the joint where that is least, beyond which a model's effort limits are none of its
+drives: published arms have up to 6; placeholders, and limits copied from larger arms, 11 to 5000."""
 FRICTION = 0.02
-"""Coulomb friction of the simulated arm, as a share of rated torque; assumed."""
+"""Coulomb friction of the simulated arm, as a share of the torque that its drives need; assumed."""
 
 
 @dataclass
@@ -42,6 +48,8 @@ class JointDraft:
     max_torque: float
     max_torque_rate: float
     max_velocity: float
+    friction: float
+    """Coulomb friction of the simulated arm [N·m]."""
     stops: tuple[float, float] | None = None
     """Only where the model has none, or others were given [rad]."""
     notes: list[str] = field(default_factory=list)
@@ -79,8 +87,9 @@ def draft_of_model(
     gravity: tuple[float, float, float],
     stops: Mapping[str, tuple[float, float]],
     base: str | None = None,
+    ratings: Mapping[str, float] | None = None,
 ) -> Draft:
-    """The draft for one chain of a model; `stops` [rad] by joint name and `base` were given by the user.
+    """The draft for one chain; `stops` [rad], `ratings` [N·m] by joint name and `base` were given by the user.
 
     Raises BadModel.
     """
@@ -90,11 +99,15 @@ def draft_of_model(
         gravity = STANDARD_GRAVITY
         notes.append("gravity: the model has none, assumed to point down")
     need = _load_torque(path, [joint.name for joint in chain.joints], gravity)
-    rated = np.maximum(LOAD_FACTOR * need, min(LEAST_TORQUE, LOAD_FACTOR * float(need.max())))
-    joints = [
-        _joint(place, chain, stops.get(chain.joints[place].name), float(rated[place]))
-        for place in range(len(chain.joints))
-    ]
+    rated = _ratings(chain, need, ratings or {})
+    doubted: dict[str, list[str]] = {}
+    for joint, rating in zip(chain.joints, rated, strict=True):
+        if rating.source == "load":
+            doubted.setdefault(rating.doubt, []).append(joint.name)
+    for doubt, names in doubted.items():
+        who = "every joint" if len(names) == len(rated) else ", ".join(names)
+        notes.append(f"rated torques assumed ({who}): {doubt}; a drive's own: --rated-torque JOINT:TORQUE")
+    joints = [_joint(place, chain, stops.get(joint.name), rated[place]) for place, joint in enumerate(chain.joints)]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
     servo = f"{', '.join(free)}: no stop to press on" if free else None
     return Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, base=base, servo=servo)
@@ -108,14 +121,68 @@ def narrow(draft: Draft, found: ClearRange) -> None:
     draft.servo = f"the range under kinematics.stops is narrower than the model's limits: {found.reason}"
 
 
-def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rated: float) -> JointDraft:
-    joint, notes = chain.joints[place], []
-    if joint.effort is None:
-        effort = float(f"{rated:.2g}")
-        notes.append(f"rated_torque assumed: {LOAD_FACTOR:g} times the load, the model states no effort limit")
-    else:
-        effort = round(joint.effort, 4)
-        notes.append("rated_torque assumed to be the model's effort limit: the drive's own rating must be the same")
+@dataclass(frozen=True)
+class Rating:
+    """Rated torque of a drive, as far as the model tells it."""
+
+    torque: float
+    """[N·m]"""
+    needed: float
+    """Rating that the load alone suggests [N·m]."""
+    source: Literal["given", "model", "load"]
+    doubt: str
+    """Why the model's effort limit is not believed; empty where it is."""
+
+    @property
+    def note(self) -> str:
+        """Where it comes from, as a comment of the arm file."""
+        if self.source == "load":
+            return f"rated_torque assumed: {LOAD_FACTOR:g} times the load, {self.doubt}"
+        if self.source == "model":
+            return "rated_torque assumed to be the model's effort limit: the drive's own rating must be the same"
+        return ""
+
+
+def _ratings(chain: Chain, need: Array, given: Mapping[str, float]) -> list[Rating]:
+    """One rating a joint: the one given, else the model's effort limit if it can be a drive's, else what is needed."""
+    least = max(min(LEAST_TORQUE, LOAD_FACTOR * float(need.max())), LEAST_RATING)
+    needed = np.maximum(LOAD_FACTOR * need, least).tolist()
+    found = []
+    for joint, enough, doubt in zip(chain.joints, needed, _effort_doubts(chain, need), strict=True):
+        if joint.name in given:
+            found.append(Rating(given[joint.name], enough, "given", doubt))
+        elif joint.effort is None or doubt:
+            found.append(Rating(float(f"{enough:.2g}"), enough, "load", doubt))
+        else:
+            found.append(Rating(round(joint.effort, 4), enough, "model", doubt))
+    return found
+
+
+def _effort_doubts(chain: Chain, need: Array) -> list[str]:
+    """Why a joint's effort limit is no drive's rating, empty where it may be one; `need` (n,) [N·m] is the load's."""
+    efforts = [joint.effort for joint in chain.joints]
+    stated = {joint: effort for joint, effort in enumerate(efforts) if effort is not None}
+    alike = len(stated) > 1 and len(set(stated.values())) == 1
+    short = {joint for joint, effort in stated.items() if effort < max(need[joint], LEAST_RATING)}
+    everywhere = ""
+    if alike and (short or math.log10(min(stated.values())).is_integer()):
+        everywhere = f"the model's effort limit of {min(stated.values()):g} N·m for every joint is a placeholder"
+    elif stated and min(effort / max(need[joint], 1e-12) for joint, effort in stated.items()) > MOST_RESERVE:
+        everywhere = f"the model's effort limits are all more than {MOST_RESERVE:g} times the load"
+    doubts = []
+    for joint, effort in enumerate(efforts):
+        doubt = everywhere
+        if effort is None:
+            doubt = "the model states no effort limit"
+        elif not doubt and joint in short:
+            doubt = f"the model's effort limit of {effort:g} N·m is less than the load"
+        doubts.append(doubt)
+    return doubts
+
+
+def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rating: Rating) -> JointDraft:
+    joint, effort = chain.joints[place], rating.torque
+    notes = [rating.note] if rating.note else []
     stops = given
     if given is None and joint.limits is None:
         stops = (-ASSUMED_STOP, ASSUMED_STOP)
@@ -136,6 +203,7 @@ def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rated: f
         max_torque=effort,
         max_torque_rate=float(f"{effort / RATE_TIME:.3g}"),
         max_velocity=round(speed, 4),
+        friction=float(f"{FRICTION * min(effort, rating.needed):.4g}"),
         stops=stops,
         notes=notes,
     )

@@ -5,9 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.model_file import read_model
-from calib.arm.kinematics import gcomp_arm
+from armlink.model_file import NOT_FOUND, UNFETCHED, read_model
+from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.commissioning.finding import SetupFinding
+from calib.commissioning.model_judgement import NO_MASS
 from calib.plan.sweep_plan import DEAD_LEVER
 from gcomp.gravity.torque import gravity_levers
 
@@ -33,7 +34,17 @@ def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         )
     else:
         yield from _file_findings(arm_file)
+        yield from _massless_links(arm_file)
     yield from _lever_findings(arm_file)
+
+
+def _massless_links(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    model = model_arm(arm_file)
+    lacking = [name for name, mass in zip(model.arm.names, model.mass, strict=True) if mass < NO_MASS]
+    if lacking:
+        what = f"the model states no mass for what turns with {', '.join(lacking)}"
+        remedy = "give these links their masses and centres of mass: until then demo and torque lack them"
+        yield SetupFinding("warning", what, str(arm_file.model_path), remedy)
 
 
 def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
@@ -48,9 +59,14 @@ def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             "correct the inertia of these links: until then their torque under acceleration is not modelled",
         )
     if model.left_out:
-        remedy = "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)"
-        if not model.absent:
-            remedy = "convert them to binary STL or OBJ, or keep the workspace clear"
+        reasons = {reason for _, reason in model.unused_meshes}
+        remedy = "convert them to binary STL or OBJ, or keep the workspace clear"
+        if NOT_FOUND in reasons:
+            remedy = (
+                "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)"
+            )
+        elif UNFETCHED in reasons:
+            remedy = "run git lfs pull where the model was cloned"
         yield SetupFinding("warning", f"collision geometry incomplete: {model.left_out}", where, remedy)
     elif not model.shapes:
         yield SetupFinding(

@@ -11,6 +11,7 @@ from armlink.content.model_sizes import model_budget
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import sweep_section
 from calib.commissioning.finding import SetupFinding
+from calib.commissioning.model_judgement import gravity_need
 from calib.creep.choice import sweep_motion
 from calib.creep.plan import plan_creep
 from calib.plan.bias_torque import pressable_joints
@@ -19,8 +20,7 @@ from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
 from calib.plan.sweep_plan import plan_sweep
-from gcomp.arm.load import joint_inertias, place_chain
-from gcomp.gravity.torque import gravity_torque
+from gcomp.arm.load import ModelArm, joint_inertias, place_chain
 
 TORQUE_RESERVE = 1.2
 """Torque that a drive should have over gravity, as a factor; a choice: friction and acceleration need the rest."""
@@ -45,7 +45,7 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     if arm_file.model_path is not None:
         model = model_arm(arm_file)
         guess = guess_of_model(model.arm, model.beta)
-        yield from _strength(arm_file, guess)
+        yield from _strength(arm_file, model)
         yield from _damping(arm_file, arm_file.model_path)
         if (
             not creeping
@@ -65,20 +65,12 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         yield SetupFinding("hint", checked, str(arm_file.path), "give the missing meshes")
 
 
-def _strength(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
-    """Joints whose drives cannot hold the arm everywhere in its range."""
-    arm, limits = gcomp_arm(arm_file), DriveLimits.of(arm_file)
-    low, high = np.nan_to_num(arm.lower, neginf=-np.pi), np.nan_to_num(arm.upper, posinf=np.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (500, arm.n))
-    need = np.abs(gravity_torque(arm, guess.beta, poses)).max(axis=0)
-    for joint, name in enumerate(arm.names):
-        most = limits.max_torque[joint]
-        if need[joint] > most:
-            what = f"by the model, gravity needs up to {need[joint]:.3g} N·m, but max_torque is {most:g}"
-            remedy = "check the model's masses and max_torque: the arm would fall"
-            yield SetupFinding("error", what, name, remedy)
-        elif TORQUE_RESERVE * need[joint] > most:
-            what = f"by the model, gravity needs up to {need[joint]:.3g} N·m of max_torque {most:g}: little is left"
+def _strength(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
+    """Joints whose drives can hold the arm and do little more."""
+    limits = DriveLimits.of(arm_file)
+    for name, need, most in zip(model.arm.names, gravity_need(model), limits.max_torque, strict=True):
+        if need <= most < TORQUE_RESERVE * need:
+            what = f"by the model, gravity needs up to {need:.3g} N·m of max_torque {most:g}: little is left"
             yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
 
 

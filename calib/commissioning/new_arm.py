@@ -18,6 +18,7 @@ from calib.commissioning.draft import Draft, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
 from calib.commissioning.finding import SetupFinding
 from calib.commissioning.model_joints import model_joints
+from calib.commissioning.model_judgement import refuse_impossible_model
 
 RATING_FACTOR = 2.5
 """A drive whose rated torque differs from the model's effort limit by more is doubted; a choice."""
@@ -67,6 +68,7 @@ def new_arm(
     base: str | None = None,
     tip: str | None = None,
     stops: Mapping[str, tuple[float, float]] | None = None,
+    ratings: Mapping[str, float] | None = None,
     name: str | None = None,
     questions: Questions | None = None,
 ) -> NewArm:
@@ -74,7 +76,7 @@ def new_arm(
 
     The longest chain of revolute joints is the arm, or the one from body `base` to body `tip`. A gripper, mimic and
     prismatic joints at its end and the joints that carry `base` keep the model's position. Where sweeps within the
-    model's limits would collide, a narrower range is chosen.
+    model's limits would collide, a narrower range is chosen. `ratings` [N·m] by joint name replace the model's efforts.
     """
     if model.suffix.lower() not in MODEL_SUFFIXES:
         raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)})")
@@ -84,12 +86,14 @@ def new_arm(
     chains = find_chains(joints, model, base, tip)
     chain = chains[0] if questions is None or len(chains) == 1 else questions.which(chains)
     given = _given_stops(chain, dict(stops or {}), model, questions)
-    draft = draft_of_model(model, chain, gravity, given, base)
+    _refuse_other_joints("--rated-torque", ratings or {}, chain, model)
+    draft = draft_of_model(model, chain, gravity, given, base, ratings)
     if len(chains) > 1 and questions is None:
         others = ", ".join(each.tip for each in chains if each is not chain)
         draft.notes.append(f"tip assumed: the model has {len(chains)} arms; the others end in {others} (--tip)")
     draft.name = name or draft.name
     made = NewArm(out, draft)
+    refuse_impossible_model(made.parsed())
     clear = find_clear_range(made.parsed())
     if clear is not None:
         narrow(draft, clear)
@@ -99,16 +103,20 @@ def new_arm(
 def _given_stops(
     chain: Chain, stops: dict[str, tuple[float, float]], model: Path, questions: Questions | None
 ) -> dict[str, tuple[float, float]]:
-    names = [joint.name for joint in chain.joints]
-    for name in stops:
-        if name not in names:
-            raise BadInput(f"--stops {name}: no joint of the arm in {model}; there are {', '.join(names)}")
+    _refuse_other_joints("--stops", stops, chain, model)
     for joint in chain.joints:
         if joint.limits is None and joint.name not in stops and questions is not None:
             answer = questions.stops(joint.name)
             if answer is not None:
                 stops[joint.name] = answer
     return stops
+
+
+def _refuse_other_joints(option: str, given: Mapping[str, object], chain: Chain, model: Path) -> None:
+    names = [joint.name for joint in chain.joints]
+    for name in given:
+        if name not in names:
+            raise BadInput(f"{option} {name}: no joint of the arm in {model}; there are {', '.join(names)}")
 
 
 def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -> list[Match]:

@@ -134,6 +134,15 @@ def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
     )
 
 
+def refuse_unbearable_creeps(arm_file: ArmFile, mass: float) -> None:
+    """Raise BadInput, naming the joint, where the drives cannot hold a reference mass [kg] in any creep."""
+    ground = CreepGround.of(arm_file)
+    random = np.random.default_rng(0)
+    home = _home(ground, random)
+    for joint in range(ground.arm.n):
+        _candidates(ground, joint, home, mass, random)
+
+
 def check_creep_limits(ground: CreepGround, arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused, naming sweep, joint and value, where a plan of creeps leaves what this one would plan within."""
     ends = np.array([ground.range(joint) for joint in range(ground.arm.n)]).T

@@ -196,7 +196,7 @@ def _along_axes(arm: Arm, rho: Array) -> Array:
     along = np.empty(arm.n)
     along[-1] = rho[2]
     for link in reversed(range(arm.n - 1)):
-        along[link] = np.cos(arm.alpha[link]) * along[link + 1] + arm.d[link]
+        along[link] = np.cos(arm.alpha[link]) * along[link + 1] + arm.span[link, 2]
     return along
 
 

@@ -28,8 +28,7 @@ COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e
 def frame_origins(kinematics: Arm, q: Array) -> Array:
     """Origins of all frames, base to tip (K, n + 1, 3) [m], at poses q (K, n) [rad]."""
     rotation = bar_frames(kinematics, q).rotation
-    levers = np.column_stack([kinematics.a, np.zeros(kinematics.n), np.zeros(kinematics.n)])
-    along = np.einsum("knij,nj->kni", rotation, levers) + rotation[..., 2] * kinematics.d[:, None]
+    along = np.einsum("knij,nj->kni", rotation, kinematics.span)
     places = np.zeros((len(q), kinematics.n + 1, 3))
     places[:, 1:] = np.cumsum(along, axis=1)
     return places
@@ -96,7 +95,7 @@ def draw_plan(arm_file: ArmFile, plan: SweepPlan, path: Path) -> None:
         marker={"size": 4, "color": "black"},
     )
     down = kinematics.gravity / max(float(np.linalg.norm(kinematics.gravity)), 1e-9)
-    length = 0.3 * max(float(np.abs(kinematics.a).sum() + np.abs(kinematics.d).sum()), 0.1)
+    length = 0.3 * max(float(np.abs(kinematics.span).sum()), 0.1)
     arrow = np.vstack([np.zeros(3), length * down])
     figure.add_scatter3d(
         x=arrow[:, 0], y=arrow[:, 1], z=arrow[:, 2], mode="lines", name="gravity", line={"width": 8, "color": "grey"}

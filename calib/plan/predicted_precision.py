@@ -57,7 +57,7 @@ def predicted_gain_std(
     if position_offset_std > 0:
         unknown.add("position_offset")
         priors["position_offset"] = Prior(0.0, position_offset_std)
-    tip = np.array([kinematics.a[-1] + SIDE, SIDE, kinematics.d[-1]])
+    tip = kinematics.span[-1] + [SIDE, SIDE, 0.0]
     if point is not None:
         priors["rho"], tip = point, np.asarray(point.mean, dtype=np.float64)
     start = Parameters.nominal(kinematics.n, beta=guess.beta, rho=tip)

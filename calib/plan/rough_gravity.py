@@ -12,6 +12,8 @@ GAIN_STD = 0.3
 """Standard deviation of an uncalibrated torque gain; tests/calib/drawn_arms.py draws 0.7 to 1.3."""
 MODEL_ERROR = 0.1
 """Standard deviation of a model file's mass moments, as a share of each; a choice."""
+HAND = 0.15
+"""Largest distance of the reference mass from the flange [m], as in tests/calib/drawn_arms.py."""
 BOUND_DEVIATIONS = 3.0
 """Standard deviations of the rough model that its bounds include: 99.7 %."""
 
@@ -51,9 +53,10 @@ def guess_of_model(kinematics: Arm, beta: Array) -> GravityGuess:
     return GravityGuess(kinematics, beta, np.diag((MODEL_ERROR * size) ** 2))
 
 
-def reach(kinematics: Arm, hand: float = 0.15) -> Array:
+def reach(kinematics: Arm, hand: float = HAND) -> Array:
     """Largest distance (n,) [m] from each joint to the far side of a hand of size `hand` [m]."""
-    return np.hypot(kinematics.a, kinematics.d)[::-1].cumsum()[::-1] + hand
+    length: Array = np.linalg.norm(kinematics.span, axis=1)
+    return length[::-1].cumsum()[::-1] + hand
 
 
 def guess_gravity(

@@ -77,7 +77,7 @@ def choose_stops(
     `moments` are the mass moments β (2n,) [kg·m] for which the design is made, several guesses if they are unknown;
     sigma (n,) [N·m] of one reading; mass [kg] of the second pass.
     """
-    flange, free = [kinematics.a[-1], 0.0, kinematics.d[-1]], free_mask(kinematics.n, UNKNOWN)
+    flange, free = kinematics.span[-1], free_mask(kinematics.n, UNKNOWN)
     guesses = [Parameters.nominal(kinematics.n, beta=beta, rho=flange) for beta in moments]
     information = [
         np.stack([_information(kinematics, guess, each, sigma, free, mass) for guess in guesses]) for each in candidates
@@ -93,7 +93,7 @@ def choose_stops(
 def guessed_moments(kinematics: Arm, seed: int) -> list[Array]:
     """Mass moments (2n,) of three plausible arms of these dimensions, for planning before anything was measured."""
     generator = np.random.default_rng(seed)
-    length = np.hypot(kinematics.a, kinematics.d)
+    length = np.linalg.norm(kinematics.span, axis=1)
     beyond = np.cumsum((length + 0.1)[::-1])[::-1]
     return [(generator.normal(size=(kinematics.n, 2)) * beyond[:, None]).ravel() for _ in range(3)]
 

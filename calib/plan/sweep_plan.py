@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits
 from calib.plan.bias_torque import (
     bias_and_acceleration,
@@ -17,7 +18,7 @@ from calib.plan.bias_torque import (
 from calib.plan.plan_limits import SERVO_GAP
 from calib.plan.poses import Poses, scout_poses, sweep_range
 from calib.plan.predicted_precision import predicted_gain_std, worst_gain_std
-from calib.plan.rough_gravity import GravityGuess, reach
+from calib.plan.rough_gravity import HAND, GravityGuess, reach
 from calib.plan.stop_selection import Candidates, choose_stops, guessed_moments
 from calib.plan.sweep_options import PlannedArm, sweep_options
 from calib.plan.types import Sweep, SweepPlan
@@ -31,14 +32,14 @@ MASS_SHARES = (0.3, 0.5, 0.7)
 ASSUMED_GRAVITY = 0.6
 """Share of max_torque that gravity is assumed to take before any measurement: drives have 1.5 to 2.2 times gravity in
 tests/calib/drawn_arms.py."""
-HAND = 0.15
-"""Largest distance of the reference mass from the flange [m], as in tests/calib/drawn_arms.py."""
 DEAD_LEVER = 0.005
 """Γ/g below which a joint is swept at one combination, for its offset alone (docs/theory.md, section 4.4)."""
 MORE_POSES = 2
 """Stop combinations per joint that may be added to reach the gains' precision; a choice: each takes minutes."""
 FINEST = 3.0
 """Largest factor of precision by averaging longer: nine times the samples; a choice."""
+GRAMS = 100.0
+"""Reference mass from which grams may be meant [kg]."""
 ENOUGH = 1.2
 """Factor by which the gains may be less precise than asked without a note; a choice."""
 
@@ -87,6 +88,31 @@ def plan_sweep(
         gain_std=None if gain_std is None else gain_std / finer,
         notes=tuple(notes),
     )
+
+
+def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess | None) -> None:
+    """Raise BadInput where a reference mass [kg] is more than a joint's drive, or another's, can hold while it sweeps.
+
+    `guess` is of the arm alone; without one, gravity counts as nothing. Where the mass hangs beyond the flange is not
+    known and counts as nothing, too.
+    """
+    planned = PlannedArm.of(arm_file, guess)
+    at_origin, by_point = payload_columns(planned.kinematics)
+    column = at_origin + by_point @ planned.kinematics.span[-1]
+    most = {}
+    for options in sweep_options(planned)[0]:
+        regressor = gravity_regressor(planned.kinematics, options.poses)
+        own = 0.0 if guess is None else np.abs(regressor @ guess.beta)
+        room = planned.limits.max_torque - own
+        bearable = (room / np.maximum(np.abs(regressor @ column), 1e-9)).min(axis=(1, 2))
+        most[planned.kinematics.names[options.joint]] = max(float(bearable.max()), 0.0)
+    name = min(most, key=lambda joint: most[joint])
+    if mass > most[name]:
+        unit = f"; is it {mass / 1000:g} kg?" if mass >= GRAMS and mass / 1000 < most[name] else ""
+        raise BadInput(
+            f"--reference-mass {mass:g}: with it no sweep of {name} stays within max_torque: attach at most "
+            f"{float(f'{most[name]:.2g}'):g} kg{unit}"
+        )
 
 
 def _choose(
@@ -178,8 +204,7 @@ def reference_masses(
     poses = np.concatenate([each.poses.reshape(-1, kinematics.n) for each in options])
     regressor = gravity_regressor(kinematics, poses)
     at_origin, by_point = payload_columns(kinematics)
-    flange = np.array([kinematics.a[-1], 0.0, kinematics.d[-1]])
-    per_kg = np.abs(regressor @ (at_origin + by_point @ flange))
+    per_kg = np.abs(regressor @ (at_origin + by_point @ kinematics.span[-1]))
     per_kg += HAND * np.linalg.norm(regressor @ by_point, axis=-1)
     gravity = ASSUMED_GRAVITY * limits.max_torque if guess is None else np.abs(guess.torque(poses)).max(axis=0)
     room = np.maximum(limits.max_torque - gravity, 0.05 * limits.max_torque)

@@ -10,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from armlink.errors import BadInput
+from armlink.extras import require_extra
 from calib.records.schema import MIGRATIONS
 
 HEAD = MIGRATIONS[-1]
@@ -53,6 +54,8 @@ def open_database(url: str) -> sa.Engine:
     """
     full = _full_url(url)
     try:
+        if sa.make_url(full).get_backend_name() == "postgresql":
+            require_extra(f"record store {_shown(full)}", "postgresql")
         connect = _POSTGRESQL if sa.make_url(full).get_backend_name() == "postgresql" else {}
         engine = sa.create_engine(full, pool_pre_ping=True, connect_args=connect)
         if engine.dialect.name == "sqlite":

@@ -16,7 +16,16 @@ from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, Parameter
 from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
-from calib.report.page import ReportSection, ReportTable, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.page import (
+    ReportSection,
+    ReportTable,
+    html_of,
+    interval_table,
+    paragraph,
+    paragraphs,
+    render,
+    verdict_line,
+)
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
@@ -43,9 +52,13 @@ class Calibrated:
 def write_report(done: Calibrated, path: Path) -> None:
     """Write one self-contained HTML file; raises OSError."""
     record = done.record
-    sections = [_identity(done), _sensors(done), _comparison(done), *_sweeps(done), _left_out(done)]
     title = f"Calibration {record.id}: {record.arm} {record.serial}"
-    render(path, title, sections, f"{record.created:%Y-%m-%d %H:%M} UTC, {record.software}")
+    render(path, title, [_identity(done), *sections(done)], f"{record.created:%Y-%m-%d %H:%M} UTC, {record.software}")
+
+
+def sections(done: Calibrated) -> list[ReportSection]:
+    """The results, for a part of another report."""
+    return [_sensors(done), _comparison(done), *_sweeps(done), _left_out(done)]
 
 
 def _identity(done: Calibrated) -> ReportSection:
@@ -99,17 +112,12 @@ def _advice(done: Calibrated, broken: list[str]) -> Markup:
 
 def _sensors(done: Calibrated) -> ReportSection:
     fit = done.fit
-    header = [
-        "joint",
-        *(f"{title} [{unit}]" for _, title, unit in PARAMETERS),
-        "residual RMS [N·m]",
-        "hysteresis [N·m]",
-    ]
-    rows = []
-    for j, name in enumerate(fit.names):
-        cells = [_interval(fit.value(key)[j], fit.half95(key)[j]) for key, _, _ in PARAMETERS]
-        rows.append([name, *cells, f"{fit.residual_rms[j]:.4f}", f"{fit.hysteresis[j]:.4f}"])
-    table = ReportTable(header, rows, "Estimates ± half of the 95 % interval; reading = gain · torque + offset.")
+    columns = {f"{title} [{unit}]": (fit.value(key), fit.half95(key)) for key, title, unit in PARAMETERS}
+    columns |= {"residual RMS [N·m]": (fit.residual_rms, 0 * fit.residual_rms)}
+    columns |= {"hysteresis [N·m]": (fit.hysteresis, 0 * fit.hysteresis)}
+    table = interval_table(
+        fit.names, columns, "Estimates ± half of the 95 % interval; reading = gain · torque + offset."
+    )
     reasons = [f"{joint}, {parameter.replace('_', ' ')}: {why}." for (joint, parameter), why in fit.reasons.items()]
     reasons += [f"{why}." for why in fit.imprecise.values()]
     if fit.attachment is not None:
@@ -182,7 +190,7 @@ def _sweeps(done: Calibrated) -> list[ReportSection]:
         " the 95 % interval of one reading."
     )
     left_out = {each.sweep: each for each in fit.goodness.left_out}
-    sections = []
+    made = []
     for joint in reversed(range(len(fit.names))):
         rows = []
         for sweep in sweeps_of(fit, joint):
@@ -212,13 +220,13 @@ def _sweeps(done: Calibrated) -> list[ReportSection]:
         )
         caption = "Cross-validation: RMS of this sweep minus a fit without it, and its ratio to the expected error."
         figures = [joint_figure(arm, fit, joint)] if rows else []
-        sections.append(
+        made.append(
             ReportSection(
                 f"Sweeps of {fit.names[joint]}", paragraph(text), figures, [ReportTable(header, rows, caption)]
             )
         )
         text = ""
-    return sections
+    return made
 
 
 def _left_out(done: Calibrated) -> ReportSection:
@@ -238,12 +246,6 @@ def _left_out(done: Calibrated) -> ReportSection:
     return ReportSection(
         "Model against sensor (the paper's Figure 6)", paragraph(text), [left_out_figure(fit.names, sensor, model)]
     )
-
-
-def _interval(value: float, half: float) -> str:
-    if not np.isfinite(value):
-        return "not observable"
-    return f"{value:.4f}\u00a0±\u00a0{half:.4f}" if half > 0 else f"{value:.4f}"
 
 
 def _number(value: float | None, form: str) -> str:

@@ -1,4 +1,4 @@
-"""Figures of the calibration report: sweeps with their fits, before and after, and the paper's Figure 6."""
+"""Figures of the calibration reports: sweeps with their fits, before and after, and the paper's Figure 6."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ import numpy.typing as npt
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
+from calib.creep.fit import CreepFit
 from calib.fit.sensor_fit import SensorFit
 from calib.sweep.verify import Verification
 from gcomp.arm.arm import Arm
@@ -36,22 +37,13 @@ def sweep_rows(fit: SensorFit, joint: int, sweep: str) -> Indices:
 
 
 def joint_figure(arm: Arm, fit: SensorFit, joint: int) -> Any:
-    """One joint's sweeps: readings over position with the fitted curve, and residuals with their 95 % intervals."""
-    titles = ("sensor reading [N·m]", "reading minus fit [N·m]")
+    """One joint's sweeps, up (▸) and down (◂): readings with the fitted curve, and residuals with 95 % intervals."""
+    titles, readings = ("sensor reading [N·m]", "reading minus fit [N·m]"), fit.rows.readings
     figure = make_subplots(rows=1, cols=2, column_widths=[0.58, 0.42], subplot_titles=titles, horizontal_spacing=0.1)
-    add_sweeps(figure, arm, fit, joint, row=1, intervals=True)
-    figure.update_xaxes(title_text="position reading [rad]")
-    figure.update_layout(height=330, legend={"orientation": "h", "y": -0.28, "x": 0}, margin={"t": 40})
-    return figure
-
-
-def add_sweeps(figure: Any, arm: Arm, fit: SensorFit, joint: int, row: int, *, intervals: bool) -> None:
-    """Put a joint's sweeps into both columns of a row, up (▸) and down (◂)."""
-    readings = fit.rows.readings
     for colour, sweep in enumerate(sweeps_of(fit, joint)):
         at = sweep_rows(fit, joint, sweep)
         x, y, left = readings.position[at, joint], readings.torque[at, joint], fit.fit.residual[at, joint]
-        place = {"name": sweep, "legendgroup": sweep, "row": row}
+        place = {"name": sweep, "legendgroup": sweep, "row": 1}
         paint = COLOURS[colour % len(COLOURS)]
         symbol = np.where(readings.direction[at, joint] > 0, "triangle-right", "triangle-left")
         marker = {"color": paint, "size": 7, "symbol": symbol}
@@ -60,8 +52,10 @@ def add_sweeps(figure: Any, arm: Arm, fit: SensorFit, joint: int, row: int, *, i
         figure.add_scatter(x=angle, y=reading, mode="lines", line=line, col=1, showlegend=False, **place)
         figure.add_scatter(x=x, y=y, mode="markers", marker=marker, col=1, **place)
         half = 1.96 * readings.sigma[at, joint] * fit.noise_factor[joint]
-        bars = {"type": "data", "array": half, "thickness": 1, "width": 2} if intervals else None
+        bars = {"type": "data", "array": half, "thickness": 1, "width": 2}
         figure.add_scatter(x=x, y=left, error_y=bars, mode="markers", marker=marker, col=2, showlegend=False, **place)
+    figure.update_xaxes(title_text="position reading [rad]")
+    return figure.update_layout(height=330, legend={"orientation": "h", "y": -0.28, "x": 0}, margin={"t": 40})
 
 
 def curve(arm: Arm, fit: SensorFit, rows: Indices, joint: int) -> tuple[Array, Array]:
@@ -73,6 +67,24 @@ def curve(arm: Arm, fit: SensorFit, rows: Indices, joint: int) -> tuple[Array, A
     )
     asked = StaticReadings.of(position, np.zeros_like(position), 1.0, readings.load[rows[0]])
     return position[:, joint], predict(arm, fit.fit.complete, asked)[:, joint]
+
+
+def creep_figure(fit: CreepFit) -> Any:
+    """Creeps of each joint, up (▸) and down (◂), a colour a sweep of one pass: readings over position with the fit."""
+    n, rows = len(fit.names), fit.rows
+    figure = make_subplots(rows=n, cols=1, subplot_titles=[f"{name}: reading [N·m]" for name in fit.names])
+    for joint in range(n):
+        own, place = np.flatnonzero(rows.joint == joint), {"row": joint + 1, "col": 1, "showlegend": False}
+        for number, sweep in enumerate(np.unique(rows.sweep[own])):
+            paint = COLOURS[number % len(COLOURS)]
+            for side, symbol in ((1.0, "triangle-right"), (-1.0, "triangle-left")):
+                at = own[(rows.sweep[own] == sweep) & (rows.side[own] == side)]
+                at = at[np.argsort(rows.position[at, joint])]
+                x, y, marker = rows.position[at, joint], rows.reading[at], {"symbol": symbol, "color": paint}
+                figure.add_scatter(x=x, y=y, mode="markers", marker=marker, **place)
+                figure.add_scatter(x=x, y=y - fit.solution.residual[at], mode="lines", line={"color": GREY}, **place)
+    figure.update_xaxes(title_text="position reading [rad]", row=n)
+    return figure.update_layout(height=PANEL * n + 80)
 
 
 def before_after_figure(names: tuple[str, ...], before: Array, after: Array, label: str) -> Any:

@@ -3,19 +3,20 @@
 A drive that gets too hot later says so by an emergency, which ends any sweep.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
+from armlink.link.joints.groups import make_groups, traits_of
 from armlink.link.types import Stats
 from armlink.loop.driver import ArmDriver
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
 from calib.motion.mover import Mover, Stalled
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 
 LISTEN = 0.5
 """Seconds for which the sensors are listened to at rest, after as long again in which switching on dies down."""
@@ -62,7 +63,8 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     samples = [mover.cycle() for _ in range(cycles)]
     torque = np.array([sample.torque for sample in samples])
     position = np.array([sample.position for sample in samples])
-    _check_readings(link.names, before, link.stats, torque, position)
+    every = [each.torque_cycles for each in traits_of(make_groups(arm))]
+    _check_readings(link.names, before, link.stats, torque, position, every)
     for joint, name in enumerate(link.names):
         if np.nanmax(np.abs(torque[:, joint])) > SATURATION_RATIO * limits.rated[joint]:
             raise Refused(
@@ -81,28 +83,36 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
     return Preflight(link.names, np.array([_noise(each) for each in torque.T]), mean, nowhere, expected, temperature)
 
 
-def _check_readings(names: tuple[str, ...], before: Stats, after: Stats, torque: Array, position: Array) -> None:
+def _check_readings(
+    names: tuple[str, ...], before: Stats, after: Stats, torque: Array, position: Array, torque_cycles: Sequence[int]
+) -> None:
     """Raise Refused naming the joint whose readings are missing: lost on the way, or late.
 
-    `before` and `after` count what was asked for and what came while torque and position (K, n) were read.
+    `before` and `after` count what was asked for and what came while torque and position (K, n) were read; a torque
+    comes every so many cycles (n,).
     """
     asked = after.asked - before.asked
     for joint, name in enumerate(names):
         lost = asked - (after.came[joint] - before.came[joint])
-        for what, values in (("torque", torque[:, joint]), ("position", position[:, joint])):
-            missing = int(np.isnan(values).sum())
-            if missing <= MISSING * len(values):
+        came = {"torque": ~np.isnan(torque[:, joint]), "position": ~np.isnan(position[:, joint])}
+        for what, cycles in (("torque", torque_cycles[joint]), ("position", 1)):
+            here, anything = (_any_in(each, cycles) for each in (came[what], came["torque"] | came["position"]))
+            if (~here).sum() <= MISSING * len(here):
                 continue
-            empty = int((np.isnan(values) & ~(np.isnan(torque[:, joint]) & np.isnan(position[:, joint]))).sum())
-            if max(lost, empty) > MISSING * asked:
+            empty = int((~here & anything).sum())
+            for count, of in ((lost, asked), (empty, len(here))):
+                if count > MISSING * of:
+                    raise Refused(f"{name}: {count} of {of} {what} readings are missing: check its drive and cable")
+            if (~here).sum() > LATE * len(here):
                 raise Refused(
-                    f"{name}: {max(lost, empty)} of {asked} {what} readings are missing: check its drive and cable"
+                    f"{name}: {(~here).sum()} of {len(here)} {what} readings came after their cycle was over: the arm"
+                    " or this machine does not keep pace: lower link.rate, or give them more processor time"
                 )
-            if missing > LATE * len(values):
-                raise Refused(
-                    f"{name}: {missing} of {len(values)} {what} readings came after their cycle was over: the arm or"
-                    " this machine does not keep pace: lower link.rate, or give them more processor time"
-                )
+
+
+def _any_in(came: Mask, cycles: int) -> Mask:
+    """Whether a reading came in each stretch of so many cycles."""
+    return np.asarray(came[: len(came) // cycles * cycles].reshape(-1, cycles).any(axis=1))
 
 
 def read_temperatures(link: ArmDriver) -> Array:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gcomp.arrays import Array, as_array, frozen
 from gcomp.errors import BadArray
@@ -13,6 +14,9 @@ class Arm:
     """A serial arm of n revolute joints in standard Denavit-Hartenberg form (docs/theory.md, section 1).
 
     Joint i turns about z_{i-1} by θ_i = q_i + theta_offset_i. Raises BadArray on wrong shapes or an empty range.
+
+    The common normal of nearly parallel axes, such as those of a model with rounded angles, lies kilometres away. There
+    the origins stay on the axes near the arm, and the way between them has a third component `b`.
     """
 
     names: tuple[str, ...]
@@ -30,6 +34,8 @@ class Arm:
     """Lower joint limit (n,) [rad]; -inf for none."""
     upper: Array
     """Upper joint limit (n,) [rad]; +inf for none."""
+    b: ArrayLike = 0.0
+    """Offsets of the origins along ȳ of the bar frames (n,) [m]; zero in Denavit-Hartenberg form."""
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -37,6 +43,7 @@ class Arm:
             raise BadArray(f"joint names are {list(self.names)}, expected at least one, each different")
         for key in ("alpha", "a", "d", "theta_offset"):
             frozen(self, **{key: as_array(key, getattr(self, key), (n,))})
+        frozen(self, b=as_array("b", np.full(n, self.b) if np.ndim(self.b) == 0 else self.b, (n,)))
         frozen(self, names=tuple(self.names), gravity=as_array("gravity", self.gravity, (3,)))
         for key in ("lower", "upper"):
             frozen(self, **{key: as_array(key, getattr(self, key), (n,), finite=False)})
@@ -48,6 +55,11 @@ class Arm:
     def n(self) -> int:
         """Number of joints."""
         return len(self.names)
+
+    @property
+    def span(self) -> Array:
+        """From each joint's origin to the next one's, in its bar frame (n, 3) [m]."""
+        return np.stack([self.a, as_array("b", self.b, (self.n,)), self.d], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

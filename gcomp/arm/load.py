@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from gcomp.arm.arm import Arm
 from gcomp.arm.dh_rows import ArmGeometry, axes_to_arm
+from gcomp.arm.mass_moments import base_parameters
 from gcomp.arm.model_file import NotXml, parse_xml, upwards
 from gcomp.arrays import Array, as_array
 from gcomp.errors import BadModel
@@ -34,6 +35,8 @@ class ModelArm:
     arm: Arm
     beta: Array
     """Mass moments (2n,) of the model's inertials [kg·m]."""
+    mass: Array
+    """Masses (n,) of the links [kg]."""
 
 
 def load_model(
@@ -195,12 +198,6 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None,
         own[f"joint {model.joint(joint).name}"] = [at_rest, *data.xaxis[joint], *data.xanchor[joint]]
     own |= {f"body {model.body(body).name}": [model.body_mass[body], *data.xipos[body]] for body in link_of}
     _refuse_what_is_no_number(own, path)
-    mass, first_moment = np.zeros(len(chain)), np.zeros((len(chain), 3))
-    bodies: list[list[int]] = [[] for _ in chain]
-    for body, link in link_of.items():
-        mass[link] += model.body_mass[body]
-        first_moment[link] += model.body_mass[body] * (data.xipos[body] - data.xanchor[chain[link]])
-        bodies[link].append(body)
     geometry = axes_to_arm(
         names=tuple(model.joint(joint).name or f"joint_{i + 1}" for i, joint in enumerate(chain)),
         axes=data.xaxis[chain],
@@ -209,8 +206,13 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None,
         gravity=np.array(model.opt.gravity) if gravity is None else as_array("gravity", gravity, (3,)),
         limits=limits,
     )
-    moments = np.einsum("ndk,nd->nk", geometry.bar, first_moment)
-    arm = ModelArm(geometry.arm, geometry.base_parameters(mass, moments))
+    mass, first_moment = np.zeros(len(chain)), np.zeros((len(chain), 3))
+    bodies: list[list[int]] = [[] for _ in chain]
+    for body, link in link_of.items():
+        mass[link] += model.body_mass[body]
+        first_moment[link] += model.body_mass[body] * geometry.bar[link].T @ (data.xipos[body] - geometry.origins[link])
+        bodies[link].append(body)
+    arm = ModelArm(geometry.arm, base_parameters(geometry.arm, mass, first_moment), mass)
     return PlacedChain(model, data, arm, geometry, data.xanchor[chain], reference, tuple(map(tuple, bodies)))
 
 

@@ -6,22 +6,25 @@ from numpy.typing import ArrayLike
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, as_array
 
+VERTICAL = 1e-4
+"""Angle between a joint's axis and gravity below which it counts as vertical [rad]: models round π to 3.1416."""
+
 
 def base_parameters(arm: Arm, mass: ArrayLike, first_moment: ArrayLike) -> Array:
     """Mass moments β = (n_1x, n_1y, …, n_nx, n_ny) (2n,) [kg·m], on which gravity torque depends; equation (R).
 
-    mass (n,) [kg]; first_moment (n, 3) [kg·m], mass times centre of mass in each link's bar frame (origin on the
-    joint axis at o_{i-1}, turning with the joint, z along the axis).
+    mass (n,) [kg]; first_moment (n, 3) [kg·m], mass times centre of mass in each link's bar frame (origin
+    o_{i-1} on the joint axis, turning with the joint, z along the axis).
     """
     masses = as_array("mass", mass, (arm.n,))
     moments = as_array("first_moment", first_moment, (arm.n, 3))
-    beta = np.empty((arm.n, 2))
+    span, beta = arm.span, np.empty((arm.n, 2))
     distal_mass = along_axis = 0.0
     for i in reversed(range(arm.n)):
-        beta[i, 0] = moments[i, 0] + distal_mass * arm.a[i]
-        beta[i, 1] = moments[i, 1] - np.sin(arm.alpha[i]) * along_axis
-        along_axis = moments[i, 2] + np.cos(arm.alpha[i]) * along_axis + distal_mass * arm.d[i]
-        distal_mass += masses[i]
+        next_axis = np.array([0.0, -np.sin(arm.alpha[i]), np.cos(arm.alpha[i])])
+        moment = moments[i] + distal_mass * span[i] + along_axis * next_axis
+        beta[i], along_axis = moment[:2], float(moment[2])
+        distal_mass += float(masses[i])
     return beta.ravel()
 
 
@@ -42,9 +45,9 @@ def payload_columns(arm: Arm) -> tuple[Array, Array]:
 def base_parameter_names(arm: Arm) -> tuple[str, ...]:
     """Names of the 2(n − p) mass moments that act on a torque in some pose (docs/theory.md, section 2.4).
 
-    p leading joints have their axis along gravity in every pose, to within 1e-6 rad; they carry no torque.
+    p leading joints have their axis along gravity in every pose, to within `VERTICAL`; they carry no torque.
     """
-    vertical, tolerance = 0, 1e-6
+    vertical, tolerance = 0, VERTICAL
     strength = float(np.linalg.norm(arm.gravity))
     if np.hypot(arm.gravity[0], arm.gravity[1]) <= tolerance * strength:
         bends = np.abs(np.sin(arm.alpha)) > tolerance

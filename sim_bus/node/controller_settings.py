@@ -5,6 +5,7 @@ from zlib import crc32
 import numpy as np
 
 from armlink.arm_file import ArmFile, LinkJoint
+from armlink.drives.canopen.eds_file import expected_identity, of_joints
 from sim_bus.node.devices import Device
 from sim_bus.node.drives import SUPPORTED_MODES, UNWATCHED, SimulatedDrives
 from sim_bus.node.node import Node
@@ -15,6 +16,8 @@ from sim_bus.sim_section import sim_section
 APPLIED = (0x6007, 0x605A, 0x6065, 0x607D, 0x6085, 0x60C2)
 """Objects of the drive profile that take effect when written."""
 
+IDENTITY = ("vendor", "product", "revision", "serial")
+"""Keys of a joint's identity in the arm file, in the order of 1018h's sub-indices."""
 TEMPERATURE = 310
 """Temperature of every drive [0.1 °C]."""
 
@@ -22,6 +25,7 @@ TEMPERATURE = 310
 def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int, device: Device) -> dict[Key, int | str]:
     """Objects of one joint that differ from the EDS's defaults; `increments` of the encoder per joint revolution."""
     link, servo = arm.require_link(), sim_section(arm).servo
+    stated = expected_identity(joint, of_joints(arm, [joint])[0]).model_dump(exclude_none=True)
     deceleration = round(servo.quick_stop_deceleration / UNIT)
     return {
         (0x1018, 4): crc32(f"{arm.name} {arm.serial} {joint.name}".encode()),
@@ -37,6 +41,7 @@ def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int, device: Dev
         (0x60C2, 1): min(max(round(1000 / link.rate), 1), 255),
         (0x6502, 0): _modes_shown(device),
         **device.values,
+        **{(0x1018, sub): stated[key] for sub, key in enumerate(IDENTITY, start=1) if key in stated},
     }
 
 

@@ -9,7 +9,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.causes import remainder
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, Rollout
-from sim_gap.attribution.notes import aside_notes, law_notes, notes
+from sim_gap.attribution.notes import aside_notes, law_notes, notes, worse_notes
 from sim_gap.attribution.residual_laws import ResidualLaw, as_effects, residual_laws
 from sim_gap.attribution.rollout import roll_out
 from sim_gap.attribution.verdict import share_left, verdict
@@ -48,6 +48,7 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
     result = verdict(found, sets, unsettled=bool(laws) or any(place.clear for place in aside))
     if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
         result = "unexplained"
+    margin = combine_by_joint(judge, judge.margin)
     return Diagnosis(
         verdict=result,
         names=made.model.arm.names,
@@ -61,12 +62,13 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
         heldout_before=by_joint(judge),
         heldout_after=by_joint(judge, left),
         unexplained=share_left(judge, left),
-        margin=combine_by_joint(judge, judge.margin),
+        margin=margin,
         heldout_is=heldout_is,
         rollout=_rolled(made, found, laws),
         laws=tuple(laws),
         notes=(
             *notes(found, stuck, estimate, fit, judge, left),
+            *worse_notes(made.model.arm.names, by_joint(judge), by_joint(judge, left), margin),
             *aside_notes(aside),
             *law_notes(laws, made.model.arm.names),
         ),

@@ -140,7 +140,9 @@ def diagnose(
     compensated += find_compensations(estimate, (fit, judge))
     told = tuple(each.sentence() for each in compensated)
     aside = (*told, *unchecked_note(recordings))
-    return replace(made, checks=findings, notes=(*made.notes, *aside), friction_compensation=tuple(compensated))
+    made = replace(made, checks=findings, notes=(*made.notes, *aside), friction_compensation=tuple(compensated))
+    settled = not made.doubts or made.verdict == "unexplained"
+    return made if settled else replace(made, verdict="ambiguous")
 
 
 def _placed(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:

@@ -126,6 +126,11 @@ class Diagnosis:
     internals: Any = field(default=None, repr=False, compare=False)
     """Fit and data behind the result (`answer.Internals`), for report and export."""
 
+    @property
+    def doubts(self) -> tuple[RecordingFinding, ...]:
+        """Findings that were not corrected: the recordings may not be what they are taken for."""
+        return tuple(finding for finding in self.checks if not finding.corrected)
+
     def to_json(self) -> dict[str, Any]:
         """The dictionary of schema armlink.gap/2."""
         roll = self.rollout

@@ -19,6 +19,8 @@ from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import NOMINAL, EffectEstimate
 from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants, shares_a_factor
 
+WORSE = 1.1
+"""Gap with the corrections over the one without them from which the corrections do not carry over; a choice."""
 ALIKE = 0.05
 """A general law that scores worse than a cause by less than this is noted."""
 
@@ -154,6 +156,16 @@ def _remaining(data: ResidualSet, left: dict[Row, Array]) -> tuple[str, ...]:
         + ("without a known regime" if at.regime == "other" else f"correlated with {at.regime} ({at.share:.0%})")
         for at in (locate(data, left, above)[:3] if above else [])
     )
+
+
+def worse_notes(names: Sequence[str], before: Array, after: Array, margin: Array) -> list[str]:
+    """Joints whose held-out gap [N·m] (n,) grows by what was fitted."""
+    return [
+        f"{name}: what was fitted makes the held-out gap larger, {old:.2g} to {new:.2g} N·m: leave it out of the model "
+        "for this joint, and record more of its motion"
+        for name, old, new, least in zip(names, before, after, margin, strict=True)
+        if new > WORSE * old and new > least
+    ]
 
 
 def _at_rest(data: ResidualSet) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 The nominal arm is that of `sim.xml`; `perturb` is the arm that the plant simulates, with small errors everywhere.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -52,18 +53,20 @@ class BenchArm:
     def with_added(self, link: int, mass: float, moment: Array, inertia: Array) -> "BenchArm":
         """The arm with mass [kg], first moment [kg·m] and inertia about the link's origin [kg·m²] added to one link."""
         total = self.mass[link] + mass
-        first = self.mass[link] * self.com[link] + moment
+        com = (self.mass[link] * self.com[link] + moment) / total
         about_origin = self.inertia[link] + self.mass[link] * _steiner(self.com[link]) + inertia
-        com = first / total
-        arm = replace(self, mass=self.mass.copy(), com=self.com.copy(), inertia=self.inertia.copy())
-        arm.mass[link], arm.com[link], arm.inertia[link] = total, com, about_origin - total * _steiner(com)
-        return arm
+        heavier = self.with_entry("mass", link, total).with_entry("com", link, com)
+        return heavier.with_entry("inertia", link, about_origin - total * _steiner(com))
+
+    def with_entry(self, quantity: str, joint: int, value: float | Array) -> "BenchArm":
+        """The arm with another value of one link or joint in the array `quantity`."""
+        values = getattr(self, quantity).copy()
+        values[joint] = value
+        return replace(self, **{quantity: values})
 
     def with_moved(self, link: int, moment: Array) -> "BenchArm":
         """The arm with the centre of mass of one link moved so that its first moment grows by `moment` [kg·m]."""
-        arm = replace(self, com=self.com.copy())
-        arm.com[link] += moment / self.mass[link]
-        return arm
+        return self.with_entry("com", link, self.com[link] + moment / self.mass[link])
 
 
 def draw_arm(random: np.random.Generator, joints: int | None = None) -> BenchArm:
@@ -109,11 +112,8 @@ def perturb(arm: BenchArm, random: np.random.Generator) -> BenchArm:
     )
 
 
-def mjcf(arm: BenchArm, shared_rotors: tuple[tuple[int, int, float, float], ...] = ()) -> str:
-    """The arm as MJCF text.
-
-    `shared_rotors` lists (i, j, coefficient, inertia): a rotor that turns by q_i + coefficient·q_j.
-    """
+def mjcf(arm: BenchArm, more: Sequence[str] = ()) -> str:
+    """The arm as MJCF text, with further lines at its end."""
     lines = [
         '<mujoco model="arm">',
         '<compiler angle="radian"/>',
@@ -122,30 +122,15 @@ def mjcf(arm: BenchArm, shared_rotors: tuple[tuple[int, int, float, float], ...]
     ]
     for k, name in enumerate(arm.names):
         inertia = arm.inertia[k][[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        span = _text([arm.lower[k], arm.upper[k]])
+        span, axes = _text([arm.lower[k], arm.upper[k]]), _text(arm.rotation[k][:, :2].T.ravel())
         lines += [
-            f'<body name="link_{k + 1}" pos="{_text(arm.offset[k])}" quat="{_text(quaternion(arm.rotation[k]))}">',
+            f'<body name="link_{k + 1}" pos="{_text(arm.offset[k])}" xyaxes="{axes}">',
             f'<joint name="{name}" type="hinge" axis="{_text(arm.axis[k])}" range="{span}"'
             f' limited="true" armature="{arm.armature[k]:.12g}" damping="{arm.damping[k]:.12g}"'
             f' frictionloss="{arm.frictionloss[k]:.12g}"/>',
             f'<inertial pos="{_text(arm.com[k])}" mass="{arm.mass[k]:.12g}" fullinertia="{_text(inertia)}"/>',
         ]
-    lines += ["</body>"] * arm.n + ["</worldbody>"]
-    for i, j, coefficient, inertia in shared_rotors:
-        lines += [
-            f'<tendon><fixed armature="{inertia:.12g}"><joint joint="{arm.names[i]}" coef="1"/>',
-            f'<joint joint="{arm.names[j]}" coef="{coefficient:.12g}"/></fixed></tendon>',
-        ]
-    return "\n".join([*lines, "</mujoco>", ""])
-
-
-def quaternion(rotation: Array) -> Array:
-    """Unit quaternion (w, x, y, z) of a rotation matrix."""
-    import mujoco
-
-    out = np.empty(4)
-    mujoco.mju_mat2Quat(out, np.ascontiguousarray(rotation).ravel())
-    return out
+    return "\n".join([*lines, *["</body>"] * arm.n, "</worldbody>", *more, "</mujoco>", ""])
 
 
 def _text(values: Array | list[float]) -> str:
@@ -202,22 +187,9 @@ def compile_arm(arm: BenchArm) -> Any:
     """The arm's links and rotors as a MuJoCo model without friction, damping or limits."""
     import mujoco
 
-    return quiet(mujoco.MjModel.from_xml_string(mjcf(arm)))
-
-
-def quiet(model: Any) -> Any:
-    """Disable everything in a model except the mechanics of its links and rotors."""
-    import mujoco
-
-    off = mujoco.mjtDisableBit
-    model.opt.disableflags |= int(
-        off.mjDSBL_CONSTRAINT
-        | off.mjDSBL_CONTACT
-        | off.mjDSBL_SENSOR
-        | off.mjDSBL_ACTUATION
-        | off.mjDSBL_DAMPER
-        | off.mjDSBL_SPRING
-    )
+    model, off = mujoco.MjModel.from_xml_string(mjcf(arm)), mujoco.mjtDisableBit
+    for part in ("CONSTRAINT", "CONTACT", "SENSOR", "ACTUATION", "DAMPER", "SPRING"):
+        model.opt.disableflags |= int(getattr(off, f"mjDSBL_{part}"))
     return model
 
 
@@ -234,13 +206,18 @@ def inverse(model: Any, q: Array, v: Array, a: Array) -> Array:
     return out
 
 
+def mass_matrices(model: Any, q: Array) -> Array:
+    """Joint-space inertia at the poses `q` (K, n) → (K, n, n) [kg·m²]."""
+    still = np.zeros_like(q)
+    weight = inverse(model, q, still, still)
+    columns = [inverse(model, q, still, np.broadcast_to(push, q.shape)) - weight for push in np.eye(q.shape[1])]
+    return np.stack(columns, axis=2)
+
+
 def controlled_inertia(model: Any, q: Array) -> Array:
     """Inertia of each joint for a controller's gains [kg·m²], (n,): the largest over the poses `q` (K, n), but at most
     twice the least with the other joints free (1/(M⁻¹)_jj), for stability.
     """
-    still, n = np.zeros_like(q), q.shape[1]
-    weight = inverse(model, q, still, still)
-    columns = [inverse(model, q, still, np.broadcast_to(push, q.shape)) - weight for push in np.eye(n)]
-    mass = np.stack(columns, axis=2)
+    mass = mass_matrices(model, q)
     free = 1.0 / np.diagonal(np.linalg.inv(mass), axis1=1, axis2=2)
     return np.asarray(np.minimum(np.diagonal(mass, axis1=1, axis2=2).max(0), 2.0 * free.min(0)))

@@ -15,9 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from armlink.errors import ArmlinkError, BadInput, Refused
-from sim_gap.blind.cases import HELDOUT_S, TRAIN_S
-from sim_gap.blind.position_score import score_positions
-from sim_gap.blind.score import answer_name, score
+from sim_gap.blind.score import answer_name, score, score_positions
 
 MANIFEST = "manifest.json"
 SCHEMA = "armlink.blind-seal/1"
@@ -77,10 +75,8 @@ def _hashes(folder: Path) -> dict[str, str]:
     }
 
 
-SERVO_LENGTHS_S = 36.0, 18.0
-"""Training and held-out recordings of arms with servos [s]."""
-MAKER, SERVO_MAKER = "sim_gap.blind.cases", "sim_gap.blind.servo_cases"
-"""Modules that make the cases, of arms with torque channels and of arms with servos."""
+LENGTHS_S, SERVO_LENGTHS_S = (120.0, 40.0), (36.0, 18.0)
+"""Training and held-out recordings, and those of arms with servos [s]."""
 MOST_EFFECTS = 10
 """Largest number of effects in one case."""
 Diagnose = Callable[[Path, Sequence[Path], Sequence[Path], Sequence[str]], dict[str, Any]]
@@ -112,11 +108,11 @@ def run_bench(
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):
         raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
-    lengths = lengths or (SERVO_LENGTHS_S if positions else (TRAIN_S, HELDOUT_S))
+    lengths = lengths or (SERVO_LENGTHS_S if positions else LENGTHS_S)
     started = time.monotonic()
     progress("making cases", 0, cases)
-    maker = SERVO_MAKER if positions else MAKER
-    for done in make_apart(out, seed, cases, workers, lengths, effects, maker):
+    given = {"seed": seed, "cases": cases, "workers": workers, "lengths": lengths}
+    for done in make_apart(out, **given, effects=effects, positions=positions):
         progress("making cases", done, cases)
     made = time.monotonic()
     todo = tasks(out)
@@ -140,14 +136,11 @@ def _require_range(effects: str) -> None:
         raise BadInput(f"--effects {effects}: expected LOW-HIGH from 1 to {MOST_EFFECTS}, such as 5-8")
 
 
-def make_apart(
-    out: Path, seed: int, cases: int, workers: int, lengths: tuple[float, float], effects: str = "", maker: str = MAKER
-) -> Iterator[int]:
-    """Make the cases in a separate process and yield their number from time to time. Raises Refused if it fails."""
-    command = [sys.executable, "-m", maker, "--seed", str(seed), "--cases", str(cases)]
-    command += ["--out", str(out / "cases"), "--labels", str(out / "labels"), "--workers", str(workers)]
-    command += ["--train-s", str(lengths[0]), "--heldout-s", str(lengths[1]), "--effects", effects]
+def make_apart(out: Path, **given: Any) -> Iterator[int]:
+    """Make the cases in a separate process and yield their number from time to time; `given` are arguments of
+    `sim_gap.blind.cases.make_cases`. Raises Refused if it fails."""
     (out / "cases").mkdir(parents=True)
+    command = [sys.executable, "-m", "sim_gap.blind.cases", json.dumps({"out": str(out), **given})]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         while True:
             try:
@@ -156,9 +149,8 @@ def make_apart(
             except subprocess.TimeoutExpired:
                 yield len(list((out / "cases").glob("*/heldout.csv")))
     if process.returncode:
-        raise Refused(
-            f"the cases could not be made: {complaint.strip().splitlines()[-1] if complaint else process.returncode}"
-        )
+        why = complaint.strip().splitlines()[-1] if complaint else process.returncode
+        raise Refused(f"the cases could not be made: {why}")
 
 
 def tasks(out: Path) -> list[tuple[str, str]]:
@@ -166,10 +158,9 @@ def tasks(out: Path) -> list[tuple[str, str]]:
 
     The effects to withhold are listed in `labels/withhold.txt`; no label is opened for them.
     """
-    names = sorted(path.name for path in (out / "cases").iterdir())
     lines = (out / "labels" / "withhold.txt").read_text(encoding="utf-8").splitlines()
     withheld = [(case, effect) for case, effect in (line.split() for line in lines)]
-    return [*((name, "") for name in names), *withheld]
+    return [*((path.name, "") for path in sorted((out / "cases").iterdir())), *withheld]
 
 
 def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], exclude: Sequence[str]) -> dict[str, Any]:
@@ -177,20 +168,16 @@ def diagnose_files(sim: Path, train: Sequence[Path], heldout: Sequence[Path], ex
     from armlink.recording.files import load_recording
     from sim_gap.attribution.diagnose import diagnose
 
-    answer = diagnose(
-        sim, [load_recording(path) for path in train], [load_recording(path) for path in heldout], withhold=exclude
-    )
-    return answer.to_json()
+    parts = ([load_recording(path) for path in paths] for paths in (train, heldout))
+    return diagnose(sim, *parts, withhold=exclude).to_json()
 
 
 def answer_case(diagnose: Diagnose, cases: Path, case: str, withheld: str) -> tuple[str, dict[str, Any]]:
     """Name and answer of one diagnosis; refused input is an answer without causes."""
-    folder = cases / case
-    started = time.monotonic()
+    folder, started = cases / case, time.monotonic()
+    less = [withheld] if withheld else []
     try:
-        answer = diagnose(
-            folder / "sim.xml", [folder / "train.csv"], [folder / "heldout.csv"], [withheld] if withheld else []
-        )
+        answer = diagnose(folder / "sim.xml", [folder / "train.csv"], [folder / "heldout.csv"], less)
     except ArmlinkError as error:
         nothing: dict[str, Any] = {"before": [], "after": []}
         answer = {"verdict": "unexplained", "causes": [], "gap": {"heldout": nothing}, "refused": str(error)}
@@ -204,13 +191,11 @@ def _answers(
     diagnose: Diagnose, cases: Path, todo: Sequence[tuple[str, str]], workers: int
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     if workers <= 1:
-        for case, withheld in todo:
-            yield answer_case(diagnose, cases, case, withheld)
+        yield from (answer_case(diagnose, cases, *each) for each in todo)
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = [pool.submit(answer_case, diagnose, cases, case, withheld) for case, withheld in todo]
+        jobs = [pool.submit(answer_case, diagnose, cases, *each) for each in todo]
         try:
-            for job in as_completed(jobs):
-                yield job.result()
+            yield from (job.result() for job in as_completed(jobs))
         finally:  # after a failure, pending cases are not diagnosed
             pool.shutdown(cancel_futures=True)

@@ -1,44 +1,62 @@
-"""Makes blind-check cases in a process of its own: `python -m sim_gap.blind.cases --out DIR --labels DIR`."""
+"""Makes blind-check cases in a process of its own: `python -m sim_gap.blind.cases '{"out": …}'`, see `make_cases`."""
 
-import argparse
 import json
 import os
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
+from armlink.recording.csv_text import write_numbers
 from gcomp.arrays import Array
+from sim_bus.effects.registry import imperfections
 from sim_gap.blind.arms import BenchArm, compile_arm, inverse, mjcf
-from sim_gap.blind.plant.plant import simulate
-from sim_gap.blind.plant.sensors import columns_at, record
-from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, label, recipes
-from sim_gap.blind.true_arm import Log
+from sim_gap.blind.effects.drawn_effect import DrawnEffect, Values
+from sim_gap.blind.motion import RATE
+from sim_gap.blind.plant import Log, PlantRun, TrueArm, columns_at, controller_bandwidth, record, simulate, true_arm
+from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, recipes, servo_recipes
+from sim_gap.blind.servo_plant import ServoRun, record_servos, simulate_servos
 
+RECORDED_HZ, SERVO_HZ = 250.0, (50.0, 100.0)
+"""Rates of the recordings with torques, and of positions alone [Hz]."""
 BAND_HZ = 6.0
 """Band in which a gap counts [Hz]."""
 REVERSAL_SPEED = 0.02
 """Speed over which nominal friction changes sign [rad/s]."""
-VISIBLE_RATIO, VISIBLE_LEAST = 3.0, 0.08
-"""Least factor on some held-out gap, and least increase of it [N·m], by a visible effect."""
+VISIBLE_RATIO, VISIBLE_LEAST, VISIBLE_COUNTS = 3.0, 0.08, 2.0
+"""Least factor on some held-out gap, and least increase of it by a visible effect: [N·m], and of positions alone counts
+of the encoder."""
 MOVING = 0.03
 """Motor channels count only above this speed [rad/s]: at rest friction is undetermined."""
+ROUNDS = 4
+"""Number of drawings of a case that does not show its effects."""
+FOLLOWED, SERVO_FOLLOWED = 0.3, 0.6
+"""Largest deviation from the command [rad] of an arm under control, and of one with servos."""
+SETTLING_S = 1.0
+"""Time at the start of a run of positions alone that is not judged [s]."""
+DECIMALS = {"t": 6, "q": 7, "dq": 6, "q_cmd": 7}
+"""Of a column in a file; 5 of the others."""
+Columns = dict[str, Array]
+Gap = dict[str, list[float]]
 
 
-def gap(arm: BenchArm, columns: dict[str, Array]) -> dict[str, list[float]]:
+def gap(arm: BenchArm, columns: Columns) -> Gap:
     """RMS [N·m] per joint of `tau`, `tau_motor` and `tau_cmd` against the nominal model, below 6 Hz."""
     from scipy.signal import butter, sosfiltfilt
 
-    t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RATE)
+    t = np.arange(columns["t"][0], columns["t"][-1], 1.0 / RECORDED_HZ)
     even = {k: columns_at(t, columns["t"], columns[k]) for k in ("q", "tau", "tau_motor", "tau_cmd")}
-    low = butter(4, BAND_HZ, fs=RATE, output="sos")
-    q = sosfiltfilt(butter(4, 15.0, fs=RATE, output="sos"), even["q"], axis=0)
-    v = np.gradient(q, 1.0 / RATE, axis=0)
-    a = np.gradient(v, 1.0 / RATE, axis=0)
+    low = butter(4, BAND_HZ, fs=RECORDED_HZ, output="sos")
+    q = sosfiltfilt(butter(4, 15.0, fs=RECORDED_HZ, output="sos"), even["q"], axis=0)
+    v = np.gradient(q, 1.0 / RECORDED_HZ, axis=0)
+    a = np.gradient(v, 1.0 / RECORDED_HZ, axis=0)
     motor = inverse(compile_arm(arm), q, v, a)
     link = motor - arm.armature * a
     motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / REVERSAL_SPEED)
@@ -52,7 +70,7 @@ def gap(arm: BenchArm, columns: dict[str, Array]) -> dict[str, list[float]]:
     return out
 
 
-def largest_fall(before: dict[str, list[float]], after: dict[str, list[float]]) -> dict[str, Any]:
+def largest_fall(before: Gap, after: Gap) -> dict[str, Any]:
     """Channel and joint at which the effect's absence lowers the gap most, with both values and the shrink."""
     falls = [
         (b - a, channel, j, b, a)
@@ -68,154 +86,214 @@ def is_visible(fall: dict[str, Any], least: float = VISIBLE_LEAST) -> bool:
     return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > least)
 
 
-Values = TypeVar("Values")
-TRAIN_S, HELDOUT_S, RATE = 120.0, 40.0, 250.0
-ROUNDS = 4
-"""Number of drawings of a case that does not show its effects."""
-FOLLOWED = 0.3
-"""Largest deviation from the commanded trajectory [rad] of an arm under control."""
-DECIMALS = {"t": 6, "q": 7, "dq": 6, "q_cmd": 7}
-
-
-def make_cases(
-    wanted: Sequence[CaseRecipe],
-    out: Path,
-    labels: Path,
-    train_s: float = TRAIN_S,
-    heldout_s: float = HELDOUT_S,
-    rate: float = RATE,
-) -> None:
-    """Draw, simulate and write cases: `out/case_XXXX/{sim.xml,train.csv,heldout.csv}`, `labels/case_XXXX.json`.
-
-    A case is drawn again if its effects do not show in the held-out data or its arm was not under control, and left out
-    if no arm shows it.
-    """
-    labels.mkdir(parents=True, exist_ok=True)
-    todo = dict.fromkeys(wanted, 0)
-    for last in (*[False] * (ROUNDS - 1), True):
-        drawings = [d for recipe, first in todo.items() if (d := draw(recipe, train_s, heldout_s, first)) is not None]
-        if not drawings:
-            return
-        logs = iter(simulate([run for d in drawings for run in (d.heldout, *d.without)]))
-        seen = [_judged(drawing, [next(logs) for _ in range(1 + len(drawing.without))], rate) for drawing in drawings]
-        good = [(d, judged) for d, judged in zip(drawings, seen, strict=True) if last or judged.good]
-        done = set()
-        for (drawing, judged), train in zip(good, simulate([d.train for d, _ in good]) if good else (), strict=True):
-            steady = _steady(drawing.train.command, train)
-            if last or steady:
-                judged = replace(judged, good=judged.good and steady)
-                _write(drawing, judged, train, out / drawing.recipe.name, labels, rate)
-                done.add(drawing.recipe.name)
-        todo = {d.recipe: d.attempt + 1 for d in drawings if d.recipe.name not in done}
-        if not todo:
-            return
-
-
 @dataclass(frozen=True)
-class Judged:
-    """A case's held-out recording, the gaps with and without its effects, and whether it can be used."""
+class MadeCase:
+    """A case as it is written: the model, recordings, and what its label has beside the drawing."""
 
-    heldout: dict[str, Array]
-    gaps: dict[str, Any]
-    good: bool
+    sim: str
+    train: Columns
+    heldout: Columns
+    label: dict[str, Any]
+    clear: bool
+    """Whether its effects show in the held-out data, and its arm stayed under control."""
 
 
-def _judged(drawing: CaseDrawing, logs: list[Log], rate: float) -> Judged:
-    """Compare the held-out recording with those without each effect."""
-    runs = (drawing.heldout, *drawing.without)
-    recordings = [
-        record(run.truth, log, rate, drawing.columns["velocity"], run.command, _random(drawing, 1))
-        for run, log in zip(runs, logs, strict=True)
+def make_case(recipe: CaseRecipe, out: Path, labels: Path, train_s: float, heldout_s: float) -> None:
+    """Draw, simulate and write a case: `out/case_XXXX/{sim.xml,train.csv,heldout.csv}`, `labels/case_XXXX.json`.
+
+    It is drawn again if it is not clear, and left out if no arm shows its effects.
+    """
+    make, first = _servo_case if recipe.servos else _torque_case, 0
+    for last in (*[False] * (ROUNDS - 1), True):
+        drawing = draw(recipe, train_s, heldout_s, first)
+        if drawing is None:
+            return
+        first, made = drawing.attempt + 1, make(drawing, last)
+        if made is not None and (made.clear or last):
+            folder = out / recipe.name
+            folder.mkdir(parents=True, exist_ok=True)
+            labels.mkdir(parents=True, exist_ok=True)
+            (folder / "sim.xml").write_text(made.sim, encoding="utf-8")
+            write_csv(folder / "train.csv", made.train)
+            write_csv(folder / "heldout.csv", made.heldout)
+            label = {**label_of(drawing), **made.label, "clear": made.clear}
+            (labels / f"{recipe.name}.json").write_text(json.dumps(label, indent=1), encoding="utf-8")
+            return
+
+
+def label_of(drawing: CaseDrawing) -> dict[str, Any]:
+    """The true effects of the case, for the score."""
+    chirp, nominal = "chirp" in drawing.motions["train"], drawing.nominal
+    effects = [
+        {
+            "effect": d.effect,
+            "joints": list(d.joints),
+            "parameters": d.parameters,
+            "axis": nominal.axis[nominal.names.index(d.joints[0])].tolist() if d.joints else None,
+            "implied": list(d.implied),
+            "undecided": "" if chirp and d.effect in ("actuator.lag", "actuator.delay") else d.undecided,
+            "confused_with": list(d.confused_with),
+        }
+        for d in drawing.drawn
     ]
-    gaps = [gap(drawing.nominal, recording) for recording in recordings]
-    recorded = [
-        _chosen(each, drawing.columns) for each in gaps
-    ]  # channels that are not recorded do not make a case clear
-    others = recorded[1 : 1 + len(drawing.drawn)]
-    if drawing.recipe.several:  # the others hold one effect each
-        falls = [largest_fall(alone, recorded[-1]) for alone in others]
-    else:
-        falls = [largest_fall(recorded[0], less) for less in others]
-    steady = all(_steady(run.command, log) for run, log in zip(runs, logs, strict=True))
-    found = {"with": gaps[0], "without": gaps[-1], "falls": falls}
-    return Judged(recordings[0], found, steady and (bool(drawing.recipe.several) or all(is_visible(f) for f in falls)))
+    return {
+        "schema": "armlink.blind-label/1",
+        "case": drawing.recipe.name,
+        "kind": drawing.recipe.kind,
+        "n": nominal.n,
+        "effects": effects,
+        "motions": {name: list(kinds) for name, kinds in drawing.motions.items()},
+    }
 
 
-def _steady(command: Array, log: Log) -> bool:
+def _torque_case(drawing: CaseDrawing, last: bool) -> MadeCase | None:
+    """The held-out motion with all effects against that without each in turn (of several: with each alone), and without
+    any; None before the training motion if they do not show, unless it is the last attempt."""
+    scene, drawn, random, several = drawing.scene, drawing.drawn, drawing.random, bool(drawing.recipe.several)
+    seed = int(random.integers(2**31))
+
+    def truth(effects: Sequence[DrawnEffect]) -> TrueArm:
+        return true_arm(scene.arm, scene.rated, np.random.default_rng(seed), effects)
+
+    def run(effects: Sequence[DrawnEffect], number: int) -> PlantRun:
+        command = (scene.command, drawing.heldout)[number]
+        bandwidth = controller_bandwidth(truth(drawn))  # the same controller for all runs
+        return PlantRun(truth(effects), command, scene.feed_forward(command), scene.inertia, bandwidth, seed + number)
+
+    shares = {"dq": 0.5, "q_cmd": 0.8, "tau_cmd": 0.8}
+    missing = {name for name, share in shares.items() if random.random() >= share}
+    if any(effect.startswith("actuator") for effect in drawing.recipe.effects):
+        missing.discard("tau_cmd")
+
+    def recorded(run: PlantRun, log: Log, number: int) -> Columns:
+        noise = np.random.default_rng([*drawing.recipe.seed, drawing.attempt, 1000 + number])
+        return record(run, log, RECORDED_HZ, noise)
+
+    some = [(each,) if several else tuple(d for d in drawn if d is not each) for each in drawn]
+    runs = [run(effects, 1) for effects in (drawn, *(some if several or len(drawn) > 1 else ()), ())]
+    logs = [simulate(each) for each in runs]
+    columns = [recorded(each, log, 1) for each, log in zip(runs, logs, strict=True)]
+    gaps = [gap(scene.arm, each) for each in columns]
+    # channels that are not recorded do not make a case clear
+    seen = [{name: values for name, values in each.items() if name not in missing} for each in gaps]
+    others = seen[1 : 1 + len(drawn)]
+    falls = [largest_fall(each, seen[-1]) if several else largest_fall(seen[0], each) for each in others]
+    clear = all(_is_steady(*each) for each in zip(runs, logs, strict=True))
+    clear = clear and (several or all(is_visible(fall) for fall in falls))
+    if not (clear or last):
+        return None
+    training = run(drawn, 0)
+    log = simulate(training)
+    train, heldout = (
+        {name: values for name, values in each.items() if name not in missing}
+        for each in (recorded(training, log, 0), columns[0])
+    )
+    label = {"gap": {"with": gaps[0], "without": gaps[-1], "falls": falls}}
+    return MadeCase(mjcf(scene.arm), train, heldout, label, clear and _is_steady(training, log))
+
+
+def _is_steady(run: PlantRun, log: Log) -> bool:
     """Whether the controller followed its trajectory without oscillation."""
     oscillating = np.abs(np.diff(log.motor, 2, axis=0)).mean(0) > 0.25 * log.motor.std(0) + 0.1
-    return bool(np.abs(log.position - command).max() < FOLLOWED and not oscillating.any())
+    return bool(np.abs(log.position - run.command).max() < FOLLOWED and not oscillating.any())
 
 
-def _write(drawing: CaseDrawing, judged: Judged, train: Log, folder: Path, labels: Path, rate: float) -> None:
-    run, name = drawing.train, drawing.recipe.name
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "sim.xml").write_text(mjcf(drawing.nominal), encoding="utf-8")
-    columns = record(run.truth, train, rate, drawing.columns["velocity"], run.command, _random(drawing, 0))
-    write_csv(folder / "train.csv", _chosen(columns, drawing.columns))
-    write_csv(folder / "heldout.csv", _chosen(judged.heldout, drawing.columns))
-    truth = {**label(drawing), "gap": judged.gaps, "clear": judged.good}
-    (labels / f"{name}.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
+def _servo_case(drawing: CaseDrawing, last: bool) -> MadeCase | None:
+    """The held-out motion with the effect and without, each against that of the nominal model; None before the training
+    motion if they do not differ, unless it is the last attempt."""
+    scene, drawn, random, names = drawing.scene, drawing.drawn, drawing.random, drawing.nominal.names
+    assert scene.law is not None
+    nominal, law, limit = scene.arm, scene.law, 2.0 * scene.rated
+    seed, hz, bits = int(random.integers(2**31)), float(random.choice(SERVO_HZ)), int(random.integers(12, 16))
+    hold = round(RATE / hz)  # the command is sent with each row, and holds until the next
+    paths = [path[np.arange(len(path)) // hold * hold] for path in (scene.command, drawing.heldout)]
+    small = np.random.default_rng([seed, 5]).uniform(0.99, 1.01, (2, nominal.n))
+
+    def run(number: int, effects: Sequence[DrawnEffect], perfect: bool = False) -> ServoRun:
+        truth = replace(true_arm(nominal, scene.rated, np.random.default_rng(seed), effects), encoder_bits=bits)
+        off = np.ones_like(small) if perfect else small
+        own = deepcopy(law)
+        own.stiffness *= off[0]
+        own.damping *= off[1]
+        for effect in effects:
+            effect.law(own)
+        if perfect:
+            truth = replace(truth, arm=nominal, state=imperfections(names, ()))
+            truth.state.coulomb, truth.state.viscous = nominal.frictionloss, nominal.damping
+        truth.state.actuator_saturation = np.minimum(truth.state.actuator_saturation, limit)
+        return ServoRun(truth, paths[number], own, seed + number)
+
+    runs = [run(1, drawn), run(1, ()), run(1, (), perfect=True)]
+    positions = [simulate_servos(each) for each in runs]
+    real, without, ideal = (each[round(SETTLING_S * RATE) :] for each in positions)
+    gaps: list[Gap] = [{"q": np.sqrt(np.mean((each - ideal) ** 2, axis=0)).tolist()} for each in (real, without)]
+    falls = [largest_fall(*gaps)] * len(drawn)
+    clear = all(np.abs(q - paths[1]).max() < SERVO_FOLLOWED for q in positions)
+    clear = clear and all(is_visible(fall, VISIBLE_COUNTS * runs[0].truth.encoder_step) for fall in falls)
+    if not (clear or last):
+        return None
+    training = run(0, drawn)
+    trained = simulate_servos(training)
+    train, heldout = (
+        record_servos(each, q, hz, np.random.default_rng([*drawing.recipe.seed, 2000 + number]))
+        for number, (each, q) in enumerate(((training, trained), (runs[0], positions[0])))
+    )
+    known = bool(drawing.recipe.controller_known)
+    rows = [
+        f'<position name="{name}" joint="{name}" kp="{kp:.9g}" kv="{kv:.9g}" forcerange="{-top:.9g} {top:.9g}"/>'
+        for name, kp, kv, top in zip(names, law.stiffness, law.damping, limit, strict=True)
+    ]
+    label: dict[str, Any] = {"controller_known": known, "gap": {"with": gaps[0], "without": gaps[1], "falls": falls}}
+    if drawn:
+        whole = label_of(drawing)["effects"][0]
+        label["effects"] = [{**whole, "parameters": _whole_parameters(drawn[0], training, names, known)}]
+    return MadeCase(
+        mjcf(nominal, ["<actuator>", *rows, "</actuator>"] if known else ()),
+        train,
+        heldout,
+        label,
+        clear and bool(np.abs(trained - paths[0]).max() < SERVO_FOLLOWED),
+    )
 
 
-def _random(drawing: CaseDrawing, number: int) -> np.random.Generator:
-    return np.random.default_rng([*drawing.recipe.seed, drawing.attempt, 1000 + number])
-
-
-def _chosen(columns: dict[str, Values], wanted: dict[str, bool]) -> dict[str, Values]:
-    dropped = {name for name, key in (("q_cmd", "position_command"), ("tau_cmd", "torque_command")) if not wanted[key]}
-    return {name: values for name, values in columns.items() if name not in dropped}
+def _whole_parameters(effect: DrawnEffect, run: ServoRun, names: Sequence[str], known: bool) -> dict[str, Values]:
+    """Parameters as they are answered: all of a joint's friction and inertia, with what the model has of it."""
+    arm, state = run.truth.arm, run.truth.state
+    whole = {
+        "friction.coulomb": ("torque", state.coulomb),
+        "friction.viscous": ("damping", state.viscous + (run.law.damping if known else 0.0)),
+        "actuator.rotor_inertia": ("inertia", arm.armature + state.rotor_inertia),
+    }
+    if effect.effect not in whole:
+        return effect.parameters
+    name, values = whole[effect.effect]
+    return {joint: {name: float(values[names.index(joint)])} for joint in effect.parameters}
 
 
 def write_csv(path: Path, columns: dict[str, Array]) -> None:
     """Write columns as in docs/formats.md: `t`, then `name_1` … `name_n` of each channel."""
-    import pyarrow as pa
-    from pyarrow.csv import WriteOptions, write_csv
-
     flat: dict[str, Array] = {}
     for name, values in columns.items():
         rounded = np.round(values, DECIMALS.get(name, 5)) + 0.0
         flat |= {name: rounded} if values.ndim == 1 else {f"{name}_{j + 1}": x for j, x in enumerate(rounded.T)}
     with path.open("wb") as file:
-        file.write((",".join(flat) + "\n").encode())  # pyarrow would quote the names
-        write_csv(pa.table(flat), file, WriteOptions(include_header=False))
+        write_numbers(file, flat)
 
 
-Make = Callable[[Sequence[Any], Path, Path, float, float], None]
-"""Makes cases: recipes, folder of the cases, folder of the labels, seconds of training and of held-out motion."""
-
-
-def parse_words(description: str) -> argparse.Namespace:
-    """Options that `gap bench` gives to a maker of cases."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--cases", type=int, default=150)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--labels", type=Path, required=True)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--effects", default="")
-    parser.add_argument("--train-s", type=float, default=TRAIN_S)
-    parser.add_argument("--heldout-s", type=float, default=HELDOUT_S)
-    return parser.parse_args()
-
-
-def make_all(make: Make, wanted: Sequence[Any], given: argparse.Namespace) -> None:
+def make_cases(
+    out: str, seed: int, cases: int, workers: int, lengths: Sequence[float], effects: str = "", positions: bool = False
+) -> None:
+    """Make all cases of a check in folders below `out`, in parallel."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    size = max(1, min(12, -(-len(wanted) // given.workers)))  # simulated together in one process
-    with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
-        jobs = [
-            pool.submit(make, wanted[first : first + size], given.out, given.labels, given.train_s, given.heldout_s)
-            for first in range(0, len(wanted), size)
-        ]
-        for job in jobs:
-            job.result()
-
-
-def main() -> None:
-    given = parse_words(str(__doc__))
-    low, _, high = given.effects.partition("-")
-    make_all(make_cases, recipes(given.seed, given.cases, (int(low), int(high)) if high else None), given)
-    (given.labels / "withhold.txt").write_text("\n".join(draw_withheld(given.labels)), encoding="utf-8")
+    low, _, high = effects.partition("-")
+    wanted = recipes(seed, cases, (int(low), int(high)) if high else None)
+    labels, train_s, heldout_s = Path(out) / "labels", *lengths
+    labels.mkdir(parents=True, exist_ok=True)
+    make = partial(make_case, out=Path(out) / "cases", labels=labels, train_s=train_s, heldout_s=heldout_s)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        list(pool.map(make, servo_recipes(seed, cases) if positions else wanted))
+    withheld = draw_withheld(labels, 1)[::3] if positions else draw_withheld(labels)
+    (labels / "withhold.txt").write_text("\n".join(withheld), encoding="utf-8")
 
 
 def draw_withheld(labels: Path, each: int = 2) -> list[str]:
@@ -231,4 +309,4 @@ def draw_withheld(labels: Path, each: int = 2) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    make_cases(**json.loads(sys.argv[1]))

@@ -47,9 +47,8 @@ class Judgement:
     """True effects among the causes, at any position."""
     blamed: tuple[str, ...]
     """Confident causes that this arm does not have (small true imperfections listed last are excused)."""
-    joints_right: int = 0
-    joints_wrong: int = 0
-    joints_missed: int = 0
+    joints: tuple[int, int, int] = (0, 0, 0)
+    """Numbers of joints that are right, wrong and missed."""
     errors: tuple[ParameterError, ...] = ()
     shrink: float = float("nan")
     """Claimed relative decrease of the held-out gap at the joint concerned."""
@@ -72,7 +71,6 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
     leading = [c for c in causes if c["effect"] in names or c["effect"] not in implied] or causes
     first = leading[0] if leading else None
     offered = {first["effect"], *(first["confounded_with"] or ())} if first else set()
-    right, wrong, missed = _joints(causes, truths)
     shrink, shrink_true = _shrinks(answer, label)
     shown = _shown(label, truths)
     return Judgement(
@@ -88,9 +86,7 @@ def judge(answer: Json, label: Json, withheld: str = "") -> Judgement:
         tellable=bool(truths) and not any(t["undecided"] for t in truths),
         found=tuple(t["effect"] for t in truths if t["effect"] in {c["effect"] for c in causes}),
         blamed=_blamed(causes, label, withheld),
-        joints_right=right,
-        joints_wrong=wrong,
-        joints_missed=missed,
+        joints=_joints(causes, truths),
         errors=tuple(error for t in truths for error in _parameter_errors(causes, t)),
         shrink=shrink,
         shrink_true=shrink_true,

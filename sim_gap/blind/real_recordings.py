@@ -83,15 +83,11 @@ def recordings_of(folder: Path, case: Json) -> tuple[list[Recording], list[Recor
     """Training and held-out recordings of a case, and their labels."""
     train, heldout = ([load_recording(folder / name) for name in case.get(key, ())] for key in ("train", "heldout"))
     if "share" in case:
-        train, heldout = _parts(train, case["share"])
+        cuts = [int(case["share"] * len(each.t)) for each in train]
+        heldout = [slice_rows(each, slice(cut, None)) for each, cut in zip(train, cuts, strict=True)]
+        train = [slice_rows(each, slice(0, cut)) for each, cut in zip(train, cuts, strict=True)]
     names = [*case["train"], *(case["heldout"] if "heldout" in case else case["train"])]
     return train, heldout, [Path(name).name.split(".")[0] for name in names]
-
-
-def _parts(recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
-    cuts = [int(share * len(each.t)) for each in recordings]
-    first = [slice_rows(each, slice(0, cut)) for each, cut in zip(recordings, cuts, strict=True)]
-    return first, [slice_rows(each, slice(cut, None)) for each, cut in zip(recordings, cuts, strict=True)]
 
 
 def score_real(answers: Mapping[str, Mapping[str, Any]], cases: Sequence[Json]) -> Json:

@@ -7,20 +7,43 @@ from typing import Any
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.blind.arms import BenchArm, compile_arm, controlled_inertia, inverse
+from sim_gap.blind.arms import BenchArm, compile_arm, controlled_inertia, inverse, mass_matrices
 from sim_gap.blind.motion import RATE, derivatives
 
+SENSOR_LEAST, MOTOR_LEAST = 0.12, 0.3
+"""Least RMS that an effect causes in its channel [N·m], for every torque."""
+SHARES = (0.06, 0.14)
+"""RMS that an effect causes, as a share of the joint's RMS torque: several times that of small background errors."""
 THIN = 25
 """Magnitudes are judged on every 25th row of the trajectory."""
+THINNED_S = THIN / RATE
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
+class ServoLaw:
+    """u = stiffness·e − damping·q̇ + integral·∫e of a command that is late, slew-limited and has a dead zone; (n,) each.
+
+    SI units; the motor's torque limit and back-EMF belong to the arm.
+    """
+
+    stiffness: Array
+    damping: Array
+    integral: Array
+    delay: Array
+    slew: Array
+    dead_zone: Array
+    """Half width [rad]."""
+
+
+@dataclass(eq=False)
 class Scene:
     """A nominal arm and its commanded training motion."""
 
     arm: BenchArm
     command: Array
     """(K, n) [rad] at `motion.RATE`."""
+    law: ServoLaw | None = None
+    """Of an arm with position servos."""
 
     @property
     def seconds(self) -> float:
@@ -63,6 +86,12 @@ class Scene:
         return controlled_inertia(self.model, self.command[:: len(self.command) // 16 + 1])
 
     @cached_property
+    def link_inertia(self) -> Array:
+        """Inertia of each joint in the middle of all ranges without its rotor [kg·m²], (n,)."""
+        middle = 0.5 * (self.arm.lower + self.arm.upper)[None]
+        return np.asarray(np.diag(mass_matrices(self.model, middle)[0]) - self.arm.armature)
+
+    @cached_property
     def slope(self) -> Array:
         """∂τ_i/∂q_j along the motion (K', n, n) [N·m/rad]: gravity, Coriolis and inertia together."""
         q, v, a = self.motion
@@ -81,6 +110,18 @@ class Scene:
         """Change of the gravity torque with another arm in place of this one, (K', n)."""
         still = np.zeros_like(self.motion[0])
         return inverse(compile_arm(other), self.motion[0], still, still) - self.gravity
+
+    def sensor_level(self, random: np.random.Generator) -> Array:
+        """RMS that an effect should cause in `tau` − model, (n,) [N·m]."""
+        return np.maximum(SENSOR_LEAST, random.uniform(*SHARES) * rms(self.torque))
+
+    def motor_level(self, random: np.random.Generator) -> Array:
+        """RMS that an effect should cause in `tau_motor` − model, (n,) [N·m]."""
+        return np.maximum(MOTOR_LEAST, random.uniform(*SHARES) * rms(self.torque + self.rotor_torque))
+
+    def turn_felt(self, error: Array) -> Array:
+        """RMS torque at joint i (first axis) caused by an angle error (K', n) of joint j, (n, n) [N·m]."""
+        return np.stack([rms(self.slope[:, :, j] * error[:, j, None]) for j in range(self.arm.n)], axis=1)
 
     def feed_forward(self, command: Array) -> Array:
         """Nominal torque along a trajectory at `motion.RATE`, rotors included (K, n)."""

@@ -9,30 +9,64 @@ import numpy as np
 
 from sim_gap.blind.judge import Judgement, judge
 
-SCHEMA = "armlink.blind/1"
+SCHEMA, POSITIONS_SCHEMA = "armlink.blind/1", "armlink.blind-positions/1"
+NAMED_SHARE, FALSE_SHARE = 0.85, 0.03
+"""Of positions alone: required share of first causes that are right or named as confounded, and of answers with a false
+cause above 0.8."""
+Answers = Mapping[str, Mapping[str, Any]]
+"""Answers or labels by name."""
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
 WITHHELD = "--without--"
 """Separator of case and effect removed from the library, in an answer's name."""
 
 
-def score(answers: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def score(answers: Answers, labels: Answers) -> dict[str, Any]:
     """Score all answers (by name, see `answer_name`) against the labels (by case)."""
-    judged = []
-    for name, answer in answers.items():
-        case, _, withheld = name.partition(WITHHELD)
-        if not labels[case].get("clear", True):
-            continue  # no arm shows its effects and stays under control
-        judged.append(judge(answer, labels[case], withheld))
+    judged = judge_all(answers, labels)
     whole = [j for j in judged if not j.withheld]
-    without = [j for j in judged if j.withheld]
-    parts = {"label_withheld": label_withheld(whole), "effect_withheld": effect_withheld(without)}
+    parts = {
+        "label_withheld": label_withheld(whole),
+        "effect_withheld": effect_withheld([j for j in judged if j.withheld]),
+    }
+    return {"schema": SCHEMA, **parts, "meets": meets_bounds(parts), **_tables(judged, calibrated=whole)}
+
+
+def score_positions(answers: Answers, labels: Answers) -> dict[str, Any]:
+    """Score the answers of positions alone, as `score` does; shares over no case are None."""
+    judged = judge_all(answers, labels)
+    whole = [j for j in judged if not j.withheld]
+    told = [j for j in whole if j.tellable and j.kind == "single"]
+    named, false = share([j.named for j in told]), share([bool(j.blamed) for j in judged])
+    met = {
+        "named_where_tellable": named is not None and named >= NAMED_SHARE,
+        "false_confident": false is not None and false <= FALSE_SHARE,
+    }
     return {
-        "schema": SCHEMA,
-        **parts,
-        "meets": meets_bounds(parts),
+        "schema": POSITIONS_SCHEMA,
+        "answers": len(judged),
+        "tellable": len(told),
+        "named_where_tellable": named,
+        "false_confident": false,
+        "label_withheld": label_withheld(whole),
+        "meets": met,
+        **_tables(judged, calibrated=judged),
+    }
+
+
+def judge_all(answers: Answers, labels: Answers) -> list[Judgement]:
+    """Judgements of the answers whose case counts: some arm shows its effects and stays under control."""
+    named = [(*name.partition(WITHHELD)[::2], answer) for name, answer in answers.items()]
+    return [
+        judge(answer, labels[case], withheld) for case, withheld, answer in named if labels[case].get("clear", True)
+    ]
+
+
+def _tables(judged: Sequence[Judgement], calibrated: Sequence[Judgement]) -> dict[str, Any]:
+    whole = [j for j in judged if not j.withheld]
+    return {
         "confusion": confusion(whole),
         "by_effect": by_effect(whole),
-        "calibration": calibration(whole),
+        "calibration": calibration(calibrated),
         "cases": [case_row(j) for j in judged],
     }
 
@@ -45,11 +79,12 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
     """Shares over the cases with hidden labels: with one effect, with none, with two."""
     some = [j for j in judged if j.kind != "none"]
     single, two, none = ([j for j in judged if j.kind == kind] for kind in ("single", "two", "none"))
-    errors = np.array([e.relative for j in some for e in j.errors])
+    errors = [e.relative for j in some for e in j.errors]
     inside = [e.inside for j in some for e in j.errors if e.inside is not None]
-    right, wrong, missed = (sum(getattr(j, f"joints_{k}") for j in some) for k in ("right", "wrong", "missed"))
+    right, wrong, missed = (sum(j.joints[k] for j in some) for k in range(3))
     precision, recall = _ratio(right, right + wrong), _ratio(right, right + missed)
-    ratios = np.array([j.shrink / j.shrink_true for j in single if np.isfinite(j.shrink) and j.shrink_true > 0])
+    f1 = 2 * precision * recall / (precision + recall) if precision and recall else None
+    ratios = [j.shrink / j.shrink_true for j in single if np.isfinite(j.shrink) and j.shrink_true > 0]
     return {
         "cases": len(judged),
         "tellable": sum(j.tellable for j in single),
@@ -57,19 +92,19 @@ def label_withheld(judged: Sequence[Judgement]) -> dict[str, Any]:
         "first_right": share([j.first_right for j in single]),
         "first_or_confounded": share([j.named for j in single]),
         "extra_confident": share([bool(j.blamed) for j in some]),
-        "joints": {"precision": precision, "recall": recall, "f1": _f1(precision, recall)},
+        "joints": {"precision": precision, "recall": recall, "f1": f1},
         "no_effect": {"cases": len(none), "false_alarms": share([j.verdict != "no_gap" for j in none])},
         "several": score_several([j for j in judged if j.kind == "several"]),
         "two": {"cases": len(two), "both_found": share([set(j.found) == set(j.truth) for j in two])},
         "parameters": {
             "count": len(errors),
-            "median_error": float(np.median(errors)) if len(errors) else None,
-            "within_10_percent": share((errors <= 0.1).tolist()),
-            "inside_ci95": share([bool(x) for x in inside]),
+            "median_error": _median(errors),
+            "within_10_percent": share([error <= 0.1 for error in errors]),
+            "inside_ci95": share(inside),
         },
         "shrink": {
-            "median_ratio": float(np.median(ratios)) if len(ratios) else None,
-            "at_least_0.95": share((ratios >= 0.95).tolist()),
+            "median_ratio": _median(ratios),
+            "at_least_0.95": share([ratio >= 0.95 for ratio in ratios]),
         },
         "verdicts": dict(Counter(j.verdict for j in judged)),
     }
@@ -113,54 +148,39 @@ def by_effect(judged: Sequence[Judgement]) -> dict[str, dict[str, Any]]:
     for j in judged:
         if j.kind == "single":
             groups[j.truth[0]].append(j)
-    out = {}
-    for effect in sorted(groups):
-        errors = [e.relative for j in groups[effect] for e in j.errors]
-        out[effect] = {
-            "cases": len(groups[effect]),
-            "first_right": sum(j.first_right for j in groups[effect]),
-            "named": sum(j.named for j in groups[effect]),
-            "median_error": float(np.median(errors)) if errors else None,
+    return {
+        effect: {
+            "cases": len(here),
+            "first_right": sum(j.first_right for j in here),
+            "named": sum(j.named for j in here),
+            "median_error": _median([e.relative for j in here for e in j.errors]),
         }
-    return out
+        for effect, here in sorted(groups.items())
+    }
 
 
 def calibration(judged: Sequence[Judgement]) -> list[dict[str, Any]]:
     """First causes by confidence: number, mean confidence, and the share that was right."""
-    named = [j for j in judged if j.first]
     out = []
     for low, high in pairwise(BINS):
-        here = [j for j in named if low <= j.confidence < high or (high == 1.0 and j.confidence == 1.0)]
+        here = [j for j in judged if j.first and (low <= j.confidence < high or high == 1.0 == j.confidence)]
         if here:
-            out.append(
-                {
-                    "from": low,
-                    "to": high,
-                    "count": len(here),
-                    "mean_confidence": float(np.mean([j.confidence for j in here])),
-                    "right": share([j.first_right for j in here]),
-                }
-            )
+            mean, right = float(np.mean([j.confidence for j in here])), share([j.first_right for j in here])
+            out.append({"from": low, "to": high, "count": len(here), "mean_confidence": mean, "right": right})
     return out
 
 
 def case_row(j: Judgement) -> dict[str, Any]:
     """One case as a row of the table of all cases."""
+    same = ("case", "kind", "tellable", "verdict", "confidence", "first_right", "named")
     return {
-        "case": j.case,
-        "kind": j.kind,
+        **{name: getattr(j, name) for name in same},
         "withheld": j.withheld or None,
-        "truth": list(j.truth),
-        "tellable": j.tellable,
-        "verdict": j.verdict,
         "first": j.first or None,
-        "confidence": j.confidence,
-        "first_right": j.first_right,
-        "named": j.named,
+        "truth": list(j.truth),
         "blamed": list(j.blamed),
         "errors": {f"{e.effect}.{e.name}": e.relative for e in j.errors},
-        "shrink": _finite(j.shrink),
-        "shrink_true": _finite(j.shrink_true),
+        **{name: x if np.isfinite(x) else None for name, x in (("shrink", j.shrink), ("shrink_true", j.shrink_true))},
     }
 
 
@@ -189,13 +209,9 @@ def share(flags: Sequence[bool]) -> float | None:
     return sum(flags) / len(flags) if flags else None
 
 
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if len(values) else None
+
+
 def _ratio(part: int, whole: int) -> float | None:
     return part / whole if whole else None
-
-
-def _f1(precision: float | None, recall: float | None) -> float | None:
-    return 2 * precision * recall / (precision + recall) if precision and recall else None
-
-
-def _finite(x: float) -> float | None:
-    return x if np.isfinite(x) else None

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armlink.errors import BadInput
-from armlink.recording.corrections import Corrections, parse_corrections
+from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections, parse_corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.column_order import find_changed_order
 from sim_gap.checks.finding import RecordingFinding
@@ -22,14 +22,23 @@ from sim_gap.checks.rigid_fit import ChannelMotion, fit_beside_slow_torques, fit
 from sim_gap.checks.sampling import drop_held, drop_repeats, even_times, find_dropped, find_time_unit
 from sim_gap.checks.small_zero import find_small_zero
 from sim_gap.checks.torque_delay import find_delay, find_short_delay
-from sim_gap.checks.torque_source import find_gain_command, find_same, find_source, find_unsigned
+from sim_gap.checks.torque_source import (
+    find_gain_command,
+    find_same,
+    find_source,
+    find_unsigned,
+    find_without_gravity,
+    with_gravity,
+)
 from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import TRIM_S, PreparedSignals, prepare
+from sim_gap.residuals.preprocess import CHANNELS, TRIM_S, PreparedSignals, prepare
 
 LEAST_WAY = 1.5
 """Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
+SIGNAL = 2.0
+"""Standard deviation of a reading over that of its noise from which it holds a signal."""
 LEAST_RANGE = 0.1
 """Range from which a joint moves [rad]."""
 WAY_STEP_S = 0.1
@@ -72,20 +81,27 @@ def check_recordings(
         labels: their names for messages.
         stated: corrections that the user stated, already made; those are not looked into again.
 
-    Returns the corrected recordings and the findings of all. Raises BadInput for a finding that is not certain.
+    Returns the corrected recordings and the findings of all. What is not certain is left as recorded and among the
+    findings. Raises BadInput for times, counts and angles that no arm can have.
     """
-    checked, found = [], []
+    checked, found = list[Recording](), list[RecordingFinding]()
     for recording, label in zip(recordings, labels, strict=True):
         corrected, findings = check_recording(arm, recording, label, stated)
         checked.append(corrected)
-        found += [finding for finding in findings if finding not in found]
+        asked = {(each.channel, each.joint, each.option) for each in found if not each.corrected}
+        found += [
+            finding
+            for finding in findings
+            if finding not in found
+            and (finding.corrected or (finding.channel, finding.joint, finding.option) not in asked)
+        ]
     return checked, found
 
 
 def check_recording(
     arm: RigidArm, recording: Recording, label: str, stated: Corrections
 ) -> tuple[Recording, list[RecordingFinding]]:
-    """Check and correct one recording. Raises BadInput for a finding that is not certain."""
+    """Check and correct one recording, as `check_recordings`."""
     for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, wrapped = unwrap(recording)
@@ -96,28 +112,34 @@ def check_recording(
     recording, jitter = even_times(recording, stated)
     same = find_same(recording, stated)
     for finding in same:
-        recording = _corrected(recording, finding, label)
+        recording = _corrected(recording, finding, label, arm)
     if same and (law := find_gain_command(recording, stated)):
         same, recording = [*same, *law], replace(recording, torque_command=None)
+    if stated.without_gravity:
+        recording = with_gravity(arm, recording, tuple(CHANNELS))
     found = [*wrapped, *repeated, *held, *jitter, *([] if repeated else find_dropped(recording)), *same]
     s = _prepared(recording, arm, label, stated)
     for channel in s.channels:
         view = _view(arm, s, channel, recording, stated)
-        for look in (_unsigned, _mapping, _source):
+        if view.silent:
+            continue
+        for look in (_gravity, _unsigned, _mapping, _source):
             findings = look(view)
             found += findings
-            for finding in findings:
-                if not finding.corrected:
-                    raise BadInput(f"{label}: {finding.sentence()}")
-                recording = _corrected(recording, finding, label)
-            if not findings:
+            certain = [finding for finding in findings if finding.corrected]
+            if len(certain) < len(findings):  # what looks on would see the same fault again
+                break
+            for finding in certain:
+                recording = _corrected(recording, finding, label, arm)
+            if not certain:
                 continue
             s = _prepared(recording, arm, label, stated)
             if channel not in s.channels:  # taken for another one
                 break
             view = _view(arm, s, channel, recording, stated)
-    for finding in find_beyond_range(arm, recording, stated):
-        raise BadInput(f"{label}: {finding.sentence()}")
+    beyond = find_beyond_range(arm, recording, stated)
+    if beyond and all(finding.corrected for finding in found):  # else it is what the doubt is about
+        raise BadInput(f"{label}: {beyond[0].sentence()}")
     recording, velocity = sound_velocity(recording, stated)
     for finding in find_seam(recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
@@ -145,15 +167,25 @@ class _ChannelView:
         """Rows per second."""
         return float((len(self.motion.q) - 1) / max(self.s.t[-1] - 2.0 * TRIM_S, 1e-9))
 
+    @property
+    def silent(self) -> bool:
+        """Whether the channel holds noise alone, as of an arm that swings with its drives off: nothing has a place."""
+        return bool((self.motion.reading.std(0) < SIGNAL * self.s.noise[self.motion.channel]).all())
+
     def in_time(self, delay: RecordingFinding) -> ChannelMotion:
         """The motion with a delay of its channel taken off."""
-        corrected = _corrected(self.recording, delay, self.s.label)
+        corrected = _corrected(self.recording, delay, self.s.label, self.arm)
         return motion_of(_prepared(corrected, self.arm, self.s.label, self.stated), self.motion.channel)
 
 
 def _view(arm: RigidArm, s: PreparedSignals, channel: str, recording: Recording, stated: Corrections) -> _ChannelView:
     motion = motion_of(s, channel)
     return _ChannelView(arm, find_mounting(arm, motion), s, motion, recording, stated)
+
+
+def _gravity(view: _ChannelView) -> list[RecordingFinding]:
+    """A channel from which gravity was subtracted."""
+    return [] if goes_one_way(view.recording) else find_without_gravity(view.arm, view.motion, view.stated)
 
 
 def _unsigned(view: _ChannelView) -> list[RecordingFinding]:
@@ -197,10 +229,12 @@ def _source(view: _ChannelView) -> list[RecordingFinding]:
     return [*scale, *find_source(fit, view.s, motion, stated)]
 
 
-def _corrected(recording: Recording, finding: RecordingFinding, label: str) -> Recording:
+def _corrected(recording: Recording, finding: RecordingFinding, label: str, arm: RigidArm) -> Recording:
     """The recording after the correction that a finding's option makes."""
     name, _, value = finding.option.partition(" ")
     keys = {"--sign": "sign", "--units": "units", "--zero": "zero", "--clock": "clock", "--map": "columns"}
+    if value == WITHOUT_GRAVITY:
+        return with_gravity(arm, recording, [finding.channel])
     if name == "--effort-is":
         return parse_corrections(effort=value).apply(recording, label)
     made = parse_corrections(**{keys[name]: [value]})  # type: ignore[arg-type]

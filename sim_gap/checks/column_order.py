@@ -23,9 +23,9 @@ ROUGHLY, LIKELY = 200, 6
 def likely_orders(arm: RigidArm, motion: ChannelMotion) -> list[tuple[tuple[int, ...], bool, bool]]:
     """Orders that fit the model best, each with whether columns of the positions have it, and those of the torques.
 
-    None for an arm of many joints.
+    None for an arm of many joints, or of one.
     """
-    if arm.n > MOST:
+    if not 1 < arm.n <= MOST:
         return []
     few = rows_of(motion, slice(None, None, max(1, len(motion.q) // 50)))
     orders = list(permutations(range(arm.n)))[1:]

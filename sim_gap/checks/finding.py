@@ -22,14 +22,15 @@ class RecordingFinding:
     option: str
     """Option of `armlink gap diagnose` that makes, or prevents, the correction."""
     corrected: bool
-    """Whether it was corrected; where it was not, there is no diagnosis."""
+    """Whether it was corrected; where it was not, the recording is diagnosed as it stands."""
     fall: float = 0.0
     """Fall of the logarithm of what the model leaves unexplained, summed over the joints."""
 
     def sentence(self) -> str:
         where = f"{self.channel} of {'all joints' if self.joint == 'all' else self.joint}"
-        done = "corrected" if self.corrected else "not corrected"
-        return f"{where}: {self.evidence} ({self.finding}, {done}: {self.option})"
+        if self.corrected:
+            return f"{where}: {self.evidence} ({self.finding}, corrected: {self.option})"
+        return f"{where}: {self.evidence} ({self.finding}; diagnosed as recorded; otherwise: {self.option})"
 
     def to_json(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "fall"}

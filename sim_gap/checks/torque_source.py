@@ -1,20 +1,24 @@
 """Sign of rectified readings, and source of a torque channel."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from armlink.recording.corrections import Corrections
+from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections
 from armlink.recording.recording import Recording
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.mapping import FITS
-from sim_gap.checks.rigid_fit import ChannelMotion, RigidFit, fit_model
+from sim_gap.checks.rigid_fit import MOVING_SHARE, TURNING, ChannelMotion, RigidFit, fit_model
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import PreparedSignals
+from sim_gap.residuals.preprocess import CHANNELS, PreparedSignals
 
 GEAR_FRICTION = 0.13
 """Friction over torque (root sum of squares over the joints that move) from which a channel is a motor's: link sensors
 of two real arms show 0.04 to 0.07, motors of four others 0.26 to 0.6."""
+CARRIED, NO_GRAVITY, UNEXPLAINED = 0.3, 0.1, 0.2
+"""Gravity over the reading (standard deviations) from which a joint carries some; gravity's part in the reading below
+which it lacks it; share of the reading's variance that model and friction may leave, or nothing follows from that."""
 LAWFUL, STEPS = 0.3, 50
 """Least share of the variance of a command's steps that a law of gains explains (half on OpenArm, where positions,
 velocities and targets are rounded on the bus); least number of such steps."""
@@ -54,6 +58,42 @@ def find_unsigned(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> 
             option = f"record signed torque, or --sign {motion.channel}_{j + 1}=1 if it is right"
             found.append(RecordingFinding("unsigned", motion.channel, arm.names[j], evidence, option, False))
     return found
+
+
+def find_without_gravity(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> list[RecordingFinding]:
+    """A channel without the model's gravity at every joint that carries any: subtracted before it was recorded.
+
+    One joint alone says nothing: a spring or a weight may balance it.
+    """
+    if stated.without_gravity or stated.states("units", f"{motion.channel}_1"):
+        return []
+    gravity = arm.torque(motion.q, 0.0 * motion.v, 0.0 * motion.a)
+    rest = arm.carried(motion.q, motion.v, motion.a) - gravity
+    weightless = 0
+    for j in range(arm.n):
+        moving = np.abs(motion.v[:, j]) > TURNING
+        if gravity[:, j].std() < CARRIED * motion.reading[:, j].std() or moving.mean() < MOVING_SHARE:
+            continue
+        columns = [gravity[:, j], rest[:, j], motion.direction[:, j], motion.v[:, j], motion.a[:, j]]
+        rows = np.stack([*columns, np.ones(len(moving))], axis=1)[moving]
+        reading = motion.reading[moving, j]
+        found = np.linalg.lstsq(rows, reading, rcond=None)[0]
+        part = abs(found[0]) * gravity[:, j].std()
+        if part > NO_GRAVITY * reading.std() or np.var(reading - rows @ found) > UNEXPLAINED * np.var(reading):
+            return []
+        weightless += 1
+    if weightless < 2:
+        return []
+    evidence = f"lacks the model's gravity at each of the {weightless} joints that carry any: it was subtracted"
+    return [RecordingFinding("effort_source", motion.channel, "all", evidence, f"--effort-is {WITHOUT_GRAVITY}", True)]
+
+
+def with_gravity(arm: RigidArm, recording: Recording, channels: Sequence[str]) -> Recording:
+    """The recording with the model's gravity added to these torque channels."""
+    still = np.zeros_like(recording.position)
+    gravity = arm.torque(recording.position, still, still)
+    made = {CHANNELS[channel]: getattr(recording, CHANNELS[channel]) for channel in channels}
+    return replace(recording, **{name: values + gravity for name, values in made.items() if values is not None})
 
 
 def find_same(recording: Recording, stated: Corrections) -> list[RecordingFinding]:

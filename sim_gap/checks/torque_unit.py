@@ -7,7 +7,14 @@ from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.mounting import find_load
-from sim_gap.checks.rigid_fit import STRONG_CORRELATION, ChannelMotion, RigidFit, fit_rigid
+from sim_gap.checks.rigid_fit import (
+    MOVING_SHARE,
+    STRONG_CORRELATION,
+    TURNING,
+    ChannelMotion,
+    RigidFit,
+    fit_rigid,
+)
 from sim_gap.model.rigid_body import RigidArm
 
 SCALE = 0.42, 2.4
@@ -98,11 +105,14 @@ def _follows(fit: RigidFit) -> NDArray[np.bool_]:
 def find_outgrown(
     arm: RigidArm, mounted: RigidArm, motion: ChannelMotion, stated: Corrections
 ) -> list[RecordingFinding]:
-    """Joints with friction alone that read more than any joint between them and the base does: in a smaller unit."""
+    """Joints with friction alone that read more than any joint between them and the base that moves, too."""
     spread, model = motion.reading.std(0), mounted.carried(motion.q, motion.v, motion.a).std(0)
+    turns = np.mean(np.abs(motion.v) > TURNING, axis=0) > MOVING_SHARE
     found = []
     for j in range(1, arm.n):
-        column, largest = f"{motion.channel}_{j + 1}", float(max(spread[:j].max(), model.max()))
+        if not turns[:j].any():  # what they read at rest says nothing of their unit
+            continue
+        column, largest = f"{motion.channel}_{j + 1}", float(max(spread[:j][turns[:j]].max(), model.max()))
         if model[j] < ALONE * spread[j] and spread[j] > OUTGROWN * largest and not stated.states("units", column):
             evidence = (
                 f"varies by {spread[j]:.3g} N·m, of which the model's torque is {model[j] / spread[j]:.0%}; no joint "

@@ -32,10 +32,12 @@ def demo(
 
     Example: armlink demo --arm sarcos --seed 1 --out armlink-demo
     """
-    from armlink.commands.plain_console import PlainConsole
     from armlink.errors import BadInput
+    from armlink.extras import require_extra
+
+    require_extra("armlink demo", "reports")
     from sim_gap.demo.run import run_demo
 
     if target is not None and arm is not None and target != arm:
         raise BadInput(f"demo: two arms, {target} and --arm {arm}: give one")
-    run_demo(target or arm or "sarcos", seed=seed, realism=realism, out=out, json_path=json, console=PlainConsole())
+    run_demo(target or arm or "sarcos", seed=seed, realism=realism, out=out, json_path=json)

@@ -81,16 +81,8 @@ def bench(
         if real is not None:
             result = run_real(real, out or Path(scratch), known or KNOWN, progress)
         else:
-            result = run_bench(
-                diagnose_files,
-                out or Path(scratch),
-                seed,
-                cases,
-                workers,
-                progress=progress,
-                effects=effects,
-                positions=positions,
-            )
+            folder = out or Path(scratch)
+            result = run_bench(diagnose_files, folder, seed, cases, workers, None, progress, effects, positions)
     shown = show_real if real is not None else show_positions if positions else show
     shown(result, results(json))
     write_json(json, result)

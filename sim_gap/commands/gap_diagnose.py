@@ -107,6 +107,7 @@ def diagnose(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
+    from armlink.extras import require_extra
     from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
@@ -118,6 +119,10 @@ def diagnose(
     for target in (None if str(json) == "-" else json, report, out_model, out_samples, out_actuators):
         if target is not None and not target.resolve().parent.is_dir():
             raise BadInput(f"{target}: its folder does not exist: create it first")
+    if report is not None:
+        require_extra("--report", "reports")
+    if out_samples is not None and out_samples.suffix == ".parquet":
+        require_extra("--out-samples", "parquet")
     stated = parse_corrections(
         columns=columns or (),
         sign=sign or (),
@@ -170,11 +175,14 @@ def diagnose(
 
 
 def _suggest(answer: "Diagnosis", sim: str, json: Path | None, out_model: Path | None) -> None:
-    """The next command after an ambiguous or explained gap."""
+    """The next command after an ambiguous or explained gap, or with what settles a doubt about the recordings."""
     from armlink.arm_file import bundled_arms
     from armlink.commands.plain_console import PlainConsole, command_line, suggest
 
-    if answer.verdict == "ambiguous":
+    if answer.doubts:
+        options = dict.fromkeys(finding.option for finding in answer.doubts)
+        PlainConsole().print(f"next: the same command with {', or '.join(options)}")
+    elif answer.verdict == "ambiguous":
         arm = sim if sim in bundled_arms() or sim.endswith((".yaml", ".yml")) else "ARM.yaml"
         kept = json is not None and str(json) != "-"
         plan = command_line("gap", "plan", arm, answer=json if kept else "gap.json", out="motion.csv")

@@ -30,11 +30,15 @@ def diagnose_fleet(
 
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
+    from armlink.extras import require_extra
     from sim_gap.fleet import Answers, cluster, diagnose_fleet, find_cases, open_to_all
     from sim_gap.fleet import table as table_of
     from sim_gap.trends import fleet_outliers, fleet_trends
     from sim_gap.trends import rows as rows_of
 
+    require_extra("diagnose-fleet", "cluster")
+    if table is not None:
+        require_extra("--table", "parquet")
     cases = find_cases(folder, sim)
     answers = Answers(out or folder / "answers.jsonl")
     left = [case for case in cases if case.name not in answers.found]

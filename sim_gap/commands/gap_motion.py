@@ -66,12 +66,14 @@ def collect(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainColumn, PlainConsole, command_line, results, suggest
     from armlink.errors import BadInput
+    from armlink.extras import require_extra
     from armlink.loop.open import open_arm
     from sim_gap.experiment import collect as run
     from sim_gap.experiment import load_motion
 
     if out.suffix != ".mcap" or not out.resolve().parent.is_dir():
         raise BadInput(f"--out {out}: expected a .mcap file in an existing folder")
+    require_extra(f"--out {out}", "bags")
     arm_file = load_arm(arm)
     target = load_motion(motion, arm_file)
     console = PlainConsole()

@@ -1,263 +1,286 @@
-"""Runs the demo: sweep, calibrate, identify, verify, record, drift and recalibrate or float, diagnose, report.
-
-Every step is one call of the product; the demo's own are the hidden truth, the operator's hands and the order.
-"""
+"""Runs the demo: each step is a call of the product; the demo's own are the hidden truth, the operator, the order."""
 
 import shutil
-from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
-from multiprocessing import get_context
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from rich.console import Console
 
-from armlink.arm_file import MODEL_SUFFIXES, ArmFile, load_arm
-from armlink.commands.output import write_json
-from armlink.commands.plain_console import results
+from armlink import Recording, calibrate, diagnose, identify, load_arm, sweep, verify
+from armlink.arm_file import MODEL_SUFFIXES, ArmFile
 from armlink.errors import BadInput
-from armlink.recording.recording import Recording
-from calib.arm.kinematics import gcomp_arm, model_arm
+from armlink.extras import has_extra
+from armlink.link.types import Sample
+from calib.api import Calibrated
+from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_section
+from calib.commissioning.model_judgement import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
 from calib.creep.choice import sweep_motion
-from calib.creep.fit import fit_creep
-from calib.creep.plan import plan_creep
-from calib.creep.record import CreepCalibration, gravity_fit
+from calib.creep.record import CreepCalibration
 from calib.creep.run import contacts, run_creep
-from calib.creep.verify import verify_creeping
-from calib.fit.gravity_fit import identify_gravity
-from calib.fit.sensor_fit import fit_sensors
-from calib.install.apply import Apply, admit_sweeps
 from calib.install.journaled_write import install
 from calib.install.plausibility import admit
-from calib.plan.types import Sweep, SweepPlan
-from calib.records.records import CalibrationRecord
+from calib.motion.random_work import WorkMotion, work_targets
+from calib.observer.observer import Observer
+from calib.observer.recalibrator import Recalibrator
+from calib.observer.watch_loop import WatchHistory, watch
+from calib.plan.types import SweepPlan
+from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
+from calib.report import calibration
+from calib.report.figures import creep_figure, verify_figure
+from calib.report.page import ReportSection, paragraph, paragraphs
 from calib.sweep.dataset import SweepData
-from calib.sweep.run import run_sweep
-from calib.sweep.verify import Verification, run_verify
+from calib.sweep.verify import Verification
+from gcomp.arrays import Array
 from sim_bus.sim_section import with_realism
-from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.demo.bench import Bench, Sag, check_gravity, diagnose_recordings, mean_sag, record_pair, sag_poses
-from sim_gap.demo.drift import run_drift
-from sim_gap.demo.narrator import Narrator
-from sim_gap.demo.report import calibration_table, creep_table, verify_table, write_report
-from sim_gap.demo.result import DemoResult, summary
+from sim_bus.truth import Truth
+from sim_gap.demo.account import Account
+from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
+from sim_gap.model.load import compile_model
 from sim_gap.report.effect_text import sentence
+from sim_gap.report.page import sections as gap_sections
+from sim_gap.report.time_figures import watch_figure
 
 BY = "armlink demo"
+SUFFIX = ".mcap" if has_extra("bags") else ".csv.gz"
+"""Form of the recordings that are kept."""
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
 """Shorter and faster creeps than on a real arm, for two minutes: they cost a factor of two in precision."""
+DRIFT_GAIN, DRIFT_OFFSET, DRIFT_OFFSET_SHARE = 1.03, 0.3, 0.05
+"""Factor on the sensor's readings; offset added to them [N·m], at most this share of rated torque."""
+QUIET_SECONDS, WORK_SECONDS, WATCHED_SECONDS = 30.0, 300.0, 15.0
+"""Ordinary work before the drift begins, at most, and after a recalibration [s]."""
+WATCHED = "At every stop the observer compares gravity and sensors. Estimates: against the calibration then in force."
 
 
-def run_demo(
-    arm_name: str, *, seed: int, out: Path, json_path: Path | None, console: Console, realism: float | None = None
-) -> DemoResult:
+def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, realism: float | None = None) -> None:
     """Run it, write `report.html`, `summary.json` and the data into `out`; raises BadInput, Refused, BusFault."""
-    teller = Narrator(console, results(json_path))
+    account = Account(json_path)
     if Path(arm_name).suffix.lower() in MODEL_SUFFIXES:
-        arm_name = str(_from_model(Path(arm_name), out, teller))
+        made = new_arm(Path(arm_name), out / f"{Path(arm_name).stem}.yaml")
+        made.write()
+        arm_name, joints, assumed = str(made.out), len(made.draft.joints), len(made.draft.assumed)
+        account.say(f"{arm_name} made of the model: {joints} joints, {assumed} assumed values, each says so there")
     arm = load_arm(arm_name)
     if realism is not None:
         arm = with_realism(arm, realism, seed)
-    arm.require_link()
-    data_folder = _fresh(out)
-    teller.say(f"arm {arm.name}, hidden truth of seed {seed}, results in {out}")
-    creeping = sweep_motion(arm) == "creep"
-    arm = quick(arm) if creeping else arm
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as other_core:
-        bench = Bench.build(arm, gcomp_arm(arm), seed)
-        store = RecordStore(str(data_folder / "records.sqlite"))
-        with bench.link:
-            demo = _Demo(bench, store, seed, data_folder, teller, other_core)
-            result = demo.creep_demo() if creeping else demo.sensor_demo()
-        store.close()
-    if result.creep is not None:
-        teller.results.print(creep_table(result, result.creep))
-    write_report(result, out / "report.html")
-    content = summary(result)
-    write_json(out / "summary.json", content)
-    write_json(json_path, content)
-    teller.find(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}")
-    return result
+    refuse_impossible_model(arm)
+    bench, data = Bench(quick(arm), seed), _fresh(out)
+    account.say(f"arm {arm.name}, hidden truth of seed {seed}, results in {out}")
+    account.note(arm=arm.name, seed=seed, joints=arm.joint_names)
+    Demo(bench, seed, data, account).run()
+    account.write(out, f"simulated arm {arm.name}, hidden truth of seed {seed}")
 
 
 def quick(arm: ArmFile) -> ArmFile:
-    """The arm with the demo's creeps, where its file states none."""
+    """The arm with the demo's creeps, where it creeps and its file states none."""
     section = sweep_section(arm)
-    if "creep" in section.model_fields_set:
+    if sweep_motion(arm) != "creep" or "creep" in section.model_fields_set:
         return arm
     return arm.model_copy(update={"sweep": section.model_copy(update={"creep": QUICK})})
-
-
-@dataclass
-class _Demo:
-    """One demo as it goes on; its methods raise BadInput, Refused, BusFault."""
-
-    bench: Bench
-    store: RecordStore
-    seed: int
-    folder: Path
-    teller: Narrator
-    other_core: ProcessPoolExecutor
-
-    def sensor_demo(self) -> DemoResult:
-        """An arm with torque sensors, one of which drifts."""
-        link, arm, store, seed, teller = self.bench.link, self.bench.arm, self.store, self.seed, self.teller
-        self._enable(f"{link.n} nodes found on the bus, mapped and enabled; SYNC at {link.rate:g} Hz")
-        data = self._sweeps()
-        self._look_at_truth()
-        with teller.stage("fitting sensors and mass moments, all joints together"):
-            sensors = fit_sensors(arm, data)
-        gravity = identify_gravity(arm, data, sensors)
-        record = sensors.record(arm)
-        gravity_record = gravity.record(arm, record)
-        store.put(gravity_record, arm, by=BY, reason="sweeps")
-        apply = Apply(BY, accepted=arm.joint_names)
-        admitted = admit_sweeps(record, arm, store, data, sensors.goodness.findings, apply)
-        written = install(admitted, store, link, by=BY, reason="sweeps without and with reference mass", check=None)
-        teller.results.print(calibration_table(self.bench, sensors))
-        teller.say(f"record {record.id} written to {len(written)} controllers and read back")
-        check = self._verified(
-            "verifying at poses that the fit has not seen",
-            lambda progress: run_verify(link, arm, gravity_record, record, seed=seed, progress=progress),
-        )
-        gravity_check = check_gravity(self.bench, gravity.beta, record, seed)
-        teller.results.print(verify_table(link.names, check, gravity_check))
-        recordings, diagnosis = self._recorded(record, (40.0, 25.0), motor_only=False)
-        with teller.stage("ordinary work: a torque sensor will drift") as report:
-            drift = run_drift(self.bench, store, gravity_record, check, seed, report)
-        teller.find(drift.sentence(link.names))
-        with teller.stage("diagnosing the gap between the recording and the nominal simulation"):
-            try:
-                gap = diagnosis.result()
-            except BrokenProcessPool:
-                teller.say("the process that did it was killed: doing it again in this one")
-                gap = diagnose_recordings(arm.path, recordings)
-        teller.find(sentence(gap))
-        result = DemoResult(self.bench, seed, sensors, gravity_check, check, gap, link.stats, 0.0, 0.0, drift=drift)
-        return self._ended(result)
-
-    def creep_demo(self) -> DemoResult:
-        """An arm without torque sensors: creep sweeps, records in the host, and how far the arm sags with them."""
-        link, arm, store, seed, teller = self.bench.link, self.bench.arm, self.store, self.seed, self.teller
-        self._enable(f"{link.n} drives found on the bus, set up and enabled; {link.rate:g} cycles a second")
-        plan = plan_creep(arm, seed=seed)
-        for note in plan.notes:
-            teller.say(note)
-        passes = self._creeps(plan)
-        for data in passes:
-            for each in contacts(data):
-                teller.say(each.reason)
-        with teller.stage("fitting torque constants, friction, zeros and mass moments, all joints together"):
-            fit = fit_creep(arm, passes)
-        self._look_at_truth()
-        sensors, nominal, sag = CreepCalibration(fit), None, None
-        record = sensors.record(arm)
-        gravity = gravity_fit(fit).record(arm, record)
-        store.put(gravity, arm, by=BY, reason="creep sweeps")
-        if arm.model_path is not None:
-            with teller.stage("holding poses by a tenth of the gains and the nominal model"):
-                nominal = mean_sag(self.bench, plan, model_arm(arm).beta, np.zeros(link.n))
-        install(admit(record, arm, store), store, link, by=BY, reason="creep sweeps", check=None)
-        teller.say(f"record {record.id} kept by the host and in force: it corrects readings and commands")
-        _, diagnosis = self._recorded(record, (30.0, 20.0), motor_only=True)
-        check = self._verified(
-            "verifying at poses that the fit has not seen, creeping both ways",
-            lambda progress: verify_creeping(link, arm, gravity, record, poses=8, seed=seed, progress=progress),
-        )
-        gravity_check = check_gravity(self.bench, fit.beta, record, seed)
-        if nominal is not None:
-            with teller.stage("holding the same poses by a tenth of the gains and the records"):
-                zero = record.values("position_offset", 0.0)
-                sag = Sag(nominal, mean_sag(self.bench, plan, fit.beta, zero), len(sag_poses(plan)))
-        with teller.stage("diagnosing the gap between the recording and the nominal simulation"):
-            gap = diagnosis.result()
-        return self._ended(
-            DemoResult(self.bench, seed, sensors, gravity_check, check, gap, link.stats, 0.0, 0.0, sag=sag)
-        )
-
-    def _enable(self, said: str) -> None:
-        self.bench.link.start()
-        self.bench.link.enable()
-        self.teller.say(said)
-
-    def _look_at_truth(self) -> None:
-        """Keep the sensors as they are now: zeros move as the arm warms up."""
-        self.bench = replace(self.bench, truth=self.bench.simulated.true_sensors)
-
-    def _sweeps(self) -> tuple[SweepData, SweepData]:
-        """Both passes; between them the operator bolts the reference mass on, somewhere the fit is not told."""
-        bench = self.bench
-        with self.teller.stage("sweeping each joint, tip to base, the others pressed on their stops") as report:
-            bare = run_sweep(bench.link, bench.arm, self.folder / "unloaded", progress=report, seed=self.seed)
-        assert bare.plan is not None
-        mass, folder = bare.plan.reference_mass, self.folder / "loaded"
-        bench.simulated.attach_mass(mass)
-        with self.teller.stage(f"sweeping again with a reference mass of {mass:g} kg on the hand") as report:
-            loaded = run_sweep(bench.link, bench.arm, folder, reference_mass=mass, progress=report, seed=self.seed)
-        bench.simulated.detach_mass()
-        return bare, loaded
-
-    def _creeps(self, plan: SweepPlan) -> tuple[SweepData, ...]:
-        """Empty, loaded, empty: what changes as the drives warm up is then not taken for the mass."""
-        bench, first = self.bench, dict[int, Sweep]()
-        for sweep in plan.sweeps:
-            first.setdefault(sweep.joint, sweep)
-        short = plan.model_copy(update={"sweeps": tuple(first.values())})
-        mass, made = plan.reference_mass, []
-        for name, load, used in (("unloaded", 0.0, plan), ("loaded", mass, plan), ("unloaded-again", 0.0, short)):
-            if load:
-                bench.simulated.attach_mass(load)
-            else:
-                bench.simulated.detach_mass()
-            text = f"with {load:g} kg on the hand" if load else "without a load"
-            with self.teller.stage(f"creeping through each joint's range both ways, {text}") as report:
-                folder = self.folder / name
-                made.append(run_creep(bench.link, bench.arm, folder, reference_mass=load, progress=report, plan=used))
-        return tuple(made)
-
-    def _verified(self, headline: str, verify: Callable[[Callable[[int, int], None]], Verification]) -> Verification:
-        with self.teller.stage(headline) as report:
-            return verify(lambda k, n: report(k, n, None, f"pose {k}"))
-
-    def _recorded(
-        self, record: CalibrationRecord, seconds: tuple[float, float], *, motor_only: bool
-    ) -> tuple[tuple[Recording, Recording], Future[Diagnosis]]:
-        """Motion to learn from and to judge on, and its diagnosis on the other core."""
-        with self.teller.stage("recording motion for the gap diagnosis") as report:
-            both = record_pair(self.bench, record, self.folder, self.seed, seconds, report, motor_only=motor_only)
-        return both, self.other_core.submit(diagnose_recordings, self.bench.arm.path, both)
-
-    def _ended(self, result: DemoResult) -> DemoResult:
-        """The result with its times, once the drives are off."""
-        self.bench.link.disable()
-        return replace(result, wall_s=self.teller.elapsed, sim_s=self.bench.simulated.time)
-
-
-def _from_model(model: Path, out: Path, teller: Narrator) -> Path:
-    """The arm file made of a URDF or MJCF model, in the demo's folder; raises BadInput, Refused."""
-    path = out / f"{model.stem}.yaml"
-    teller.say(f"making an arm file of {model}")
-    made = new_arm(model, path)
-    made.write()
-    teller.say(f"{path}: {len(made.draft.joints)} joints, {len(made.draft.assumed)} assumed values, each says so there")
-    return path
 
 
 def _fresh(out: Path) -> Path:
     """The folder for the data, empty; an earlier demo's is replaced, anything else is not touched."""
     data = out / "data"
-    if data.exists():
-        if not (data / ".armlink-demo").exists():
-            raise BadInput(f"{data}: exists and is not an earlier demo's: choose another folder with --out")
-        shutil.rmtree(data)
+    if data.exists() and not (data / ".armlink-demo").exists():
+        raise BadInput(f"{data}: exists and is not an earlier demo's: choose another folder with --out")
     try:
+        shutil.rmtree(data, ignore_errors=True)
         data.mkdir(parents=True)
         (data / ".armlink-demo").touch()
     except OSError as error:
         raise BadInput(f"{out}: cannot be written: {error.strerror}") from None
     return data
+
+
+class Demo:
+    """One demo; its methods raise BadInput, Refused, BusFault."""
+
+    def __init__(self, bench: Bench, seed: int, folder: Path, account: Account) -> None:
+        self.bench, self.seed, self.folder, self.account = bench, seed, folder, account
+        self.store = RecordStore(str(folder / "records.sqlite"))
+
+    def run(self) -> None:
+        bench, link, arm, account = self.bench, self.bench.link, self.bench.arm, self.account
+        with link:
+            link.start()
+            link.enable()
+            account.say(f"{link.n} drives found on the bus, set up and enabled; {link.rate:g} cycles a second")
+            passes = self._passes()
+            truth = bench.simulated.true_sensors  # as they are now: zeros move as the arm warms up
+            account.say("fitting sensors and mass moments, all joints together", "bold")
+            sensors = calibrate(*passes, arm=arm)
+            gravity = identify(*passes, arm=arm, sensors=sensors)
+            record = sensors.record(arm)
+            model = gravity.record(arm, record)
+            self._tell_sensors(passes, sensors, record, truth)
+            self.store.put(model, arm, by=BY, reason="sweeps")
+            plan = passes[0].plan if bench.creeping and arm.model_path is not None else None
+            sags = {} if plan is None else self._sag(plan, "nominal", model_arm(arm).beta, np.zeros(link.n))
+            install(admit(record, arm, self.store), self.store, link, by=BY, reason="sweeps", check=None)
+            kept = "kept by the host" if bench.creeping else f"written to {link.n} controllers and read back"
+            account.say(f"record {record.id} {kept}")
+            if bench.creeping:
+                recordings, check = self._recordings(record, 30.0, 20.0), self._verified(model, record, 8)
+            else:
+                check, recordings = self._verified(model, record, 24), self._recordings(record, 40.0, 25.0)
+            if plan is not None:
+                sags |= self._sag(plan, "calibrated", gravity.beta, record.values("position_offset", 0.0))
+                account.note(sag={"poses": len(sag_poses(plan)), **sags})
+            self._tell_gravity(check, bench.gravity_errors(truth, gravity.beta, record, self.seed), sags)
+            if not bench.creeping:
+                self._drift(record, model, check)
+            account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
+            gap, bus = diagnose(compile_model(arm.path), *recordings), link.stats
+            link.disable()
+        self.store.close()
+        account.find(sentence(gap))
+        account.sections += gap_sections(gap)
+        account.summary["gap"] = gap.to_json()
+        account.note(bus={key: getattr(bus, key) for key in ("frames", "rate_hz", "load", "missed")})
+        account.note(wall_s=time.monotonic() - account.began, sim_s=bench.simulated.time)
+        traffic = f"{bus.frames:,} CAN frames in {bench.simulated.time:.0f} s of the arm's time at {bus.rate_hz:.0f} Hz"
+        account.find(f"{traffic}, {bus.load:.0%} bus load, {bus.missed} missed")
+
+    def _passes(self) -> list[SweepData]:
+        """Without, with and, of drives that warm up, again without the mass, which hangs where the fit is not told."""
+        bench, passes = self.bench, list[SweepData]()
+        steps = "sweeping each joint, tip to base, the others pressed on their stops"
+        motion = "creeping through each joint's range both ways" if bench.creeping else steps
+        for name in ("unloaded", "loaded", "unloaded-again")[: 3 if bench.creeping else 2]:
+            plan, folder = passes[0].plan if passes else None, self.folder / name
+            mass = plan.reference_mass if plan is not None and name == "loaded" else 0.0
+            if mass:
+                bench.simulated.attach_mass(mass)
+            load = f"with a reference mass of {mass:g} kg on the hand" if mass else "without a load"
+            with self.account.stage(f"{motion}, {load}") as screen:
+                if plan is None or mass:
+                    made = sweep(bench.link, folder, reference_mass=mass, seed=self.seed, progress=screen.update)
+                else:
+                    first = {each.joint: each for each in reversed(plan.sweeps)}.values()
+                    short = plan.model_copy(update={"sweeps": tuple(each for each in plan.sweeps if each in first)})
+                    made = run_creep(bench.link, bench.arm, folder, progress=screen.update, plan=short)
+            if mass:
+                bench.simulated.detach_mass()
+            notes = made.plan.notes if made.plan is not None and not passes else ()
+            for said in (*notes, *(each.reason for each in contacts(made))):
+                self.account.say(said)
+            passes.append(made)
+        return passes
+
+    def _sag(self, plan: SweepPlan, model: str, beta: Array, zero: Array) -> dict[str, Array]:
+        self.account.say(f"holding poses by a tenth of the gains and the {model} model", "bold")
+        return {model: self.bench.mean_sag(plan, beta, zero)}
+
+    def _verified(self, model: GravityRecord, record: CalibrationRecord, poses: int) -> Verification:
+        with self.account.stage("verifying at poses that the fit has not seen") as screen:
+            return verify(self.bench.link, model, record, poses=poses, seed=self.seed, progress=screen.count)
+
+    def _recordings(self, record: CalibrationRecord, *seconds: float) -> list[Recording]:
+        """Two different motions, to learn from and to judge on."""
+        made = []
+        with self.account.stage("recording motion for the gap diagnosis") as screen:
+            for number, name in enumerate(("train", "heldout")):
+                seed, path = 1000 * (self.seed + 1) + number, self.folder / f"{name}{SUFFIX}"
+                made.append(self.bench.record_motion(seconds[number], seed, record, path, screen.update))
+        return made
+
+    def _drift(self, record: CalibrationRecord, model: GravityRecord, check: Verification) -> None:
+        """Let the arm work, change one sensor, and watch until the observer has put it right or the time is over."""
+        bench, link, described, account = self.bench, self.bench.link, self.bench.described, self.account
+        section = bench.arm.require_link()
+        joint = drifting_joint(record, check, section.rated_torques)
+        name, offset = link.names[joint], min(DRIFT_OFFSET, DRIFT_OFFSET_SHARE * section.joints[joint].rated_torque)
+        limits = described.lower, described.upper, np.array([each.max_velocity for each in section.joints])
+        motion = WorkMotion.of_drives(with_integral=all(setup.gains is None for setup in link.setups))
+        targets = work_targets(link.position_sent, *limits, link.period, np.random.default_rng([self.seed, 8]), motion)
+        start, began, before = np.nan, np.inf, (0.0, 0.0)
+
+        def course(sample: Sample, history: WatchHistory) -> bool:
+            """Make the sensor drift when its time has come; whether the watch is over."""
+            nonlocal start, began, before
+            start = sample.t if np.isnan(start) else start
+            if began == np.inf and sample.t - start >= QUIET_SECONDS:
+                began = sample.t
+                bench.simulated.drift(joint, DRIFT_GAIN, offset)
+                before = bench.sensor_error(joint)
+            written = [t for t, outcome in history.recalibrations if outcome.applied]
+            state = "put right" if written else "the arm works" if began == np.inf else "the sensor has drifted"
+            screen.update(int(sample.t - start), int(WORK_SECONDS), WORK_SECONDS - sample.t + start, state)
+            return bool(written) and sample.t - written[-1] >= WATCHED_SECONDS
+
+        observer = Observer.of_records(described, record, model, section.rated_torques)
+        recalibrator = Recalibrator(bench.arm, link, self.store, "apply")
+        with account.stage("ordinary work: a torque sensor will drift") as screen:
+            history = watch(link, observer, targets, WORK_SECONDS, recalibrator, course)
+        times = [t - began for kind in ("alarm", "outliers") if (t := history.first(kind, name, began)) is not None]
+        noticed = min(times, default=None)
+        written = next((t - began for t, done in history.recalibrations if done.joint == name and done.applied), None)
+        after, ended = bench.sensor_error(joint), history.t[-1] if written is None else began + written
+        seen = "not noticed" if noticed is None else f"noticed after {noticed:.1f} s"
+        right = "not recalibrated" if written is None else f"recalibrated by itself after {written:.0f} s of work"
+        drifted = f"{name} drifted by {DRIFT_GAIN - 1:+.0%} gain and {offset:+.2f} N·m: {seen}, {right}"
+        account.find(f"{drifted}; error now {after[0]:+.2%} and {after[1]:+.3f} N·m")
+        truth = np.repeat([(1.0, 0.0), (1.0 + before[0], before[1]), (1.0 + after[0], after[1])], 2, axis=0).T
+        marks = [(began, f"drifts, {seen}"), *([] if written is None else [(ended, "recalibrated")])]
+        figure = watch_figure(history, joint, ([history.t[0], began, began, ended, ended, history.t[-1]], truth), marks)
+        account.sections.append(ReportSection("Drift and automatic recalibration", paragraph(WATCHED), [figure]))
+        summary: dict[str, object] = {"joint": name, "gain": DRIFT_GAIN, "offset": offset, "detected_after_s": noticed}
+        summary |= {"recalibrated": written is not None, "recalibrated_after_s": written}
+        account.note(drift=summary | {"gain_error_after": abs(after[0]), "offset_error_after": abs(after[1])})
+
+    def _tell_sensors(self, passes: list[SweepData], fit: Calibrated, record: CalibrationRecord, truth: Truth) -> None:
+        """Estimates beside the truth, which is opened only for this."""
+        account, true = self.account, {**vars(truth), "coulomb": self.bench.simulated.true_friction}
+        names: tuple[Any, ...] = ("gain", "offset", "position_offset" if self.bench.creeping else "position_gain")
+        account.note(sensors={name: {"true": true[name], **_estimate(fit, name)} for name in names}, drift=None)
+        account.note(not_identifiable={f"{joint}.{name}": why for (joint, name), why in fit.reasons.items()})
+        if isinstance(fit, CreepCalibration):
+            text = (
+                "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
+            )
+            parts = [ReportSection("Creep sweeps", paragraph(text) + paragraphs(fit.findings), [creep_figure(fit.fit)])]
+            friction = {name: _estimate(fit.fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
+            friction["coulomb"]["true"] = true["coulomb"]
+            account.note(friction=friction, disturbed=fit.findings, sag=None)
+            names += ("coulomb", "load", "viscous")
+        else:
+            text = f"The reference mass hung at ({', '.join(f'{x:.4f}' for x in truth.attachment)}) m of the last link."
+            parts = calibration.sections(calibration.Calibrated(self.bench.arm, passes, fit, record, None))
+        columns: dict[str, tuple[Array, Array]] = {}
+        for name in names:
+            columns[name.replace("_", " ")] = fit.value(name), fit.ci95(name)[:, 1] - fit.value(name)
+            if name in true:
+                columns["true " + name.replace("_", " ")] = true[name], 0 * true[name]
+        table = account.table("torque gain, offset [N·m] and the like: estimated ± 95 %, and true", fit.names, columns)
+        account.sections += [ReportSection("Sensor calibration and the truth", paragraph(text), (), [table]), *parts]
+        error = np.abs(fit.value("gain") / truth.gain - 1)
+        unseen = ", ".join(name for name, each in zip(fit.names, error, strict=True) if np.isnan(each))
+        known = f"Torque gains found to {np.nanmax(error, initial=0.0):.2%} at worst"
+        account.find(f"{known}; not observable on {unseen}" if unseen else known)
+
+    def _tell_gravity(self, check: Verification, errors: dict[str, Any], sags: dict[str, Array]) -> None:
+        """The model against the sensors, and against the plant's own gravity."""
+        account, poses, largest = self.account, len(check.position), errors["max_torque"]
+        account.note(verify={"poses": poses, "rms": check.rms}, gravity=errors)
+        columns = {"RMS to sensor": check.rms, "RMS to truth": errors["rms_error"]}
+        columns |= {"largest error": errors["max_abs_error"], "largest torque": largest}
+        columns |= {f"sag, {model} model [°]": np.degrees(sag) for model, sag in sags.items()}
+        title = f"gravity model [N·m]: at {poses} poses of the arm; at {errors['poses']} against the truth"
+        table = account.table(title, check.names, {name: (each, 0 * each) for name, each in columns.items()})
+        html = paragraph(f"Torque of model and arm at {poses} poses that were not used for any fit.")
+        account.sections.append(ReportSection("Gravity model", html, [verify_figure(check)], [table]))
+        share = (errors["rms_error"][largest > 1e-6] / largest[largest > 1e-6]).max()
+        account.find(f"Gravity torque of the model within {share:.2%} RMS of each joint's largest")
+        if sags:
+            before, after = (np.degrees(sag.max()) for sag in sags.values())
+            account.find(f"Held by a tenth of the gains, the worst joint sags by {after:.1f}° instead of {before:.1f}°")
+
+
+def _estimate(fit: Any, name: str) -> dict[str, Any]:
+    """Estimates and 95 % intervals, null for a joint without one."""
+    return {"estimated": fit.value(name), "ci95": [each if np.isfinite(each[0]) else None for each in fit.ci95(name)]}

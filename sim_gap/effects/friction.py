@@ -18,7 +18,6 @@ from sim_gap.effects.effect import (
     Signature,
     added_or_taken_off,
     as_fitted_and_shape,
-    not_negative,
 )
 from sim_gap.residuals.layout import ChannelLayout
 from sim_gap.residuals.preprocess import PreparedSignals
@@ -30,6 +29,9 @@ SLOWEST = 0.05
 """Usual speed of a joint from which dry friction in the model may be taken for viscous [rad/s]."""
 VELOCITIES = (0.03, 0.06, 0.12, 0.25, 0.5)
 """Stribeck velocities that the search starts with [rad/s]."""
+SELF_LOCKING = 0.5
+"""Friction over transmitted torque from which a gear is self-locking: it cannot be driven from its output, as the
+weight of an arm that swings free drives it. Harmonic and cycloidal gears have 0.05 to 0.3, worm gears up to this."""
 WITHIN = 0.5
 """A Stribeck velocity is below this share of the fastest usual speed."""
 
@@ -48,6 +50,10 @@ def _dry_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> 
 def _viscous_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
     loss, damping, _, speed = beneath["nominal"]
     return added_or_taken_off(float(coefficients[0]), float(damping + loss / max(speed, SLOWEST)), beneath)
+
+
+def _below_self_locking(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
+    return bool(0.0 <= coefficients[0] < SELF_LOCKING)
 
 
 def _above_minus_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
@@ -110,6 +116,6 @@ EFFECTS = (
     InverseEffect(
         "friction.load",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint] * np.abs(s.model[:, joint])),
-        Plausibility(allows=not_negative),
+        Plausibility(allows=_below_self_locking),
     ),
 )

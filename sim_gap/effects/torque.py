@@ -97,7 +97,8 @@ EFFECTS = (
     InverseEffect(  # without a sensor, an offset of the motor's torque
         "torque.offset",
         Signature.at_sensor(lambda s, _joint, _shape: np.ones(len(s.t)), "any"),
-        Plausibility(prior_penalty=0, background_std=0.02, background_nm=True),
+        # of a joint that went one way only, friction is the likelier cause: every gear rubs
+        Plausibility(prior_penalty=2, background_std=0.02, background_nm=True),
     ),
     InverseEffect(
         "torque.gain",

@@ -14,6 +14,8 @@ def advice(answer: Diagnosis) -> str:
         return "Nothing needs to be changed: the simulator agrees with the arm within the noise of the recordings."
     if answer.verdict == "unexplained":
         return "Change nothing yet: look at where the gap is, check cabling, payload and model there, and record again."
+    if answer.doubts:
+        return "First settle what the recordings hold: each question names the option that answers it."
     if answer.verdict == "ambiguous":
         return "Record one more motion that separates the candidates; gap plan makes it of the answer in JSON."
     return "Add these effects to the simulation: with --out-model the diagnosis writes the corrected model."
@@ -27,6 +29,9 @@ def sentence(answer: Diagnosis) -> str:
         return f"Gap not explained: {answer.notes[0]}"
     if answer.verdict == "unexplained":
         return f"Gap not explained: no effect of the library accounts for {answer.unexplained:.0%} of it"
+    if answer.doubts:
+        columns = " and ".join(dict.fromkeys(f"{each.channel} of {each.joint}" for each in answer.doubts))
+        return f"Cause ambiguous: it depends on {columns}, which may not hold what they are taken for"
     first = answer.causes[0]
     if answer.verdict == "ambiguous" and not first.confounded_with:
         hints = ", ".join(cause.effect for cause in answer.causes if cause.confidence < HINT)

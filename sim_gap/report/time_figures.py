@@ -1,4 +1,4 @@
-"""Held-out data over time, one row a joint: measured, nominal and corrected, and each effect left out."""
+"""Held-out data over time, a row a joint: measured, nominal and corrected, each effect left out; a drift over time."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from plotly.subplots import make_subplots
 
+from calib.observer.watch_loop import WatchHistory
+from calib.report.figures import GREY
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.report.cause_figures import is_of
@@ -81,3 +83,28 @@ def torque_over_time(answer: Diagnosis, channel: str) -> Any:
         lines += lines_without_each(list(kept), list(kept.values()))
     t = data.time[shown] - data.time[0]
     return lines_over_time(t, [answer.names[j] for _, j in rows], lines, "N·m")
+
+
+def watch_figure(
+    history: WatchHistory, joint: int, truth: tuple[Sequence[float], Array], marks: Sequence[tuple[float, str]]
+) -> Any:
+    """The observer's gain and offset of a joint over time with 95 % bands, and what happened when.
+
+    `truth` is times (K,) and true values (2, K).
+    """
+    t, figure = np.array(history.t), make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.08)
+    for row, (name, title) in enumerate((("gain", "gain"), ("offset", "offset [N·m]"))):
+        value, std = (np.array(getattr(history, key))[:, joint] for key in (name, f"{name}_std"))
+        place = {"showlegend": row == 0, "row": row + 1, "col": 1}
+        band = np.concatenate([value + 1.96 * std, (value - 1.96 * std)[::-1]])
+        paint = {"fill": "toself", "fillcolor": "rgba(31,95,168,0.18)", "line": {"width": 0}, "hoverinfo": "skip"}
+        figure.add_scatter(x=np.concatenate([t, t[::-1]]), y=band, name="95 % interval", **paint, **place)
+        figure.add_scatter(x=t, y=value, name="observer", line={"color": BLUE}, **place)
+        figure.add_scatter(x=truth[0], y=truth[1][row], name="truth", line={"color": GREY, "dash": "dot"}, **place)
+        figure.update_yaxes(title_text=title, row=row + 1, col=1)
+    anchor = {"showarrow": False, "xanchor": "left", "yanchor": "bottom", "y": 1.0, "yref": "y domain"}
+    for when, text in marks:
+        figure.add_vline(x=when, line={"color": ORANGE, "width": 1}, row="all", col=1)
+        figure.add_annotation(x=when, text=text, **anchor)
+    figure.update_xaxes(title_text="link time [s]", row=2)
+    return figure.update_layout(height=520, legend={"orientation": "h", "y": 1.1, "x": 0})

@@ -17,6 +17,8 @@ from sim_gap.search.term import Term
 from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
 
 MOMENTS, BODY = "link.mass_moment", "link.payload"
+SURE_FRICTION = ("friction.coulomb", "friction.viscous")
+"""Effects that every joint has."""
 
 
 def one_body(store: ColumnStore, search: StepwiseSearch, offered: Sequence[Term]) -> list[Term] | None:
@@ -83,10 +85,15 @@ def search_again(
 
 def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term], list[Term]]:
     """The terms that are offered to the search about the estimate, and those that a search about the nominal model
-    selects."""
-    search = StepwiseSearch(NormalEquations(store, candidates(store.data, library)))
-    search.run()
-    search = replace_doubtful(search)
+    selects: one that begins with nothing, and one with the friction that every arm has. Of an arm that swings free,
+    dry and viscous friction explain the torque together, and neither does alone.
+    """
+    normal = NormalEquations(store, candidates(store.data, library))
+    friction = [term for term in normal.terms if term.effect in SURE_FRICTION]
+    starts = [StepwiseSearch(normal), StepwiseSearch(normal, friction)]
+    for start in starts:
+        start.run()
+    search = replace_doubtful(min(starts, key=lambda start: start.score))
     return likely_shapes(search), search.active
 
 

@@ -1,13 +1,14 @@
 """Model files that cannot be used are refused in one line."""
 
 import struct
+import sys
 import warnings
 
 import numpy as np
 import pytest
 
 from armlink.errors import BadInput
-from armlink.model_file import compile_model, read_model
+from armlink.model_file import compile_model, expanded, read_model
 
 MODEL = """<mujoco><asset>{mesh}</asset><worldbody>{geom}<body name="arm">
 <joint name="hinge" axis="0 1 0"/></body></worldbody></mujoco>"""
@@ -70,7 +71,7 @@ def test_a_mesh_in_the_text_form_of_stl_costs_its_shape_alone(tmp_path):
     path = urdf(tmp_path)
     (tmp_path / "l1.stl").write_text("solid l1\nendsolid l1\n")
     found = read_model(path)
-    assert (found.absent, found.unreadable) == ((), ("l1.stl",))
+    assert [file for file, _ in found.unused_meshes] == ["l1.stl"]
     assert found.left_out == "1 mesh not binary STL, OBJ or MSH, which MuJoCo reads, such as l1.stl"
     assert compile_model(path).ngeom == 0
 
@@ -78,7 +79,41 @@ def test_a_mesh_in_the_text_form_of_stl_costs_its_shape_alone(tmp_path):
 def test_an_stl_file_without_faces_costs_its_shape_alone(tmp_path):
     path = urdf(tmp_path)
     binary_stl(tmp_path / "l1.stl", [])
-    assert read_model(path).unreadable == ("l1.stl",)
+    assert [file for file, _ in read_model(path).unused_meshes] == ["l1.stl"]
+    assert compile_model(path).ngeom == 0
+
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n"
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:abab\nsize 12345\n"
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl"])
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (POINTER, "not fetched (git lfs pull)"),
+        ("", "without volume"),
+        (SQUARE, "without volume"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "without volume"),
+        ("v 0 0 x\n", "without volume"),
+    ],
+)
+def test_a_mesh_of_no_use_costs_its_shape_alone(tmp_path, suffix, content, reason):
+    """A pointer of Git LFS, an empty file, a flat one: whatever the format is."""
+    path = urdf(tmp_path)
+    path.write_text(path.read_text().replace("l1.stl", f"l1.{suffix}"))
+    (tmp_path / f"l1.{suffix}").write_text(content)
+    if suffix == "stl" and content != POINTER:
+        reason = "not binary STL, OBJ or MSH, which MuJoCo reads"
+    assert read_model(path).unused_meshes == ((f"l1.{suffix}", reason),)
+    assert compile_model(path).ngeom == 0
+
+
+def test_a_flat_stl_costs_its_shape_alone(tmp_path):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype=float)
+    path = urdf(tmp_path)
+    binary_stl(tmp_path / "l1.stl", corners[[[0, 1, 2], [1, 3, 2]]])
+    assert read_model(path).unused_meshes == (("l1.stl", "without volume"),)
     assert compile_model(path).ngeom == 0
 
 
@@ -130,3 +165,24 @@ def test_numbers_that_are_none_are_refused_by_name(tmp_path, key, value, of):
     (tmp_path / "arm.xml").write_text(NUMBERS.format(**SOUND | {key: value}))
     with pytest.raises(BadInput, match=f"arm.xml: {of}"):
         compile_model(tmp_path / "arm.xml")
+
+
+XACRO = """<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="length" value="0.4"/>
+<xacro:macro name="arm_link" params="name mass"><link name="${name}"><inertial><origin xyz="${length / 2} 0 0"/>
+<mass value="${mass}"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</xacro:macro>
+<link name="base"/><xacro:arm_link name="l1" mass="2"/><joint name="j1" type="revolute"><parent link="base"/>
+<child link="l1"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="20" velocity="1"/></joint></robot>"""
+
+
+def test_a_xacro_file_is_expanded(tmp_path, monkeypatch):
+    (tmp_path / "two.xacro").write_text(XACRO)
+    model = compile_model(expanded(tmp_path / "two.xacro", tmp_path / "two.urdf"))
+    assert model.body_mass[model.body("l1").id] == 2.0
+    assert model.body_ipos[model.body("l1").id] == pytest.approx([0.2, 0, 0])
+    (tmp_path / "two.xacro").write_text(XACRO.replace("0.4", "$(find somewhere)"))
+    with pytest.raises(BadInput, match=r"xacro cannot expand it: .* need ROS: xacro .*two.xacro > "):
+        expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    with pytest.raises(BadInput, match=r"is a xacro file: pip install xacro, or expand it yourself"):
+        expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")

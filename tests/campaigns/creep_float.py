@@ -21,7 +21,7 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.arrays import Array
 from armlink.errors import Refused
 from armlink.link.types import Command
-from calib.arm.kinematics import gcomp_arm, model_arm
+from calib.arm.kinematics import model_arm
 from calib.creep.fit import fit_creep
 from calib.creep.plan import plan_creep
 from calib.creep.record import calibration_record
@@ -31,7 +31,7 @@ from calib.install.plausibility import admit
 from calib.plan.types import SweepPlan
 from calib.records.store import RecordStore
 from gcomp.gravity.batch import GravityModel
-from sim_gap.demo.bench import WEAK_SHARE, Bench, WeakHold, sag_poses, travel
+from sim_gap.demo.bench import WEAK_SHARE, Bench, sag_poses, weak_hold
 from sim_gap.demo.run import quick
 
 LEFT = 0.25
@@ -69,14 +69,14 @@ def moved(bench: Bench, plan: SweepPlan, model: GravityModel, zero: Array, relea
     if released is not None:
         kp[released], held[released] = 0.0, 0.0
     for pose in sag_poses(plan):
-        travel(bench, link.position_sent, home)
-        travel(bench, home, pose)
-        hold, away = WeakHold(model, zero, pose, kp, held), np.zeros(link.n)
+        bench.travel(link.position_sent, home)
+        bench.travel(home, pose)
+        away = np.zeros(link.n)
         for _ in range(round(SETTLE * link.rate)):
             sample = link.cycle(Command.hold(pose))
         began = sample.position
         for _ in range(round((2.0 if released is None else SECONDS) * link.rate)):
-            sample = link.cycle(hold.command(sample))
+            sample = link.cycle(weak_hold(sample, model, zero, pose, kp, held))
             away = np.abs(sample.position - began)
             if released is not None and away[released] > 0.3:
                 break
@@ -96,7 +96,7 @@ def run(seed: int, folder: Path, wrong: bool) -> bool:
     """One arm; whether the bound holds on all joints together and on each that moved."""
     arm = quick(load_arm("openarm"))
     believed = wrong_model(arm, folder, seed) if wrong else arm
-    bench = Bench.build(arm, gcomp_arm(arm), seed)
+    bench = Bench(arm, seed)
     plan, store, link = plan_creep(believed, seed=seed), RecordStore(f"sqlite:///{folder}/records.db"), bench.link
     link.start()
     link.enable()

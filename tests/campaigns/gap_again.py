@@ -99,7 +99,7 @@ def real_cases(folder: Path, only: str) -> Iterator[Case]:
 
 
 def bench_cases(folder: Path, seed: int, cases: int, effects: str) -> Iterator[Case]:
-    for _ in make_apart(folder, seed, cases, 1, LENGTHS, effects):
+    for _ in make_apart(folder, seed=seed, cases=cases, workers=1, lengths=LENGTHS, effects=effects):
         pass
     for path in sorted((folder / "cases").iterdir()):
         train, heldout = ([load_recording(path / f"{each}.csv")] for each in ("train", "heldout"))

@@ -25,7 +25,7 @@ from scipy.ndimage import maximum_filter1d
 
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
-from sim_gap.blind.servo_cases import make_cases, recipes
+from sim_gap.blind.cases import make_cases
 from sim_gap.model.load import load_model
 from sim_gap.position_gap.surface import find_surface
 
@@ -103,7 +103,7 @@ def main() -> int:
         random = np.random.default_rng(seed)
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder)
-            make_cases(recipes(seed, given.cases), out / "cases", out / "labels", 36.0, 18.0)
+            make_cases(folder, seed, given.cases, 2, (36.0, 18.0), positions=True)
             for case in sorted((out / "cases").iterdir()):
                 arm = load_model(case / "sim.xml").arm
                 train, held = (load_recording(case / f"{name}.csv") for name in ("train", "heldout"))

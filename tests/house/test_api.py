@@ -20,7 +20,7 @@ SIGNATURES = {
     "sweep": "(arm, out, *, bus=None, simulated=False, reference_mass=0.0, resume=False, seed=0, progress=None)",
     "calibrate": "(*sweeps, arm=None)",
     "identify": "(*sweeps, arm=None, sensors=None)",
-    "verify": "(arm, gravity, sensors=None, *, bus=None, simulated=False, poses=24, seed=0)",
+    "verify": "(arm, gravity, sensors=None, *, bus=None, simulated=False, poses=24, seed=0, progress=None)",
     "observe": "(arm, recording, gravity, sensors, *, config=None)",
     "diagnose": "(model, train, heldout=(), *, base=None, tip=None)",
 }
@@ -84,6 +84,14 @@ def test_paths_are_text_or_path(kind, tmp_path):
 
     save_recording(run, kind(tmp_path / "run.csv"))
     assert armlink.load_recording(kind(tmp_path / "run.csv")).n == 3
+
+
+def test_an_open_link_takes_no_bus(tmp_path):
+    with (
+        armlink.open_link(ROOT / "examples" / "planar3.yaml", simulated=True) as link,
+        pytest.raises(armlink.ArmlinkError, match="the link given is open already"),
+    ):
+        armlink.sweep(link, tmp_path / "unloaded", bus="socketcan:can0")
 
 
 @pytest.mark.parametrize(

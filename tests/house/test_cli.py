@@ -311,7 +311,10 @@ def test_completion_works_in_bash(capsys):
         ("fastapi", "daemon"),
         ("uvicorn", "daemon"),
         ("prometheus_client", "daemon"),
-        ("distributed", "gap"),
+        ("distributed", "cluster"),
+        ("mcap", "bags"),
+        ("pyarrow", "parquet"),
+        ("plotly", "reports"),
         ("msgpack", "simulator"),
         ("psycopg", "postgresql"),
     ],
@@ -323,7 +326,7 @@ def test_a_missing_extra_is_named(command, capsys, module, extra):
 
 
 def test_the_daemon_names_its_own_extra_before_it_begins_anything(monkeypatch, capsys):
-    monkeypatch.setattr("calib.commands.daemon.find_spec", lambda module: None if module == "uvicorn" else object())
+    monkeypatch.setattr("armlink.extras.find_spec", lambda module: None if module == "uvicorn" else object())
     assert cli.run(["daemon", "no-such-arm"]) == 2
     assert capsys.readouterr().err == "armlink: daemon: uvicorn is not installed: pip install 'armlink[daemon]'\n"
 
@@ -341,4 +344,4 @@ def test_the_package_states_its_pythons():
     assert stated["Requires-Python"] == ">=3.11"
     pythons = [each for each in stated.get_all("Classifier") if each.startswith("Programming Language")]
     assert [each[-4:] for each in pythons] == ["3.11", "3.12", "3.13"]
-    assert {"all", "daemon", "gap", "simulator"} <= set(stated.get_all("Provides-Extra"))
+    assert {"all", "daemon", "cluster", "simulator"} <= set(stated.get_all("Provides-Extra"))

@@ -55,7 +55,7 @@ def test_the_forms_share_parameters_and_units() -> None:
 
 def test_a_blind_effect_with_a_parameter_outside_the_catalogue_is_refused() -> None:
     with pytest.raises(ValueError, match="strength not in the catalogue"):
-        DrawnEffect("friction.coulomb", {"joint_1": {"strength": 1.0}}, lambda _arm: None)
+        DrawnEffect("friction.coulomb", {"joint_1": {"strength": 1.0}})
 
 
 def test_the_sensor_fit_and_the_cause_test_use_its_ids() -> None:

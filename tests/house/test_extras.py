@@ -1,22 +1,45 @@
-"""Without any extra: every command loads, and arms on other buses than udp_multicast can be driven."""
+"""Without extras: every command loads, works on what the core holds, and names the extra that it needs."""
 
+import json
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+from armlink.extras import REQUIREMENT, has_extra
+from armlink.recording.files import save_recording
+from armlink.recording.recording import Recording
+
+ROOT = Path(__file__).parents[2]
+EXTRAS = {
+    "bags": ("lz4", "mcap", "rosbags", "zstandard"),
+    "cluster": ("cryptography", "dask", "distributed"),
+    "daemon": ("fastapi", "prometheus_client", "uvicorn"),
+    "foxglove": ("foxglove",),
+    "parquet": ("pyarrow",),
+    "postgresql": ("psycopg",),
+    "reports": ("jinja2", "plotly"),
+    "rerun": ("rerun",),
+    "simulator": ("msgpack",),
+}
+"""Extra → the modules that it alone brings."""
 WITHOUT = """
 import sys
 from importlib.abc import MetaPathFinder
-from importlib.metadata import entry_points
 
-EXTRAS = {"cryptography", "distributed", "fastapi", "foxglove", "msgpack", "prometheus_client", "psycopg", "rerun"}
-EXTRAS |= {"uvicorn"}
+ABSENT = {absent!r}
 
 class Absent(MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in EXTRAS:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        if name.partition(".")[0] in ABSENT:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 
 sys.meta_path.insert(0, Absent())
+"""
+CORE = """
+from importlib.metadata import entry_points
 for group in ("armlink.commands", "armlink.api", "armlink.drives", "armlink.sections"):
     for point in entry_points(group=group):
         point.load()
@@ -29,6 +52,121 @@ with open_link("sarcos", simulated=True) as link:
 """
 
 
-def test_the_core_needs_no_extra():
-    done = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, check=False)
+def run_without(extras, source: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run Python as if these extras were not installed."""
+    absent = {module for extra in extras for module in EXTRAS[extra]}
+    words = [sys.executable, "-c", WITHOUT.format(absent=absent) + source]
+    return subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+
+
+COMMANDS = """
+import contextlib, io, json
+from armlink import cli
+for words in {words!r}:
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        status = cli.run(words)
+    print(json.dumps([status, said.getvalue()]))
+"""
+
+
+def outcomes(extras, commands: list[list[str]], folder: Path) -> list[tuple[int, str]]:
+    """Exit status and standard error of each command, in one interpreter."""
+    done = run_without(extras, COMMANDS.format(words=commands), folder)
     assert done.returncode == 0, done.stderr
+    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """One with a recording in CSV, and one of each suffix that is there to be read."""
+    recording = Recording(t=np.arange(9) * 0.1, position=np.zeros((9, 3)), torque=np.ones((9, 3)))
+    for suffix in (".csv", ".csv.gz", ".parquet", ".mcap"):
+        save_recording(recording, tmp_path / f"run{suffix}")
+    (tmp_path / "lerobot" / "meta").mkdir(parents=True)
+    (tmp_path / "lerobot" / "meta" / "info.json").touch()
+    return tmp_path
+
+
+def test_the_core_needs_no_extra(tmp_path):
+    done = run_without(EXTRAS, CORE, tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_commands_of_the_core_work_without_any_extra(folder):
+    commands = [
+        ["--help"],
+        ["doctor", "sarcos"],
+        ["drives"],
+        ["sweep", "sarcos", "--plan"],
+        ["convert", "run.csv", "other.csv.gz"],
+        ["convert", "run.csv.gz", "other.csv"],
+        ["gap", "plan", "sarcos", "--out", "motion.csv", "--joint", "joint_1"],
+        ["history", "sarcos", "--store", "records.sqlite"],
+    ]
+    for words, (status, said) in zip(commands, outcomes(EXTRAS, commands, folder), strict=True):
+        assert status == 0, (words, said)
+        assert "not installed" not in said, words
+
+
+NAMED = {
+    "bags": [
+        ("run.mcap", ["convert", "run.mcap", "other.csv"]),
+        ("other.mcap", ["convert", "run.csv", "other.mcap"]),
+        ("other.mcap", ["record", "sarcos", "other.mcap", "--bus", "virtual:x"]),
+        ("--out other.mcap", ["gap", "collect", "sarcos", "--motion", "m.csv", "--out", "other.mcap"]),
+    ],
+    "cluster": [("diagnose-fleet", ["gap", "diagnose-fleet", "."])],
+    "daemon": [("daemon", ["daemon", "no-such-arm"])],
+    "foxglove": [("--foxglove", ["monitor", "sarcos", "--bus", "virtual:x", "--foxglove", "0"])],
+    "parquet": [
+        ("run.parquet", ["convert", "run.parquet", "other.csv"]),
+        ("other.parquet", ["convert", "run.csv", "other.parquet"]),
+        ("lerobot", ["convert", "lerobot", "other.csv"]),
+        ("--table", ["gap", "diagnose-fleet", ".", "--table", "t.parquet"]),
+    ],
+    "postgresql": [("record store postgresql+psycopg://u@h/d", ["history", "sarcos", "--store", "postgresql://u@h/d"])],
+    "reports": [
+        ("--report", ["calibrate", "no-such-sweeps", "--report", "r.html"]),
+        ("--report", ["verify", "no-such-arm", "--report", "r.html"]),
+        ("--picture", ["sweep", "no-such-arm", "--plan", "--picture", "p.html"]),
+        ("--report", ["gap", "diagnose", "--sim", "s.xml", "--train", "t.csv", "--report", "r.html"]),
+    ],
+    "rerun": [("--rerun", ["monitor", "sarcos", "--bus", "virtual:x", "--rerun", "1"])],
+    "simulator": [("bus udp_multicast:239.0.0.1", ["scan", "--bus", "udp_multicast:239.0.0.1"])],
+}
+"""Extra → commands that need it, with the purpose that their error begins with."""
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_a_command_names_the_extra_that_it_needs(folder, extra):
+    purposes, commands = zip(*NAMED[extra], strict=True)
+    for purpose, (status, said) in zip(purposes, outcomes([extra], list(commands), folder), strict=True):
+        lines = {
+            f"armlink: {purpose}: {module} is not installed: pip install 'armlink[{extra}]'\n"
+            for module in EXTRAS[extra]
+        }
+        assert (status, said in lines) == (2, True), said
+
+
+def test_the_table_has_every_extra_of_the_project():
+    from importlib.metadata import metadata
+
+    known = set(metadata("armlink").get_all("Provides-Extra"))
+    assert known - {"all", "demo", "dev", "notebooks"} == EXTRAS.keys()
+    assert all(has_extra(extra) for extra in EXTRAS if extra != "rerun")
+    assert REQUIREMENT.match('psycopg[binary]>=3.2; extra == "postgresql"')["extra"] == "postgresql"
+
+
+@pytest.mark.slow
+def test_the_demo_needs_the_extra_that_draws_its_report_alone(tmp_path):
+    words = ["demo", str(ROOT / "examples" / "planar3.yaml"), "--out", "demo"]
+    source = f"from armlink import cli\nsys.exit(cli.run({words!r}))"
+    lacking = run_without(["reports"], source, tmp_path)
+    assert lacking.returncode == 2
+    assert lacking.stderr.strip().endswith("is not installed: pip install 'armlink[reports]'")
+    assert not (tmp_path / "demo").exists()
+    done = run_without(EXTRAS.keys() - {"reports"}, source, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "demo" / "summary.json").read_text())["schema"] == "armlink.demo/1"
+    assert {each.name for each in (tmp_path / "demo" / "data").glob("*.csv.gz")} == {"train.csv.gz", "heldout.csv.gz"}

@@ -14,7 +14,10 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS = {"requirements.lock": ("daemon", "gap", "simulator", "postgresql"), "requirements-dev.lock": ("dev",)}
+EXTRAS = {
+    "requirements.lock": ("bags", "cluster", "daemon", "parquet", "reports", "simulator", "postgresql"),
+    "requirements-dev.lock": ("dev",),
+}
 HASH = re.compile(r"--hash=sha256:[0-9a-f]{64}\b")
 
 

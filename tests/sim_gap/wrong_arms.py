@@ -80,8 +80,20 @@ def record(
     channels: tuple[str, ...] = ("tau", "tau_motor"),
 ) -> Recording:
     """A recording of the arm that is wrong like this; noise is that of the torque channels [N·m]."""
+    return record_along(motion(nominal.nv, seconds, rate, seed), nominal, wrong, seed, noise, channels)
+
+
+def record_along(
+    moved: tuple[np.ndarray, ...],
+    nominal: mujoco.MjModel,
+    wrong: Wrong,
+    seed: int = 0,
+    noise: float = 0.02,
+    channels: tuple[str, ...] = ("tau", "tau_motor"),
+) -> Recording:
+    """As `record`, along a motion: time (K,) and position, velocity, acceleration (K, n)."""
     random = np.random.default_rng(seed + 1000)
-    t, q, v, a = motion(nominal.nv, seconds, rate, seed)
+    t, q, v, a = moved
     true = q + wrong.position_offset
     link = _inverse(_truth(nominal, wrong), true, v, a) + wrong.spring * true
     if np.any(wrong.play):

@@ -3,10 +3,12 @@
 import re
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import canopen
+from canopen.objectdictionary.eds import import_eds
 
 from armlink.arm_file import ArmFile, DeviceIdentity, LinkJoint
 from armlink.content.file_content import read_whole
@@ -73,8 +75,9 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
     if path.suffix.lower() not in SUFFIXES:
         raise BadInput(f"{where}: expected a file that ends in {' or '.join(SUFFIXES)}")
     try:
-        _require_few_entries(read_whole(path, MOST_SHEET), where)
-        sheet = canopen.import_od(str(path), joint.settings.node)
+        content = read_whole(path, MOST_SHEET)
+        _require_few_entries(content, where)
+        sheet = import_eds(StringIO(_text(content)), joint.settings.node)
     except OSError as error:
         raise BadInput(f"{where}: {error.strerror or error}: correct eds of this joint under link.joints") from None
     except BadInput:
@@ -83,6 +86,11 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
         raise BadInput(f"{where}: not a valid EDS (CiA 306): {' '.join(str(error).split())}") from None
     if joint.settings.torque != "record":  # a stock device is asked what it has
         return sheet
+    if object_dictionary.TORQUE_READING.index not in sheet:
+        raise BadInput(
+            f"{where}: the device has no torque sensor record 2100h: give drive: {{family: canopen, node: "
+            f"{joint.settings.node}, torque: motor}}, which reads the drive's own estimate (docs/drives.md)"
+        )
     for entry in used_objects():
         found = sheet.get_variable(entry.index, entry.sub)
         if found is None and entry not in OPTIONAL:
@@ -94,6 +102,14 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
             if not sheet.get_variable(entry.index, entry.sub).pdo_mappable:
                 raise BadInput(f"{where}: {entry} cannot be mapped into a PDO, but the link needs it in {pdo.name}")
     return sheet
+
+
+def _text(content: bytes) -> str:
+    """Text of a data sheet: CiA 306 says ASCII, makers' editors write UTF-8 or Windows-1252."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252", errors="replace")
 
 
 def _require_few_entries(content: bytes, where: str) -> None:

@@ -13,7 +13,7 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, error_text, unpack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
-from armlink.drives.family import Ask
+from armlink.drives.family import Ask, Family
 from armlink.drives.mit_drives import MitDrives, MitKnown
 from armlink.drives.mit_packing import Special, pack_command, special, unwrap
 from armlink.drives.mit_setup import mit_setup, require_window
@@ -255,3 +255,8 @@ def _watched(settings: CubeMarsSettings) -> str:
     if not settings.can_timeout:
         return "no CAN timeout stated (drive.can_timeout): it keeps on after its host died"
     return f"CAN timeout of {settings.can_timeout} cycles as stated: it cannot be read over CAN"
+
+
+FAMILY = Family(
+    "cubemars", TRAITS, CubeMarsSettings, CubeMarsDrives, summary="CubeMars AK (firmware 1 and 2), MIT mode"
+)

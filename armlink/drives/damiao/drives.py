@@ -9,8 +9,8 @@ from armlink.bus.port import Frame
 from armlink.drives.damiao import frames
 from armlink.drives.damiao.frames import READ, WRITE, DamiaoRegister, DamiaoStatus
 from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_position, read_registers
-from armlink.drives.damiao.settings import delivered
-from armlink.drives.family import Ask
+from armlink.drives.damiao.settings import DamiaoSettings, delivered
+from armlink.drives.family import Ask, Family
 from armlink.drives.mit_drives import MitDrives, MitKnown
 from armlink.drives.mit_packing import Ranges, Special, feedback_in, special, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
@@ -221,3 +221,8 @@ def _fault_text(state: int) -> str:
         return ""
     words = FAULTS[DamiaoStatus(state)] if state in FAULTS else "unknown state"
     return f"{words} (state {state:X}h)"
+
+
+FAMILY = Family(
+    "damiao", TRAITS, DamiaoSettings, DamiaoDrives, summary="Damiao DM-J (OpenArm, YAM, reBot B601-DM), MIT mode"
+)

@@ -10,7 +10,7 @@ from pydantic import Field
 from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import BasicDrives, no_order
-from armlink.drives.family import Ask
+from armlink.drives.family import Ask, Family
 from armlink.drives.moteus import frames
 from armlink.drives.moteus.frames import (
     COMMAND,
@@ -376,3 +376,6 @@ def _float_within(value: float, most: float) -> float:
 
 def _finite(value: float) -> float:
     return value if math.isfinite(value) else math.nan
+
+
+FAMILY = Family("moteus", TRAITS, MoteusSettings, MoteusDrives, summary="mjbots moteus r4, c1, n1, x1, on CAN FD")

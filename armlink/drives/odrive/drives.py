@@ -14,7 +14,7 @@ from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import REMOTE, Frame
 from armlink.drives.base import BasicDrives, no_order
-from armlink.drives.family import Ask
+from armlink.drives.family import Ask, Family
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import (
     INPUT_FEED_FORWARD,
@@ -386,3 +386,8 @@ def _checked(value: float) -> float:
     if not math.isfinite(value):
         raise ValueError(f"an order of {value}: expected a finite number")
     return value
+
+
+FAMILY = Family(
+    "odrive", TRAITS, ODriveSettings, ODriveDrives, summary="ODrive Pro, S1, Micro with firmware 0.6, CANSimple"
+)

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import BasicDrives, no_order
-from armlink.drives.family import ANY, BROADCAST, Ask
+from armlink.drives.family import ANY, BROADCAST, Ask, Family
 from armlink.drives.mit_leash import damping, order_of, round_within
 from armlink.drives.mit_packing import MitCommand, Ranges, grid_of
 from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.robstride import frames
 from armlink.drives.robstride.frames import RANGES, RobStrideParameter, Type, fault_names
 from armlink.drives.robstride.set_up import identify, prepare, read_parameter
+from armlink.drives.robstride.settings import RobStrideSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
 
@@ -240,3 +241,12 @@ def _power(known: _RobStrideState) -> Power:
 
 def _fault_text(bits: int) -> str:
     return f"{fault_names(bits)} (fault bits {bits:02X}h)" if bits else ""
+
+
+FAMILY = Family(
+    "robstride",
+    TRAITS,
+    RobStrideSettings,
+    RobStrideDrives,
+    summary="RobStride RS00 to RS06 (reBot B601-RS), private protocol",
+)

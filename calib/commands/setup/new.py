@@ -38,6 +38,12 @@ def new(
             help="JOINT:LOWER:UPPER [rad], instead of the model's limits; may be repeated.", rich_help_panel="Model"
         ),
     ] = None,
+    rated_torque: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="JOINT:TORQUE [N·m], instead of the model's effort limit; may be repeated.", rich_help_panel="Model"
+        ),
+    ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the arm; default: the model's.")] = None,
     bus: Annotated[
         str | None,
@@ -72,8 +78,9 @@ def new(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.errors import BadInput
+    from armlink.model_file import expanded
     from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
-    from calib.commands.setup.terminal import Terminal, hand, parse_stops
+    from calib.commands.setup.terminal import Terminal, hand, parse_ratings, parse_stops
     from calib.commissioning.new_arm import new_arm
 
     console = PlainConsole()
@@ -85,8 +92,10 @@ def new(
             raise BadInput(
                 "new: give a URDF or MJCF model of the arm, or --bus INTERFACE:CHANNEL to begin with its drives"
             )
-        if base or tip or stops:
-            raise BadInput("--base, --tip and --stops are for a model: give one, or change the arm file itself")
+        if base or tip or stops or rated_torque:
+            raise BadInput(
+                "--base, --tip, --stops and --rated-torque are for a model: give one, or change the arm file itself"
+            )
         out = out or Path("arm.yaml")
         _require_free(out, force, interactive)
         return begin_with_drives(out, bus, name, hand(by_hand, interactive), json_file)
@@ -94,12 +103,17 @@ def new(
     is_arm_file = bundled is not None or model.suffix.lower() in (".yaml", ".yml")
     if is_arm_file and bus is None:
         raise BadInput(f"{model}: is an arm file already: give --bus to find its drives, or armlink doctor {model}")
-    if is_arm_file and (base or tip or stops or name):
-        raise BadInput(f"{model}: --base, --tip, --stops and --name are for a model: change the arm file itself")
-    if not is_arm_file and model.suffix.lower() not in MODEL_SUFFIXES:
-        raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)}), or an arm file (.yaml)")
-    out = out or Path(f"{model.stem}.yaml")
+    if is_arm_file and (base or tip or stops or rated_torque or name):
+        options = "--base, --tip, --stops, --rated-torque and --name"
+        raise BadInput(f"{model}: {options} are for a model: change the arm file itself")
+    is_xacro = model.suffix.lower() == ".xacro"
+    if not is_arm_file and not is_xacro and model.suffix.lower() not in MODEL_SUFFIXES:
+        suffixes = ", ".join((*MODEL_SUFFIXES, ".xacro"))
+        raise BadInput(f"{model}: expected a URDF or MJCF model ({suffixes}), or an arm file (.yaml)")
+    out = out or Path(f"{Path(model.stem).stem if is_xacro else model.stem}.yaml")
     _require_free(out, force, interactive)
+    if is_xacro:
+        model = expanded(model, out.with_suffix(".urdf"))
     if is_arm_file:
         found = bundled or model
         if drives_by_ids(found):
@@ -111,7 +125,16 @@ def new(
         return rewire(found, out, str(bus), hand(by_hand, interactive), json_file)
     with console.status(f"reading {model} and looking for collisions"):
         asked = Terminal(console) if interactive else None
-        made = new_arm(model, out, base=base, tip=tip, stops=parse_stops(stops or []), name=name, questions=asked)
+        made = new_arm(
+            model,
+            out,
+            base=base,
+            tip=tip,
+            stops=parse_stops(stops or []),
+            ratings=parse_ratings(rated_torque or []),
+            name=name,
+            questions=asked,
+        )
     if bus is not None:
         from armlink.drives.registry import found_drives
         from calib.commissioning.new_arm import match_drives

@@ -1,5 +1,6 @@
 """Questions of `armlink new` to a person at a terminal, and answers from its options."""
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,21 @@ def parse_stops(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
         if not joint or not low < high:
             raise BadInput(f"--stops {text}: expected JOINT:LOWER:UPPER in rad, such as elbow:-2.1:2.1")
         found[joint] = (low, high)
+    return found
+
+
+def parse_ratings(texts: Sequence[str]) -> dict[str, float]:
+    """Rated torques [N·m] by joint from texts JOINT:TORQUE; raises BadInput."""
+    found = {}
+    for text in texts:
+        joint, _, number = text.rpartition(":")
+        try:
+            torque = float(number)
+        except ValueError:
+            torque = math.nan
+        if not joint or not 0 < torque < math.inf:
+            raise BadInput(f"--rated-torque {text}: expected JOINT:TORQUE in N·m, such as elbow:27")
+        found[joint] = torque
     return found
 
 

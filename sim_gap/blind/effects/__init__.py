@@ -1,16 +1,9 @@
-"""The blind form of the effects: magnitudes that show in a recording, put into the true arm."""
+"""The blind form of the effects: magnitudes that show in a recording."""
 
-from sim_gap.blind.effects import actuator, friction, link, position, torque, transmission
+from sim_gap.blind.effects import link, motor_side, sensors
 from sim_gap.blind.effects.drawn_effect import Draw
 
-DRAWS: dict[str, Draw] = {
-    **link.DRAWS,
-    **position.DRAWS,
-    **torque.DRAWS,
-    **friction.DRAWS,
-    **transmission.DRAWS,
-    **actuator.DRAWS,
-}
+DRAWS: dict[str, Draw] = {**link.DRAWS, **sensors.DRAWS, **motor_side.DRAWS}
 NOT_DRAWN = {"torque.nonlinearity": "no diagnosis names it, so a case of it could not be scored"}
 """Catalogue ids without a blind form, and why."""
 EFFECTS = tuple(sorted(DRAWS))

@@ -2,25 +2,27 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from armlink.effect_catalogue import CATALOGUE
 from gcomp.arrays import Array, Mask
 from sim_gap.blind.arms import BenchArm
-from sim_gap.blind.scene import Scene, rms
-from sim_gap.blind.true_arm import TrueArm
+from sim_gap.blind.scene import Scene, ServoLaw
 
-SENSOR_LEAST = 0.12
-MOTOR_LEAST = 0.3
-"""Least RMS that an effect causes in its channel [N·m], for every torque."""
-SHARES = (0.06, 0.14)
-"""RMS that an effect causes, as a share of the joint's RMS torque: several times that of small background errors."""
 OFTEN = 0.08
 """Torque reversals per second from which effects at a reversal show."""
 
 Values = dict[str, float]
-Apply = Callable[[TrueArm], None]
+
+
+class ArmSetting(NamedTuple):
+    """An entry of `sim.effects` in an arm file: how the simulated arm gets the effect."""
+
+    effect: str
+    joint: str
+    parameters: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,13 @@ class DrawnEffect:
     effect: str
     parameters: dict[str, Values]
     """By joint name (`arm` for the whole arm); named as a diagnosis reports them."""
-    apply: Apply
-    """Puts the effect into the true arm."""
-    nominal: Callable[[BenchArm], BenchArm] | None = None
+    settings: tuple[ArmSetting, ...] = ()
+    """Puts it into joints, drives and sensors of the true arm."""
+    links: Callable[[BenchArm], BenchArm] = lambda arm: arm
+    """Puts it into the true links and base."""
+    law: Callable[[ServoLaw], None] = lambda law: None
+    """Puts it into the servos."""
+    nominal: Callable[[BenchArm], BenchArm] = lambda arm: arm
     """Changes the nominal model, if need be."""
     implied: tuple[str, ...] = ()
     """Simpler effects that are part of it and may correctly be named as well."""
@@ -40,26 +46,12 @@ class DrawnEffect:
     """Effects that are an equally good answer if it is undecided."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a parameter that is not in the catalogue."""
+        """Raise ValueError for a parameter that is not in the catalogue, which has no controllers."""
+        if self.effect not in CATALOGUE and self.effect.startswith("controller."):
+            return
         known = {name for name, _ in CATALOGUE[self.effect].reported}
         if unknown := {name for values in self.parameters.values() for name in values} - known:
             raise ValueError(f"{self.effect}: {', '.join(sorted(unknown))} not in the catalogue")
-
-    @classmethod
-    def at(
-        cls,
-        scene: Scene,
-        joint: int,
-        effect: str,
-        values: Values,
-        apply: Apply,
-        nominal: Callable[[BenchArm], BenchArm] | None = None,
-        implied: tuple[str, ...] = (),
-        undecided: str = "",
-        confused_with: tuple[str, ...] = (),
-    ) -> "DrawnEffect":
-        name = scene.arm.names[joint]
-        return cls(effect, {name: values}, apply, nominal, implied, undecided, confused_with)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -71,32 +63,10 @@ Draw = Callable[[Scene, np.random.Generator], DrawnEffect | None]
 """Draws an effect for the arm of a scene; None if the arm cannot show it."""
 
 
-def set_entry(array: Callable[[TrueArm], Array], index: int, value: float) -> Apply:
-    """An effect that sets one entry of an array."""
-
-    def apply(true: TrueArm) -> None:
-        array(true)[index] = value
-
-    return apply
-
-
-def add_to_entry(array: Callable[[TrueArm], Array], index: int, value: float) -> Apply:
-    """An effect that adds to one entry of an array."""
-
-    def apply(true: TrueArm) -> None:
-        array(true)[index] += value
-
-    return apply
-
-
-def sensor_level(scene: Scene, random: np.random.Generator) -> Array:
-    """RMS that an effect should cause in `tau` − model, (n,) [N·m]."""
-    return np.maximum(SENSOR_LEAST, random.uniform(*SHARES) * rms(scene.torque))
-
-
-def motor_level(scene: Scene, random: np.random.Generator) -> Array:
-    """RMS that an effect should cause in `tau_motor` − model, (n,) [N·m]."""
-    return np.maximum(MOTOR_LEAST, random.uniform(*SHARES) * rms(scene.torque + scene.rotor_torque))
+def on_joint(scene: Scene, joint: int, effect: str, values: Values, **more: Any) -> DrawnEffect:
+    """An effect of one joint that the simulated arm gets by the same parameters; `more` are fields of DrawnEffect."""
+    name = scene.arm.names[joint]
+    return DrawnEffect(effect, {name: values}, **{"settings": (ArmSetting(effect, name, values),), **more})
 
 
 def pick(wanted: Array, cap: float | Array, random: np.random.Generator, allowed: Mask | None = None) -> int | None:
@@ -113,8 +83,5 @@ def sign(random: np.random.Generator) -> float:
 
 def reversals(x: Array, width: Array) -> Array:
     """How often each column passes from beyond +width to beyond −width or back, (n,)."""
-    out = np.zeros(x.shape[1])
-    for j, column in enumerate(x.T):
-        beyond = np.sign(column[np.abs(column) > width[j]])
-        out[j] = np.count_nonzero(np.diff(beyond))
-    return out
+    beyond = (np.sign(column[np.abs(column) > limit]) for column, limit in zip(x.T, width, strict=True))
+    return np.array([np.count_nonzero(np.diff(signs)) for signs in beyond], float)

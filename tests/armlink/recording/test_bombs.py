@@ -14,7 +14,7 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from armlink.errors import BadInput
-from armlink.recording import mcap, recording, tables
+from armlink.recording import mcap, parquet, recording, tables
 from armlink.recording.files import load_recording, save_recording
 from armlink.recording.recording import Recording
 
@@ -83,9 +83,9 @@ def test_a_file_larger_than_a_recording_may_be(tmp_path, monkeypatch):
 @pytest.mark.parametrize("content", [b"{", b"[" * 100_000, b"\xff", b"3", b'{"a": 1}', b"[1, 2]"])
 def test_metadata_that_are_no_names(tmp_path, content):
     table = pa.table({name: [0.0, 1.0] for name in ("t", "q_1", "tau_1")})
-    pq.write_table(table.replace_schema_metadata({tables.NAMES_KEY: content}), tmp_path / "r.parquet")
+    pq.write_table(table.replace_schema_metadata({parquet.NAMES_KEY: content}), tmp_path / "r.parquet")
     refused(tmp_path / "r.parquet", "armlink.names is no JSON list of joint names")
-    good = table.replace_schema_metadata({tables.NAMES_KEY: json.dumps(["a"]).encode()})
+    good = table.replace_schema_metadata({parquet.NAMES_KEY: json.dumps(["a"]).encode()})
     pq.write_table(good, tmp_path / "r.parquet")
     assert load_recording(tmp_path / "r.parquet").names == ("a",)
 

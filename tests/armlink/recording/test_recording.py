@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from armlink.errors import BadInput
 from armlink.recording.files import load_recording, save_recording
+from armlink.recording.parquet import numbers
 from armlink.recording.recording import Recording, slice_rows
-from armlink.recording.tables import numbers
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_uneven_times_are_fine(tmp_path):
         ("t,q_1,tau_1\n0,0,0\n,0,0\n", "row 2: t is nan"),
         ("t,q_1,tau_1\n0,0,0\n1,inf,0\n", "row 2: q_1 is infinite"),
         ("t,q_1,tau_1\n0,0,0\n1,abc,0\n", "invalid value 'abc'"),
-        ("t,q_1,tau_1\n0,0,0\n1,0\n", "Expected 3 columns, got 2"),
+        ("t,q_1,tau_1\n0,0,0\n1,0\n", "row 2: expected 3 columns, got 2"),
         ("t,q_1,q_1,tau_1\n0,0,0,0\n", "'q_1' occurs twice"),
         ("t,q_1,tau_1\n0,0,0\n", "1 rows: a recording needs at least two"),
         ("t,q_1,tau_1\n", "0 rows"),

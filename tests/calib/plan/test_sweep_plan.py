@@ -8,7 +8,7 @@ from sweep_arms import random_arm, synthetic_pass, with_section
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits
-from calib.plan.sweep_plan import plan_sweep
+from calib.plan.sweep_plan import plan_sweep, refuse_unbearable_mass
 from calib.plan.types import SweepPlan
 from calib.sweep.scout import rough_model
 from sim_bus.simulated_arm import SimulatedArm
@@ -127,3 +127,16 @@ def test_a_range_too_short_to_sweep_names_the_joint() -> None:
 def test_one_bias_torque_per_joint() -> None:
     with pytest.raises(BadInput, match=r"sweep\.bias_torque: 2 values, expected 3"):
         plan_sweep(with_section(random_arm(8, 3), bias_torque=(5.0, 5.0)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_reference_mass_beyond_the_drives_is_refused_before_anything_moves(seed: int) -> None:
+    """Grams for kilograms above all; the mass that the message allows passes."""
+    arm, _ = drawn_arm(seed)
+    with pytest.raises(BadInput, match=r"no sweep of \w+ stays within max_torque: attach at most [\d.]+ kg") as refused:
+        refuse_unbearable_mass(arm, 5000.0, None)
+    most = float(str(refused.value).partition("at most ")[2].partition(" kg")[0])
+    refuse_unbearable_mass(arm, 0.95 * most, None)
+    with pytest.raises(BadInput, match="at most"):
+        refuse_unbearable_mass(arm, 1.06 * most, None)
+    assert plan_sweep(arm).reference_mass <= most

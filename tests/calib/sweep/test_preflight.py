@@ -11,6 +11,7 @@ from hard_cases import stick
 from sweep_arms import random_arm
 
 from armlink.arm_file import ArmFile
+from armlink.drives.canopen.settings import CanopenSettings
 from armlink.errors import Refused
 from armlink.link.link import Link
 from calib.arm.kinematics import DriveLimits
@@ -92,6 +93,30 @@ def test_a_silent_sensor_is_named() -> None:
         link.cycle = deaf  # type: ignore[method-assign]
         with pytest.raises(Refused, match=r"j2: \d+ of \d+ torque readings are missing"):
             listen(link, ARM)
+
+
+@pytest.mark.parametrize("mute", [False, True])
+def test_a_drives_own_torque_in_every_fourth_cycle_is_no_loss(mute: bool) -> None:
+    """6077h of a CiA 402 drive comes in TPDO2; where it does not come at all, it is missing."""
+    rows = [row.model_copy(update={"node": None, "drive": motor(row.node)}) for row in ARM.link.joints]
+    arm = ARM.model_copy(update={"link": ARM.link.model_copy(update={"joints": tuple(rows)})})
+    with enabled(SimulatedArm(arm, Truth.of(arm), 1), arm) as link:
+        whole = link.cycle
+
+        def deaf(command: Any) -> Any:
+            sample = whole(command)
+            return replace(sample, torque=np.array([sample.torque[0], np.nan]))
+
+        if mute:
+            link.cycle = deaf  # type: ignore[method-assign]
+            with pytest.raises(Refused, match=r"j2: (\d+) of \1 torque readings are missing"):
+                listen(link, arm)
+        else:
+            assert np.isfinite(listen(link, arm).torque).all()
+
+
+def motor(node: int | None) -> CanopenSettings:
+    return CanopenSettings(node=node, torque="motor")
 
 
 def test_stops_are_found_where_the_arm_file_has_them_and_named_where_not() -> None:

@@ -9,6 +9,7 @@ import pytest
 from published_arms import HALF, IIWA, MJCF, PANDA, UR10, mujoco_torque, urdf
 
 from gcomp.arm.load import load_model, place_chain
+from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
 from gcomp.errors import BadModel
 from gcomp.gravity.torque import gravity_torque
@@ -45,6 +46,35 @@ def test_ur10_converts_to_the_published_denavit_hartenberg_rows(tmp_path: Path) 
     assert np.abs(arm.a) == pytest.approx([0, 0.612, 0.5723, 0, 0, 0], abs=1e-9)
     assert np.abs(arm.alpha) == pytest.approx([HALF, 0, 0, HALF, HALF, 0], abs=1e-9)
     assert np.abs(arm.d)[3:5] == pytest.approx([0.163941, 0.1157], abs=1e-9)
+
+
+@pytest.mark.parametrize("rows", [UR10, PANDA, IIWA], ids=["ur10", "panda", "iiwa"])
+@pytest.mark.parametrize("digits", [2, 4, 6, 9])
+def test_rounded_angles_leave_the_arm_as_large_as_it_is(rows: list, digits: int, tmp_path: Path, rng) -> None:
+    """Angles as published models have them (3.14, 3.1416): the common normal of such axes is up to 27 km away."""
+    # one rounding error in every joint, however its angles divide
+    rounded = [
+        (xyz, tuple(round(angle, digits) + 3 * 10.0**-digits for angle in rpy), *rest) for xyz, rpy, *rest in rows
+    ]
+    text = urdf(rounded)
+    path = tmp_path / "arm.urdf"
+    path.write_text(text)
+    model, sound = load_model(path), tmp_path / "sound.urdf"
+    sound.write_text(urdf(rows))
+    assert np.abs(model.arm.span).max() < 1.1 * np.abs(load_model(sound).arm.span).max()
+    q = rng.uniform(-2.9, 2.8, (50, len(rows)))
+    assert np.abs(gravity_torque(model.arm, model.beta, q) - pinocchio_torque(text, q)).max() < 1e-8
+    at_origin, by_point = payload_columns(model.arm)
+    placed, point = place_chain(path), np.array([0.03, -0.05, 0.2])
+    loaded, last = pin.buildModelFromXML(text), len(rows)
+    data = loaded.createData()
+    pin.forwardKinematics(loaded, data, placed.reference)
+    world = placed.geometry.origins[-1] + placed.geometry.bar[-1] @ point
+    loaded.appendBodyToJoint(last, pin.Inertia(2.0, data.oMi[last].actInv(world), np.eye(3)), pin.SE3.Identity())
+    data = loaded.createData()
+    expected = np.array([pin.computeGeneralizedGravity(loaded, data, row) for row in q])
+    held = gravity_torque(model.arm, model.beta + 2.0 * (at_origin + by_point @ point), q)
+    assert np.abs(held - expected).max() < 1e-8
 
 
 def test_mjcf_of_every_kind_holds_what_mujoco_says(tmp_path: Path, rng) -> None:

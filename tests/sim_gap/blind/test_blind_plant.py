@@ -10,16 +10,15 @@ import pinocchio as pin
 import pytest
 
 from armlink.recording.files import load_recording
+from sim_bus.effects.registry import imperfections
 from sim_gap.blind.arms import BenchArm, draw_arm
-from sim_gap.blind.cases import make_cases
+from sim_gap.blind.cases import make_case
 from sim_gap.blind.effects import DRAWS, EFFECTS
 from sim_gap.blind.motion import KINDS, RATE, MotionLimits, derivatives, trajectory
-from sim_gap.blind.plant.drive import Bristles
-from sim_gap.blind.plant.plant import simulate
-from sim_gap.blind.plant.sensors import _stays_behind, record
+from sim_gap.blind.plant import Log, PlantRun, controller_bandwidth, joint_sensors, record, simulate, true_arm
 from sim_gap.blind.recipe import CaseRecipe
 from sim_gap.blind.scene import Scene
-from sim_gap.blind.true_arm import Log, PlantRun, sound_arm
+from sim_gap.blind.servo_plant import Bristles
 
 ALL = {
     "link.mass_moment",
@@ -67,20 +66,23 @@ def no_effect() -> tuple[PlantRun, Log]:
     random = np.random.default_rng(3)
     arm = draw_arm(random, 5)
     scene = Scene(arm, trajectory(("sines",), 8.0, limits(5), random))
-    run = PlantRun(
-        sound_arm(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 7
-    )
-    return run, simulate([run])[0]
+    truth, feed = true_arm(arm, scene.rated, random), scene.feed_forward(scene.command)
+    run = PlantRun(truth, scene.command, feed, scene.inertia, controller_bandwidth(truth), 7)
+    return run, simulate(run)
+
+
+def link_motion(run: PlantRun, log: Log) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """True angles, velocities and accelerations but for the first and the last row."""
+    angle = joint_sensors(run.truth).angle_of(log.position)
+    return angle[1:-1], derivatives(angle)[0][1:-1], (angle[2:] - 2 * angle[1:-1] + angle[:-2]) * RATE**2
 
 
 def test_link_torque_is_pinocchios_for_the_true_arm(no_effect: tuple[PlantRun, Log]) -> None:
     run, log = no_effect
     model = _pinocchio(run.truth.arm)
-    velocity = derivatives(log.angle)[0][1:-1]
-    acceleration = (log.angle[2:] - 2 * log.angle[1:-1] + log.angle[:-2]) * RATE**2
     inner = slice(20, -20)
-    motion = (log.angle[1:-1][inner], velocity[inner], acceleration[inner])
     data = model.createData()
+    motion = (part[inner] for part in link_motion(run, log))
     expected = np.array([pin.rnea(model, data, *row) for row in zip(*motion, strict=True)])
     # the torque of one instant against a second difference over 4 ms: equal but for the controller's own noise
     left = np.sqrt(((log.torque[1:-1][inner] - expected) ** 2).mean(0))
@@ -100,11 +102,10 @@ def _pinocchio(arm: BenchArm) -> pin.Model:
 
 def test_motor_torque_is_link_torque_plus_rotor_and_friction(no_effect: tuple[PlantRun, Log]) -> None:
     run, log = no_effect
-    acceleration = (log.angle[2:] - 2 * log.angle[1:-1] + log.angle[:-2]) * RATE**2
-    rest = run.truth.motor_gain * log.motor[1:-1] - log.torque[1:-1] - run.truth.arm.armature * acceleration
-    velocity = derivatives(log.angle)[0][1:-1]
+    state, (_, velocity, acceleration) = run.truth.state, link_motion(run, log)
+    rest = state.actuator_gain * log.motor[1:-1] - log.torque[1:-1] - run.truth.arm.armature * acceleration
     moving = np.abs(velocity) > 0.1
-    most = run.truth.coulomb + run.truth.viscous * np.abs(velocity) + run.truth.ripple[:, 0]
+    most = state.coulomb + state.viscous * np.abs(velocity)
     mean = np.array([rest[m, j].mean() for j, m in enumerate((moving & (velocity > 0)).T)])
     assert (np.abs(mean) < most.max(0) + 0.02).all()
     assert (mean > 0.0).all()
@@ -115,23 +116,9 @@ def test_arm_stays_on_its_trajectory(no_effect: tuple[PlantRun, Log]) -> None:
     assert np.abs(log.position - run.command).max() < 0.05
 
 
-def test_a_run_is_the_same_whoever_its_neighbours_are(no_effect: tuple[PlantRun, Log]) -> None:
-    run, log = no_effect
-    short = PlantRun(run.truth, run.command[:500], run.feed_forward[:500], run.inertia, run.seed)
-    random = np.random.default_rng(11)
-    arm = draw_arm(random, 7)
-    scene = Scene(arm, trajectory(("points",), 2.0, limits(7), random))
-    other = PlantRun(
-        sound_arm(arm, scene.rated, random), scene.command, scene.feed_forward(scene.command), scene.inertia, 1
-    )
-    beside = simulate([short, other])[0]
-    for name in ("position", "torque", "motor", "command"):
-        np.testing.assert_allclose(getattr(beside, name), getattr(log, name)[:500], rtol=0, atol=1e-9)
-
-
 def test_recording_is_uneven_quantised_and_complete(no_effect: tuple[PlantRun, Log]) -> None:
     run, log = no_effect
-    columns = record(run.truth, log, 250.0, True, run.command, np.random.default_rng(0))
+    columns = record(run, log, 250.0, np.random.default_rng(0))
     step = np.diff(columns["t"])
     assert columns["t"][0] == 0.0
     assert (step > 0).all()
@@ -176,43 +163,30 @@ def test_a_short_motion_from_point_to_point_moves_and_comes_back() -> None:
 
 
 def _bristles(coulomb: float) -> Bristles:
-    random = np.random.default_rng(0)
-    arm = draw_arm(random, 3)
-    truth = sound_arm(arm, np.full(3, 10.0), random)
-    truth.coulomb[:], truth.viscous[:] = coulomb, 0.0
-    return Bristles([truth], np.full((1, 3), 0.1), 5e-4)
+    state = imperfections(("a", "b", "c"), ())
+    state.coulomb[:] = coulomb
+    return Bristles(state, np.full(3, 0.1), 5e-4)
 
 
 def test_friction_slides_at_coulombs_level() -> None:
     bristles = _bristles(2.0)
     for _ in range(400):
-        force = bristles.force(np.full((1, 3), 0.3), np.zeros((1, 3)))
+        force = bristles.force(np.full(3, 0.3), np.zeros(3))
     np.testing.assert_allclose(force, 2.0, rtol=1e-3)
 
 
 def test_friction_does_not_creep_at_rest() -> None:
     """A mass on bristles, pushed with half of breakaway and shaken by noise, stays: plain LuGre would wander off."""
     bristles, random = _bristles(2.0), np.random.default_rng(1)
-    x, v = np.zeros((1, 3)), np.zeros((1, 3))
+    x, v = np.zeros(3), np.zeros(3)
     places = []
     for _ in range(20000):
-        push = 1.0 + 0.3 * random.standard_normal((1, 3))
-        v += 5e-4 * (push - bristles.force(v, np.zeros((1, 3)))) / 0.1
+        push = 1.0 + 0.3 * random.standard_normal(3)
+        v += 5e-4 * (push - bristles.force(v, np.zeros(3))) / 0.1
         x += 5e-4 * v
         places.append(x.copy())
-    settled = np.array(places)[2000:, 0]
+    settled = np.array(places)[2000:]
     assert np.abs(settled[-2000:].mean(0) - settled[:2000].mean(0)).max() < 1e-5
-
-
-def test_hysteresis_stays_behind_by_its_width() -> None:
-    torque = 5.0 * np.sin(np.linspace(0, 6 * np.pi, 6000))
-    read = _stays_behind(torque, 0.5)
-    rising = np.gradient(torque) > 0
-    late = torque - read
-    assert np.abs(late).max() <= 0.5 + 1e-9
-    middle = (np.abs(torque) < 2.0) & (np.arange(6000) > 1500)
-    np.testing.assert_allclose(late[middle & rising], 0.5, atol=0.02)
-    np.testing.assert_allclose(late[middle & ~rising], -0.5, atol=0.02)
 
 
 def test_every_effect_is_drawn() -> None:
@@ -237,7 +211,8 @@ def labels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A short case of an effect of every kind, made as the check makes them; the labels by effect."""
     folder = tmp_path_factory.mktemp("blind")
     wanted = [CaseRecipe(f"case_{k:04d}", (effect,), (23, k)) for k, effect in enumerate(SHOWN)]
-    make_cases(wanted, folder / "cases", folder / "labels", train_s=10.0, heldout_s=7.0)
+    for recipe in wanted:
+        make_case(recipe, folder / "cases", folder / "labels", train_s=10.0, heldout_s=7.0)
     found = [json.loads(path.read_text()) for path in sorted((folder / "labels").glob("*.json"))]
     return {label["effects"][0]["effect"]: label for label in found}
 
@@ -262,9 +237,9 @@ def test_effect_shows_in_its_channels_only(labels: dict[str, Any], effect: str) 
 
 
 def test_cases_are_the_same_for_the_same_seed(tmp_path: Path) -> None:
-    wanted = [CaseRecipe("case_0000", ("friction.coulomb",), (5, 1))]
+    wanted = CaseRecipe("case_0000", ("friction.coulomb",), (5, 1))
     for folder in ("a", "b"):
-        make_cases(wanted, tmp_path / folder, tmp_path / f"{folder}_labels", train_s=3.0, heldout_s=3.0)
+        make_case(wanted, tmp_path / folder, tmp_path / f"{folder}_labels", train_s=3.0, heldout_s=3.0)
     for name in ("sim.xml", "train.csv", "heldout.csv"):
         assert (tmp_path / "a/case_0000" / name).read_bytes() == (tmp_path / "b/case_0000" / name).read_bytes()
 
@@ -272,15 +247,13 @@ def test_cases_are_the_same_for_the_same_seed(tmp_path: Path) -> None:
 def test_a_case_that_no_arm_shows_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(DRAWS, "torque.offset", lambda scene, random: None)
     monkeypatch.setattr("sim_gap.blind.recipe.ATTEMPTS", 3)
-    wanted = [CaseRecipe("case_0000", ("torque.offset",), (6, 1)), CaseRecipe("case_0001", (), (6, 2))]
-    make_cases(wanted, tmp_path / "c", tmp_path / "l", train_s=3.0, heldout_s=3.0)
-    assert [path.name for path in (tmp_path / "c").iterdir()] == ["case_0001"]
-    make_cases(wanted[:1], tmp_path / "c", tmp_path / "l", train_s=3.0, heldout_s=3.0)
+    for wanted in (CaseRecipe("case_0000", ("torque.offset",), (6, 1)), CaseRecipe("case_0001", (), (6, 2))):
+        make_case(wanted, tmp_path / "c", tmp_path / "l", train_s=3.0, heldout_s=3.0)
     assert [path.name for path in (tmp_path / "c").iterdir()] == ["case_0001"]
 
 
 def test_nominal_model_and_recordings_load(tmp_path: Path) -> None:
-    make_cases([CaseRecipe("case_0000", (), (6, 1))], tmp_path / "c", tmp_path / "l", train_s=4.0, heldout_s=3.0)
+    make_case(CaseRecipe("case_0000", (), (6, 1)), tmp_path / "c", tmp_path / "l", train_s=4.0, heldout_s=3.0)
     recording = load_recording(tmp_path / "c/case_0000/train.csv")
     label = json.loads((tmp_path / "l/case_0000.json").read_text())
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "c/case_0000/sim.xml"))

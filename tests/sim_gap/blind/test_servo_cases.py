@@ -4,28 +4,27 @@ import mujoco
 import numpy as np
 
 from armlink.recording.files import load_recording
-from sim_gap.blind.position_score import score_positions
-from sim_gap.blind.servo_cases import ServoRecipe, make_cases, recipes
-from sim_gap.blind.servo_effects import OF_THE_ARM, OF_THE_SERVO
+from sim_gap.blind.cases import make_case
+from sim_gap.blind.effects.controller import DRAWS, OF_THE_ARM
+from sim_gap.blind.recipe import CaseRecipe, servo_recipes
+from sim_gap.blind.score import score_positions
 from sim_gap.position_gap.training.replay import Simulated, replay_rms
 
 
 def test_every_effect_comes_in_turn() -> None:
-    drawn = recipes(3, 80)
-    assert {r.effect for r in drawn if r.known} == {"", *OF_THE_SERVO, *OF_THE_ARM}
-    assert not any(r.effect in ("controller.stiffness", "friction.viscous") for r in drawn if not r.known)
-    assert drawn == recipes(3, 80)
+    drawn = servo_recipes(3, 80)
+    every = {(), *((effect,) for effect in (*DRAWS, *OF_THE_ARM))}
+    assert {r.effects for r in drawn if r.controller_known} == every
+    undecidable = {("controller.stiffness",), ("friction.viscous",)}
+    assert not any(r.effects in undecidable for r in drawn if not r.controller_known)
+    assert drawn == servo_recipes(3, 80)
 
 
 def test_the_arm_without_an_effect_moves_as_its_model_does_in_mujoco(tmp_path) -> None:
     """Plant and servo against MuJoCo's own position actuators; with a lower gain both part."""
-    make_cases(
-        [ServoRecipe("case_0000", "", True, (9, 1)), ServoRecipe("case_0001", "controller.stiffness", True, (9, 2))],
-        tmp_path / "cases",
-        tmp_path / "labels",
-        4.0,
-        4.0,
-    )
+    for k, effects in enumerate(((), ("controller.stiffness",))):
+        recipe = CaseRecipe(f"case_{k:04d}", effects, (9, 1 + k), controller_known=True)
+        make_case(recipe, tmp_path / "cases", tmp_path / "labels", 4.0, 4.0)
     rms = {}
     for case in ("case_0000", "case_0001"):
         folder = tmp_path / "cases" / case

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from sim_gap.blind import recipe
-from sim_gap.blind.effects import actuator, friction, torque, transmission
+from sim_gap.blind.arms import draw_arm
+from sim_gap.blind.effects import motor_side, sensors
+from sim_gap.blind.effects.controller import integral
 from sim_gap.blind.effects.drawn_effect import DrawnEffect
+from sim_gap.blind.motion import RATE
 from sim_gap.blind.recipe import OTHER_PAIR, CaseRecipe
-from sim_gap.blind.servo_effects import integral
+from sim_gap.blind.scene import Scene
 from sim_gap.blind.tables import _percent
 
 K = 400
@@ -18,20 +21,28 @@ STEP_S = 0.05
 """Between two rows of a scene [s]."""
 
 
-def scene(torques: np.ndarray, turn: float = 1.0) -> SimpleNamespace:
+def scene(torques: np.ndarray, turn: float = 1.0) -> Scene:
     """An arm along a motion with these torques (K, n) [N·m]; an angle error of 1 rad changes each by `turn` [N·m]."""
     n = torques.shape[1]
     t = STEP_S * np.arange(len(torques))
     velocity = np.column_stack([0.5 * np.sin((1.0 + j) * t) for j in range(n)])
-    return SimpleNamespace(
-        arm=SimpleNamespace(n=n, names=tuple(f"joint_{j + 1}" for j in range(n)), armature=np.full(n, 0.1)),
+    arm = SimpleNamespace(n=n, names=tuple(f"joint_{j + 1}" for j in range(n)), armature=np.full(n, 0.1))
+    made = Scene(arm, np.zeros((round(STEP_S * len(torques) * RATE), n)))
+    vars(made).update(
         torque=torques,
         rotor_torque=np.zeros_like(torques),
         motion=(velocity, velocity, velocity),
-        seconds=STEP_S * len(torques),
         inertia=np.full(n, 0.5),
+        link_inertia=np.full(n, 0.4),
         slope=np.broadcast_to(turn * np.eye(n), (len(torques), n, n)),
     )
+    return made
+
+
+def settings(drawn: DrawnEffect) -> dict[str, dict[str, float]]:
+    """What the simulated arm gets, by effect."""
+    assert all(setting.joint in drawn.joints for setting in drawn.settings)
+    return {setting.effect: setting.parameters for setting in drawn.settings}
 
 
 def swing(hz: float, size: float, mean: float = 0.0) -> np.ndarray:
@@ -45,64 +56,69 @@ def rng() -> np.random.Generator:
 
 def test_a_gain_error_is_that_of_a_joint_with_enough_torque() -> None:
     """On the weak one, the least error that shows would be more than a quarter."""
-    drawn = torque.gain(scene(np.column_stack([swing(0.2, 0.1), swing(0.2, 5.0)])), rng())
+    drawn = sensors.torque_gain(scene(np.column_stack([swing(0.2, 0.1), swing(0.2, 5.0)])), rng())
     assert drawn is not None
     assert drawn.joints == ("joint_2",)
-    truth = SimpleNamespace(torque_gain=np.ones(2))
-    drawn.apply(truth)
-    assert truth.torque_gain[0] == 1.0
-    assert 0.06 <= abs(truth.torque_gain[1] - 1.0) <= 0.14
+    assert 0.06 <= abs(settings(drawn)["torque.gain"]["gain"] - 1.0) <= 0.14
 
 
 def test_hysteresis_is_drawn_where_the_torque_swings_and_not_where_it_is_large() -> None:
     both = scene(np.column_stack([swing(0.2, 1.0, mean=40.0), swing(0.2, 5.0)]))
-    assert {torque.hysteresis(both, np.random.default_rng(seed)).joints for seed in range(8)} == {("joint_2",)}
-    assert torque.hysteresis(scene(swing(0.2, 1.0, mean=40.0)[:, None]), rng()) is None
+    assert {sensors.hysteresis(both, np.random.default_rng(seed)).joints for seed in range(8)} == {("joint_2",)}
+    assert sensors.hysteresis(scene(swing(0.2, 1.0, mean=40.0)[:, None]), rng()) is None
 
 
 def test_a_sensor_saturates_within_its_torque() -> None:
     torques = np.column_stack([swing(0.2, 5.0), swing(0.13, 3.0)])
-    drawn = torque.saturation(scene(torques), rng())
+    drawn = sensors.saturation(scene(torques), rng())
     assert drawn is not None
     j = ("joint_1", "joint_2").index(drawn.joints[0])
     limit = drawn.parameters[drawn.joints[0]]["limit"]
     lost = np.maximum(np.abs(torques[:, j]) - limit, 0.0)
     assert np.sqrt(np.mean(lost**2)) > 0.06 * np.sqrt(np.mean(torques[:, j] ** 2))
-    truth = SimpleNamespace(torque_limit=np.full(2, 100.0))
-    drawn.apply(truth)
-    assert truth.torque_limit[j] == limit
-    assert truth.torque_limit[1 - j] == 100.0
+    assert settings(drawn) == {"torque.saturation": {"limit": limit}}
 
 
 def test_a_lag_is_drawn_on_a_joint_whose_torque_changes() -> None:
-    drawn = actuator.DRAWS["actuator.lag"](scene(np.column_stack([np.full(K, 5.0), swing(1.0, 5.0)])), rng())
+    drawn = motor_side.DRAWS["actuator.lag"](scene(np.column_stack([np.full(K, 5.0), swing(1.0, 5.0)])), rng())
     assert drawn is not None
     assert drawn.joints == ("joint_2",)
-    truth = SimpleNamespace(motor_lag=np.zeros(2), motor_delay=np.zeros(2), bandwidth=np.full(2, 100.0))
-    drawn.apply(truth)
-    assert truth.motor_lag[1] == drawn.parameters["joint_2"]["time"]
-    assert actuator.LATE_S[0] <= truth.motor_lag[1] <= actuator.LATE_S[1]
+    time = settings(drawn)["actuator.lag"]["time"]
+    assert time == drawn.parameters["joint_2"]["time"]
+    assert motor_side.LATE_S[0] <= time <= motor_side.LATE_S[1]
 
 
 def test_stribeck_friction_lies_on_top_of_coulombs() -> None:
-    drawn = friction.stribeck(scene(swing(0.2, 5.0)[:, None]), rng())
-    assert drawn is not None
-    truth = SimpleNamespace(coulomb=np.zeros(1), breakaway=np.zeros(1), stribeck_velocity=np.zeros(1))
-    drawn.apply(truth)
-    assert 0.8 * truth.breakaway[0] < truth.coulomb[0] < 1.6 * truth.breakaway[0] + 0.03
-    assert drawn.parameters["joint_1"] == {"breakaway": truth.breakaway[0], "velocity": truth.stribeck_velocity[0]}
+    """Of the arm alone, or of the nominal model too."""
+    nominal = 0
+    for seed in range(8):
+        drawn = motor_side.stribeck(scene(swing(0.2, 5.0)[:, None]), np.random.default_rng(seed))
+        put = settings(drawn)
+        breakaway = put["friction.stribeck"]["breakaway"]
+        arm = draw_arm(np.random.default_rng(seed), 3)
+        known = float(drawn.nominal(arm).frictionloss[0])
+        if "friction.coulomb" in put:
+            assert drawn.implied == ("friction.coulomb",)
+            assert known == arm.frictionloss[0]
+        else:
+            nominal += 1
+        assert 0.8 * breakaway < put.get("friction.coulomb", {"torque": known})["torque"] < 1.6 * breakaway
+        assert drawn.parameters["joint_1"] == put["friction.stribeck"]
+    assert 0 < nominal < 8
 
 
 def test_backlash_is_drawn_on_a_joint_whose_torque_changes_sign_often() -> None:
     """Four reversals in twenty seconds are often; one is not."""
-    assert transmission.backlash(scene(swing(0.1, 5.0)[:, None], turn=100.0), rng()) is not None
+    assert motor_side.backlash(scene(swing(0.1, 5.0)[:, None], turn=100.0), rng()) is not None
     once = np.where(np.arange(K) < 200, 5.0, -5.0)
-    assert transmission.backlash(scene(once[:, None], turn=100.0), rng()) is None
+    assert motor_side.backlash(scene(once[:, None], turn=100.0), rng()) is None
 
 
 def test_a_servos_integral_part_is_the_one_that_is_told() -> None:
     law = SimpleNamespace(stiffness=np.array([20.0, 50.0]), integral=np.zeros(2))
-    change = integral(scene(np.column_stack([swing(0.2, 1.0)] * 2)), law, rng())
+    moved = scene(np.column_stack([swing(0.2, 1.0)] * 2))
+    moved.law = law
+    change = integral(moved, rng())
     change.law(law)
     (name,) = change.parameters
     j = ("joint_1", "joint_2").index(name)
@@ -143,7 +159,7 @@ def test_of_several_effects_a_payload_counts_as_one_of_the_last_link(monkeypatch
     """Slow motion cannot separate it from a mass moment of that link; it can from one of another link."""
 
     def drawn(effect: str, joint: str) -> DrawnEffect:
-        return DrawnEffect(effect, {joint: {}}, lambda true: None)
+        return DrawnEffect(effect, {joint: {}})
 
     arm = SimpleNamespace(arm=SimpleNamespace(names=("joint_1", "joint_2")))
     for joint, found in (("joint_2", False), ("joint_1", True)):

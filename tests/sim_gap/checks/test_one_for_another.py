@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from doubts import doubt
 
-from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
@@ -52,9 +52,10 @@ def moved(recording: Recording, joint: int, angle: float) -> Recording:
 def test_a_zero_is_no_order_no_delay_and_no_tilt(arms, folder, joint, angle):
     """LWR4's joints 2 and 5 move alike: exchanged, they fit nearly as well as with the zero put right."""
     arm, recording = arms[folder]
-    with pytest.raises(BadInput, match=f"joint_{joint + 1}: may have its zero off") as refused:
-        check_recording(arm, moved(recording, joint, angle), "r", AS_IT_IS)
-    told = float(str(refused.value).partition("about ")[2].partition(" rad")[0])
+    refused = doubt(
+        check_recording(arm, moved(recording, joint, angle), "r", AS_IT_IS), f"joint_{joint + 1}: may have its zero off"
+    )
+    told = float(refused.partition("about ")[2].partition(" rad")[0])
     assert told == pytest.approx(-angle, abs=0.03)
 
 
@@ -84,8 +85,10 @@ def test_one_joint_in_another_unit_makes_no_motors_of_link_sensors(arms, joint):
     torque = recording.torque.copy()
     torque[:, joint] *= 10.0
     column = f"tau_{joint + 1}"
-    with pytest.raises(BadInput, match=f"contains friction .*--units {column}=A:K"):
-        check_recording(arm, replace(recording, torque=torque), "r", AS_IT_IS)
+    doubt(
+        check_recording(arm, replace(recording, torque=torque), "r", AS_IT_IS),
+        f"contains friction .*--units {column}=A:K",
+    )
     stated = parse_corrections(units=[f"{column}=N·m"])
     assert check_recording(arm, replace(recording, torque=torque), "r", stated)[1] == []
 

@@ -5,10 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim_gap.demo.bench import ACCELERATION, RANGE_SHARE, SPEED_SHARE, multisine
-from sim_gap.demo.drift import drifting_joint
-from sim_gap.demo.result import DemoResult, summary
-from sim_gap.demo.run import BY
+from sim_gap.demo.account import Account
+from sim_gap.demo.bench import ACCELERATION, RANGE_SHARE, SPEED_SHARE, drifting_joint, multisine
+from sim_gap.demo.run import BY, Demo
 
 
 def motion(low: float, high: float, speeds: tuple[float, float], seed: int) -> tuple[np.ndarray, ...]:
@@ -51,22 +50,25 @@ def test_the_joint_that_drifts_is_the_third_or_the_one_that_gravity_moves_most(s
     assert drifting_joint(calibration, SimpleNamespace(model=model), np.ones(3)) == joint
 
 
-def test_a_summary_sets_what_was_found_beside_the_truth() -> None:
-    truth = SimpleNamespace(gain=np.array([1.1]), offset=np.array([0.2]), position_gain=np.array([1.01]))
-    found = {"gain": 1.12, "offset": np.nan, "position_gain": 1.012}
+def test_a_summary_sets_what_was_found_beside_the_truth(monkeypatch) -> None:
+    truth = SimpleNamespace(gain=[1.1], offset=[0.2], position_gain=[1.01], attachment=[0.0, 0.0, 0.1])
+    truth = SimpleNamespace(**{name: np.array(value) for name, value in vars(truth).items()})
+    found = {"gain": 1.12345678, "offset": np.nan, "position_gain": 1.012}
     fit = SimpleNamespace(
+        names=("elbow",),
         value=lambda name: np.array([found[name]]),
         ci95=lambda name: np.array([[found[name] - 0.5, found[name] + 0.5]]),
         reasons={("elbow", "offset"): "no sweep tells it"},
     )
-    nothing = SimpleNamespace(**dict.fromkeys(("frames", "missed", "poses"), 0), rate_hz=1.0, load=0.0)
-    nothing.max_torque = nothing.rms_error = nothing.max_abs_error = nothing.rms = nothing.position = np.zeros(1)
-    bench = SimpleNamespace(arm=SimpleNamespace(name="arm"), truth=truth, link=SimpleNamespace(names=("elbow",)))
-    gap = SimpleNamespace(to_json=dict)
-    made = summary(DemoResult(bench, 0, fit, nothing, nothing, gap, nothing, 1.0, 2.0))
+    simulated = SimpleNamespace(true_friction=np.zeros(1))
+    demo, account = Demo.__new__(Demo), Account(None)
+    demo.bench, demo.account = SimpleNamespace(simulated=simulated, arm=None, creeping=False), account
+    monkeypatch.setattr("calib.report.calibration.sections", lambda done: [])
+    demo._tell_sensors([], fit, None, truth)
+    made = account.summary
     assert {name: (each["true"], each["estimated"], each["ci95"]) for name, each in made["sensors"].items()} == {
-        "gain": ([1.1], [1.12], [[0.62, 1.62]]),
-        "offset": ([0.2], [None], [None]),
+        "gain": ([1.1], [1.123457], [[0.6234568, 1.623457]]),
+        "offset": ([0.2], [pytest.approx(np.nan, nan_ok=True)], [None]),
         "position_gain": ([1.01], [1.012], [[0.512, 1.512]]),
     }
     assert made["not_identifiable"] == {"elbow.offset": "no sweep tells it"}

@@ -8,7 +8,7 @@ from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO1
 from armlink.drives.canopen.profile import Profile
-from armlink.drives.canopen.units import Units
+from armlink.drives.canopen.units import TORQUE_PER_MICRO, Units
 from armlink.drives.orders import Limits
 from armlink.errors import BadInput
 
@@ -47,8 +47,14 @@ class Wire:
         return self.profile.by_velocity
 
 
-def check_fits(name: str, limits: Limits, unit: Units) -> None:
-    """Raise BadInput where limits fit no frame and no object."""
+def check_fits(name: str, limits: Limits, unit: Units, record: bool = False) -> None:
+    """Raise BadInput where limits fit no frame and no object, our torque record 2100h included."""
+    if record and limits.max_torque / TORQUE_PER_MICRO > INT32_MAX:
+        most = INT32_MAX * TORQUE_PER_MICRO
+        raise BadInput(
+            f"{name}: max_torque {limits.max_torque} N·m: the readings of 2100h end at {most:.4g} N·m: lower it, or "
+            "take a drive whose protocol carries more"
+        )
     if limits.max_torque / unit.torque > INT16_MAX:
         most = INT16_MAX * unit.torque
         raise BadInput(f"{name}: max_torque {limits.max_torque} N·m: 6071h carries at most {most:.6g} N·m")

@@ -5,11 +5,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-from armlink.arm_file import bundled_arms
+from armlink.arm_file import bundled_arms, parse_arm
 from armlink.cli import run
 from armlink.drives.canopen import eds_file as data_sheet
 from armlink.errors import BadInput, Refused
 from armlink.link.link import Link
+from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.simulated_arm import SimulatedArm
+from sim_bus.truth import Truth
 
 OURS = Path(data_sheet.bundled_path()).read_text()
 
@@ -122,3 +125,31 @@ def test_a_file_that_is_no_sheet_is_one_line_of_the_command(tmp_path, capsys, na
     assert len(error) == 1
     assert "joint_3: data sheet" in error[0]
     assert complaint in error[0]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_a_makers_umlauts_are_read(arm_of, tmp_path, encoding):
+    """CiA 306 says ASCII; Windows tools write their own code page, newer ones UTF-8 with or without a mark."""
+    text = OURS.replace("ProductName=armlink joint", "ProductName=Würfel °")
+    (tmp_path / "maker.eds").write_bytes(text.encode(encoding))
+    arm = arm_of(joint={"eds": str(tmp_path / "maker.eds")})
+    sheets = data_sheet.of_joints(arm, arm.link.joints)
+    assert sheets[0].device_information.product_name == "Würfel °"
+
+
+def test_a_stock_drives_sheet_is_told_how_to_read_its_torque(arm_of, sheet):
+    arm = arm_of(joint={"eds": sheet(other=("2100", "2900"))})
+    with pytest.raises(BadInput, match=r"no torque sensor record 2100h: .*torque: motor") as caught:
+        data_sheet.of_joints(arm, arm.link.joints)
+    assert "wiring" not in str(caught.value)
+
+
+def test_the_simulated_arm_is_the_controller_that_the_arm_file_states(sheet):
+    """A file is rehearsed as it is, a maker's identity and data sheet included."""
+    content = yaml.safe_load(bundled_arms()["parallel6"].read_text())
+    path = sheet(vendor=("VendorNumber=0\n", "VendorNumber=0x11\n"))
+    content["link"]["joints"][1] |= {"eds": path, "identity": {"product": 0x77, "serial": 5}}
+    arm = parse_arm(content, Path(path).with_name("arm.yaml"))
+    with Link(arm, LockStepBus(arm=SimulatedArm(arm, Truth.of(arm)))) as link:
+        assert not any(each.mismatch for each in link.scan())
+        link.start()

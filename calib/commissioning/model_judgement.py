@@ -1,0 +1,90 @@
+"""Whether a model and its torque limits can be those of an arm: one judgement for all that rests upon them."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.errors import BadInput
+from armlink.link.joints.values import try_limits
+from calib.arm.kinematics import DriveLimits, model_arm
+from calib.commissioning.finding import SetupFinding
+from calib.plan.rough_gravity import HAND, reach
+from gcomp.arm.load import ModelArm
+from gcomp.gravity.torque import gravity_torque
+
+NO_MASS = 1e-9
+"""Mass of all moving links that stands for none [kg]: the reader gives massless bodies a negligible one."""
+LIGHTEST, HEAVIEST = 0.3, 1000.0
+"""Mass of the moving links over the cube of the reach [kg/m³] that an arm may have. Published arms, legs and hands have
+1.2 to 81 (57 models of example-robot-data and rtb-data); with grams taken for kilograms they have 1200 or more."""
+POSES = 500
+"""Random poses at which the torque against gravity is looked at."""
+
+
+def refuse_impossible_model(arm_file: ArmFile) -> None:
+    """Raise BadInput in the words of doctor where a model's masses or the torque limits cannot be those of an arm."""
+    for found in model_errors(arm_file):
+        raise BadInput(str(found))
+
+
+def model_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Errors in masses or torque limits, each with its remedy; those that follow from another are left out."""
+    model = None if arm_file.model_path is None else model_arm(arm_file)
+    impossible = None if model is None else _mass_error(arm_file, model)
+    if impossible is not None:
+        yield impossible
+        return
+    if arm_file.link is None:
+        return
+    try:
+        try_limits(arm_file)
+    except BadInput as error:
+        what, _, remedy = str(error).rpartition(": ")
+        yield SetupFinding("error", what, f"{arm_file.path}: link.joints", remedy)
+        return
+    if model is not None:
+        yield from _strength_errors(arm_file, model)
+
+
+def gravity_need(model: ModelArm) -> np.ndarray:
+    """Largest torque against gravity (n,) [N·m] in the range of the joints."""
+    low, high = np.nan_to_num([model.arm.lower, model.arm.upper], neginf=-np.pi, posinf=np.pi)
+    poses = np.random.default_rng(0).uniform(low, high, (POSES, model.arm.n))
+    need: np.ndarray = np.abs(gravity_torque(model.arm, model.beta, poses)).max(axis=0)
+    return need
+
+
+def _mass_error(arm_file: ArmFile, model: ModelArm) -> SetupFinding | None:
+    mass, where = float(model.mass.sum()), str(arm_file.model_path)
+    if mass < NO_MASS:
+        return SetupFinding(
+            "error",
+            "the model states no masses: no gravity, nothing to calibrate or to simulate",
+            where,
+            "give its links the maker's masses and centres of mass (URDF: inertial), or take a model that has them",
+        )
+    last = 2 * float(np.linalg.norm(model.beta[-2:])) / max(float(model.mass[-1]), NO_MASS)
+    length = float(reach(model.arm, max(HAND, last))[0])
+    if LIGHTEST < mass / length**3 < HEAVIEST:
+        return None
+    usual = f"arms of its size weigh {_usual(LIGHTEST, length)} to {_usual(HEAVIEST, length)} kg"
+    return SetupFinding(
+        "error",
+        f"its moving links weigh {mass:.3g} kg at a reach of {length:.2g} m, but {usual}",
+        where,
+        "state masses in kg and lengths in m",
+    )
+
+
+def _usual(density: float, length: float) -> str:
+    return f"{float(f'{density * length**3:.1g}'):g}"
+
+
+def _strength_errors(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
+    """Joints whose drives cannot hold the arm everywhere in its range."""
+    most = DriveLimits.of(arm_file).max_torque
+    for name, need, limit in zip(model.arm.names, gravity_need(model), most, strict=True):
+        if need > limit:
+            what = f"by the model, gravity needs up to {need:.3g} N·m, but max_torque is {limit:g}: the arm would fall"
+            yield SetupFinding("error", what, name, "check the model's masses and max_torque, or narrow the ranges")

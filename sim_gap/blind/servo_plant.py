@@ -1,0 +1,155 @@
+"""Positions alone: a second plant, kept because the diagnosis replays such arms with MuJoCo's own friction, servos and
+integrator, which `sim_bus` has as well: against those it would be tested on the laws that it fits.
+
+Links get velocities at half steps from MuJoCo's accelerations at full steps (leapfrog, 0.5 ms). Friction is
+elasto-plastic (Dupont, Hayward, Armstrong, Altpeter 2002): LuGre friction without drift at rest.
+
+f = σ₀ z + σ₁ ż + d v,  ż = v (1 − α(z, v) z/z_ss),  z_ss = g(v, τ)/σ₀ in the direction of v; α is 0 in the elastic
+range (|z| below 0.7 z_ss, or v and z of opposite sign), rises smoothly and is 1 in sliding.
+g = (coulomb + breakaway·exp(−(v/v_s)²) + load·|τ|)·(1 ± asymmetry).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gcomp.arrays import Array
+from sim_bus.effects.state import Imperfections
+from sim_gap.blind.arms import compile_arm
+from sim_gap.blind.motion import RATE
+from sim_gap.blind.plant import JITTER_S, TrueArm, columns_at
+from sim_gap.blind.scene import ServoLaw
+
+SUBSTEPS = 4
+STEP = 1.0 / (RATE * SUBSTEPS)
+"""Time step [s]: springs must be slower."""
+VELOCITY_HZ = 200.0
+"""Low pass of the velocity in a servo [Hz]."""
+FINE = 1e-6
+"""Resolution of the servo's own position [rad]; it is finer than what is recorded."""
+ENCODER_NOISE = 0.2
+"""Standard deviation of a recorded position before it is rounded, in counts."""
+ELASTIC_SHARE = 0.7
+"""Deflection of the bristles, as a share of z_ss, up to which α is 0."""
+SPRING_DAMPING_RATIO = 0.04
+"""Damping ratio of a gear with play."""
+SPRING_SHARE = 0.04
+"""Stiffness of a gear with play times the square of the time step over inertia, for a stable step."""
+STIFFEST = 0.05
+"""σ₀ h²/(inertia) is at most this, for a stable step."""
+LEAST_INERTIA = 0.01
+"""Least inertia that a motor is taken to move [kg·m²]."""
+
+
+@dataclass(frozen=True)
+class ServoRun:
+    """One arm with servos and the commands that they get."""
+
+    truth: TrueArm
+    command: Array
+    """Positions at `motion.RATE`, (K, n) [rad]."""
+    law: ServoLaw
+    seed: int
+
+
+class Bristles:
+    """Friction of one arm; (n,) each."""
+
+    def __init__(self, state: Imperfections, inertia: Array, step: float) -> None:
+        """`inertia` (n,): least inertia that each motor moves [kg·m²]; `step` [s]."""
+        self._state, self._step = state, step
+        largest = np.maximum(state.coulomb + state.breakaway, 0.05)
+        self.bristle = np.minimum(largest / 2e-4, STIFFEST * inertia / step**2)
+        self._bristle_damping = 0.3 * np.sqrt(self.bristle * inertia)
+        self._bend = np.zeros_like(inertia)
+
+    def force(self, v: Array, load: Array) -> Array:
+        """Friction torque against the motors' velocities `v` [rad/s], `load` the torque carried."""
+        state = self._state
+        level = state.coulomb
+        if not state.steady_friction:
+            level = level + state.breakaway * np.exp(-((v / state.stribeck_velocity) ** 2))
+            level = (level + state.load_friction * np.abs(load)) * (1.0 + state.asymmetry * np.sign(v))
+        longest = level / self.bristle + 1e-12
+        ratio = self._bend * np.sign(v) / longest
+        slip = np.clip((ratio - ELASTIC_SHARE) / (1.0 - ELASTIC_SHARE), 0.0, 1.0)
+        rate = v * (1.0 - slip * slip * (3.0 - 2.0 * slip) * np.abs(ratio))
+        self._bend = np.clip(self._bend + self._step * rate, -longest, longest)
+        return np.asarray(self.bristle * self._bend + self._bristle_damping * rate + state.viscous * v)
+
+
+class ServoController:
+    """Torque commands of one arm at `motion.RATE`."""
+
+    def __init__(self, law: ServoLaw, command: Array) -> None:
+        self._law = law
+        ticks, last = np.arange(len(command)), command[0]
+        self._targets = np.column_stack(
+            [np.interp(ticks - late * RATE, ticks, column) for late, column in zip(law.delay, command.T, strict=True)]
+        )
+        if np.isfinite(law.slew).any():
+            for tick, wanted in enumerate(self._targets):
+                last = last + np.clip(wanted - last, -law.slew / RATE, law.slew / RATE)
+                self._targets[tick] = last
+        self._smooth = 1.0 - np.exp(-2 * np.pi * VELOCITY_HZ / RATE)
+        self._before: Array = command[0]
+        self._velocity, self._error_sum = np.zeros_like(command[0]), np.zeros_like(command[0])
+
+    def torque(self, tick: int, reading: Array) -> Array:
+        """Torque [N·m] from the exact reading [rad], (n,)."""
+        law, seen = self._law, np.rint(reading / FINE) * FINE
+        self._velocity += self._smooth * ((seen - self._before) * RATE - self._velocity)
+        self._before = seen
+        error = self._targets[tick] - seen
+        error = np.sign(error) * np.maximum(np.abs(error) - law.dead_zone, 0.0)
+        self._error_sum += error / RATE
+        return np.asarray(law.stiffness * error - law.damping * self._velocity + law.integral * self._error_sum)
+
+
+def simulate_servos(run: ServoRun) -> Array:
+    """Exact readings of the encoders, which are at the motors, at `motion.RATE` (K, n) [rad]."""
+    import mujoco
+
+    arm, state = run.truth.arm, run.truth.state
+    rotor, soft = arm.armature + state.rotor_inertia, state.backlash > 0.0
+    model = compile_arm(replace(arm, armature=np.where(soft, 0.0, rotor)))
+    data = mujoco.MjData(model)
+    bristles, servo = Bristles(state, np.maximum(rotor, LEAST_INERTIA), STEP), ServoController(run.law, run.command)
+    stiffness = SPRING_SHARE * rotor / STEP**2
+    damping, half_play = 2.0 * SPRING_DAMPING_RATIO * np.sqrt(stiffness * rotor), 0.5 * state.backlash
+    spring, rest = state.spring.T
+    turn = np.tile(run.command[0] + state.position_offset, (2, 1))  # of links and motors
+    speed, half, pull = np.zeros_like(turn), np.zeros_like(turn), np.zeros_like(turn)
+    carried, out = np.zeros(arm.n), np.empty_like(run.command)
+    for tick in range(len(out)):
+        out[tick] = turn[1] - state.position_offset
+        asked = np.clip(servo.torque(tick, out[tick]), -state.actuator_saturation, state.actuator_saturation)
+        for _ in range(SUBSTEPS):
+            passed = state.actuator_gain * asked - bristles.force(speed[1], carried)
+            if soft.any():
+                twist = turn[1] - turn[0]
+                stretch = twist - np.clip(twist, -half_play, half_play)
+                through = stiffness * stretch + damping * (speed[1] - speed[0])
+                through = np.where(through * stretch <= 0.0, 0.0, through)  # contact never pulls
+                pull[1], passed = (passed - through) / rotor, np.where(soft, through, passed)
+            data.qpos[:], data.qvel[:] = turn[0], speed[0]
+            data.qfrc_applied[:] = passed - spring * (turn[0] - rest)
+            mujoco.mj_forward(model, data)
+            pull[0] = data.qacc
+            carried = passed - np.where(soft, 0.0, rotor) * pull[0]
+            pull[1] = np.where(soft, pull[1], pull[0])
+            half += STEP * pull
+            turn += STEP * half
+            speed = half + 0.5 * STEP * pull
+    return out
+
+
+def record_servos(run: ServoRun, position: Array, hz: float, random: np.random.Generator) -> dict[str, Array]:
+    """Columns t, q, q_cmd; positions are read at uneven times, each with the command that was sent in its turn."""
+    clock = np.arange(len(position)) / RATE
+    t = np.arange(0.0, clock[-1] - 2.0 / hz, 1.0 / hz)
+    sent = run.command[np.rint(t * RATE).astype(int)]
+    t[1:] += np.clip(JITTER_S * random.standard_normal(len(t) - 1), -0.2 / hz, 0.2 / hz)
+    step = run.truth.encoder_step
+    q = columns_at(t, clock, position)
+    return {"t": t, "q": np.rint(q / step + ENCODER_NOISE * random.standard_normal(q.shape)) * step, "q_cmd": sent}
