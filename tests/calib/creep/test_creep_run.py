@@ -33,6 +33,7 @@ def test_the_drives_choose_the_motion_and_the_arm_file_overrides_it() -> None:
     assert sweep_motion(arm("steps")) == "steps"
 
 
+@pytest.mark.long
 def test_passes_through_the_link_find_constants_that_verification_confirms(tmp_path: Path) -> None:
     simulated = SimulatedArm(arm(), Truth.draw(arm(), 3), 3)
     plan, passes = plan_creep(arm()), []

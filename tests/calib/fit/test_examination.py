@@ -92,6 +92,7 @@ def drawn_lag(seed: int, width: float) -> Callable[[StaticReading, np.ndarray, n
     return lag
 
 
+@pytest.mark.long
 def test_a_lag_of_another_size_in_each_sweep_stays_within_the_intervals(sound) -> None:
     arm, truth, data = sound
     scores = []
@@ -198,6 +199,7 @@ def test_a_joint_without_readings_shows_no_limit(sound) -> None:
     assert _without_plateaus(arm.joint_names, silent) == (silent, [])
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(("bit", "level"), [(6, 0), (9, 1), (11, 0)])
 def test_a_stuck_encoder_bit_is_named(sound, bit: int, level: int) -> None:
     arm, _, data = sound
@@ -237,6 +239,7 @@ def test_a_motion_tells_a_stuck_bit_and_a_sound_encoder_none(bit: int | None) ->
         assert found == bit or (bit == 2 and found is None)  # four counts: a fast motion does not tell
 
 
+@pytest.mark.long
 def test_a_range_of_sixty_degrees_leaves_the_intervals_true() -> None:
     arm = random_arm(52, 3)
     kinematics = arm.kinematics.model_copy(
@@ -255,6 +258,7 @@ def test_a_range_of_sixty_degrees_leaves_the_intervals_true() -> None:
         assert np.nanmax(np.abs(z_scores(fit, truth, parameter))) < 4
 
 
+@pytest.mark.long
 def test_held_out_torque_of_the_papers_arm_is_three_times_better_than_published() -> None:
     arm = load_arm("sarcos")
     truth = Truth.draw(arm, 7)

@@ -58,6 +58,7 @@ def test_a_sweep_that_was_ended_early_says_where(tmp_path: Path, caplog: pytest.
     assert "ended before its first sweep" in caplog.text
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("readings", [1, 2, 5, 12, 25])
 def test_whatever_is_there_is_fitted(readings: int, tmp_path: Path) -> None:
     """As typed while the sweep still runs."""

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from small_pair import MASS, SEED, armlink, describe, simulated
 
 from armlink.arm_file import load_arm
@@ -19,19 +18,15 @@ LOWEST, HIGHEST = 25.0, 100.0
 """Rates that are tried [Hz]: one emulated processor makes the cycles, simulates the arm and does the job."""
 
 
-def described(folder: Path, **sweep: int) -> Path:
+def described(folder: Path) -> Path:
     """The arm at a rate that this machine keeps."""
     describe(folder, rate=HIGHEST)
     host = armlink(folder, "check", "pair.yaml", "--host", "--seconds", "2", ok=(0, 1))
-    path = describe(folder, rate=float(np.clip(host["holds_hz"], LOWEST, HIGHEST)))
-    content = yaml.safe_load(path.read_text())
-    content["sweep"] |= sweep
-    path.write_text(yaml.safe_dump(content))
-    return path
+    return describe(folder, rate=float(np.clip(host["holds_hz"], LOWEST, HIGHEST)))
 
 
 def test_a_short_sweep_is_complete_and_true(tmp_path: Path) -> None:
-    path = described(tmp_path, steps=3)
+    path = described(tmp_path)
     with simulated(tmp_path, BUS):
         armlink(tmp_path, "sweep", "pair.yaml", "--out", "unloaded", *OPTIONS)
     data, truth = load_data(tmp_path / "unloaded"), Truth.draw(load_arm(str(path)), SEED)

@@ -185,6 +185,7 @@ def test_samples_scatter_about_the_fit(answer, tmp_path: Path) -> None:
         write_samples(answer.internals, 3, tmp_path / "draws.txt")
 
 
+@pytest.mark.long
 def test_actuator_entries_hold_the_fit(answer, tmp_path: Path, monkeypatch) -> None:
     for name, entry in (
         ("isaaclab.actuators", "DelayedPDActuatorCfg"),
