@@ -43,8 +43,8 @@ def convert(
     )
     if stated.without_gravity:
         raise BadInput(
-            f"--effort-is {effort_is}: gravity is added by the arm's model, which convert has not: state it to "
-            "armlink gap diagnose"
+            f"--effort-is {effort_is}: it takes the arm's model to add gravity, which convert does not have: convert "
+            "without it, and give this option with the diagnosis"
         )
     recording = load_recording(source, stated)
     try:

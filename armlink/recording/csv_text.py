@@ -24,6 +24,8 @@ DATE = re.compile(
     r" ?(?:Z|(?P<zone>[+-]\d\d)(?::?(?P<zone_minute>\d\d))?)?"
 )
 """A date of ISO 8601, with or without time of day and zone."""
+WHOLE = re.compile(r"\.0(?=[,\n])")
+"""End of a whole number, which is written without it."""
 BLOCK_ROWS = 10_000
 """Rows that are turned into text at a time."""
 
@@ -211,4 +213,5 @@ def write_numbers(stream: IO[bytes] | io.BufferedIOBase, columns: Mapping[str, A
     for begin in range(0, len(rows), BLOCK_ROWS):
         block = rows[begin : begin + BLOCK_ROWS].tolist()
         text = "\n".join([",".join(map(repr, row)) for row in block])
-        stream.write(f"{text}\n".replace("nan", "").encode())
+        text = WHOLE.sub("", f"{text}\n".replace("nan", ""))
+        stream.write(text.encode())

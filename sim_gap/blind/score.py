@@ -9,7 +9,8 @@ import numpy as np
 
 from sim_gap.blind.judge import Judgement, judge
 
-SCHEMA, POSITIONS_SCHEMA = "armlink.blind/1", "armlink.blind-positions/1"
+SCHEMA = "armlink.blind/1"
+POSITIONS_SCHEMA = "armlink.blind-positions/1"
 NAMED_SHARE, FALSE_SHARE = 0.85, 0.03
 """Of positions alone: required share of first causes that are right or named as confounded, and of answers with a false
 cause above 0.8."""
@@ -41,15 +42,16 @@ def score_positions(answers: Answers, labels: Answers) -> dict[str, Any]:
         "named_where_tellable": named is not None and named >= NAMED_SHARE,
         "false_confident": false is not None and false <= FALSE_SHARE,
     }
+    hidden, tables = label_withheld(whole), _tables(judged, calibrated=judged)
     return {
         "schema": POSITIONS_SCHEMA,
         "answers": len(judged),
         "tellable": len(told),
         "named_where_tellable": named,
         "false_confident": false,
-        "label_withheld": label_withheld(whole),
+        "label_withheld": hidden,
         "meets": met,
-        **_tables(judged, calibrated=judged),
+        **tables,
     }
 
 

@@ -24,7 +24,7 @@ class Account:
     """Takes what happens as it happens."""
 
     def __init__(self, json_path: Path | None) -> None:
-        self.summary: dict[str, Any] = {"schema": "armlink.demo/1"}
+        self.summary: dict[str, Any] = {}
         self.sections: list[Section] = []
         self._findings, self.began = list[str](), time.monotonic()
         self._json, self._results, self._console = json_path, results(json_path), PlainConsole()
@@ -57,8 +57,9 @@ class Account:
         """Write `report.html` and `summary.json`; raises OSError."""
         short = Section("In short", paragraph(OPENED) + bullets(self._findings))
         render(out / "report.html", "armlink demo", [short, *self.sections], subtitle)
-        write_json(out / "summary.json", self.summary)
-        write_json(self._json, self.summary)
+        summary = {"schema": "armlink.demo/1", **self.summary}
+        for path in (out / "summary.json", self._json):
+            write_json(path, summary)
         self.say(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}", console=self._results)
 
 

@@ -288,7 +288,7 @@ def test_a_foreign_table_gets_a_map_to_paste(tmp_path):
         ({"columns": ["q_1"]}, "--map q_1: expected COLUMN=VALUE"),
         ({"columns": ["q_1=nope"]}, "--map q_1=nope: no such column"),
         ({"joints": "x,y"}, "--joints x: .* has no such joint"),
-        ({"effort": "gear"}, "--effort-is gear: expected motor or link"),
+        ({"effort": "gear"}, "--effort-is gear: expected motor, link, without-gravity"),
     ],
 )
 def test_options_that_do_not_fit_are_one_line(tmp_path, options, message):
