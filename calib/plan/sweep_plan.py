@@ -41,7 +41,7 @@ FINEST = 3.0
 HOLDING_RESERVE = 1.1
 """Torque that the drives keep over gravity with the mass on, as a factor: friction and acceleration need the rest."""
 TRAVEL_POSES = 400
-"""Random poses at which it is looked whether the mass can be held on the way from one sweep to the next."""
+"""Random poses on the way from one sweep to another at which it is looked whether the mass can be held."""
 GRAMS = 100.0
 """Reference mass from which grams may be meant [kg]."""
 ENOUGH = 1.2
@@ -214,16 +214,17 @@ def reference_masses(
     room = np.maximum(limits.max_torque - gravity, 0.05 * limits.max_torque)
     most = float(np.min(room / np.maximum(per_kg.max(axis=0), 1e-9)))
     most = min(most, 2 * float(limits.rated.max()) / (9.81 * float(reach(kinematics)[0])))
-    anywhere = np.inf if guess is None else _bearable_anywhere(kinematics, limits, guess, most)
-    return [float(f"{min(share * most, anywhere):.2g}") for share in MASS_SHARES]
+    on_the_way = np.inf if guess is None else _bearable_on_the_way(kinematics, limits, guess, poses, most)
+    return [float(f"{min(share * most, on_the_way):.2g}") for share in MASS_SHARES]
 
 
-def _bearable_anywhere(kinematics: Arm, limits: DriveLimits, guess: GravityGuess, most: float) -> float:
-    """Mass [kg] that the drives hold with `HOLDING_RESERVE` wherever the arm may travel from one sweep to the next."""
+def _bearable_on_the_way(kinematics: Arm, limits: DriveLimits, guess: GravityGuess, poses: Array, most: float) -> float:
+    """Mass [kg] that the drives hold with `HOLDING_RESERVE` on straight ways from one sweep's poses to another's."""
     random = np.random.default_rng(0)
-    regressor = gravity_regressor(kinematics, random.uniform(limits.lower, limits.upper, (TRAVEL_POSES, kinematics.n)))
+    begin, end = poses[random.integers(len(poses), size=(2, TRAVEL_POSES))]
+    regressor = gravity_regressor(kinematics, begin + random.uniform(size=(TRAVEL_POSES, 1)) * (end - begin))
     at_origin, by_point = payload_columns(kinematics)
     per_kg = np.abs(regressor @ (at_origin + by_point @ kinematics.span[-1]))
     per_kg += HAND * np.linalg.norm(regressor @ by_point, axis=-1)
     room = limits.max_torque / HOLDING_RESERVE - np.abs(regressor @ guess.beta)
-    return max(float(np.min(room / np.maximum(per_kg, 1e-9))), MASS_SHARES[0] * 0.1 * most)
+    return max(float(np.min(room / np.maximum(per_kg, 1e-9))), MASS_SHARES[0] * most / 2)
