@@ -17,7 +17,7 @@ from armlink.commands.plain_console import confirm as ask_to_confirm
 from armlink.errors import Stall
 from armlink.link.lateness import Lateness
 from calib.plan.types import SweepPlan
-from calib.report.page import interval_table
+from calib.report.tables import interval_table
 
 if TYPE_CHECKING:
     from calib.sweep.dataset import SweepData

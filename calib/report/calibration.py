@@ -16,16 +16,8 @@ from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, Parameter
 from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
-from calib.report.page import (
-    ReportSection,
-    ReportTable,
-    html_of,
-    interval_table,
-    paragraph,
-    paragraphs,
-    render,
-    verdict_line,
-)
+from calib.report.page import ReportSection, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.tables import ReportTable, interval_table
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque

@@ -1,6 +1,6 @@
 """One self-contained HTML page from sections: text, tables and plotly figures, for screen and paper."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -11,6 +11,7 @@ from markupsafe import Markup, escape
 
 from armlink.content.atomic_file import open_whole
 from armlink.content.printable_text import printable_text
+from calib.report.tables import ReportTable
 
 SCREEN = {"responsive": True, "displayModeBar": False}
 FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"}
@@ -29,32 +30,8 @@ class ReportSection:
     html: Markup = field(default_factory=Markup)
     figures: Sequence[Any] = ()
     """plotly figures, shown below one another."""
-    tables: Sequence["ReportTable"] = ()
+    tables: Sequence[ReportTable] = ()
     """Shown before the figures."""
-
-
-@dataclass(frozen=True)
-class ReportTable:
-    """A table with a caption; numbers are formatted already."""
-
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    caption: str = ""
-    texts: int = field(default=1, kw_only=True)
-    """Number of text columns, from the left; the others are numbers, aligned right."""
-
-
-def interval_text(value: float, half: float) -> str:
-    """A value ± half of its 95 % interval; alone where that is 0."""
-    if not np.isfinite(value):
-        return "not observable"
-    return f"{value:.4f}\u00a0±\u00a0{half:.4f}" if half > 0 else f"{value:.4f}"
-
-
-def interval_table(names: Sequence[str], columns: Mapping[str, tuple[Any, Any]], caption: str = "") -> ReportTable:
-    """A row a joint; `columns` maps heading to (value, half of its 95 % interval), (n,) each."""
-    rows = [[name, *(interval_text(v[j], half[j]) for v, half in columns.values())] for j, name in enumerate(names)]
-    return ReportTable(("joint", *columns), rows, caption)
 
 
 def paragraph(text: str) -> Markup:

@@ -5,7 +5,8 @@ from pathlib import Path
 from armlink.arm_file import ArmFile
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.report.figures import verify_figure
-from calib.report.page import ReportSection, ReportTable, paragraph, render, verdict_line
+from calib.report.page import ReportSection, paragraph, render, verdict_line
+from calib.report.tables import ReportTable
 from calib.sweep.verify import Verification
 
 

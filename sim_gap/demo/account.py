@@ -14,7 +14,8 @@ from armlink.commands.plain_console import PlainConsole, results
 from armlink.content.printable_text import printable_text
 from calib.commands.screen import SweepScreen, print_intervals
 from calib.report.page import ReportSection as Section
-from calib.report.page import ReportTable, bullets, interval_table, paragraph, render
+from calib.report.page import bullets, paragraph, render
+from calib.report.tables import ReportTable, interval_table
 from gcomp.arrays import Array
 
 OPENED = "The fit saw only what came over the bus. What is called true was opened after everything was estimated."

@@ -5,7 +5,8 @@ from typing import Any
 
 from armlink.effect_catalogue import CATALOGUE
 from calib.report.page import ReportSection as Section
-from calib.report.page import ReportTable, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.page import html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.tables import ReportTable
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.report.cause_figures import cause_figure, law_figure
 from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, parameter_rows, sentence

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from calib.report.page import ReportSection as Section
-from calib.report.page import ReportTable, html_of, paragraph, paragraphs, verdict_line
+from calib.report.page import html_of, paragraph, paragraphs, verdict_line
+from calib.report.tables import ReportTable
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.position_gap.identify import Identified

@@ -8,7 +8,8 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, sync_playwright
 
 from calib.report.page import ReportSection as Section
-from calib.report.page import ReportTable, paragraph, render
+from calib.report.page import paragraph, render
+from calib.report.tables import ReportTable
 
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]}
 

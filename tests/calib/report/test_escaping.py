@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import calib.report.page as report_page
-from calib.report.page import ReportSection, ReportTable, bullets, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.page import ReportSection, bullets, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.tables import ReportTable
 
 HOSTILE = (
     "<x-evil>",

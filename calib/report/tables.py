@@ -1,0 +1,31 @@
+"""Tables of numbers as texts, the same on a page and in a terminal; needs nothing of what draws a page."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class ReportTable:
+    """A table with a caption; numbers are formatted already."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    texts: int = field(default=1, kw_only=True)
+    """Number of text columns, from the left; the others are numbers, aligned right."""
+
+
+def interval_text(value: float, half: float) -> str:
+    """A value ± half of its 95 % interval; alone where that is 0."""
+    if not np.isfinite(value):
+        return "not observable"
+    return f"{value:.4f}\u00a0±\u00a0{half:.4f}" if half > 0 else f"{value:.4f}"
+
+
+def interval_table(names: Sequence[str], columns: Mapping[str, tuple[Any, Any]], caption: str = "") -> ReportTable:
+    """A row a joint; `columns` maps heading to (value, half of its 95 % interval), (n,) each."""
+    rows = [[name, *(interval_text(v[j], half[j]) for v, half in columns.values())] for j, name in enumerate(names)]
+    return ReportTable(("joint", *columns), rows, caption)
