@@ -106,10 +106,9 @@ def parse_corrections(
     [N·m/A]), `q=counts:N` (counts a turn) and `q=percent:D` (100 is an angle of D degrees, as LeRobot's normalised
     ranges have it); a unit of one joint goes before that of its channel. Raises BadInput for anything else.
     """
-    *source, gravity = effort.split(",") if "," in effort else ("", effort)
-    if gravity != WITHOUT_GRAVITY:
-        source, gravity = [effort], ""
-    if source[0] not in ("", "motor", "link") or len(source) > 1:
+    stated = effort.split(",") if effort else []
+    source = [each for each in stated if each != WITHOUT_GRAVITY]
+    if source not in ([], ["motor"], ["link"]) or len(stated) > len(source) + 1:
         raise BadInput(f"--effort-is {effort}: expected motor, link, {WITHOUT_GRAVITY}, or motor,{WITHOUT_GRAVITY}")
     mapped = _pairs("--map", columns)
     return Corrections(
@@ -119,8 +118,8 @@ def parse_corrections(
         units={column: _factors(column, text) for column, text in _pairs("--units", units)},
         zero={column: _number("--zero", column, text) for column, text in _pairs("--zero", zero)},
         clock={column: _number("--clock", column, text) for column, text in _pairs("--clock", clock)},
-        effort=source[0],
-        without_gravity=bool(gravity),
+        effort="".join(source),
+        without_gravity=WITHOUT_GRAVITY in stated,
         joints=tuple(name.strip() for name in joints.split(",") if name.strip()),
         topic=topic,
     )

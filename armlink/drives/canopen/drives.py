@@ -167,7 +167,7 @@ class CanopenDrives:
         """See Drives: data sheets are read, limits tried with the usual units."""
         of_joints(self.arm, self.rows)
         for row, limit, unit in zip(self.rows, limits, assumed_units(self.rows), strict=True):
-            check_fits(row.name, limit, unit, row.settings.torque == "record")
+            check_fits(row, limit, unit)
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
         """See Drives: nodes pre-operational, everything set and read back, nodes started (NMT)."""
@@ -197,7 +197,7 @@ class CanopenDrives:
     def _set_up(self, joint: int, services: NodeServices, limits: Limits, profile: Profile) -> tuple[Wire, Setup]:
         row, known = self.rows[joint], self.known
         unit = read_units(services, row)
-        check_fits(row.name, limits, unit, row.settings.torque == "record")
+        check_fits(row, limits, unit)
         supported = self.offered(services, joint)
         device.configure(services, row, unit, limits, self.protection, supported, profile)
         torque = services.read(objects.MOTOR_TORQUE) * unit.torque if profile.has(objects.MOTOR_TORQUE) else math.nan

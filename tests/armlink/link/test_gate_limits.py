@@ -23,7 +23,7 @@ def joint(**keys):
 def tried(row, window, units=UNITS):
     """Limits of a joint, tried on frames with these units."""
     limits = drive_limits(row, window, 0.004, 0.1)
-    check_fits(row.name, limits, units)
+    check_fits(row, limits, units)
     return gate_limits(limits)
 
 

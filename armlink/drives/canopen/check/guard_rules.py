@@ -51,7 +51,7 @@ def guard_rules(
         unit, profile = read_units(each, row), device.examined(each, row.settings)
         if profile.by_velocity:
             raise BadInput(f"{row.name}: velocity control (mode 9): no frame shows a guard where the motion ends")
-        check_fits(row.name, limit, unit)
+        check_fits(row, limit, unit)
         sheet = list(each.remote.object_dictionary)
         node = NodeRules(row.name, row.settings.node, profile, unit, limit, protection, sheet)
         rules["frames"] |= node.frames()

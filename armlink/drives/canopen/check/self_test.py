@@ -172,7 +172,7 @@ class CanopenSelfTest:
             )
         try:
             unit = read_units(services, row)
-            check_fits(row.name, limits, unit)
+            check_fits(row, limits, unit)
             supported = self.drives.offered(services, joint)
             settings = device.settings(unit, limits, self.drives.protection, supported, profile)
         except ArmlinkError as error:

@@ -4,6 +4,7 @@ import struct
 from dataclasses import dataclass
 from functools import cached_property
 
+from armlink.arm_file import LinkJoint
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO1
@@ -47,9 +48,10 @@ class Wire:
         return self.profile.by_velocity
 
 
-def check_fits(name: str, limits: Limits, unit: Units, record: bool = False) -> None:
+def check_fits(row: LinkJoint, limits: Limits, unit: Units) -> None:
     """Raise BadInput where limits fit no frame and no object, our torque record 2100h included."""
-    if record and limits.max_torque / TORQUE_PER_MICRO > INT32_MAX:
+    name = row.name
+    if row.settings.torque == "record" and limits.max_torque / TORQUE_PER_MICRO > INT32_MAX:
         most = INT32_MAX * TORQUE_PER_MICRO
         raise BadInput(
             f"{name}: max_torque {limits.max_torque} N·m: the readings of 2100h end at {most:.4g} N·m: lower it, or "
