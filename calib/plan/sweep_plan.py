@@ -100,15 +100,11 @@ def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess |
     `guess` is of the arm alone; without one, gravity counts as nothing. Where the mass hangs beyond the flange is not
     known and counts as nothing, too.
     """
-    planned = PlannedArm.of(arm_file, guess)
-    at_origin, by_point = payload_columns(planned.kinematics)
-    column = at_origin + by_point @ planned.kinematics.span[-1]
-    most = {}
+    planned, most = PlannedArm.of(arm_file, guess), {}
     for options in sweep_options(planned)[0]:
-        regressor = gravity_regressor(planned.kinematics, options.poses)
-        own = 0.0 if guess is None else np.abs(regressor @ guess.beta)
+        own = 0.0 if guess is None else np.abs(guess.torque(options.poses))
         room = planned.limits.max_torque - own
-        bearable = (room / np.maximum(np.abs(regressor @ column), 1e-9)).min(axis=(1, 2))
+        bearable = (room / _torque_per_kilogram(planned.kinematics, options.poses)).min(axis=(1, 2))
         most[planned.kinematics.names[options.joint]] = max(float(bearable.max()), 0.0)
     name = min(most, key=lambda joint: most[joint])
     if mass > most[name]:
@@ -206,13 +202,10 @@ def reference_masses(
 ) -> list[float]:
     """Masses [kg] that take `MASS_SHARES` of the torque left at the joint that they load most, to two digits."""
     poses = np.concatenate([each.poses.reshape(-1, kinematics.n) for each in options])
-    regressor = gravity_regressor(kinematics, poses)
-    at_origin, by_point = payload_columns(kinematics)
-    per_kg = np.abs(regressor @ (at_origin + by_point @ kinematics.span[-1]))
-    per_kg += HAND * np.linalg.norm(regressor @ by_point, axis=-1)
+    per_kg = _torque_per_kilogram(kinematics, poses, HAND)
     gravity = ASSUMED_GRAVITY * limits.max_torque if guess is None else np.abs(guess.torque(poses)).max(axis=0)
     room = np.maximum(limits.max_torque - gravity, 0.05 * limits.max_torque)
-    most = float(np.min(room / np.maximum(per_kg.max(axis=0), 1e-9)))
+    most = float(np.min(room / per_kg.max(axis=0)))
     most = min(most, 2 * float(limits.rated.max()) / (9.81 * float(reach(kinematics)[0])))
     on_the_way = np.inf if guess is None else _bearable_on_the_way(kinematics, limits, guess, poses, most)
     return [float(f"{min(share * most, on_the_way):.2g}") for share in MASS_SHARES]
@@ -222,9 +215,14 @@ def _bearable_on_the_way(kinematics: Arm, limits: DriveLimits, guess: GravityGue
     """Mass [kg] that the drives hold with `HOLDING_RESERVE` on straight ways from one sweep's poses to another's."""
     random = np.random.default_rng(0)
     begin, end = poses[random.integers(len(poses), size=(2, TRAVEL_POSES))]
-    regressor = gravity_regressor(kinematics, begin + random.uniform(size=(TRAVEL_POSES, 1)) * (end - begin))
-    at_origin, by_point = payload_columns(kinematics)
-    per_kg = np.abs(regressor @ (at_origin + by_point @ kinematics.span[-1]))
-    per_kg += HAND * np.linalg.norm(regressor @ by_point, axis=-1)
-    room = limits.max_torque / HOLDING_RESERVE - np.abs(regressor @ guess.beta)
-    return max(float(np.min(room / np.maximum(per_kg, 1e-9))), MASS_SHARES[0] * most / 2)
+    way = begin + random.uniform(size=(TRAVEL_POSES, 1)) * (end - begin)
+    room = limits.max_torque / HOLDING_RESERVE - np.abs(guess.torque(way))
+    return max(float(np.min(room / _torque_per_kilogram(kinematics, way, HAND))), MASS_SHARES[0] * most / 2)
+
+
+def _torque_per_kilogram(kinematics: Arm, poses: Array, hand: float = 0.0) -> Array:
+    """Largest torque (…, n) [N·m] of 1 kg that hangs within `hand` [m] of the flange at poses (…, n) [rad]; not 0."""
+    regressor, (at_origin, by_point) = gravity_regressor(kinematics, poses), payload_columns(kinematics)
+    torque = np.abs(regressor @ (at_origin + by_point @ kinematics.span[-1]))
+    bounded: Array = np.maximum(torque + hand * np.linalg.norm(regressor @ by_point, axis=-1), 1e-9)
+    return bounded

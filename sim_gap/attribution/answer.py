@@ -48,7 +48,7 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
     result = verdict(found, sets, unsettled=bool(laws) or any(place.clear for place in aside))
     if stuck or (fit.impacts and not any(cause.effect == "transmission.backlash" for cause in found)):
         result = "unexplained"
-    margin = combine_by_joint(judge, judge.margin)
+    before, after, margin = by_joint(judge), by_joint(judge, left), combine_by_joint(judge, judge.margin)
     return Diagnosis(
         verdict=result,
         names=made.model.arm.names,
@@ -59,8 +59,8 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
         noise_floor=combine_by_joint(judge, judge.floor),
         train_before=by_joint(fit),
         train_after=by_joint(fit, left_fit),
-        heldout_before=by_joint(judge),
-        heldout_after=by_joint(judge, left),
+        heldout_before=before,
+        heldout_after=after,
         unexplained=share_left(judge, left),
         margin=margin,
         heldout_is=heldout_is,
@@ -68,7 +68,7 @@ def answer(made: Internals, found: list[Cause], minor: list[Cause], heldout_is: 
         laws=tuple(laws),
         notes=(
             *notes(found, stuck, estimate, fit, judge, left),
-            *worse_notes(made.model.arm.names, by_joint(judge), by_joint(judge, left), margin),
+            *worse_notes(made.model.arm.names, before, after, margin),
             *aside_notes(aside),
             *law_notes(laws, made.model.arm.names),
         ),

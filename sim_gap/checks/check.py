@@ -6,6 +6,7 @@ option that settles it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -84,18 +85,13 @@ def check_recordings(
     Returns the corrected recordings and the findings of all. What is not certain is left as recorded and among the
     findings. Raises BadInput for times, counts and angles that no arm can have.
     """
-    checked, found = list[Recording](), list[RecordingFinding]()
+    checked, found = list[Recording](), dict[object, RecordingFinding]()
     for recording, label in zip(recordings, labels, strict=True):
         corrected, findings = check_recording(arm, recording, label, stated)
         checked.append(corrected)
-        asked = {(each.channel, each.joint, each.option) for each in found if not each.corrected}
-        found += [
-            finding
-            for finding in findings
-            if finding not in found
-            and (finding.corrected or (finding.channel, finding.joint, finding.option) not in asked)
-        ]
-    return checked, found
+        for finding in findings:  # a doubt is asked about once, whatever each recording shows of it
+            found.setdefault(finding if finding.corrected else (finding.joint, finding.option), finding)
+    return checked, list(found.values())
 
 
 def check_recording(
@@ -162,6 +158,10 @@ class _ChannelView:
     recording: Recording
     stated: Corrections
 
+    @cached_property
+    def one_way(self) -> bool:
+        return goes_one_way(self.recording)
+
     @property
     def rate(self) -> float:
         """Rows per second."""
@@ -185,13 +185,13 @@ def _view(arm: RigidArm, s: PreparedSignals, channel: str, recording: Recording,
 
 def _gravity(view: _ChannelView) -> list[RecordingFinding]:
     """A channel from which gravity was subtracted."""
-    return [] if goes_one_way(view.recording) else find_without_gravity(view.arm, view.motion, view.stated)
+    return [] if view.one_way else find_without_gravity(view.arm, view.motion, view.stated)
 
 
 def _unsigned(view: _ChannelView) -> list[RecordingFinding]:
     """Joints that read amounts, unless they do not with the channel's delay taken off."""
     found = find_unsigned(view.mounted, view.motion, view.stated)
-    if not found or goes_one_way(view.recording):
+    if not found or view.one_way:
         return found
     delay, _ = find_delay(view.mounted, view.motion, view.rate, view.stated)
     if not delay:
@@ -202,7 +202,7 @@ def _unsigned(view: _ChannelView) -> list[RecordingFinding]:
 def _mapping(view: _ChannelView) -> list[RecordingFinding]:
     """Findings on clock, order, sign, zero and angle unit, in the order in which they are corrected."""
     arm, mounted, motion, stated = view.arm, view.mounted, view.motion, view.stated
-    if goes_one_way(view.recording):
+    if view.one_way:
         return []
     follows = follows_position(view.recording)
     mapping, midway = find_mapping(arm, motion, stated, follows, mounted), find_changed_order(mounted, motion, stated)
@@ -224,7 +224,7 @@ def _source(view: _ChannelView) -> list[RecordingFinding]:
         find_joint_scale(mounted, motion, stated)
         or find_scale(arm, fit, motion, stated)
         or find_outgrown(arm, mounted, motion, stated)
-        or ([] if goes_one_way(view.recording) else find_absent(arm, fit, motion, stated))
+        or ([] if view.one_way else find_absent(arm, fit, motion, stated))
     )
     return [*scale, *find_source(fit, view.s, motion, stated)]
 

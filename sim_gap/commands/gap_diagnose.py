@@ -180,8 +180,7 @@ def _suggest(answer: "Diagnosis", sim: str, json: Path | None, out_model: Path |
     from armlink.commands.plain_console import PlainConsole, command_line, suggest
 
     if answer.doubts:
-        options = dict.fromkeys(finding.option for finding in answer.doubts)
-        PlainConsole().print(f"next: the same command with {', or '.join(options)}")
+        PlainConsole().print(f"next: the same command with {' and '.join(each.option for each in answer.doubts)}")
     elif answer.verdict == "ambiguous":
         arm = sim if sim in bundled_arms() or sim.endswith((".yaml", ".yml")) else "ARM.yaml"
         kept = json is not None and str(json) != "-"
