@@ -17,6 +17,7 @@ from armlink.loop.open import open_arm
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
+from calib.commissioning.model_judgement import refuse_impossible_sweep
 from calib.creep.choice import all_creep, sweep_motion
 from calib.creep.fit import fit_creep
 from calib.creep.record import CreepCalibration, gravity_fit
@@ -108,9 +109,10 @@ def sweep(
         seed: of the plan's search.
         progress: called with (readings done, readings in all, seconds left, what is being done).
 
-    Raises BadInput, Refused where the arm cannot be swept, BusFault.
+    Raises BadInput, Refused where the arm cannot be swept or `reference_mass` not be held, BusFault.
     """
     arm_file = arm.arm if _is_link(arm) else _arm(arm)
+    refuse_impossible_sweep(arm_file, reference_mass)
     run = run_creep if sweep_motion(arm_file) == "creep" else run_sweep
     with _enabled(arm, bus, simulated, reference_mass if simulated else 0.0) as link:
         return run(

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
     from armlink.loop.driver import ArmDriver
     from calib.commands.screen import SweepScreen
-    from calib.plan.rough_gravity import GravityGuess
     from calib.sweep.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
@@ -71,15 +70,13 @@ def sweep(
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, warn_late
-    from calib.commissioning.model_judgement import refuse_impossible_model
+    from calib.commissioning.model_judgement import refuse_impossible_sweep
     from calib.sweep.dataset import require_vacant
 
     if picture is not None:
         require_extra("--picture", "reports")
     arm_file = with_hold(load_arm(arm), hold)
-    refuse_impossible_model(arm_file)
-    if reference_mass:
-        _judge_mass(arm_file, reference_mass)
+    refuse_impossible_sweep(arm_file, reference_mass)
     if plan:
         write_json(json_file, _plan(arm_file, seed, reference_mass, picture, results(json_file)))
         folder = "loaded" if reference_mass else "unloaded"
@@ -124,26 +121,6 @@ def sweep(
     write_json(json_file, {**_answer(arm_file, data), "late_ms": lateness.in_ms()})
 
 
-def _judge_mass(arm_file: "ArmFile", mass: float) -> None:
-    """Raise BadInput where the drives cannot hold a reference mass [kg] in any sweep."""
-    from calib.creep.choice import sweep_motion
-    from calib.creep.plan import refuse_unbearable_creeps
-    from calib.plan.sweep_plan import refuse_unbearable_mass
-
-    if sweep_motion(arm_file) == "creep":
-        refuse_unbearable_creeps(arm_file, mass)
-    else:
-        refuse_unbearable_mass(arm_file, mass, _model_guess(arm_file))
-
-
-def _model_guess(arm_file: "ArmFile") -> "GravityGuess | None":
-    from calib.arm.kinematics import model_arm
-    from calib.plan.rough_gravity import guess_of_model
-
-    model = None if arm_file.model_path is None else model_arm(arm_file)
-    return None if model is None else guess_of_model(model.arm, model.beta)
-
-
 def _plan(
     arm_file: "ArmFile", seed: int, reference_mass: float, picture: Path | None, console: "PlainConsole"
 ) -> dict[str, Any]:
@@ -153,6 +130,7 @@ def _plan(
     from calib.creep.plan import creep_seconds, plan_creep
     from calib.plan.collisions import check_plan
     from calib.plan.drawing import draw_plan, pass_seconds, stops_seconds
+    from calib.plan.rough_gravity import guess_of_file
     from calib.plan.sweep_plan import plan_sweep
 
     if sweep_motion(arm_file) == "creep":
@@ -161,7 +139,7 @@ def _plan(
         took = creep_seconds(planned)
         console.print(f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass")
         return {**planned.model_dump(mode="json"), "seconds": took, "picture": None}
-    planned = plan_sweep(arm_file, _model_guess(arm_file), seed=seed, reference_mass=reference_mass)
+    planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
     print_plan(arm_file, planned, console)
     drawn = ""
     if picture is not None:

@@ -9,7 +9,10 @@ from armlink.errors import BadInput
 from armlink.link.joints.values import try_limits
 from calib.arm.kinematics import DriveLimits, model_arm
 from calib.commissioning.finding import SetupFinding
-from calib.plan.rough_gravity import HAND, reach
+from calib.creep.choice import sweep_motion
+from calib.creep.plan import refuse_unbearable_creeps
+from calib.plan.rough_gravity import HAND, guess_of_file, reach
+from calib.plan.sweep_plan import refuse_unbearable_mass
 from gcomp.arm.load import ModelArm
 from gcomp.gravity.torque import gravity_torque
 
@@ -26,6 +29,17 @@ def refuse_impossible_model(arm_file: ArmFile) -> None:
     """Raise BadInput in the words of doctor where a model's masses or the torque limits cannot be those of an arm."""
     for found in model_errors(arm_file):
         raise BadInput(str(found))
+
+
+def refuse_impossible_sweep(arm_file: ArmFile, reference_mass: float) -> None:
+    """Raise BadInput as `refuse_impossible_model`, and where the drives cannot hold a reference mass [kg] in sweeps."""
+    refuse_impossible_model(arm_file)
+    if not reference_mass:
+        return
+    if sweep_motion(arm_file) == "creep":
+        refuse_unbearable_creeps(arm_file, reference_mass)
+    else:
+        refuse_unbearable_mass(arm_file, reference_mass, guess_of_file(arm_file))
 
 
 def model_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armlink.arm_file import ArmFile
+from calib.arm.kinematics import model_arm
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor
@@ -51,6 +53,14 @@ def guess_of_model(kinematics: Arm, beta: Array) -> GravityGuess:
     """Mass moments β (2n,) [kg·m] of a model file, each taken as known to a tenth."""
     size = np.maximum(np.abs(beta), np.abs(beta).max(initial=0.0) / 20)
     return GravityGuess(kinematics, beta, np.diag((MODEL_ERROR * size) ** 2))
+
+
+def guess_of_file(arm_file: ArmFile) -> GravityGuess | None:
+    """That of an arm file's model; None where it has none. Raises BadInput."""
+    if arm_file.model_path is None:
+        return None
+    model = model_arm(arm_file)
+    return guess_of_model(model.arm, model.beta)
 
 
 def reach(kinematics: Arm, hand: float = HAND) -> Array:

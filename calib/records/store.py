@@ -11,6 +11,7 @@ import sqlalchemy as sa
 
 from armlink.arm_file import ArmFile, read_yaml
 from armlink.errors import BadInput, Refused
+from armlink.torque_calibration import Calibration
 from calib.records.bounds import require_sound
 from calib.records.database import StoreFault, default_url, first_line, open_database, reading, transaction
 from calib.records.records import CalibrationRecord, GravityRecord, digest_id, parse_record
@@ -18,6 +19,7 @@ from calib.records.schema import ACTIVATIONS, RECORDS, WRITES
 
 R = TypeVar("R", CalibrationRecord, GravityRecord)
 AnyRecord = CalibrationRecord | GravityRecord
+BLANK = Calibration(1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -265,3 +267,23 @@ def way_to(arm: ArmFile, *kinds: str) -> str:
     """The commands that make records of these kinds, from the first."""
     made = " and ".join(MAKERS[kind] for kind in kinds)
     return f"sweep the arm, then {made}: armlink sweep {arm.argument} --out unloaded"
+
+
+def calibrations_in_force(arm: ArmFile) -> tuple[Calibration | None, ...]:
+    """Gain and offset of each joint by the arm's current calibration record in the default store; None without one.
+
+    For the drives that keep none themselves (entry point `armlink.calibrations`). A value that the record does not
+    identify counts as 1 or 0. Raises Refused if the record is of another description of the arm.
+    """
+    store = RecordStore()
+    try:
+        record = store.current(CalibrationRecord, arm)
+    finally:
+        store.close()
+    if record is None:
+        return (None,) * len(arm.require_link().joints)
+    date, found = int(record.created.timestamp()), []
+    for joint in record.joints:
+        values = joint.torque_calibration(BLANK)
+        found.append(Calibration(values.gain, values.offset, record.number, date))
+    return tuple(found)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import armlink
+from armlink.errors import BadInput
 
 ROOT = Path(__file__).parents[2]
 SIGNATURES = {
@@ -129,3 +130,9 @@ def test_a_user_s_script_passes_mypy_strict(tmp_path):
     lines = [line for line in done.stdout.splitlines() if line.startswith("script.py") and "error" in line]
     assert lines == [], done.stdout
     assert 'Revealed type is "int"' in done.stdout.replace("builtins.", "")
+
+
+def test_a_sweep_with_a_mass_that_no_drive_holds_is_refused_before_anything_is_opened(tmp_path):
+    with pytest.raises(BadInput, match=r"attach at most 13 kg; is it 5 kg\?"):
+        armlink.sweep("sarcos", tmp_path / "loaded", simulated=True, reference_mass=5000.0)
+    assert not (tmp_path / "loaded").exists()

@@ -1,7 +1,7 @@
 """Temperatures, and the calibrations in force: in the drives that keep one, in the host for the others.
 
 A calibration in the host is in force by record: what the entry-point group `armlink.calibrations` tells of an arm
-(`calib.records.in_force`) is taken when its drives are opened, and said to be missing where there is none.
+(`calib.records.store`) is taken when its drives are opened, and said to be missing where there is none.
 """
 
 import logging

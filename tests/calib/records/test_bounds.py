@@ -17,9 +17,8 @@ from calib.install.journaled_write import install
 from calib.install.plausibility import Admitted
 from calib.records.bounds import CLOCK_TOLERANCE, require_sound
 from calib.records.database import StoreFault
-from calib.records.in_force import calibrations_in_force
 from calib.records.records import CalibrationRecord, Discrepancy, GravityRecord, MotorTorque, parse_record
-from calib.records.store import RecordStore
+from calib.records.store import RecordStore, calibrations_in_force
 
 AnyRecord = CalibrationRecord | GravityRecord
 
