@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from armlink.arm_file import load_arm
+from armlink.arm_file import ArmFile, load_arm
 from armlink.bus.port import EXTENDED, REMOTE, Frame
 from armlink.errors import ArmlinkError, BusFault
 from armlink.link.bus_watchdog import MOST_FRAMES, frame_name
@@ -16,6 +16,8 @@ from armlink.link.link import Link
 from armlink.link.park import straight
 from armlink.link.types import Command, Setpoints
 from sim_bus.bus.lock_step import LockStepBus
+from sim_bus.effects.quasi_direct import QuasiDirect
+from sim_bus.sim_section import EffectEntry
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -57,10 +59,22 @@ class FloodedBus(LockStepBus):
         arm.advance = watched  # type: ignore[method-assign]
 
 
+def damping_of(arm: ArmFile) -> list[EffectEntry]:
+    """The least damping that drives come with: these arms have none, and where one hangs without power it would rock
+    for ever about its rest from wherever the flood left it.
+    """
+    shares = QuasiDirect().viscous[0] * arm.require_link().rated_torques
+    return [
+        EffectEntry(effect="friction.viscous", joint=name, damping=share)
+        for name, share in zip(arm.joint_names, shares, strict=True)
+    ]
+
+
 def flooded(family: str, kind: str, count: int) -> tuple[FloodedBus, ArmlinkError | None]:
     """An arm in motion is flooded; its bus after its end, and the error that ended it."""
     arm = load_arm(f"six-{family}")
     simulated = SimulatedArm(arm, Truth.of(arm), 1)
+    simulated.set_effects(damping_of(arm))
     bus, found = FloodedBus(simulated), None
     try:
         with Link(arm, bus) as link:
