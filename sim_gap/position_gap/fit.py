@@ -1,30 +1,32 @@
-"""Output-error fit: parameters of all joints by Gauss-Newton on simulated minus measured positions."""
+"""Parameters of all joints fitted to simulated minus measured positions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gcomp.arrays import Array
+from gcomp.estimate.problem import Parameter, Problem, linearise
+from gcomp.estimate.solve import solve
+from sim_gap.position_gap.links import range_of, size_of
 from sim_gap.position_gap.parameters import (
-    FARTHEST,
+    INVERSE,
     LOGARITHMIC,
     PARAMETERS,
     Scales,
-    gain_companions,
-    relative_step,
-    step_parameter,
+    from_coordinate,
+    to_coordinate,
 )
-from sim_gap.position_gap.simulate import simulate
-from sim_gap.position_gap.windows import Windows, choose_joints
+from sim_gap.position_gap.plant import simulate
+from sim_gap.position_gap.windows import Windows
 
-DAMPINGS = (1e-6, 1e-2, 0.1, 1.0, 10.0, 100.0)
-"""Levenberg-Marquardt dampings tried together in every step."""
-STILL = 1e-3
-"""Relative fall of the cost below which a joint's fit ends."""
-DIFFERENCE = 0.02
-"""Step of a finite difference, in units of the size at which a parameter is tried."""
-
+INDEPENDENT_S = 0.5
+"""Time over which residuals are correlated [s]."""
+DIFFERENCE, RELATIVE = 0.05, 0.02
+"""Steps of finite differences: in units of the size at which a parameter is tried, and of a logarithm."""
+PRIOR, PRIOR_RELATIVE = 10.0, 3.0
+"""Standard deviation of any parameter of an effect before any recording: in units of the size at which it is tried, and
+of a logarithm."""
 Point = Mapping[str, Array]
 """Parameter → (J,)."""
 
@@ -37,7 +39,7 @@ class LoopFit:
     active: tuple[tuple[str, ...], ...]
     """Names fitted at each joint."""
     shared: tuple[str, ...] = ()
-    """Names of columns with one coefficient for the whole arm."""
+    """Names of parameters with one value for the whole arm."""
     rms: Array | None = None
     """RMS of the residual per joint and window [rad], (J, W)."""
 
@@ -48,21 +50,18 @@ class LoopFit:
 def coordinate(fit: LoopFit, scales: Scales, joint: int, name: str) -> float:
     """A fit's value of a parameter in its own coordinate; `joint` is −1 for the whole arm."""
     value = float(fit.point[name][max(joint, 0)])
-    if joint < 0:
-        return value
-    return float(np.log(value)) if name in LOGARITHMIC else value / float(scales.of(name)[joint])
+    return value if joint < 0 else to_coordinate(name, value, float(scales.of(name)[joint]))
 
 
 def residuals(data: Windows, values: Mapping[str, Array]) -> Array:
     """Simulated minus measured positions, as far as they count, (P, To, J, W)."""
-    return (simulate(data, values) - data.measured) * data.weight
+    return (simulate(data, values) - data.measured) * (data.weight > 0.0)
 
 
 def root_mean_squares(data: Windows, residual: Array) -> Array:
     """RMS over the time of each window, (…, J, W); 0 for one without samples."""
-    count = data.weight.sum(0)
-    total = np.einsum("...tjw,...tjw->...jw", residual, residual)
-    return np.asarray(np.sqrt(total / np.maximum(count, 1.0)))
+    total = np.einsum("...tjw,tjw->...jw", residual**2, data.weight)
+    return np.asarray(np.sqrt(total / np.maximum(data.weight.sum(0), 1.0)))
 
 
 def batch(points: Sequence[Point]) -> dict[str, Array]:
@@ -74,143 +73,94 @@ def evaluate(data: Windows, fit: LoopFit) -> LoopFit:
     return replace(fit, rms=root_mean_squares(data, residuals(data, batch([fit.point])))[0])
 
 
+class Layout:
+    """Parameters of joints (joint, name) and of the whole arm (−1, name) in the order of a `Problem`."""
+
+    def __init__(self, data: Windows, scales: Scales, point: Point, names: Iterable[tuple[int, str]]) -> None:
+        self.data, self.scales, self.point = data, scales, dict(point)
+        self.names = list(names)
+        for j, name in self.names:
+            if j < 0:
+                self.point.setdefault(name, np.zeros(data.joints))
+
+    def size(self, j: int, name: str) -> float:
+        return 1.0 if j < 0 else float(self.scales.of(name)[j])
+
+    def theta(self, point: Point) -> Array:
+        """The coordinates of a point, (K,)."""
+        return np.array(
+            [
+                float(point[name][0]) if j < 0 else to_coordinate(name, float(point[name][j]), self.size(j, name))
+                for j, name in self.names
+            ]
+        )
+
+    def at(self, theta: Array) -> dict[str, Array]:
+        """The point at coordinates (K,)."""
+        point = {name: values.copy() for name, values in self.point.items()}
+        for x, (j, name) in zip(theta, self.names, strict=True):
+            if j < 0:
+                point[name] = np.full(self.data.joints, x)
+            else:
+                point[name][j] = from_coordinate(name, np.array(x), np.array(self.size(j, name)))
+        return point
+
+    def problem(self, nominal: Point, steps: Mapping[tuple[int, str], float], floor: Array) -> Problem:
+        parameters = tuple(self._parameter(j, name, nominal, steps.get((j, name))) for j, name in self.names)
+        shape = (self.data.joints, -1)
+
+        def predict(thetas: Array) -> Array:
+            left = residuals(self.data, batch([self.at(theta) for theta in thetas]))
+            return left.transpose(0, 2, 1, 3).reshape(len(thetas), *shape)
+
+        weight = self.data.weight.transpose(1, 0, 2).reshape(shape) * min(self.data.judged_s / INDEPENDENT_S, 1.0)
+        block = np.broadcast_to(np.arange(self.data.count), (len(self.data.measured), self.data.count)).ravel()
+        return Problem(parameters, predict, weight, block.astype(np.intp), floor)
+
+    def _parameter(self, j: int, name: str, nominal: Point, step: float | None) -> Parameter:
+        if j < 0:
+            low, high = range_of(self.data.plant.sim.arm, name)
+            size = size_of(self.data.plant.sim.arm, name)
+            return Parameter(name, 0.0, 0.5 * max(-low, high), low, high, -1, step or DIFFERENCE * size)
+        size = self.size(j, name)
+        low, high = PARAMETERS[name].low, PARAMETERS[name].high
+        if name in LOGARITHMIC:
+            ends, own, usual = (float(np.log(max(low, 1e-12))), float(np.log(high))), PRIOR_RELATIVE, RELATIVE
+        elif name in INVERSE:
+            ends, own, usual = (0.0, size / low), PRIOR, DIFFERENCE
+        else:
+            ends, own, usual = (low / size, high / size), PRIOR, DIFFERENCE
+        return Parameter(
+            name, to_coordinate(name, float(nominal[name][j]), size), own, *ends, channel=j, step=step or usual
+        )
+
+
+def names_of(fit: LoopFit) -> list[tuple[int, str]]:
+    """What was fitted: joint and name, then the whole arm's."""
+    return [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
+
+
 def jacobian(
     data: Windows, fit: LoopFit, scales: Scales, names: Sequence[Sequence[str]], shared: Sequence[str] = ()
 ) -> tuple[Array, list[Array]]:
-    """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the parameters' own coordinates.
-
-    That by a gain is the difference by the gain and all that goes with it, less the derivatives by the latter: their
-    common scale changes next to nothing of the motion, and differences of each alone, which sticking and slipping
-    roughen, do not add up to that.
-    """
-    width = max((len(each) for each in names), default=0)
-    steps = [[_difference(name, fit.point[name][j], scales, j) for name in own] for j, own in enumerate(names)]
-    points = [dict(fit.point)]
-    for k in range(width):
-        point = {name: values.copy() for name, values in fit.point.items()}
-        for j, own in enumerate(names):
-            if k < len(own):
-                point[own[k]][j] = step_parameter(own[k], fit.point[own[k]][j], steps[j][k], scales, j)
-                for name in gain_companions(own) if own[k] == "kp" else ():
-                    point[name][j] *= np.exp(steps[j][k])
-        points.append(point)
-    points += [{**fit.point, name: fit.point[name] + DIFFERENCE} for name in shared]
-    all_residuals = residuals(data, batch(points))
-    now, out = all_residuals[0], []
-    for j, own in enumerate(names):
-        columns = [(all_residuals[1 + k][:, j] - now[:, j]) / step for k, step in enumerate(steps[j])]
-        for name in gain_companions(own):
-            share = relative_step(name, fit.point[name][j], scales, j)
-            columns[own.index("kp")] -= share * columns[own.index(name)]
-        columns += [(all_residuals[1 + width + s][:, j] - now[:, j]) / DIFFERENCE for s in range(len(shared))]
-        out.append(np.stack(columns) if columns else np.zeros((0, *now[:, j].shape)))
-    return now, out
+    """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the parameters' own coordinates."""
+    listed = [(j, name) for j, own in enumerate(names) for name in own] + [(-1, name) for name in shared]
+    layout = Layout(data, scales, fit.point, listed)
+    about = linearise(layout.problem(fit.point, {}, np.zeros(data.joints)), layout.theta(layout.point), range(len(listed)))
+    shape = (len(data.measured), data.count)
+    now = about.residual.reshape(data.joints, *shape).transpose(1, 0, 2)
+    return now, [x.reshape(len(x), *shape) for x in about.slopes]
 
 
-def _difference(name: str, value: float, scales: Scales, joint: int) -> float:
-    """Step of a finite difference in the parameter's own coordinate, away from the highest value where that is near."""
-    step = 0.01 if name in LOGARITHMIC else DIFFERENCE
-    return -step if step_parameter(name, value, step, scales, joint) >= PARAMETERS[name].high else step
-
-
-def improve(data: Windows, fit: LoopFit, scales: Scales, iterations: int = 6) -> LoopFit:
-    """Gauss-Newton steps from a fit until nothing falls; joints are independent unless `shared` couples them."""
-    moving = [j for j, own in enumerate(fit.active) if own]
-    if not fit.shared and len(moving) < data.joints:
-        return _improved_part(data, fit, scales, iterations, moving)
-    fit = evaluate(data, fit)
-    assert fit.rms is not None
-    cost = (fit.rms**2 * data.weight.sum(0)).sum(1)
-    busy = [bool(own) or bool(fit.shared) for own in fit.active]
-    for _ in range(iterations):
-        names = [own if going else () for own, going in zip(fit.active, busy, strict=True)]
-        if not any(busy):
-            break
-        now, slopes = jacobian(data, fit, scales, names, fit.shared)
-        trials = [_stepped(data, fit, names, now, slopes, damping, scales) for damping in DAMPINGS]
-        left = residuals(data, batch(trials))
-        costs = np.einsum("ptjw,ptjw->pj", left, left)
-        best = np.full(data.joints, int(costs.sum(1).argmin())) if fit.shared else costs.argmin(0)
-        chosen = costs[best, np.arange(data.joints)]
-        better = chosen < cost if not fit.shared else np.full(data.joints, chosen.sum() < cost.sum())
-        point = {
-            name: np.where(better, np.array([trials[b][name][j] for j, b in enumerate(best)]), values)
-            for name, values in fit.point.items()
-        }
-        fall = np.where(better, 1.0 - chosen / np.maximum(cost, 1e-300), 0.0)
-        cost = np.where(better, chosen, cost)
-        fit = replace(fit, point=point)
-        going = fall > STILL
-        busy = [b and bool(going.any() if fit.shared else g) for b, g in zip(busy, going, strict=True)]
-    return evaluate(data, fit)
-
-
-def _improved_part(data: Windows, fit: LoopFit, scales: Scales, iterations: int, joints: list[int]) -> LoopFit:
-    """The fit improved at the joints that have parameters to fit; the others are as they were."""
-    if not joints:
-        return fit if fit.rms is not None else evaluate(data, fit)
-    some = LoopFit({name: values[joints] for name, values in fit.point.items()}, tuple(fit.active[j] for j in joints))
-    sizes = Scales(**{name: values[joints] for name, values in vars(scales).items()})
-    better = improve(choose_joints(data, joints), some, sizes, iterations)
-    assert better.rms is not None
-    fit = fit if fit.rms is not None else evaluate(data, fit)
-    assert fit.rms is not None
-    point, rms = {name: values.copy() for name, values in fit.point.items()}, fit.rms.copy()
-    for name, values in better.point.items():
-        point[name][joints] = values
-    rms[joints] = better.rms
-    return replace(fit, point=point, rms=rms)
-
-
-def _stepped(
-    data: Windows,
-    fit: LoopFit,
-    names: Sequence[Sequence[str]],
-    now: Array,
-    slopes: list[Array],
-    damping: float,
-    scales: Scales,
-) -> dict[str, Array]:
-    """The point after one damped Gauss-Newton step."""
-    return stepped(data, fit, scales, names, *solve(names, len(fit.shared), now, slopes, damping))
-
-
-def stepped(
-    data: Windows, fit: LoopFit, scales: Scales, names: Sequence[Sequence[str]], steps: Sequence[Array], common: Array
-) -> dict[str, Array]:
-    """The point after steps of each joint's own parameters and of the shared ones.
-
-    What goes with a gain is scaled as the gain is and moved by what its step is more than that: however far the scale
-    moves, ratios stay.
-    """
-    point = {name: values.copy() for name, values in fit.point.items()}
-    for j, (own, each) in enumerate(zip(names, steps, strict=True)):
-        step = dict(zip(own, each.tolist(), strict=True))
-        scale = float(np.clip(step.get("kp", 0.0), -FARTHEST, FARTHEST))
-        for name in set(gain_companions(own)).difference(LOGARITHMIC):
-            step[name] += (np.exp(scale) - 1.0 - scale) * relative_step(name, point[name][j], scales, j)
-        for name, size in step.items():
-            point[name][j] = step_parameter(name, float(point[name][j]), size, scales, j)
-    for name, size in zip(fit.shared, common.tolist(), strict=True):
-        point[name] = np.clip(point[name] + size, *data.ranges[name])
-    return point
-
-
-def solve(
-    names: Sequence[Sequence[str]], shared: int, now: Array, slopes: list[Array], damping: float
-) -> tuple[list[Array], Array]:
-    """Steps of each joint's own parameters and of the shared ones; each joint is weighted by what it leaves."""
-    sizes = [len(own) for own in names]
-    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-    total = int(starts[-1]) + shared
-    normal, right = np.zeros((total, total)), np.zeros(total)
-    for j, x in enumerate(slopes):
-        flat, r = x.reshape(len(x), now[:, j].size), now[:, j].ravel()
-        weight = 1.0 / max(float(r @ r), 1e-300)
-        index = np.concatenate([np.arange(starts[j], starts[j + 1]), np.arange(starts[-1], total)]).astype(int)
-        normal[np.ix_(index, index)] += weight * flat @ flat.T
-        right[index] -= weight * flat @ r
-    diagonal = np.diag(normal).copy()
-    normal[np.diag_indices(total)] += damping * diagonal + 1e-9 * max(float(diagonal.max(initial=0.0)), 1e-30)
-    step: Array = np.asarray(np.linalg.solve(normal, right)) if total else np.zeros(0)
-    return [step[starts[j] : starts[j + 1]] for j in range(len(names))], step[starts[-1] :]
+def improve(
+    data: Windows, fit: LoopFit, scales: Scales, floor: Array, nominal: Point, iterations: int = 6
+) -> LoopFit:
+    """The most probable values of what is active, from a fit on."""
+    names = names_of(fit)
+    if not names:
+        return evaluate(data, fit)
+    layout = Layout(data, scales, fit.point, names)
+    found = solve(layout.problem(nominal, {}, floor), layout.theta(layout.point), range(len(names)), iterations)
+    shape = (data.joints, len(data.measured), data.count)
+    left = found.residual.reshape(shape).transpose(1, 0, 2)
+    return replace(fit, point=layout.at(found.theta), rms=root_mean_squares(data, left))

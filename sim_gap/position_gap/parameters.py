@@ -109,9 +109,31 @@ class Scales:
         return np.asarray(parameter.trial * (one if parameter.scale == "1" else getattr(self, parameter.scale)))
 
 
-LOGARITHMIC = ("kp", "ki", "limit", "slew", "stribeck_velocity", "gain")
+LOGARITHMIC = ("kp", "stribeck_velocity", "gain")
+INVERSE = "limit", "slew"
+"""Limits: their inverse is fitted, which is 0 where there is none."""
+LEAST_INVERSE = 1e-3
+"""Inverse of a limit, over that of its usual size, below which there is none."""
 FARTHEST = 1.5
 """Logarithm of the largest factor of one step of a fit."""
+
+
+def to_coordinate(name: str, value: float, size: float) -> float:
+    """A parameter's value in the coordinate in which it is fitted; `size` is that at which it is tried."""
+    if name in LOGARITHMIC:
+        return float(np.log(max(value, 1e-12)))
+    return size / value if name in INVERSE else value / size
+
+
+def from_coordinate(name: str, x: Array, size: Array) -> Array:
+    """The value at a coordinate, within its bounds."""
+    if name in LOGARITHMIC:
+        value = np.exp(x)
+    elif name in INVERSE:
+        value = np.where(x > LEAST_INVERSE, size / np.maximum(x, LEAST_INVERSE), np.inf)
+    else:
+        value = x * size
+    return np.clip(value, PARAMETERS[name].low, PARAMETERS[name].high)
 
 
 def step_parameter(
@@ -121,19 +143,7 @@ def step_parameter(
 
     `farthest` is the logarithm of the largest factor on a gain.
     """
+    size = float(scales.of(name)[joint])
     if name in LOGARITHMIC:
-        new = value * float(np.exp(np.clip(step, -farthest, farthest)))
-    else:
-        new = value + step * float(scales.of(name)[joint])
-    low, high = PARAMETERS[name].low, PARAMETERS[name].high
-    return float(np.clip(new, low, high))
-
-
-def relative_step(name: str, value: float, scales: Scales, joint: int) -> float:
-    """Step in a parameter's own coordinate per relative change of its value."""
-    return 1.0 if name in LOGARITHMIC else value / float(scales.of(name)[joint])
-
-
-def gain_companions(own: Sequence[str]) -> tuple[str, ...]:
-    """Those of a joint's parameters that go with its gain where all torques change together; none without a gain."""
-    return tuple(name for name in own if name in WITH_TORQUE and name != "kp") if "kp" in own else ()
+        step = float(np.clip(step, -farthest, farthest))
+    return float(from_coordinate(name, np.array(to_coordinate(name, value, size) + step), np.array(size)))

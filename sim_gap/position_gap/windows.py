@@ -1,173 +1,304 @@
-"""Recordings of commanded and measured positions, cut into windows for the simulation of every joint by itself.
+"""Recordings of commanded and measured positions, cut into windows in which the user's model runs free.
 
-Along the recorded motion of the other joints the equation of motion of joint j is one of its own: with e the deviation
-of its angle from the recorded one, (M_jj + J) a + c + g cos e + g' sin e = u − friction. M_jj does not depend on q_j,
-and gravity's torque about a hinge is exactly a sine of its angle, so that only the c of centrifugal and coupling
-terms is taken at the recorded motion.
+A recording ends where rows are missing or a position makes a step that no motion makes: what comes after is a piece
+that begins afresh, as the short roll-outs of a data set do.
 """
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armlink.recording.recording import Recording
-from gcomp.arrays import Array
-from sim_gap.model.rigid_body import RigidArm
-from sim_gap.position_gap.surface import Surface
-from sim_gap.position_gap.tracks import RecordingTrack, in_one_order, period_of, track_of
+from armlink.errors import BadInput
+from armlink.recording.recording import Recording, slice_rows
+from gcomp.arrays import Array, Mask
+from sim_gap.model.load import SimModel
+from sim_gap.residuals.resampling import low_pass
 
-STEP_S = 0.0051
-"""Longest step of the simulation [s]; the recording's period is a multiple of the step."""
-WINDOW_S, WARM_S = 6.0, 1.5
+if TYPE_CHECKING:
+    from sim_gap.position_gap.plant import Plant
+
+WINDOW_S, WARM_S = 3.0, 1.0
 """Judged length of a window, and the simulated time before it that is not judged [s]."""
-MOVES, FAST = 0.5, 0.8
-"""Shares of a joint's largest RMS speed and largest speed of all windows that it has to have in one that is fitted."""
+SHORT_S = 3.0
+"""Length of a piece that begins as it was recorded and is judged from there [s]; longer ones have a time to warm."""
+LEAST_S = 0.2
+"""Length of a piece that shows any motion [s]."""
 JUDGED_HZ = 50.0
 """Highest rate at which simulated and measured positions are compared [Hz]."""
+SMOOTH_HZ, SMOOTH_SHARE = 15.0, 0.16
+"""Pass band of the recorded motion: at most this, and this share of the recording's rate [Hz]."""
+MISSING_ROWS, MISSING_S = 6.0, 0.25
+"""Time without a row at which a piece ends: in periods, and at least [s]."""
+STEP_RATIO, STEP_RAD = 6.0, 0.05
+"""Step of a position that no motion makes: this many times the larger of the steps beside it, and this much more."""
+BEGINNING_ROWS = 5
+"""Rows from which position and velocity at the start of a short piece follow."""
+NORMAL_MEDIAN = 0.6745
+"""Median of the amount of a standard normal value."""
+MOVES, FAST = 0.5, 0.8
+"""Shares of a joint's largest RMS speed and largest speed of all windows that it has to have in one that is fitted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A part of a recording without a break: commands as they were held from row to row."""
+
+    ends: Array
+    """Times at which each command begins, and the last ends [s], (K + 1,)."""
+    area: Array
+    """Integral of the command up to each of them [rad·s], (K + 1, n)."""
+    served: Mask
+    """Whether each row is commanded, (K, n)."""
+
+    def command(self, edges: Array, delay: Array) -> Array:
+        """Mean command between the times `edges` (T + 1,), each joint's later by its `delay` (n,) [s]; (T, n)."""
+        made = [np.interp(edges - late, self.ends, column) for late, column in zip(delay, self.area.T, strict=True)]
+        # before the first row the first command held, after the last one the last
+        outside = [
+            np.minimum(edges - late - self.ends[0], 0.0) * first + np.maximum(edges - late - self.ends[-1], 0.0) * last
+            for late, first, last in zip(delay, *self.held, strict=True)
+        ]
+        return np.asarray(np.diff(np.column_stack(made) + np.column_stack(outside), axis=0) / np.diff(edges)[:, None])
+
+    @property
+    def held(self) -> tuple[Array, Array]:
+        """First and last command, (n,) each."""
+        rates = np.diff(self.area, axis=0) / np.diff(self.ends)[:, None]
+        return rates[0], rates[-1]
+
+    def served_at(self, times: Array) -> Mask:
+        """Whether each joint is commanded at each time, (T, n)."""
+        rows = np.searchsorted(self.ends, times + 1e-9, side="right") - 1
+        return self.served[np.clip(rows, 0, len(self.served) - 1)]
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """W windows of T steps of J joints; arrays are (T, J, W) unless noted otherwise, SI units."""
+    """W windows of J joints, compared with the model at up to To times; SI units."""
 
-    dt: float
-    stride: int
-    """Steps from one comparison to the next."""
-    warm: int
-    """Steps before the first comparison."""
-    command: Array
-    """Mean of the held command over a step about each time [rad]."""
-    served: Array
-    """1 while the servo is commanded, 0 where the command is missing."""
-    speed: Array
-    """Derivative of the command, smoothed [rad/s]."""
-    recorded: Array
-    """Smoothed recorded position [rad]."""
-    inertia: Array
-    gravity: Array
-    slope: Array
-    """M_jj [kg·m²], gravity's torque [N·m] and its derivative with respect to q_j [N·m/rad]."""
-    coupling: Array
-    """Torque of the other joints' accelerations and of all velocities [N·m]."""
-    load: Array
-    """Amount of the links' torque on the gear [N·m]."""
-    feed: Array
-    """Torque of the nominal links and rotors along the command [N·m]."""
+    plant: "Plant"
+    """The model that is moved along the commands."""
+    pieces: tuple[Piece, ...]
+    piece: NDArray[np.intp]
+    """Number of the piece of each window, (W,)."""
+    begin: Array
+    """Time at which the simulation of each window begins, in its piece's time [s], (W,)."""
+    at: Array
+    """Time of each comparison after that [s], (To, W)."""
     measured: Array
     """Measured position, (To, J, W) [rad]."""
     weight: Array
-    """Weight of a sample, (To, J, W): 0 where nothing was measured, else 1, or less (`search.balanced`)."""
+    """1 where something was measured, else 0, (To, J, W)."""
     start: Array
-    """Position and velocity at the first step, (2, J, W)."""
+    """Position and velocity at the beginning, (2, J, W)."""
     error_sum: Array
-    """Integral of command minus position from the start of the recording to that of the window, (J, W) [rad·s]."""
-    travel: Array
-    """Way of the command from the start of the recording to that of the window, (J, W) [rad]."""
-    first_error: Array
-    """Command minus position at the start of the recording, (J, W) [rad]."""
-    first_torque: Array
-    """Torque that the links need there, less the feed-forward's, (2, J, W) [N·m]: without, with it."""
+    """Integral of command minus position from the piece's start to the window's, (J, W) [rad·s]."""
+    first: Array
+    """Position at the start of the piece, (J, W) [rad]."""
+    v: Array
+    """Velocity, (To, J, W) [rad/s]."""
+    torque: Array
+    """Torque that the nominal links ask for along the recorded motion, (To, J, W) [N·m]."""
+    error: Array
+    """Command minus position, (To, J, W) [rad]; 0 where there is no command."""
+    served: Array
+    """1 while the servo is commanded, (To, J, W)."""
+    noise: Array
+    """Standard deviation of the readings of the piece about a smooth course, (J, W) [rad]."""
     recording: NDArray[np.intp]
-    """Number of the recording from 0 of each window, (W,)."""
+    """Number of the recording of each window, (W,)."""
     scale: Array
     """The controller's gains in each window over those in the first recording, (W,)."""
     period: float
     """Longest sampling period of the recordings [s]."""
-    time: Array
-    """Time of the first comparison of each window [s], (W,)."""
-    q: Array
-    v: Array
-    a: Array
-    """Smoothed recorded motion, for the columns of link effects."""
-    arm: RigidArm
-    columns: dict[str, Array] = field(default_factory=dict)
-    """Torque per unit of a parameter of the links or the arm [N·m], made by `with_columns`."""
-    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Lowest and highest coefficient of each column."""
+    judged_s: float
+    """Time from one comparison to the next [s]."""
 
     @property
     def joints(self) -> int:
-        return int(self.command.shape[1])
+        return int(self.measured.shape[1])
 
     @property
     def count(self) -> int:
-        return int(self.command.shape[2])
+        return int(self.measured.shape[2])
 
     @property
     def of_one_recording(self) -> bool:
         return len(np.unique(self.recording)) == 1
 
 
+def period_of(recording: Recording) -> float:
+    """Median time from row to row [s]."""
+    return float(np.median(np.diff(recording.t)))
+
+
+def smoothing(period: float) -> Callable[[Array], Array]:
+    """The low pass of motion that was recorded every `period` [s]."""
+    return low_pass(min(SMOOTH_HZ, SMOOTH_SHARE / period), 1.0 / period)
+
+
+def pieces_of(recording: Recording) -> list[slice]:
+    """Rows of the parts of a recording without a gap or a step that no motion makes."""
+    t, period = recording.t, period_of(recording)
+    gap = np.diff(t) > max(MISSING_ROWS * period, MISSING_S)
+    step = np.abs(np.diff(recording.position, axis=0))
+    step = np.where(np.isfinite(step), step, 0.0)
+    beside = np.zeros_like(step)
+    beside[1:] = step[:-1]
+    beside[:-1] = np.maximum(beside[:-1], step[1:])
+    jump = (step > STEP_RATIO * beside + STEP_RAD).any(axis=1)
+    # a single wild reading makes two steps, there and back, and ends nothing
+    back = jump[1:] & jump[:-1]
+    jump[1:] &= ~back
+    jump[:-1] &= ~back
+    ends = np.flatnonzero(gap | jump) + 1
+    edges = [0, *ends.tolist(), len(t)]
+    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if t[b - 1] - t[a] >= LEAST_S]
+
+
 def windows_of(
-    arm: RigidArm,
-    recordings: Sequence[Recording],
-    labels: Sequence[str],
-    step: float = 0.0,
-    scales: Sequence[float] = (),
-    surface: Surface | None = None,
+    plant: "Plant", recordings: Sequence[Recording], labels: Sequence[str], scales: Sequence[float] = ()
 ) -> Windows:
     """Cut recordings into windows, the same however they are ordered. Raises BadInput for one that holds no commanded
     position.
 
-    `step` is the simulation's [s], by default a whole fraction of the recordings' period; `scales` are the controller's
-    gains in each recording relative to the first, by default 1; what touches the `surface` does not count.
+    `scales` are the controller's gains in each recording relative to the first, by default 1.
     """
     period = max(period_of(recording) for recording in recordings)
-    dt = step or min(period_of(r) / math.ceil(period_of(r) / STEP_S - 1e-6) for r in recordings)
-    stride = max(1, math.ceil(max(period, 1.0 / JUDGED_HZ) / dt - 1e-6))
-    warm, length = (stride * round(s / dt / stride) for s in (WARM_S, WINDOW_S))
-    parts: list[dict[str, Array]] = []
-    for number in in_one_order(recordings):
-        track = track_of(arm, recordings[number], labels[number], dt)
-        if surface is not None:
-            track.seen[surface.touched(arm, track.t, track.signals["q"])] = 0.0
-        parts += _cut(arm, track, number, warm, length, stride)
-    number_of = np.array([part["recording"] for part in parts], dtype=np.intp)
-    stacked: dict[str, Any] = {
-        name: np.stack([part[name] for part in parts], axis=-1) for name in parts[0] if name != "recording"
-    }
+    pieces: list[Piece] = []
+    parts: list[dict[str, Any]] = []
+    for number in _in_one_order(recordings):
+        recording = recordings[number]
+        if recording.position_command is None or not np.isfinite(recording.position_command).any():
+            raise BadInput(f"{labels[number]}: neither a torque channel nor a commanded position: record tau_1 … or "
+                           "q_cmd_1 …")
+        for rows in pieces_of(recording):
+            part = slice_rows(recording, rows)
+            if np.isfinite(part.position).all(axis=1).sum() < BEGINNING_ROWS:
+                continue
+            made = _cut(plant.sim, part, number, len(pieces))
+            if made:
+                pieces.append(_piece(part))
+                parts += made
+    if not parts:
+        raise BadInput(f"{labels[0]}: no part of at least {LEAST_S:g} s without a break in which positions are read")
+    longest = max(len(part["at"]) for part in parts)
+    stacked = {name: np.stack([_padded(part[name], longest, name) for part in parts], axis=-1) for name in parts[0]}
+    number_of = stacked.pop("recording").astype(np.intp)
     scale = np.array([*scales] or [1.0] * len(recordings), float)[number_of]
-    return Windows(dt=dt, stride=stride, warm=warm, period=period, arm=arm, recording=number_of, scale=scale, **stacked)
+    own = stacked.pop("piece").astype(np.intp)
+    every = [1.0 / JUDGED_HZ, period]
+    return Windows(plant, tuple(pieces), own, recording=number_of, scale=scale, period=period, judged_s=max(every), **stacked)
 
 
-def _cut(
-    arm: RigidArm, track: RecordingTrack, number: int, warm: int, length: int, stride: int
-) -> list[dict[str, Array]]:
-    """Windows of one recording; the last is padded and counts only as long as it goes."""
-    dt = float(track.t[1] - track.t[0])
-    rows, total = len(track.t), warm + length
-    error = (track.signals["command"] - track.signals["raw"]) * track.signals["served"]
-    sums = np.vstack([np.zeros((1, arm.n)), np.cumsum(error, axis=0)[:-1] * dt])
-    opening = slice(0, max(1, round(0.1 / dt)))
-    first_error = error[opening].mean(0)
-    needed = track.signals["needed"][opening].mean(0)
-    first_torque = np.stack([needed, needed - track.signals["feed"][opening].mean(0)])
-    kept = [name for name in track.signals if name not in ("needed", "raw")]
-    out = []
-    starts = range(0, max(rows - warm - round(0.5 / dt), 1), length)
-    for start in starts:
-        index = np.minimum(np.arange(start, start + total), rows - 1)
-        judged = np.arange(start + warm, start + total, stride)
-        inside = np.minimum(judged, rows - 1)
+PER_SAMPLE = ("at", "measured", "weight", "v", "torque", "error", "served")
+
+
+def _padded(values: Any, longest: int, name: str) -> Array:
+    """Values of a window with as many samples as the longest has, the last repeated without weight."""
+    values = np.asarray(values, float)
+    if name not in PER_SAMPLE or len(values) == longest:
+        return values
+    more = np.repeat(values[-1:], longest - len(values), axis=0)
+    return np.concatenate([values, 0.0 * more if name == "weight" else more])
+
+
+def _piece(part: Recording) -> Piece:
+    given = part.position_command
+    assert given is not None
+    served = np.isfinite(given)
+    filled = given.copy()
+    for j in range(filled.shape[1]):
+        there = served[:, j]
+        order = np.maximum.accumulate(np.where(there, np.arange(len(there)), 0))
+        filled[:, j] = filled[order, j] if there.any() else part.position[0, j]
+        filled[: int(np.argmax(there)), j] = filled[int(np.argmax(there)), j]
+    ends = np.append(part.t, part.t[-1] + period_of(part)) - part.t[0]
+    area = np.vstack([np.zeros((1, filled.shape[1])), np.cumsum(filled * np.diff(ends)[:, None], axis=0)])
+    return Piece(ends, area, served)
+
+
+def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> list[dict[str, Any]]:
+    """Windows of one piece."""
+    t, q = part.t - part.t[0], part.position
+    seen = np.isfinite(q)
+    filled = np.column_stack([np.interp(t, t[s], x[s]) if s.any() else 0.0 * t for x, s in zip(q.T, seen.T, strict=True)])
+    q0, v0 = _beginning(t, filled)
+    noise = _noise(filled)
+    smooth, v, a = _smoothed(t, filled)
+    arm = sim.arm
+    torque = arm.torque(smooth, v, a) + arm.spring_torque(smooth) + arm.armature * a
+    given = part.position_command
+    assert given is not None
+    served = np.isfinite(given)
+    error = np.where(served, np.where(served, given, 0.0) - filled, 0.0)
+    sums = np.vstack([np.zeros((1, arm.n)), np.cumsum(error[:-1] * np.diff(t)[:, None], axis=0)])
+    stride = max(1, round(1.0 / (JUDGED_HZ * period_of(part))))
+    short = t[-1] < SHORT_S
+    warm, out, begin = 0.0 if short else WARM_S, [], 0.0
+    while begin + warm < t[-1] - min(0.5, 0.5 * t[-1]):
+        first = int(np.searchsorted(t, begin - 1e-9))
+        rows = np.arange(int(np.searchsorted(t, t[first] + warm - 1e-9)), len(t), stride)
+        rows = rows[t[rows] < t[first] + warm + (SHORT_S if short else WINDOW_S)]
+        rows = rows[1:] if short else rows
+        if not len(rows):
+            break
+        state = np.stack([q0, v0]) if first == 0 and short else np.stack([smooth[first], v[first]])
         out.append(
             {
-                **{name: track.signals[name][index] for name in kept},
-                "measured": track.signals["raw"][inside],
-                "weight": track.seen[inside] * (judged < rows - 1)[:, None],
-                "start": np.stack([track.signals["q"][start], track.signals["v"][start]]),
-                "error_sum": sums[start],
-                "travel": track.signals["command"][start] - track.signals["command"][0],
-                "first_error": first_error,
-                "first_torque": first_torque,
-                "recording": np.asarray(number),
-                "time": np.asarray(track.t[inside[0]]),
+                "piece": piece, "begin": t[first], "at": t[rows] - t[first], "measured": filled[rows],
+                "weight": seen[rows], "start": state, "error_sum": sums[first], "first": smooth[0], "v": v[rows],
+                "torque": torque[rows], "error": error[rows], "served": served[rows], "noise": noise,
+                "recording": number,
             }
         )
+        begin = t[first] + (SHORT_S if short else WINDOW_S)
     return out
+
+
+def _noise(q: Array) -> Array:
+    """Standard deviation of readings about a cubic through those beside them, in the calmer half of the rows, (n,)."""
+    bent = np.diff(q, 4, axis=0)  # of white noise it has 70 times the variance (the sum of squared binomials)
+    if not len(bent):
+        return np.zeros(q.shape[1])
+    return np.asarray(np.median(np.abs(bent), axis=0) / np.sqrt(70.0) / NORMAL_MEDIAN)
+
+
+def _smoothed(t: Array, q: Array) -> tuple[Array, Array, Array]:
+    """Smoothed position, velocity and acceleration at the rows, (K, n) each."""
+    period = float(np.median(np.diff(t)))
+    even = np.arange(0.0, t[-1] + 0.5 * period, period)
+    raw = np.column_stack([np.interp(even, t, x) for x in q.T])
+    smooth = smoothing(period)(raw) if len(even) > 3 * BEGINNING_ROWS else raw
+    v = np.gradient(smooth, period, axis=0)
+    a = np.gradient(v, period, axis=0)
+    return tuple(np.column_stack([np.interp(t, even, x) for x in y.T]) for y in (smooth, v, a))  # type: ignore[return-value]
+
+
+def _beginning(t: Array, q: Array) -> tuple[Array, Array]:
+    """Position and velocity at the first row by a parabola through the first ones; a velocity that is not clear is 0."""
+    few, near = q[:BEGINNING_ROWS], t[:BEGINNING_ROWS]
+    terms = np.column_stack([np.ones_like(near), near, near**2])
+    inverse = np.linalg.pinv(terms)
+    fit = inverse @ few
+    noise = np.sqrt(np.mean((few - terms @ fit) ** 2, axis=0) * BEGINNING_ROWS / max(BEGINNING_ROWS - 3, 1))
+    doubt = 3.0 * noise * np.linalg.norm(inverse[1])
+    v = np.where(np.abs(fit[1]) > doubt, fit[1], 0.0)
+    return np.where(v == 0.0, few[0], fit[0]), v
+
+
+def _in_one_order(recordings: Sequence[Recording]) -> list[int]:
+    """Numbers of recordings in an order that is the same however they were given."""
+
+    def content(number: int) -> tuple[float, ...]:
+        recording = recordings[number]
+        command = np.nansum(recording.position_command) if recording.position_command is not None else 0.0
+        return float(len(recording.t)), float(np.nansum(recording.position)), float(command)
+
+    return sorted(range(len(recordings)), key=content)
 
 
 def thin(data: Windows, count: int) -> Windows:
@@ -198,11 +329,4 @@ def _even(total: int, count: int) -> NDArray[np.intp]:
 
 def choose_windows(data: Windows, chosen: NDArray[np.intp]) -> Windows:
     values: dict[str, Any] = {name: x[..., chosen] for name, x in vars(data).items() if isinstance(x, np.ndarray)}
-    return replace(data, **values, columns={name: x[..., chosen] for name, x in data.columns.items()})
-
-
-def choose_joints(data: Windows, joints: Sequence[int]) -> Windows:
-    chosen = list(joints)
-    arrays = {name: x for name, x in vars(data).items() if isinstance(x, np.ndarray) and x.ndim >= 2}
-    values: dict[str, Any] = {name: x[..., chosen, :] for name, x in arrays.items()}
-    return replace(data, **values, columns={name: x[:, chosen] for name, x in data.columns.items()})
+    return replace(data, **values)

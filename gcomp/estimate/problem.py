@@ -1,0 +1,87 @@
+"""What parameters leave of measurements, and its derivatives."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcomp.arrays import Array
+
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that a fit may change, in the coordinate in which it is fitted."""
+
+    name: str
+    nominal: float
+    prior_std: float
+    """Standard deviation about the nominal value before any measurement."""
+    low: float = -np.inf
+    high: float = np.inf
+    channel: int = -1
+    """The only channel that it acts on, as far as derivatives count; −1 if it acts on all."""
+    step: float = 0.01
+    """Step of a finite difference."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """C channels of N rows each; K parameters."""
+
+    parameters: tuple[Parameter, ...]
+    predict: Callable[[Array], Array]
+    """Parameters (P, K) → residuals (P, C, N)."""
+    weight: Array
+    """Number of independent measurements that each row counts for, (C, N)."""
+    block: Index
+    """Block of each row, (N,)."""
+    floor: Array
+    """Standard deviation below which a residual shows nothing, (C,)."""
+
+    def within(self, theta: Array) -> Array:
+        return np.clip(theta, [p.low for p in self.parameters], [p.high for p in self.parameters])
+
+    @property
+    def nominal(self) -> Array:
+        return np.array([p.nominal for p in self.parameters])
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A problem about a point."""
+
+    theta: Array
+    residual: Array
+    """(C, N)."""
+    acting: tuple[Index, ...]
+    """Numbers of the free parameters that act on each channel."""
+    slopes: tuple[Array, ...]
+    """Their derivatives there, (k, N) each."""
+
+
+def linearise(problem: Problem, theta: Array, free: Sequence[int]) -> Linearised:
+    """Derivatives by differences: one evaluation changes a parameter of each channel, for it acts there by far most.
+
+    The residual is exact in any case; the derivatives lead to it.
+    """
+    own = [[k for k in free if problem.parameters[k].channel == c] for c in range(len(problem.weight))]
+    shared = [k for k in free if problem.parameters[k].channel < 0]
+    together = [[each[i] for each in own if i < len(each)] for i in range(max(map(len, own), default=0))]
+    steps = np.array([p.step for p in problem.parameters])
+    steps = np.where(theta + steps > [p.high for p in problem.parameters], -steps, steps)
+    points = [theta]
+    for some in (*together, *([k] for k in shared)):
+        moved = theta.copy()
+        moved[some] += steps[some]
+        points.append(moved)
+    answers = problem.predict(np.stack(points))
+    acting, slopes = [], []
+    for c, each in enumerate(own):
+        rows = [*range(1, 1 + len(each)), *range(1 + len(together), 1 + len(together) + len(shared))]
+        index = np.array([*each, *shared], np.intp)
+        acting.append(index)
+        slopes.append((answers[rows, c] - answers[0, c]) / steps[index, None])
+    return Linearised(theta, answers[0], tuple(acting), tuple(slopes))

@@ -1,0 +1,131 @@
+"""Most probable parameters: damped Gauss-Newton steps with Student's t instead of a normal distribution.
+
+A row far off, as of a moment of contact, then counts little, with no threshold.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gcomp.arrays import Array
+from gcomp.estimate.problem import Linearised, Problem, linearise
+
+FREEDOM = 4.0
+"""Degrees of freedom of Student's t (Lange, Little and Taylor, JASA 84, 1989)."""
+STILL = 1e-3
+"""Relative fall of a channel's cost below which its fit ends."""
+LONGEST_STEP = 1.5
+"""Longest step of a parameter, in its own coordinate."""
+EASIER, HARDER = 0.2, 10.0
+"""Factors on the damping after a step that lowers the cost, and after one that does not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    theta: Array
+    residual: Array
+    """(C, N)."""
+    variance: Array
+    """Square of the scale of the residuals, (C,)."""
+
+    def robust(self, problem: Problem) -> Array:
+        """Weight of each row beside the others of its channel by Student's t, (C, N)."""
+        return robust_weight(self.residual, self.variance)
+
+
+def robust_weight(residual: Array, variance: Array) -> Array:
+    """1 for a row well within the scale and less for one far off, (C, N)."""
+    return (FREEDOM + 1.0) / (FREEDOM + residual**2 / variance[:, None])
+
+
+def scale_of(problem: Problem, residual: Array) -> Array:
+    """Variance of each channel under Student's t, by fixed-point iteration from the mean square, (C,)."""
+    count = np.maximum(problem.weight.sum(1), 1e-300)
+    variance = (problem.weight * residual**2).sum(1) / count + problem.floor**2
+    for _ in range(20):
+        weight = problem.weight * robust_weight(residual, variance)
+        variance = (weight * residual**2).sum(1) / count + problem.floor**2
+    return np.asarray(variance)
+
+
+def cost_of(problem: Problem, residual: Array, variance: Array) -> Array:
+    """Negative logarithm of the likelihood of each channel but for a constant, (C,)."""
+    spread = np.log1p(residual**2 / (FREEDOM * variance[:, None]))
+    return np.asarray(
+        (0.5 * (FREEDOM + 1.0) * problem.weight * spread).sum(1) + 0.5 * problem.weight.sum(1) * np.log(variance)
+    )
+
+
+def solve(problem: Problem, theta: Array, free: Sequence[int], iterations: int = 6) -> Solution:
+    """The most probable values of the free parameters from `theta` (K,) on.
+
+    Where no parameter acts on all channels, each channel takes its own steps.
+    """
+    free = list(free)
+    shared = any(problem.parameters[k].channel < 0 for k in free)
+    channels = len(problem.weight)
+    damping, busy = np.full(channels, 1e-3), np.ones(channels, bool)
+    theta = problem.within(np.array(theta, float))
+    best: Linearised | None = None
+    for _ in range(iterations):
+        moving = [k for k in free if shared or busy[problem.parameters[k].channel]]
+        if not moving:
+            break
+        about = linearise(problem, theta, moving) if best is None else best
+        best = None
+        variance = scale_of(problem, about.residual)
+        before = cost_of(problem, about.residual, variance) + _prior_cost(problem, theta, channels)
+        weight = problem.weight * robust_weight(about.residual, variance) / variance[:, None]
+        for _ in range(3):
+            trial = problem.within(theta + _step(problem, about, weight, damping))
+            left = problem.predict(trial[None])[0]
+            after = cost_of(problem, left, variance) + _prior_cost(problem, trial, channels)
+            lower = after < before if not shared else np.full(channels, after.sum() < before.sum())
+            damping = np.where(lower, damping * EASIER, damping * HARDER)
+            if lower[busy].any():
+                break
+        fall = before - after
+        for k in moving:
+            c = problem.parameters[k].channel
+            if lower[c if c >= 0 else 0]:
+                theta[k] = trial[k]
+        still = ~lower | (fall < STILL * np.maximum(problem.weight.sum(1), 1.0))
+        busy = np.full(channels, not still.all()) if shared else busy & ~(still & lower) & ~(~lower & (damping > 1e3))
+        if not lower.any():
+            break
+    residual = problem.predict(theta[None])[0]
+    return Solution(theta, residual, scale_of(problem, residual))
+
+
+def _prior_cost(problem: Problem, theta: Array, channels: int) -> Array:
+    """Cost of parameters away from their nominal values by channel; of those of all channels at the first, (C,)."""
+    out = np.zeros(channels)
+    for value, p in zip(theta, problem.parameters, strict=True):
+        if np.isfinite(p.nominal) and np.isfinite(p.prior_std):
+            out[max(p.channel, 0)] += 0.5 * ((value - p.nominal) / p.prior_std) ** 2
+    return out
+
+
+def precision(problem: Problem) -> Array:
+    """Inverse variance of each parameter before any measurement, (K,)."""
+    return np.array([1.0 / p.prior_std**2 if np.isfinite(p.nominal) else 0.0 for p in problem.parameters])
+
+
+def _step(problem: Problem, about: Linearised, weight: Array, damping: Array) -> Array:
+    """Step of all free parameters, (K,)."""
+    size = len(problem.parameters)
+    normal, right, prior = np.zeros((size, size)), np.zeros(size), precision(problem)
+    damped = np.zeros(size)
+    for c, (index, x) in enumerate(zip(about.acting, about.slopes, strict=True)):
+        square = (x * weight[c]) @ x.T
+        normal[np.ix_(index, index)] += square
+        right[index] -= (x * weight[c]) @ about.residual[c]
+        damped[index] += damping[c] * np.diag(square)
+    free = np.unique(np.concatenate(about.acting)) if about.acting else np.zeros(0, np.intp)
+    away = np.where(prior > 0.0, np.nan_to_num(problem.nominal) - about.theta, 0.0)
+    own = normal[np.ix_(free, free)] + np.diag(prior[free] + damped[free])
+    own[np.diag_indices(len(free))] += 1e-9 * max(float(np.diag(own).max(initial=0.0)), 1e-30)
+    step = np.zeros(size)
+    step[free] = np.linalg.solve(own, right[free] + prior[free] * away[free])
+    return np.clip(step, -LONGEST_STEP, LONGEST_STEP)

@@ -1,0 +1,278 @@
+"""Which effects of joints and of the whole arm: chosen about a fit, fitted, and chosen again until nothing changes."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcomp.arrays import Array
+from gcomp.estimate.choice import PRICE, Effect, Terms, choose, price_of, terms_of
+from gcomp.estimate.problem import linearise
+from gcomp.estimate.solve import scale_of
+from sim_gap.position_gap.fit import (
+    INDEPENDENT_S,
+    Layout,
+    LoopFit,
+    batch,
+    evaluate,
+    improve,
+    residuals,
+)
+from sim_gap.position_gap.links import shared_effects, size_of
+from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, Scales
+from sim_gap.position_gap.windows import Windows
+
+FOLDS = 6
+"""Parts of the windows of which each is held out once."""
+LEAST_FALL = 0.025
+"""Least relative fall of a joint's RMS by an effect."""
+ROUNDS = 3
+"""Times that effects are chosen and fitted."""
+LEVELS = {
+    "slew": (0.2, 0.35, 0.5, 0.65, 0.8, 0.9),
+    "limit": (0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0),
+}
+"""Levels at which a limit is tried: in units of the command's highest speed, of the joint's own torque."""
+Progress = Callable[[str], None]
+Group = tuple[str, tuple[int, ...]]
+"""An effect with the joints that have it; no joints for one of the whole arm."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopSearch:
+    """Data and nominal parameters of a choice of effects."""
+
+    data: Windows
+    scales: Scales
+    nominal: dict[str, Array]
+    """Parameters of the nominal model, to which one returns that is taken out, (J,) each."""
+    floor: Array
+    """RMS below which nothing can be seen, per joint (J,) [rad]."""
+    excluded: frozenset[str] = frozenset()
+    """Effects that do not take part."""
+    kept: frozenset[str] = frozenset()
+    """Effects that are not taken out."""
+    resting: frozenset[int] = frozenset()
+    """Joints of which nothing is fitted."""
+    open_controller: bool = False
+    """Whether the nominal model has no controller, so that the fitted one is no cause of a gap."""
+
+    def score(self, fit: LoopFit) -> Array:
+        """Half the logarithm of the mean square, times independent samples, per joint (J,); less is better."""
+        assert fit.rms is not None
+        count = self.data.weight.sum(0)
+        mean = (fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0)
+        return np.asarray(0.5 * self.samples * np.log(mean + self.floor**2))
+
+    @property
+    def samples(self) -> Array:
+        """Independent samples of each joint, (J,)."""
+        return np.asarray(self.data.weight.sum((0, 2)) * min(self.data.judged_s / INDEPENDENT_S, 1.0))
+
+    def size_of(self, name: str) -> Array:
+        """Unit of the levels of a limit, (J,): the highest speed, if a joint moves at all, or the usual size."""
+        if name != "slew":
+            return self.scales.of(name)
+        return np.asarray(np.maximum(np.abs(self.data.v).max(axis=(0, 2)), PARAMETERS["slew"].low))
+
+    def improve(self, fit: LoopFit, iterations: int = 5) -> LoopFit:
+        return improve(self.data, fit, self.scales, self.floor, self.nominal, iterations)
+
+
+def folds_of(data: Windows) -> NDArray[np.intp]:
+    """Fold of each window, (W,): recordings, or parts of a few of them."""
+    if len(np.unique(data.recording)) >= FOLDS:
+        return np.unique(data.recording, return_inverse=True)[1].astype(np.intp) % FOLDS
+    return (np.arange(data.count) * min(FOLDS, data.count) // data.count).astype(np.intp)
+
+
+def candidates_of(search: LoopSearch) -> dict[str, tuple[tuple[int, str], ...]]:
+    """Name of each effect that may act, as `effect#joint` or of the whole arm → its parameters."""
+    out: dict[str, tuple[tuple[int, str], ...]] = {}
+    for effect in EFFECTS.values():
+        if effect.id not in search.excluded:
+            for j in range(search.data.joints):
+                if j not in search.resting:
+                    out[f"{effect.id}#{j}"] = tuple((j, name) for name in effect.parameters)
+    for name, parameters in shared_effects(search.data.plant.sim.arm).items():
+        if name.partition("@")[0] not in search.excluded:
+            out[name] = tuple((-1, each) for each in parameters)
+    return out
+
+
+def chosen_of(search: LoopSearch, fit: LoopFit) -> list[str]:
+    """Names of the effects that a fit has."""
+    return [
+        name
+        for name, places in candidates_of(search).items()
+        if all(each in (fit.active[j] if j >= 0 else fit.shared) for j, each in places)
+    ]
+
+
+def with_chosen(search: LoopSearch, fit: LoopFit, names: Sequence[str]) -> LoopFit:
+    """The fit with these effects active and all others as the nominal model has them."""
+    every = candidates_of(search)
+    places = [place for name in names for place in every[name]]
+    active = tuple(tuple(n for j, n in places if j == joint) for joint in range(search.data.joints))
+    shared = tuple(n for j, n in places if j < 0)
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for _, own in every.items():
+        for j, name in own:
+            if j >= 0 and name not in active[j]:
+                point[name][j] = search.nominal[name][j]
+            elif j < 0 and name not in shared:
+                point.pop(name, None)
+    return replace(fit, point=point, active=active, shared=shared, rms=None)
+
+
+@dataclass(frozen=True, eq=False)
+class About:
+    """All that may be chosen, linear about a fit."""
+
+    search: LoopSearch
+    fit: LoopFit
+    layout: Layout
+    terms: Terms
+    effects: dict[str, Effect]
+
+    def parameters(self, names: Sequence[str]) -> frozenset[int]:
+        return frozenset(k for name in names for k in self.effects[name].parameters)
+
+    def moved(self, names: Sequence[str]) -> LoopFit:
+        """The fit with these effects alone, as the linear terms have it."""
+        change = self.terms.fit(self.parameters(names))
+        theta = self.terms.theta + np.clip(np.nan_to_num(change), -3.0, 3.0)
+        point = self.layout.at(theta)
+        return with_chosen(self.search, replace(self.fit, point=point), names)
+
+
+def look_about(search: LoopSearch, fit: LoopFit, names: Sequence[str] | None = None) -> About:
+    """Derivatives by all candidates, or those named; an effect that is not there by the difference that one of the size
+    at which it is tried makes."""
+    every = candidates_of(search)
+    listed = list(every) if names is None else list(names)
+    places = list(dict.fromkeys(place for name in listed for place in every[name]))
+    steps = dict[tuple[int, str], float]()
+    levels = {name: best_level(search, fit, name) for name in LEVELS if any(p[1] == name for p in places)}
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for j, name in places:
+        there = name in (fit.active[j] if j >= 0 else fit.shared)
+        if there:
+            continue
+        if j < 0:
+            steps[j, name] = 0.2 * size_of(search.data.plant.sim.arm, name)
+        elif name in LEVELS:
+            size = float(search.scales.of(name)[j])
+            own = size / float(point[name][j]) if np.isfinite(point[name][j]) else 0.0
+            steps[j, name] = size / float(levels[name][j]) - own or 0.05
+        elif name == "stribeck_velocity" or name in ("kp", "gain"):
+            steps[j, name] = 0.05
+        else:
+            steps[j, name] = 0.5 if point[name][j] == PARAMETERS[name].neutral else 0.1
+    stuck = [(j, n) for j, n in places if n == "stribeck_velocity"]  # says nothing without the friction that it is of
+    places = [p for p in places if p not in stuck or "stribeck" in fit.active[p[0]]]
+    layout = Layout(search.data, search.scales, point, places)
+    nominal = {**search.nominal}
+    problem = layout.problem(nominal, steps, search.floor)
+    about = linearise(problem, layout.theta(layout.point), range(len(places)))
+    at = {place: k for k, place in enumerate(places)}
+    variance = scale_of(problem, about.residual)
+    del variance
+    effects = {}
+    samples = search.samples
+    for name in listed:
+        own = tuple(at[place] for place in every[name] if place in at)
+        joints = [j for j, _ in every[name]]
+        least = LEAST_FALL * float(samples[joints[0]]) if joints[0] >= 0 else LEAST_FALL * float(samples.mean())
+        needs = tuple(
+            f"{need}#{joints[0]}"
+            for need in (EFFECTS[name.partition("#")[0]].needs if joints[0] >= 0 else ())
+            if not active_in(search.nominal, need, joints[0])
+        )
+        effects[name] = Effect(name, own, needs, least)
+    return About(search, fit, layout, terms_of(problem, about, folds_of(search.data)), effects)
+
+
+def active_in(point: dict[str, Array], effect: str, joint: int) -> bool:
+    """Whether an effect changes the motion of a joint: its first parameter is not neutral."""
+    first = EFFECTS[effect].parameters[0]
+    return bool(point[first][joint] != PARAMETERS[first].neutral)
+
+
+def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
+    """The best of some levels of a limit at every joint, (J,): one that is never reached has no slope to follow, and
+    one that is always reached leads nowhere."""
+    levels = np.minimum(np.array(LEVELS[name])[:, None] * search.size_of(name), fit.point[name])
+    gaps = residuals(search.data, batch([{**fit.point, name: level} for level in levels]))
+    squares = np.einsum("ptjw,tjw->pj", gaps**2, search.data.weight)
+    return np.asarray(levels[squares.argmin(axis=0), np.arange(search.data.joints)])
+
+
+def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> LoopFit:
+    """Choose effects about the fit and fit them, until the choice stays.
+
+    After the first time only those are looked at that were worth their price by themselves or are there.
+    """
+    names = chosen_of(search, fit)
+    every = candidates_of(search)
+    kept = [n for n in every if n.partition("#")[0] in search.kept]
+    looked: list[str] | None = None
+    for number in range(ROUNDS):
+        progress(f"round {number + 1}: {len(names)} effects of joints and arm")
+        import os
+        if os.environ.get("HP"): progress(str((names, joint_rms_(search,fit))))
+        about = look_about(search, fit, looked)
+        found = choose(about.terms, list(about.effects.values()), names, kept)
+        if looked is None:
+            worth = promising(about, names)
+            looked = [n for n in every if n in worth or n in found or n in names]
+        fit = search.improve(entered(search, about.moved(found)), 4)
+        same, names = set(found) == set(names), found
+        if same:
+            break
+    return fit
+
+
+def promising(about: About, names: Sequence[str]) -> set[str]:
+    """Effects that would pay beside those there, whatever else does."""
+    own, base = about.parameters(names), 0.0
+    base = float(about.terms.cost(own).sum())
+    return {
+        name
+        for name, effect in about.effects.items()
+        if base - float(about.terms.cost(own | {*effect.parameters}).sum()) > price_of(effect)
+    }
+
+
+def entered(search: LoopSearch, fit: LoopFit) -> LoopFit:
+    """The fit with what has just come in and is still neutral at the size at which it is tried."""
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for j, own in enumerate(fit.active):
+        for name in own:
+            if name == "stribeck_velocity":
+                continue
+            if point[name][j] == 0.0 and PARAMETERS[name].neutral == 0.0 and name != "delay":
+                point[name][j] = 0.1 * float(search.scales.of(name)[j])
+    return replace(fit, point=point)
+
+
+def prune(search: LoopSearch, fit: LoopFit) -> LoopFit:
+    """The fit without effects that do not pay."""
+    for _ in range(2):
+        names = chosen_of(search, fit)
+        about = look_about(search, fit, names)
+        kept = [n for n in names if n.partition("#")[0] in search.kept]
+        found = choose(about.terms, list(about.effects.values()), names, kept)
+        if set(found) == set(names):
+            return evaluate(search.data, fit) if fit.rms is None else fit
+        fit = search.improve(about.moved(found), 4)
+    return fit
+
+
+__all__ = ["PRICE", "About", "Group", "LoopSearch", "look_about", "prune", "select"]
+
+
+def joint_rms_(s, fit):
+    f = evaluate(s.data, fit); d=s.data
+    return np.sqrt((f.rms**2*d.weight.sum(0)).sum(1)/d.weight.sum((0,2))).round(5)

@@ -1,0 +1,147 @@
+"""Where a fit begins: the natural sizes of the joints, and the best of some gains and frictions at each."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from gcomp.arrays import Array, Mask
+from sim_gap.position_gap.choice import LoopSearch, Progress
+from sim_gap.position_gap.fit import LoopFit, batch, residuals
+from sim_gap.position_gap.parameters import EFFECTS, Scales
+from sim_gap.position_gap.plant import Servos
+from sim_gap.position_gap.windows import Windows, thin_moving
+
+GAINS = 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0
+"""Gains that are tried, over that of the model."""
+FREQUENCIES_HZ = 0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0, 16.0
+"""Natural frequencies of the gains that are tried where the model has none [Hz]."""
+FRICTIONS = 0.0, 0.4
+"""Least Coulomb friction that is tried with each gain, as a share of the gain times the RMS error."""
+LEAST_DAMPING = 0.2
+"""Least damping that is tried with each gain, over the root of gain times inertia (2 is critical)."""
+TURNS = 0.02
+"""Speed over which friction changes its direction there [rad/s]."""
+FEW = 8
+"""Windows on which they are tried."""
+RESTS_RAD = 0.002
+"""Way of a command over all recordings below which it rests [rad]."""
+HOLDS_HZ = 10.0
+"""Natural frequency of the controller that is assumed for a joint that rests and has none [Hz]."""
+LEAST_FLOOR = 1e-5
+"""Least noise floor of a position gap [rad]."""
+
+
+def scales_of(data: Windows) -> Scales:
+    """Natural sizes of each joint along the recordings."""
+    arm = data.plant.sim.arm
+    weight = data.weight
+    count = np.maximum(weight.sum((0, 2)), 1.0)
+
+    def rms(values: Array) -> Array:
+        return np.asarray(np.sqrt((values**2 * weight).sum((0, 2)) / count))
+
+    middle = data.measured[:: max(1, len(data.measured) // 8)].transpose(0, 2, 1).reshape(-1, arm.n)
+    inertia = np.empty(arm.n)
+    for j in range(arm.n):
+        unit = np.zeros_like(middle)
+        unit[:, j] = 1.0
+        inertia[j] = arm.torque(middle, 0.0 * middle, unit, np.zeros(3))[:, j].mean()
+    inertia = np.maximum(inertia, 1e-7) + arm.armature
+    torque = np.maximum(rms(data.torque), 1e-6)
+    served = np.maximum((data.served * weight).sum((0, 2)), 1.0)
+    error = np.sqrt((data.served * weight * data.error**2).sum((0, 2)) / served)
+    return Scales(torque, torque / np.maximum(rms(data.v), 0.05), inertia, np.maximum(error, 1e-4))
+
+
+def noise_floor(data: Windows) -> Array:
+    """Standard deviation of the position readings about their smooth course, per joint (J,) [rad]."""
+    return np.asarray(np.maximum(np.sqrt(np.mean(data.noise**2, axis=1)), LEAST_FLOOR))
+
+
+def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[LoopSearch, LoopFit]:
+    """The search with what rests left out, and a fit of gain, Coulomb and viscous friction at every other joint.
+
+    Where the model has position actuators and moves as the arm does, the fit begins there.
+    """
+    progress("gains and friction to begin with")
+    at_rest = rests(search.data)
+    search = replace(search, resting=frozenset(np.flatnonzero(at_rest).tolist()))
+    if not own.complete:
+        search = replace(search, nominal=_holding(search, own), open_controller=True)
+        search = replace(search, excluded=search.excluded | {"actuator.gain"})
+    few = replace(search, data=thin_moving(search.data, FEW))
+    points = _points(few, own)
+    gaps = residuals(few.data, batch(points))
+    costs = np.einsum("ptjw,tjw->pj", np.minimum(np.abs(gaps), 1.0) ** 2, few.data.weight)
+    best = costs.argmin(0)
+    point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
+    names = ("kp", "viscous", "coulomb")
+    active = tuple(() if rest else names for rest in at_rest)
+    kept = {"controller.stiffness"} if not own.complete else set()
+    search = replace(search, kept=frozenset(kept))
+    fit = search.improve(LoopFit(point, active), 5)
+    return search, fit
+
+
+def _points(search: LoopSearch, own: Servos) -> list[dict[str, Array]]:
+    """Points that are tried: the nominal model, and gains with least frictions."""
+    nominal, scales = search.nominal, search.scales
+    centre = np.where(np.isfinite(own.kp), nominal["kp"], scales.inertia)
+    tries = np.where(
+        np.isfinite(own.kp),
+        np.array(GAINS)[:, None],
+        (2.0 * np.pi * np.array(FREQUENCIES_HZ)[:, None]) ** 2,
+    )
+    points = [nominal] if own.complete else []
+    for factor, stuck in product(tries, FRICTIONS):
+        kp = np.maximum(centre * factor, 1e-3)
+        point = {name: values.copy() for name, values in nominal.items()}
+        point["kp"] = kp
+        for j in range(search.data.joints):
+            point["coulomb"][j], point["viscous"][j] = _friction(search, j, float(kp[j]), stuck)
+        points.append(point)
+    for j in search.resting:
+        for point in points:
+            for name in point:
+                point[name][j] = search.nominal[name][j]
+    return points
+
+
+def _friction(search: LoopSearch, j: int, kp: float, stuck: float) -> tuple[float, float]:
+    """Coulomb friction and damping that a gain asks for along the recorded motion, by least squares."""
+    data, counted = search.data, (search.data.weight[:, j] * search.data.served[:, j]) > 0.0
+    v, over = data.v[:, j][counted], (kp * data.error[:, j] - data.torque[:, j])[counted]
+    columns = np.column_stack([np.tanh(v / TURNS), v])
+    coulomb = max(float(np.linalg.lstsq(columns, over, rcond=None)[0][0]), stuck * kp * float(search.scales.angle[j]))
+    rest = over - coulomb * columns[:, 0]
+    viscous = float(v @ rest) / max(float(v @ v), 1e-12)
+    return coulomb, max(viscous, LEAST_DAMPING * np.sqrt(kp * float(search.scales.inertia[j])))
+
+
+def rests(data: Windows) -> Mask:
+    """Joints whose command rests in all windows, (J,): any controller holds them there."""
+    on = (data.served > 0.5) & (data.weight > 0.0)
+    command = data.measured + data.error
+    ends = [find(np.where(on, command, fill), axis=(0, 2)) for find, fill in ((np.max, -np.inf), (np.min, np.inf))]
+    return np.asarray(on.any(axis=(0, 2)) & (ends[0] - ends[1] < RESTS_RAD))
+
+
+def _holding(search: LoopSearch, own: Servos) -> dict[str, Array]:
+    """The nominal values, with a controller at joints (J,) that have none: critically damped, and stiff."""
+    held, missing = dict(search.nominal), ~np.isfinite(own.kp)
+    frequency = 2.0 * np.pi * HOLDS_HZ
+    held["kp"] = np.where(missing, search.scales.inertia * frequency**2, held["kp"])
+    held["viscous"] = np.where(missing, 2.0 * search.scales.inertia * frequency, held["viscous"])
+    held["kv"] = np.where(missing, np.inf, held["kv"])
+    return held
+
+
+def controller_name(fit: LoopFit) -> str:
+    """The controller that was found: P, PD, PI, PID, with feed-forward or without."""
+    names = {name for own in fit.active for name in own}
+    kind = "P" + "I" * ("ki" in names) + "D" * ("kd" in names)
+    return kind + " with feed-forward" * ("feed" in names)
+
+
+CONTROLLER = frozenset(effect.id for effect in EFFECTS.values() if effect.controller)
