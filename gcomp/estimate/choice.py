@@ -119,7 +119,15 @@ def terms_of(problem: Problem, about: Linearised, folds: Index) -> Terms:
     totals, counts = (np.stack([y[:, m].sum(1) for m in members], axis=1) for y in (own, problem.weight))
     away = np.where(np.isfinite(problem.nominal), problem.nominal - about.theta, np.nan)
     return Terms(
-        about.theta, about.acting, tuple(squares), tuple(products), totals, counts, variance, problem.floor, away,
+        about.theta,
+        about.acting,
+        tuple(squares),
+        tuple(products),
+        totals,
+        counts,
+        variance,
+        problem.floor,
+        away,
         precision(problem),
     )
 

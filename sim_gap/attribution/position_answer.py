@@ -7,15 +7,16 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
+from gcomp.estimate.choice import PRICE
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.position_notes import notes, running_free
 from sim_gap.attribution.verdict import EXPLAINED
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.load import SimModel
+from sim_gap.position_gap.choice import groups_of
 from sim_gap.position_gap.identify import Identified, columns_of_effect, identify
-from sim_gap.position_gap.judge import LEAST_SHRINK, Stage, groups_of
+from sim_gap.position_gap.judge import LEAST_SHRINK, Stage
 from sim_gap.position_gap.parameters import EFFECTS
-from sim_gap.position_gap.search import PRICE
 from sim_gap.position_gap.training.export import WRITTEN
 from sim_gap.position_gap.training.replay import (
     LONGEST_S,
@@ -86,7 +87,6 @@ def diagnose_positions(
         notes=(*notes(found), *running_free(found, rollout, gap=verdict != "no_gap")),
         checks=tuple(checks),
         band=found.band,
-        left_out=float(np.concatenate(found.heldout_touched).mean()),
         unit="rad",
         internals=found,
     )
@@ -124,8 +124,10 @@ def _differs(found: Identified, stage: Stage) -> bool:
 
 
 def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:
-    if _is_within(found) or (not causes and bool(np.all(found.heldout_before < 2.0 * found.margin))):
+    if _is_within(found) or (not causes and _is_small(found)):
         return "no_gap"
+    if not bool(np.all(found.train_after < np.maximum(2.0 * found.margin, EXPLAINED * found.train_before))):
+        return "unexplained"
     near = found.heldout_after < np.maximum(2.0 * found.margin, EXPLAINED * found.heldout_before)
     if _structure_left(found):
         return "unexplained"
@@ -139,9 +141,16 @@ def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdic
 def _is_within(found: Identified) -> bool:
     """Whether no joint's gap matters, in training and held-out recordings, or is what a sound arm may have."""
     within = all(bool(np.all(gap < found.margin)) for gap in (found.train_before, found.heldout_before))
-    if found.own is not None:
-        within = within or all(bool(np.all(gap < found.margin)) for gap in (found.own.gaps, found.moved_before))
+    moved = found.moved_train, found.moved_before
+    within = within or all(bool(np.all(gap < found.margin)) for gap in moved)
     return within or (found.sound is not None and found.sound.explained)
+
+
+def _is_small(found: Identified) -> bool:
+    """Whether no joint's gap is more than twice what matters, in training and held-out motion alike, in windows and
+    running free."""
+    free = (gap for gap in (found.moved_train, found.moved_before) if not np.isnan(gap).all())
+    return all(bool(np.all(gap < 2.0 * found.margin)) for gap in (found.train_before, found.heldout_before, *free))
 
 
 def _structure_left(found: Identified) -> bool:
@@ -225,7 +234,7 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
     made, groups = found.beside or found.export, groups_of(found.fit, found.search)
 
     def gap(arm: Simulated, longest: float = LONGEST_S) -> Array:
-        return replay_rms(arm, found.recordings, found.gains, longest, found.heldout_touched)
+        return replay_rms(arm, found.recordings, found.gains, longest)
 
     after = gap(simulated_model(found.sim, made))
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)

@@ -15,6 +15,8 @@ FAR = 3.0
 """So many times what the fit leaves, or the margin, must a model leave that runs free, for a note."""
 NEAR_A_ROW = 0.2
 """Share of the sampling period within which a time is taken for whole rows."""
+MOST_NAMED = 4
+"""Bodies that a note names."""
 AT_TIMES = 0.01
 """Share of the held-out samples from which a note says that they are faster than any that was fitted."""
 
@@ -24,7 +26,7 @@ def notes(found: Identified) -> list[str]:
     names = found.sim.arm.names
     kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
     out = [f"no torque channel: controller ({kind}) and effects follow from q_cmd and q; the gap is in rad"]
-    if loose := undecided_scale(found.search, found.fit, found.spread):
+    if loose := undecided_scale(found.fit, found.spread):
         listed = ", ".join(names[j] for j in loose)
         out.append(
             f"{listed}: positions show only the ratios of gain, friction and inertia here; their scale is that of the "
@@ -41,7 +43,7 @@ def notes(found: Identified) -> list[str]:
         out.append(f"{listed}: no training recording commands a motion here, so nothing can be fitted: {assumed}")
     if limits := describe(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
-    out += [*_early(found), *_touching(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
+    out += [*_early(found), *_held(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
     if found.export is not None and found.export.lines:
         module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
         out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}{module}")
@@ -95,20 +97,12 @@ def _early(found: Identified) -> list[str]:
     ]
 
 
-def _touching(found: Identified) -> list[str]:
-    """A note of the surface that the arm presses on, and of what is left out for it."""
-    if found.surface is None:
+def _held(found: Identified) -> list[str]:
+    """A note of what lies outside of the arm and could move by itself."""
+    if not found.held:
         return []
-    names = found.sim.arm.names
-    joints = ", ".join(names[j] for j in found.surface.joints)
-    some = [100.0 * float(rows.mean()) for rows in found.touched if rows.any()]
-    part = " to ".join(dict.fromkeys(f"{each:.0f}" for each in (min(some), max(some))))
-    return [
-        f"in {len(some)} of {len(found.touched)} recordings the arm presses on something below it, such as a table: "
-        f"where {names[found.surface.link]} goes below a height of {found.surface.height:.2f} m, {joints} stop short "
-        f"of the command; these moments ({part} % of such a recording) are neither fitted nor judged; if simulated "
-        "motion goes there, add the surface to the model"
-    ]
+    some = ", ".join(found.held[:MOST_NAMED]) + (", …" if len(found.held) > MOST_NAMED else "")
+    return [f"held where the model has it, and touching nothing: {some} (not between --base and --tip)"]
 
 
 def _ranges(found: Identified) -> list[str]:
@@ -163,5 +157,4 @@ def _released(found: Identified) -> list[str]:
 
 def _speeds(data: Windows, joint: int) -> Array:
     """Amounts of a joint's velocity at the judged samples [rad/s], (K,)."""
-    speed = np.abs(data.v[data.warm :: data.stride, joint][: len(data.weight)])
-    return np.asarray(speed[data.weight[:, joint][: len(speed)] > 0.0])
+    return np.asarray(np.abs(data.v[:, joint])[data.weight[:, joint] > 0.0])

@@ -7,15 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from gcomp.estimate.choice import PRICE, Effect, Terms, choose, price_of, terms_of
+from gcomp.estimate.choice import Effect, Terms, choose, price_of, terms_of
 from gcomp.estimate.problem import linearise
-from gcomp.estimate.solve import scale_of
 from sim_gap.position_gap.fit import (
     INDEPENDENT_S,
     Layout,
     LoopFit,
     batch,
-    evaluate,
     improve,
     residuals,
 )
@@ -177,8 +175,6 @@ def look_about(search: LoopSearch, fit: LoopFit, names: Sequence[str] | None = N
     problem = layout.problem(nominal, steps, search.floor)
     about = linearise(problem, layout.theta(layout.point), range(len(places)))
     at = {place: k for k, place in enumerate(places)}
-    variance = scale_of(problem, about.residual)
-    del variance
     effects = {}
     samples = search.samples
     for name in listed:
@@ -209,8 +205,8 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
     return np.asarray(levels[squares.argmin(axis=0), np.arange(search.data.joints)])
 
 
-def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> LoopFit:
-    """Choose effects about the fit and fit them, until the choice stays.
+def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> tuple[LoopFit, About]:
+    """Choose effects about the fit and fit them, until the choice stays; the fit, and what was looked at last.
 
     After the first time only those are looked at that were worth their price by themselves or are there.
     """
@@ -220,8 +216,6 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     looked: list[str] | None = None
     for number in range(ROUNDS):
         progress(f"round {number + 1}: {len(names)} effects of joints and arm")
-        import os
-        if os.environ.get("HP"): progress(str((names, joint_rms_(search,fit))))
         about = look_about(search, fit, looked)
         found = choose(about.terms, list(about.effects.values()), names, kept)
         if looked is None:
@@ -231,7 +225,12 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         same, names = set(found) == set(names), found
         if same:
             break
-    return fit
+    about = look_about(search, fit, looked)
+    found = choose(about.terms, [about.effects[n] for n in names], names, kept)
+    if set(found) != set(names):
+        fit = search.improve(about.moved(found), 4)
+        about = look_about(search, fit, looked)
+    return fit, about
 
 
 def promising(about: About, names: Sequence[str]) -> set[str]:
@@ -257,22 +256,58 @@ def entered(search: LoopSearch, fit: LoopFit) -> LoopFit:
     return replace(fit, point=point)
 
 
-def prune(search: LoopSearch, fit: LoopFit) -> LoopFit:
-    """The fit without effects that do not pay."""
-    for _ in range(2):
-        names = chosen_of(search, fit)
-        about = look_about(search, fit, names)
-        kept = [n for n in names if n.partition("#")[0] in search.kept]
-        found = choose(about.terms, list(about.effects.values()), names, kept)
-        if set(found) == set(names):
-            return evaluate(search.data, fit) if fit.rms is None else fit
-        fit = search.improve(about.moved(found), 4)
+# ---- an effect put into a fit or taken out of it
+
+
+def effect_there(fit: LoopFit, effect: str, joint: int) -> bool:
+    return EFFECTS[effect].parameters[0] in fit.active[joint]
+
+
+def shared_of(fit: LoopFit, search: LoopSearch) -> list[str]:
+    """Effects of the whole arm in a fit."""
+    return [e for e, names in shared_effects(search.data.plant.sim.arm).items() if set(names) & set(fit.shared)]
+
+
+def groups_of(fit: LoopFit, search: LoopSearch) -> list[Group]:
+    """Effects of the fit, without the controller that a model without actuators leaves open."""
+    own = [
+        (effect, tuple(j for j in range(search.data.joints) if effect_there(fit, effect, j)))
+        for effect in EFFECTS
+        if not (search.open_controller and effect in OPEN)
+    ]
+    return [group for group in own if group[1]] + [(effect, ()) for effect in shared_of(fit, search)]
+
+
+OPEN = frozenset(effect.id for effect in EFFECTS.values() if effect.controller) | {
+    "actuator.back_emf",
+    "friction.viscous",
+}
+"""Effects that a controller has that had to be found: damping may be the servo's."""
+
+
+def without_effect(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> LoopFit:
+    """The fit without an effect at one joint: its parameters are those of the nominal model."""
+    names = EFFECTS[effect].parameters
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for name in names:
+        point[name][joint] = search.nominal[name][joint]
+    active = list(fit.active)
+    active[joint] = tuple(name for name in active[joint] if name not in names)
+    return replace(fit, point=point, active=tuple(active), rms=None)
+
+
+def without_group(search: LoopSearch, fit: LoopFit, group: Group) -> LoopFit:
+    effect, joints = group
+    if not joints:
+        names = set(shared_effects(search.data.plant.sim.arm)[effect])
+        point = {name: x for name, x in fit.point.items() if name not in names}
+        return replace(fit, point=point, shared=tuple(n for n in fit.shared if n not in names), rms=None)
+    for j in joints:
+        fit = without_effect(search, fit, effect, j)
     return fit
 
 
-__all__ = ["PRICE", "About", "Group", "LoopSearch", "look_about", "prune", "select"]
-
-
-def joint_rms_(s, fit):
-    f = evaluate(s.data, fit); d=s.data
-    return np.sqrt((f.rms**2*d.weight.sum(0)).sum(1)/d.weight.sum((0,2))).round(5)
+def names_in(group: Group) -> list[str]:
+    """Names of a group among the candidates."""
+    effect, joints = group
+    return [f"{effect}#{j}" for j in joints] or [effect]

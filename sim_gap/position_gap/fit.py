@@ -146,15 +146,15 @@ def jacobian(
     """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the parameters' own coordinates."""
     listed = [(j, name) for j, own in enumerate(names) for name in own] + [(-1, name) for name in shared]
     layout = Layout(data, scales, fit.point, listed)
-    about = linearise(layout.problem(fit.point, {}, np.zeros(data.joints)), layout.theta(layout.point), range(len(listed)))
+    about = linearise(
+        layout.problem(fit.point, {}, np.zeros(data.joints)), layout.theta(layout.point), range(len(listed))
+    )
     shape = (len(data.measured), data.count)
     now = about.residual.reshape(data.joints, *shape).transpose(1, 0, 2)
     return now, [x.reshape(len(x), *shape) for x in about.slopes]
 
 
-def improve(
-    data: Windows, fit: LoopFit, scales: Scales, floor: Array, nominal: Point, iterations: int = 6
-) -> LoopFit:
+def improve(data: Windows, fit: LoopFit, scales: Scales, floor: Array, nominal: Point, iterations: int = 6) -> LoopFit:
     """The most probable values of what is active, from a fit on."""
     names = names_of(fit)
     if not names:

@@ -1,29 +1,23 @@
-"""Worth of each effect: the gap that it lowers on held-out data."""
+"""Worth of each effect: the gap that it lowers on held-out data, and what would do as well in its place."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import LoopFit, evaluate, improve
+from gcomp.estimate.choice import PRICE
+from sim_gap.position_gap.choice import About, Group, LoopSearch, groups_of, names_in, without_group
+from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.parameters import EFFECTS
-from sim_gap.position_gap.rivals import rivals_of
-from sim_gap.position_gap.search import Group, LoopSearch, effect_there, shared_of, without_group
 from sim_gap.position_gap.windows import Windows
 
 LEAST_SHRINK = 0.05
 """Least relative fall of a joint's held-out RMS by a cause; less is a minor one."""
-
-
-def groups_of(fit: LoopFit, search: LoopSearch) -> list[Group]:
-    """Effects of the fit, without the controller that a model without actuators leaves open."""
-    own = [
-        (effect, tuple(j for j in range(search.data.joints) if effect_there(fit, effect, j)))
-        for effect in EFFECTS
-        if not (search.open_controller and effect in search.kept)
-    ]
-    return [group for group in own if group[1]] + [(effect, ()) for effect in shared_of(fit, search)]
+AS_WELL = 0.1
+"""Share of an effect's worth that may be lost with another one that would do as well."""
+LOOSE = 0.35
+"""Relative standard deviation of a gain beside a free rotor from which its scale is not decided."""
 
 
 def rms_on(data: Windows, fit: LoopFit) -> Array:
@@ -48,37 +42,30 @@ class Stage:
     share: Array
     """Fall of the RMS in its place or as the last of all, whichever is more, as a share of it, (J,)."""
     evidence: float
-    """Fall of the training score that nothing else would have brought."""
+    """Fall of the held-out cost of training rows that nothing else would have brought."""
     rivals: tuple[str, ...]
     """Effects that would do as well."""
 
 
-def stages(search: LoopSearch, fit: LoopFit, heldout: Windows, matters: Array) -> list[Stage]:
-    """The groups in order of what each lowers when it is added to the nominal model and those above it.
+def stages(search: LoopSearch, fit: LoopFit, about: About, heldout: Windows, matters: Array) -> list[Stage]:
+    """The groups in order of what is lost without each, added to the nominal model and those above them.
 
     `matters` is the gap that counts as one at each joint, (J,) [rad].
     """
     groups = groups_of(fit, search)
-
-    def with_only(some: Sequence[Group]) -> LoopFit:
-        """The fit without the other groups, the rest fitted again from where it is."""
-        left = fit
-        for group in groups:
-            if group not in some:
-                left = without_group(search, left, group)
-        return improve(search.data, left, search.scales, 4)
-
-    current = with_only(())
-    before, final, out = _rms(heldout, current), _rms(heldout, fit), []
-    for number, (group, trial) in enumerate(_ordered(search, groups, with_only, current, matters), start=1):
-        after = final if number == len(groups) else _rms(heldout, trial)
-        bare = improve(search.data, without_group(search, fit, group), search.scales, 4)
-        falls = [_shrink(search, heldout, *pair) for pair in ((before, after), (_rms(heldout, bare), final))]
+    final, floor = rms_on(heldout, fit), search.floor
+    alone = {group: rms_on(heldout, without_group(search, fit, group)) for group in groups}
+    order = sorted(groups, key=lambda group: -float(((alone[group] - final) / matters).max()))
+    fits = [fit]
+    for group in reversed(order):
+        fits.append(without_group(search, fits[-1], group))
+    courses = [rms_on(heldout, each) for each in reversed(fits)]
+    out = []
+    for group, before, after in zip(order, courses[:-1], courses[1:], strict=True):
+        falls = [1.0 - np.hypot(b, floor) / np.hypot(a, floor) for a, b in ((before, after), (alone[group], final))]
         share = np.maximum(*falls)
-        lowers = bool((share > LEAST_SHRINK).any())
-        evidence, rivals = rivals_of(search, fit, group, bare) if lowers else (0.0, ())
-        out.append(Stage(group, joint_rms(heldout, before), joint_rms(heldout, after), share, evidence, rivals))
-        before = after
+        loss, rivals = _rivals(search, fit, about, group)
+        out.append(Stage(group, before, after, share, loss, rivals if (share > LEAST_SHRINK).any() else ()))
     return out
 
 
@@ -89,56 +76,55 @@ def _rms(data: Windows, fit: LoopFit) -> Array:
     return found
 
 
-def _shrink(search: LoopSearch, data: Windows, before: Array, after: Array) -> Array:
-    """Relative fall of each joint's RMS, over all windows or in the typical one, whichever is larger, (J,).
-
-    Where held-out motion shows what no training motion did, such as a motor at its limit, a few windows make up the RMS
-    over all.
-    """
-    floor = search.floor[:, None]
-    counts = (data.weight.sum(0) > 0).astype(float)
-    ratio = np.log(np.hypot(after, floor) / np.hypot(before, floor))
-    typical = 1.0 - np.exp((ratio * counts).sum(1) / np.maximum(counts.sum(1), 1.0))
-    whole = 1.0 - joint_rms(data, np.hypot(after, floor)) / joint_rms(data, np.hypot(before, floor))
-    return np.asarray(np.maximum(typical, whole))
+ALWAYS = {"controller.dead_zone": ("transmission.backlash",)}
+"""Effects that positions alone never separate."""
 
 
-def _ordered(
-    search: LoopSearch,
-    groups: Sequence[Group],
-    with_only: Callable[[Sequence[Group]], LoopFit],
-    current: LoopFit,
-    margin: Array,
-) -> Iterator[tuple[Group, LoopFit]]:
-    """The groups, each the one that lowers the training gap most beside those before it, with the fit up to there.
+def _rivals(search: LoopSearch, fit: LoopFit, about: About, group: Group) -> tuple[float, tuple[str, ...]]:
+    """Loss of the held-out cost with the best other effect in a group's place, and those that lose next to nothing."""
+    effect, joints = group
+    terms, every = about.terms, about.effects
+    chosen = [name for each in groups_of(fit, search) for name in names_in(each) if name in every]
+    chosen += [name for name in every if name.partition("#")[0] in search.kept and name not in chosen]
+    rest = [name for name in chosen if name not in names_in(group)]
+    base = float(terms.cost(about.parameters(chosen)).sum())
 
-    A group that was worth less than another beside fewer groups is not tried again until that one is worth less too,
-    or until an effect that it needs is there.
-    """
-    worth = {group: float("inf") for group in groups}
-    fresh: dict[Group, LoopFit] = {}
-    chosen: list[Group] = []
-    while worth:
-        group = max(worth, key=lambda each: worth[each])
-        if group in fresh:
-            current = fresh[group]
-            chosen.append(group)
-            del worth[group]
-            worth |= {other: float("inf") for other in worth if group[0] in _needs(other)}
-            fresh = {}
-            yield group, current
-        else:
-            fresh[group] = with_only([*chosen, group])
-            worth[group] = _worth(search, current, fresh[group], margin)
+    def lost(names: Sequence[str]) -> float:
+        return float(terms.cost(about.parameters(names)).sum()) - base
+
+    whole = lost(rest)
+    if effect == "controller.stiffness":
+        return whole, _scale_rivals(search, fit, about, chosen)
+    least, close = whole, list(ALWAYS.get(effect, ()))
+    others = {name.partition("#")[0].partition("@")[0] for name in every} - {effect.partition("@")[0]}
+    for other in sorted(others):
+        places = [f"{other}#{j}" for j in joints if f"{other}#{j}" in every]
+        if not joints or not places:
+            places = max(
+                ([name] for name in every if name.partition("@")[0] == other and "#" not in name),
+                key=lambda names: -lost([*rest, *names]),
+                default=[],
+            )
+        places = [name for name in places if name not in chosen]
+        if places:
+            left = lost([*rest, *places])
+            least = min(least, left)
+            if left < max(PRICE, AS_WELL * whole):
+                close.append(other)
+    return max(least, 0.0), tuple(dict.fromkeys(close))
 
 
-def _needs(group: Group) -> tuple[str, ...]:
-    return EFFECTS[group[0]].needs if group[0] in EFFECTS else ()
-
-
-def _worth(search: LoopSearch, current: LoopFit, trial: LoopFit, margin: Array) -> float:
-    """Largest fall of a joint's RMS in units of what matters there, by a group."""
-    assert current.rms is not None
-    assert trial.rms is not None
-    fall = joint_rms(search.data, current.rms) - joint_rms(search.data, trial.rms)
-    return float((fall / margin).max())
+def _scale_rivals(search: LoopSearch, fit: LoopFit, about: About, chosen: Sequence[str]) -> tuple[str, ...]:
+    """`actuator.rotor_inertia` if beside a free rotor some joint's gain is loose: positions show ratios."""
+    terms, places = about.terms, about.layout.names
+    for j, own in enumerate(fit.active):
+        if "kp" not in own or (j, "armature") not in places or EFFECTS["actuator.rotor_inertia"].id in search.excluded:
+            continue
+        free = sorted({k for k in about.parameters(chosen) if places[k][0] == j} | {places.index((j, "armature"))})
+        index = terms.acting[j].tolist()
+        at = [index.index(k) for k in free]
+        normal = terms.squares[j].sum(0)[np.ix_(at, at)] / terms.variance[j] + np.diag(terms.prior[free])
+        deviation = np.sqrt(np.linalg.pinv(normal, hermitian=True)[(k := free.index(places.index((j, "kp")))), k])
+        if deviation > LOOSE:
+            return ("actuator.rotor_inertia",)
+    return ()

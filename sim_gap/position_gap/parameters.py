@@ -1,6 +1,5 @@
 """Parameters of controller and joint, the effect that each belongs to, and the coordinate in which each is fitted."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,10 +46,6 @@ PARAMETERS = {
         LoopParameter("gain", "1", 1.0, 0.05, 0.2, 3.0),
     )
 }
-
-
-WITH_TORQUE = ("kp", "ki", "kd", "limit", "coulomb", "viscous", "stribeck", "back_emf", "armature", "spring", "offset")
-"""Parameters that go with the scale of all torques; the others are ratios, times or velocities."""
 
 
 @dataclass(frozen=True)
@@ -147,3 +142,8 @@ def step_parameter(
     if name in LOGARITHMIC:
         step = float(np.clip(step, -farthest, farthest))
     return float(from_coordinate(name, np.array(to_coordinate(name, value, size) + step), np.array(size)))
+
+
+def relative_step(name: str, value: float, scales: Scales, joint: int) -> float:
+    """Step in a parameter's own coordinate per relative change of its value."""
+    return 1.0 if name in LOGARITHMIC else to_coordinate(name, value, float(scales.of(name)[joint]))

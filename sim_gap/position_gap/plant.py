@@ -134,6 +134,9 @@ class Plant:
         kinds = self.model.actuator_dyntype[self.servos.actuator]
         self.pid = self.driven & (kinds == mujoco.mjtDyn.mjDYN_PID)
         self.creep = creep_speeds(self.model, self.dofs)
+        shares = self.model.body_gravcomp[self.carried()]
+        self.compensated = float(shares[0]) if np.ptp(shares) < 1e-9 else 0.0
+        """Share of gravity that the model compensates, where it is the same for all bodies of the arm."""
         self.state = mujoco.MjData(self.model)
 
     def _widen_ranges(self) -> None:
@@ -185,8 +188,10 @@ class Plant:
         angles = [float(point[name][0]) if name in point else 0.0 for name in ("tilt.angle_1", "tilt.angle_2")]
         if any(angles):
             model.opt.gravity[:] = tilt_gravity(self.sim.arm.gravity, np.array(angles))
-        if np.any(point["feed"]):  # gravity's torque is made for all, and each joint takes its share
-            model.body_gravcomp[self._carried()] = 1.0
+        if np.any(
+            point["feed"] != self.compensated
+        ):  # gravity's torque is made for all, and each joint takes its share
+            model.body_gravcomp[self.carried()] = 1.0
         mujoco.mj_setConst(model, mujoco.MjData(model))
         for j, dof in enumerate(self.dofs):
             if point["creep"][j] != self.creep[j]:
@@ -195,7 +200,7 @@ class Plant:
                 model.dof_solref[dof], model.dof_solimp[dof] = values
         return model
 
-    def _carried(self) -> list[int]:
+    def carried(self) -> list[int]:
         """Bodies that the arm's joints carry."""
         up, out = self.model.body_parentid, set(self.bodies.tolist())
         for body in range(1, self.model.nbody):
@@ -211,8 +216,9 @@ class Plant:
             if f"moment{link}.x" in point or f"moment{link}.y" in point or f"moment{link}.z" in point:
                 change[1:4] = [float(point.get(f"moment{link}.{axis}", np.zeros(1))[0]) for axis in "xyz"]
             if link == self.n - 1 and "payload.mass" in point:
-                mass, *moment = (float(point[f"payload.{k}"][0]) if f"payload.{k}" in point else 0.0
-                                 for k in ("mass", "x", "y", "z"))
+                mass, *moment = (
+                    float(point[f"payload.{k}"][0]) if f"payload.{k}" in point else 0.0 for k in ("mass", "x", "y", "z")
+                )
                 change += point_mass(mass, np.array(moment))
             if change.any():
                 self._set_body(model, link, change)
@@ -247,7 +253,9 @@ class Plant:
 
 def laws_of(point: Mapping[str, Array], plant: Plant) -> set[str]:
     """Names of the parameters of a point that act by a law at each step."""
-    found = {name for name in ("feed", "dead", "stribeck", "load") if np.any(point[name] != 0.0)}
+    found = {name for name in ("dead", "stribeck", "load") if np.any(point[name] != 0.0)}
+    if np.any(point["feed"] != plant.compensated):
+        found.add("feed")
     if np.any((point["ki"] > 0.0) & ~plant.pid):
         found.add("ki")
     if np.any(np.isfinite(point["limit"]) & ~plant.driven):
@@ -371,9 +379,7 @@ class World:
         q = self.data.first[:, self.w]
         error = self.piece.held[0] - q
         asked = self.plant.sim.arm.torque(q[None], 0 * q[None], 0 * q[None])[0]
-        return np.asarray(
-            (asked / self.point["gain"] - self.point["kp"] * error) / ki + self.data.error_sum[:, self.w]
-        )
+        return np.asarray((asked / self.point["gain"] - self.point["kp"] * error) / ki + self.data.error_sum[:, self.w])
 
 
 def run_with_laws(plant: Plant, worlds: Sequence[World], point: Mapping[str, Array], laws: Collection[str]) -> None:
@@ -463,4 +469,4 @@ def nominal_point(plant: Plant, neutral: Mapping[str, float]) -> dict[str, Array
     point["kv"] = np.where(np.isfinite(own.kp), own.kv, 0.0)
     point |= {"ki": own.ki.copy(), "limit": own.limit.copy(), "slew": own.slew.copy(), "delay": own.delay.copy()}
     point["spring"], point["offset"] = arm.stiffness.copy(), -arm.stiffness * arm.rest
-    return point | {"creep": plant.creep.copy()}
+    return point | {"creep": plant.creep.copy(), "feed": plant.compensated * one}

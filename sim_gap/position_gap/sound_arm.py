@@ -11,10 +11,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from gcomp.arrays import Array
+from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import LoopFit, jacobian
 from sim_gap.position_gap.judge import rms_on
+from sim_gap.position_gap.links import shared_names
 from sim_gap.position_gap.parameters import step_parameter
-from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.windows import Windows
 
 ERROR = 0.01
@@ -51,34 +52,33 @@ def errors_of(search: LoopSearch) -> list[dict[str, float]]:
     deviation = {
         "viscous": ERROR * nominal["viscous"],
         "coulomb": np.hypot(ERROR * nominal["coulomb"], friction),
-        "armature": ERROR * (nominal["armature"] + data.inertia.mean((0, 2))),
+        "armature": ERROR * scales.inertia,
         "delay": np.full(data.joints, np.hypot(LATE_S, APART_S)),
     }
     own = [
         {"kp": ERROR, **{name: float(x[j] / scales.of(name)[j]) for name, x in deviation.items() if x[j] > 0.0}}
         for j in range(data.joints)
     ]
-    moments = ERROR * np.linalg.norm(data.arm.inertial[:, 1:4], axis=1)
+    arm = data.plant.sim.arm
+    moments = ERROR * np.linalg.norm(arm.inertial[:, 1:4], axis=1)
     links = {f"moment{link}.{axis}": float(moments[link]) for link in range(data.joints) for axis in "xyz"}
-    return [*own, {name: size for name, size in links.items() if name in data.columns}]
+    return [*own, {name: size for name, size in links.items() if name in shared_names(arm)}]
 
 
 def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
     """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
     sizes = errors_of(search)
     deviations = np.array([size for each in sizes for size in each.values()])
-    errors, usual = np.zeros(deviations.size), np.zeros(search.data.joints)
     usually = _correlation(sizes)
-    spread, prior = usually, np.linalg.inv(usually)
-    for step in range(3):
-        gaps, changes = _weighed(search, _fit(search, sizes, errors), sizes, deviations)
-        usual = usual if step else np.array([np.linalg.norm(x) for x in changes])
-        normal, right = prior.copy(), np.zeros(errors.size)
-        for gap, x, samples, least in zip(gaps, changes, search.samples, margin, strict=True):
-            normal += samples / least**2 * x @ x.T
-            right -= samples / least**2 * x @ (gap - errors @ x)
-        spread = np.asarray(np.linalg.inv(normal))
-        errors = spread @ right
+    prior = np.linalg.inv(usually)
+    gaps, changes = _weighed(search, _fit(search, sizes, np.zeros(deviations.size)), sizes, deviations)
+    usual = np.array([np.linalg.norm(x) for x in changes])
+    normal, right = prior.copy(), np.zeros(deviations.size)
+    for gap, x, samples, least in zip(gaps, changes, search.samples, margin, strict=True):
+        normal += samples / least**2 * x @ x.T
+        right -= samples / least**2 * x @ gap
+    spread = np.asarray(np.linalg.inv(normal))
+    errors = spread @ right
     found, other = _fit(search, sizes, errors), replace(search, data=heldout)
     pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
     small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
@@ -118,7 +118,7 @@ def _fit(search: LoopSearch, sizes: list[dict[str, float]], errors: Array) -> Lo
         for name, size in own.items():
             point[name][j] = step_parameter(name, point[name][j], size * next(left), search.scales, j)
     for name, size in sizes[-1].items():
-        point[name] = point[name] + size * next(left)
+        point[name] = np.full(search.data.joints, size * next(left))
     return LoopFit(point, ((),) * search.data.joints)
 
 

@@ -173,8 +173,9 @@ def windows_of(
     for number in _in_one_order(recordings):
         recording = recordings[number]
         if recording.position_command is None or not np.isfinite(recording.position_command).any():
-            raise BadInput(f"{labels[number]}: neither a torque channel nor a commanded position: record tau_1 … or "
-                           "q_cmd_1 …")
+            raise BadInput(
+                f"{labels[number]}: neither a torque channel nor a commanded position: record tau_1 … or q_cmd_1 …"
+            )
         for rows in pieces_of(recording):
             part = slice_rows(recording, rows)
             if np.isfinite(part.position).all(axis=1).sum() < BEGINNING_ROWS:
@@ -191,7 +192,9 @@ def windows_of(
     scale = np.array([*scales] or [1.0] * len(recordings), float)[number_of]
     own = stacked.pop("piece").astype(np.intp)
     every = [1.0 / JUDGED_HZ, period]
-    return Windows(plant, tuple(pieces), own, recording=number_of, scale=scale, period=period, judged_s=max(every), **stacked)
+    return Windows(
+        plant, tuple(pieces), own, recording=number_of, scale=scale, period=period, judged_s=max(every), **stacked
+    )
 
 
 PER_SAMPLE = ("at", "measured", "weight", "v", "torque", "error", "served")
@@ -225,7 +228,9 @@ def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> list[dict[s
     """Windows of one piece."""
     t, q = part.t - part.t[0], part.position
     seen = np.isfinite(q)
-    filled = np.column_stack([np.interp(t, t[s], x[s]) if s.any() else 0.0 * t for x, s in zip(q.T, seen.T, strict=True)])
+    filled = np.column_stack(
+        [np.interp(t, t[s], x[s]) if s.any() else 0.0 * t for x, s in zip(q.T, seen.T, strict=True)]
+    )
     q0, v0 = _beginning(t, filled)
     noise = _noise(filled)
     smooth, v, a = _smoothed(t, filled)
@@ -249,9 +254,19 @@ def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> list[dict[s
         state = np.stack([q0, v0]) if first == 0 and short else np.stack([smooth[first], v[first]])
         out.append(
             {
-                "piece": piece, "begin": t[first], "at": t[rows] - t[first], "measured": filled[rows],
-                "weight": seen[rows], "start": state, "error_sum": sums[first], "first": smooth[0], "v": v[rows],
-                "torque": torque[rows], "error": error[rows], "served": served[rows], "noise": noise,
+                "piece": piece,
+                "begin": t[first],
+                "at": t[rows] - t[first],
+                "measured": filled[rows],
+                "weight": seen[rows],
+                "start": state,
+                "error_sum": sums[first],
+                "first": smooth[0],
+                "v": v[rows],
+                "torque": torque[rows],
+                "error": error[rows],
+                "served": served[rows],
+                "noise": noise,
                 "recording": number,
             }
         )

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from calib.report.page import ReportSection as Section
 from calib.report.page import html_of, paragraph, paragraphs, verdict_line
 from calib.report.tables import ReportTable
@@ -10,7 +12,14 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.training.export import WRITTEN
-from sim_gap.position_gap.training.replay import Simulated, commanded_rows, replay, simulated_model, without_groups
+from sim_gap.position_gap.training.replay import (
+    Simulated,
+    commanded_rows,
+    nominal,
+    replay,
+    simulated_model,
+    without_groups,
+)
 from sim_gap.report.effect_text import WORDS, advice, parameter_rows, sentence
 from sim_gap.report.figures import BLUE, GREY, ORANGE
 from sim_gap.report.time_figures import MOST_LEFT_OUT, SHOWN_S, Line, lines_over_time, lines_without_each
@@ -63,11 +72,11 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
     command = recording.position_command
     assert command is not None
     lines: list[Line] = [
-        ("command", command[commanded_rows(recording, SHOWN_S)], GREY, True),
+        ("command", np.concatenate([command[rows] for rows in commanded_rows(recording, SHOWN_S)]), GREY, True),
         ("measured", measured, "black", True),
     ]
     if found.nominal_has_controller:
-        lines.append(("nominal model", moved(Simulated(found.sim.mujoco_model, found.sim.joints))[1], ORANGE, True))
+        lines.append(("nominal model", moved(nominal(found.sim))[1], ORANGE, True))
     lines.append(("corrected model", after, BLUE, True))
     left_out = list(dict.fromkeys(cause.effect for cause in causes if cause.effect in WRITTEN))[:MOST_LEFT_OUT]
     groups = [[stage.group for stage in found.stages if stage.group[0].partition("@")[0] == e] for e in left_out]

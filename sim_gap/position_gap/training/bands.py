@@ -13,18 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import LoopFit, batch, jacobian, root_mean_squares
 from sim_gap.position_gap.judge import joint_rms
-from sim_gap.position_gap.search import LoopSearch
-from sim_gap.position_gap.simulate import simulate
-from sim_gap.position_gap.training.jackknife import LeftOutFits, gaps_left_out
+from sim_gap.position_gap.plant import simulate
+from sim_gap.position_gap.training.jackknife import recordings_or_thirds
 from sim_gap.position_gap.training.spread import Covariance
 from sim_gap.position_gap.training.unreached_limits import LIMITS, Unreached
 from sim_gap.position_gap.windows import Windows
 
 SHARE = 0.9
 """Share of the motion that a band should hold."""
-ABOVE = (1.0, 1.1, 1.3, 2.0, 4.0)
+ABOVE = (1.0, 1.5)
 """Limits about which the band goes, over the least that the training motion admits; without a limit too."""
 OTHER_MOTION = 3.5
 """How many times as much as a single recording shows another motion leaves where all that is left of it lasts: 25
@@ -48,10 +48,13 @@ class Band:
     """RMS of half of its width on the training motion, about a single simulation [rad]: how far draws go."""
 
 
-def band(search: LoopSearch, fit: LoopFit, spread: Covariance, others: LeftOutFits, heldout: Windows) -> Band:
-    """The band that follows from the training windows of `search`, judged on the held-out ones."""
+def band(search: LoopSearch, fit: LoopFit, spread: Covariance, left: Array, heldout: Windows) -> Band:
+    """The band that follows from the training windows of `search`, judged on the held-out ones.
+
+    `left` is what fits without their recording leave of the training windows, (To, J, W) [rad].
+    """
     data = search.data
-    left, groups = gaps_left_out(search, others), others.groups
+    groups = recordings_or_thirds(data)
     each = root_mean_squares(data, left)
     unexplained = joint_rms(data, each)
     size = np.sqrt(_variance(search, fit, spread, data) + unexplained[:, None] ** 2)

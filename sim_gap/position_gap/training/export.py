@@ -23,12 +23,13 @@ from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.urdf import xml_comment
 from sim_gap.effects.base import tilt_gravity
+from sim_gap.effects.link import point_mass
 from sim_gap.model.load import SimModel
 from sim_gap.model.solver_friction import solver_parameters
-from sim_gap.position_gap.columns import payload_inertia, shared_effects
-from sim_gap.position_gap.fit import LoopFit, improve
+from sim_gap.position_gap.choice import LoopSearch, effect_there, without_effect, without_group
+from sim_gap.position_gap.fit import LoopFit
+from sim_gap.position_gap.links import along, shared_effects
 from sim_gap.position_gap.parameters import EFFECTS
-from sim_gap.position_gap.search import LoopSearch, effect_there, without_effect, without_group
 
 BEYOND = 0.02
 """Distance beyond the end of its range from which a joint of the model would have to go on [rad]; stops are soft."""
@@ -112,7 +113,7 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
     for effect in _shared_beside(search, fit, held):
         bare = without_group(search, bare, (effect, ()))
     bare = bare.with_values(kd=np.zeros(search.data.joints), feed=np.zeros(search.data.joints))
-    loaded = fit.point["load"] * search.data.load.mean(axis=(0, 2))
+    loaded = fit.point["load"] * np.abs(search.data.torque).mean(axis=(0, 2))
     dry = fit.point["stribeck"] * ("friction.stribeck" not in held) + loaded * ("friction.load" not in held)
     bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
     wanted = [(*own, *(n for n in ("coulomb", "viscous") if n not in own)) for own in bare.active]
@@ -120,7 +121,7 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
     changed = changed or any(np.any(fit.point[n] != 0.0) for n in ("kd", "feed"))
     if not changed:
         return fit
-    return improve(search.data, replace(bare, active=tuple(wanted), rms=None), search.scales, 6)
+    return search.improve(replace(bare, active=tuple(wanted), rms=None))
 
 
 def export_fit(
@@ -147,7 +148,7 @@ def export_fit(
             write_range(spec.joints[joint], actuator, sim.arm.range[j], unit)
     for link, change in _link_changes(search, native).items():
         _set_body(spec, compiled, sim.joints[link], change)
-    angles = [float(native.point.get(f"tilt.angle_{k}", np.zeros(1))[0]) for k in (1, 2)]
+    angles = [along(native.point, f"tilt.angle_{k}") for k in (1, 2)]
     spec.option.gravity = tilt_gravity(sim.arm.gravity, np.array(angles))
     spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
     spec.option.integrator = _implicit()
@@ -182,7 +183,7 @@ def _shared_beside(search: LoopSearch, fit: LoopFit, held: Collection[str]) -> l
     """Effects of the whole arm in a fit that are not among those held."""
     return [
         effect
-        for effect, names in shared_effects(search.data.arm).items()
+        for effect, names in shared_effects(search.data.plant.sim.arm).items()
         if effect.partition("@")[0] not in held and {*names} & {*fit.shared}
     ]
 
@@ -254,17 +255,14 @@ def _link_changes(search: LoopSearch, fit: LoopFit) -> dict[int, Array]:
     """Change of the ten inertial parameters of each link, about its joint and in its frame."""
     n = search.data.joints
     changes: dict[int, Array] = {}
-    payload = [
-        float(fit.point[f"payload.{p}"][0]) if f"payload.{p}" in fit.shared else 0.0 for p in ("mass", "x", "y", "z")
-    ]
-    if any(payload):
-        mass, x, y, z = (np.array(value) for value in payload)
-        changes[n - 1] = np.array([*payload, *payload_inertia(mass, (x, y, z), search.data.arm).values()])
+    mass, *moment = (along(fit.point, f"payload.{part}") for part in ("mass", "x", "y", "z"))
+    if mass or any(moment):
+        changes[n - 1] = point_mass(mass, np.array(moment))
     for link in range(n):
-        moment = np.array([float(fit.point.get(f"moment{link}.{axis}", np.zeros(1))[0]) for axis in "xyz"])
-        if moment.any():
+        moved = np.array([along(fit.point, f"moment{link}.{axis}") for axis in "xyz"])
+        if moved.any():
             changes[link] = changes.get(link, np.zeros(10))
-            changes[link][1:4] += moment
+            changes[link][1:4] += moved
     return changes
 
 

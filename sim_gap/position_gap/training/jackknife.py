@@ -1,20 +1,23 @@
-"""Windows left out: where parameters go without a group of windows, and fits to all training recordings but one.
+"""Windows left out: where parameters go without a group of windows, and what fits to the others leave of it.
 
-In the jackknife the parameters follow in one Gauss-Newton step (Bell and McCaffrey, Survey Methodology 28, 2002), as
+The parameters follow in one Gauss-Newton step (Bell and McCaffrey, Survey Methodology 28, 2002), as
 far as the others let them.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import LoopFit, batch, improve, jacobian, residuals
-from sim_gap.position_gap.search import LoopSearch
-from sim_gap.position_gap.windows import Windows, choose_windows
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit, jacobian, names_of
+from sim_gap.position_gap.windows import Windows
 
+FARTHEST = 1.5
+"""Longest step of a parameter without a group, in its own coordinate."""
 ALONE = 0.03
 """Share of the information about a direction that the others are taken to have at least, without a group."""
 LEAST_INFORMATION = 1e-12
@@ -30,21 +33,30 @@ class Terms:
     """(W, K, K)."""
     scores: Array
     """(W, K)."""
+    residual: Array
+    """(To, J, W)."""
+    slopes: list[Array]
+    """Derivatives of each joint, (K_j + S, To, W)."""
 
 
 def terms_of(search: LoopSearch, fit: LoopFit) -> Terms:
     """Normal equations of each window of the search about a fit."""
     now, slopes = jacobian(search.data, fit, search.scales, fit.active, fit.shared)
-    names = [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
-    starts = np.concatenate([[0], np.cumsum([len(own) for own in fit.active])]).astype(int)
-    size, count = len(names), search.data.count
+    names = names_of(fit)
+    size, count, weight = len(names), search.data.count, search.data.weight
     squares, scores = np.zeros((count, size, size)), np.zeros((count, size))
-    weights = search.samples / np.maximum((now**2).sum((0, 2)), 1e-300)
+    weights = search.samples / np.maximum((now**2 * weight).sum((0, 2)), 1e-300)
     for j, x in enumerate(slopes):
-        index = np.concatenate([np.arange(starts[j], starts[j + 1]), np.arange(starts[-1], size)]).astype(int)
-        squares[np.ix_(np.arange(count), index, index)] += weights[j] * np.einsum("atw,btw->wab", x, x)
-        scores[:, index] += weights[j] * np.einsum("atw,tw->wa", x, now[:, j])
-    return Terms(names, squares, scores)
+        index = acting(names, j)
+        counted = x * weight[:, j]
+        squares[np.ix_(np.arange(count), index, index)] += weights[j] * np.einsum("atw,btw->wab", counted, x)
+        scores[:, index] += weights[j] * np.einsum("atw,tw->wa", counted, now[:, j])
+    return Terms(names, squares, scores, now, slopes)
+
+
+def acting(names: Sequence[tuple[int, str]], joint: int) -> NDArray[np.intp]:
+    """Numbers of the parameters that act on a joint: its own and those of the whole arm."""
+    return np.array([k for k, (j, _) in enumerate(names) if j in (joint, -1)], np.intp)
 
 
 def jackknifed(terms: Terms, known: Array, groups: NDArray[np.intp]) -> Array:
@@ -67,18 +79,8 @@ def jackknifed(terms: Terms, known: Array, groups: NDArray[np.intp]) -> Array:
     return np.asarray((len(steps) - 1) / len(steps) * apart.T @ apart)
 
 
-FOLDS, STEPS = 3, 3
-"""Parts of a single recording of which each is left out of a fit, and the steps of such a fit."""
-
-
-@dataclass(frozen=True, eq=False)
-class LeftOutFits:
-    """A fit without each group of training windows: without each recording, or each third of a single one."""
-
-    groups: NDArray[np.intp]
-    """Number of the group of each window, (W,)."""
-    fits: tuple[LoopFit, ...]
-    """The fit without each group, in their order."""
+FOLDS = 3
+"""Parts of a single recording of which each is left out of a fit."""
 
 
 def recordings_or_thirds(data: Windows) -> NDArray[np.intp]:
@@ -86,22 +88,15 @@ def recordings_or_thirds(data: Windows) -> NDArray[np.intp]:
     return np.arange(data.count) * FOLDS // data.count if data.of_one_recording else data.recording
 
 
-def leave_out(search: LoopSearch, fit: LoopFit) -> LeftOutFits:
-    """A fit to all other windows for each group of them."""
-    data, groups = search.data, recordings_or_thirds(search.data)
-    fits = []
-    for group in np.unique(groups):
-        others = np.flatnonzero(groups != group)
-        fits.append(
-            improve(choose_windows(data, others), replace(fit, rms=None), search.scales, STEPS) if len(others) else fit
-        )
-    return LeftOutFits(groups, tuple(fits))
-
-
-def gaps_left_out(search: LoopSearch, left: LeftOutFits) -> Array:
-    """Gap that the fit without its group leaves of each training window, (To, J, W) [rad]."""
-    out = np.zeros_like(search.data.measured)
-    for group, alone in zip(np.unique(left.groups), left.fits, strict=True):
-        own = np.flatnonzero(left.groups == group)
-        out[..., own] = residuals(choose_windows(search.data, own), batch([alone.point]))[0]
+def gaps_left_out(data: Windows, terms: Terms, known: Array) -> Array:
+    """Gap that a fit without its group leaves of each training window, to first order, (To, J, W) [rad]."""
+    groups, out = recordings_or_thirds(data), terms.residual.copy()
+    whole = terms.squares.sum(0) + known
+    for group in np.unique(groups) if len(terms.names) else ():
+        own = np.flatnonzero(groups == group)
+        others = whole - terms.squares[own].sum(0)
+        step = np.linalg.lstsq(others, terms.scores[own].sum(0) - terms.scores.sum(0), rcond=1e-9)[0]
+        step = np.clip(step, -FARTHEST, FARTHEST)
+        for j, x in enumerate(terms.slopes):
+            out[:, j, own] += np.einsum("a,atw->tw", step[acting(terms.names, j)], x[..., own])
     return out

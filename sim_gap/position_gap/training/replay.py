@@ -12,8 +12,11 @@ from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.better_model.native_drives import hold
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.search import Group, LoopSearch, without_group
+from sim_gap.position_gap.choice import Group, LoopSearch, without_group
+from sim_gap.position_gap.plant import held_model, silent
 from sim_gap.position_gap.training.export import Exported, export_beside_module
+from sim_gap.position_gap.windows import LEAST_S, pieces_of
+from sim_gap.position_gap.windows import SHORT_S as SHORT_PIECE_S
 
 OPENING_S = 1.0
 """Time at the start that is not judged [s]."""
@@ -40,11 +43,16 @@ class Simulated:
         return replace(self, model=model)
 
 
+def nominal(sim: SimModel) -> Simulated:
+    """The nominal model; all but the arm is held."""
+    return Simulated(held_model(sim), tuple(sim.joints))
+
+
 def simulated_model(sim: SimModel, made: Exported) -> Simulated:
-    """A written model with what its module applies."""
+    """A written model with what its module applies; all but the arm is held."""
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string(made.xml)
+    model = held_model(replace(sim, mujoco_model=mujoco.MjModel.from_xml_string(made.xml)))
     return Simulated(model, tuple(sim.joints), Effects(model, made.effects, sim.arm.names) if made.effects else None)
 
 
@@ -57,20 +65,29 @@ def without_groups(sim: SimModel, search: LoopSearch, made: Exported, groups: Se
 
 
 def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> tuple[Array, Array, Array]:
-    """Times (K,), simulated and measured positions (K, n) of one recording from its first command to the first that
-    is missing; nothing of one without commands.
+    """Times (K,), simulated and measured positions (K, n) of the parts of a recording that are commanded without a
+    break; nothing of one without commands.
 
-    The model starts at the measured position at rest, as if the first command had been there for long; each joint's
-    actuator gets the command held from row to row, for at most `longest` [s].
+    Each part begins at its first measured position at rest, as if the first command had been there for long; each
+    joint's actuator gets the command held from row to row, for at most `longest` [s] in all.
     """
+    rows = commanded_rows(recording, longest)
+    parts = [_replay(arm, slice_rows(recording, part)) for part in rows]
+    if not parts:
+        none = slice_rows(recording, slice(0, 0))
+        return none.t, none.position, none.position
+    moved = np.concatenate(parts)
+    told = np.concatenate([np.arange(len(recording.t))[part] for part in rows])
+    return recording.t[told], moved, recording.position[told]
+
+
+def _replay(arm: Simulated, recording: Recording) -> Array:
+    """Simulated positions of one part, (K, n)."""
     import mujoco
 
     model, joints = arm.model, list(arm.joints)
-    recording = slice_rows(recording, commanded_rows(recording, longest))
     given, rows = recording.position_command, len(recording.t)
     assert given is not None
-    if not rows:
-        return recording.t, recording.position, recording.position
     data = mujoco.MjData(model)
     adr = model.jnt_qposadr[joints]
     data.qpos[adr] = recording.position[0]
@@ -82,61 +99,60 @@ def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> 
     at = 0
     mujoco.set_mjcb_passive(None if arm.effects is None else arm.effects.passive)
     try:
-        for k in range(int((times[-1] - times[0]) / dt) + 1):
-            now = times[0] + k * dt
-            while at + 1 < rows and times[at + 1] <= now + 1e-9:
-                out[at + 1] = data.qpos[adr]
-                at += 1
-            data.ctrl[controls] = given[at]
-            mujoco.mj_step(model, data)
+        with silent():
+            for k in range(int((times[-1] - times[0]) / dt) + 1):
+                now = times[0] + k * dt
+                while at + 1 < rows and times[at + 1] <= now + 1e-9:
+                    out[at + 1] = data.qpos[adr]
+                    at += 1
+                data.ctrl[controls] = given[at]
+                mujoco.mj_step(model, data)
     finally:
         mujoco.set_mjcb_passive(None)
         if arm.effects is not None:
             model.dof_frictionloss[arm.effects.dofs] = arm.effects.coulomb
     out[0], out[at + 1 :] = recording.position[0], data.qpos[adr]
-    return times, out, recording.position
+    return out
 
 
 def replay_rms(
-    arm: Simulated,
-    recordings: Sequence[Recording],
-    gains: Sequence[float] = (),
-    longest: float = LONGEST_S,
-    apart: Sequence[Mask] = (),
+    arm: Simulated, recordings: Sequence[Recording], gains: Sequence[float] = (), longest: float = LONGEST_S
 ) -> Array:
     """RMS of simulated minus measured positions over recordings [rad], (n,); NaN if none is commanded long enough.
 
-    `gains` are those of the controller in each recording over the model's, by default 1; rows of each recording that
-    are set `apart` (K,) are not judged.
+    `gains` are those of the controller in each recording over the model's, by default 1.
     """
     total, count = np.zeros(len(arm.joints)), np.zeros(len(arm.joints))
-    gains = gains or [1.0] * len(recordings)
-    apart = apart or [np.zeros(len(recording.t), bool) for recording in recordings]
-    for recording, gain, left_out in zip(recordings, gains, apart, strict=True):
-        part = commanded_rows(recording, longest)
-        if np.diff(recording.t[part]).sum() < 2.0 * OPENING_S:
-            continue
-        t, positions, measured = replay(arm.with_gain(gain), recording, longest)
-        gap = (positions - measured)[judged_rows(t, left_out[part])]
-        total += np.nansum(gap**2, axis=0)
-        count += np.isfinite(gap).sum(0)
+    for recording, gain in zip(recordings, gains or [1.0] * len(recordings), strict=True):
+        scaled = arm.with_gain(gain)
+        for part in commanded_rows(recording, longest):
+            rows = slice_rows(recording, part)
+            gap = (_replay(scaled, rows) - rows.position)[judged_rows(rows.t)]
+            total += np.nansum(gap**2, axis=0)
+            count += np.isfinite(gap).sum(0)
     return np.asarray(np.sqrt(total / np.where(count > 0, count, np.nan)))
 
 
-def judged_rows(t: Array, left_out: Mask) -> Mask:
-    """Replayed rows that are judged, (K,): those after the opening that are not left out."""
-    return np.asarray(t - t.min(initial=np.inf) >= OPENING_S) & ~left_out
+def judged_rows(t: Array) -> Mask:
+    """Replayed rows that are judged, (K,): those after the opening, or of a short part all but the first."""
+    opening = OPENING_S if t[-1] - t[0] >= SHORT_PIECE_S else 0.0
+    return np.asarray(t - t[0] > opening - 1e-9) & (np.arange(len(t)) > 0)
 
 
-def commanded_rows(recording: Recording, longest: float = LONGEST_S) -> slice:
-    """Rows of a recording from the first at which all joints are commanded to the first at which one is not, at most
-    `longest` [s] later."""
+def commanded_rows(recording: Recording, longest: float = LONGEST_S) -> list[slice]:
+    """Rows of the parts of a recording in which all joints are commanded and read without a break, for at most
+    `longest` [s] in all."""
     assert recording.position_command is not None
-    given = np.flatnonzero(np.isfinite(recording.position_command).all(axis=1))
-    if not given.size:
-        return slice(0, 0)
-    first, last = int(given[0]), int(given[0]) + int(np.argmax(np.diff(given, append=-1) != 1))
-    return slice(first, min(last + 1, int(np.searchsorted(recording.t, recording.t[first] + longest, side="right"))))
+    out, left = [], longest
+    for piece in pieces_of(recording):
+        there = np.isfinite(recording.position_command[piece]).all(axis=1)
+        ends = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
+        for first, last in (ends + piece.start).reshape(-1, 2).tolist():
+            last = min(last, int(np.searchsorted(recording.t, recording.t[first] + left, side="right")))
+            if last - first > 1 and recording.t[last - 1] - recording.t[first] >= LEAST_S:
+                out.append(slice(first, last))
+                left -= float(recording.t[last - 1] - recording.t[first])
+    return out
 
 
 def actuator_of(model: Any, joint: int) -> int:

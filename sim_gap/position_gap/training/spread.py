@@ -1,76 +1,32 @@
-"""Spread of the parameters that recordings leave open: covariance, intervals, and the fits of other choices of effects.
+"""Spread of the parameters that recordings leave open: covariance and intervals.
 
 A position alone shows ratios: of gain, friction and inertia, whose common scale rests on a little inertia. Along such a
 direction the score is flat, a fit stops anywhere, and a fit without one recording stops beside it. So parameters are
 not fitted again but follow in one step (`jackknife`) where windows are left out, and where whole recordings are: each
 motion shows what the model lacks in another way, and the parameters take it up.
-
-An interval about one choice says how well its parameters are known if that choice is right. A spring in place of a part
-of gravity, or a payload beside it, changes gain, friction and inertia together by factors, while each choice by itself
-is told well. So parameters are distributed about several fits (averaging over models; Hoeting and others, Statistical
-Science 14, 1999).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.stats import norm, t
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.columns import UNIT
-from sim_gap.position_gap.doubt import LEAST_FREEDOM, Other
-from sim_gap.position_gap.fit import LoopFit, coordinate
+from gcomp.estimate.solve import precision
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import Layout, LoopFit, coordinate
 from sim_gap.position_gap.judge import rms_on
-from sim_gap.position_gap.parameters import FARTHEST, PARAMETERS, relative_step, step_parameter
-from sim_gap.position_gap.search import LoopSearch
+from sim_gap.position_gap.links import UNIT, range_of, shared_names
+from sim_gap.position_gap.parameters import PARAMETERS, relative_step, step_parameter
 from sim_gap.position_gap.sound_arm import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
-from sim_gap.position_gap.training.jackknife import jackknifed, recordings_or_thirds, terms_of
-from sim_gap.position_gap.training.unreached_limits import LIMITS, Unreached
+from sim_gap.position_gap.training.jackknife import Terms, jackknifed, recordings_or_thirds, terms_of
+from sim_gap.position_gap.training.unreached_limits import Unreached
 
-LEAST_PROBABILITY = 0.005
-"""Probability below which another choice of effects is none."""
 INSIDE = 0.95
 """Probability of an interval."""
-
-
-@dataclass(frozen=True, eq=False)
-class Alternative:
-    """Another fit that the parameters of one joint may be distributed about, or those of the whole arm."""
-
-    joint: int
-    """−1: all joints, and the parameters of the whole arm."""
-    odds: float
-    """Probability over that of the fit itself."""
-    fit: LoopFit
-
-
-def alternatives(others: Sequence[Other]) -> tuple[Alternative, ...]:
-    """The other choices that are not beyond doubt."""
-    return tuple(
-        Alternative(joints[0] if joints else -1, each.likely / (1.0 - each.likely), each.fit)
-        for each, joints in ((each, each.group[1]) for each in others)
-        if LEAST_PROBABILITY < each.likely < 1.0
-    )
-
-
-def quantiles(shifts: Array, odds: Array, deviation: float) -> tuple[float, float]:
-    """Ends of the INSIDE interval of a mixture of normal distributions with one standard deviation, about 0 and about
-    `shifts`, the latter with `odds` over the first."""
-    means, weights = np.append(0.0, shifts), np.append(1.0, odds) / (1.0 + odds.sum())
-    deviation = max(deviation, 1e-12)
-    far = norm.isf(0.25 * (1.0 - INSIDE) * weights[0]) * deviation
-
-    def end(share: float) -> float:
-        def above(x: float) -> float:
-            return float(weights @ norm.cdf((x - means) / deviation)) - share
-
-        return float(brentq(above, means.min() - far, means.max() + far))
-
-    return end(0.5 - 0.5 * INSIDE), end(0.5 + 0.5 * INSIDE)
-
-
+LEAST_FREEDOM = 2
+"""Degrees of freedom that are counted at least: two recordings alone have one, whose 95 % are 13 standard errors."""
 SYSTEMATIC = 0.02
 """Relative standard deviation of every parameter that no recording shows: sampling, command timing, the model's own."""
 OTHERWISE = 8.0
@@ -99,14 +55,12 @@ SHARE = 0.975
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of the parameters in their own coordinates about the fit and about those without an effect that is in
-    doubt, and the limits that no recording reaches."""
+    """Covariance of the parameters in their own coordinates, and the limits that no recording reaches."""
 
     names: list[tuple[int, str]]
     """Joint (−1: whole arm) and name."""
     matrix: Array
     limits: tuple[Unreached, ...] = ()
-    others: tuple[Alternative, ...] = ()
 
     def of_joint(self, joint: int) -> Array:
         """The part of one joint's own parameters and then those of the whole arm."""
@@ -145,12 +99,17 @@ def _told(fit: LoopFit, joint: int, name: str) -> bool:
     return name in own or ("kp" in own and name in SCALED and float(fit.point[name][joint]) > 0.0)
 
 
-def covariance_within(search: LoopSearch, fit: LoopFit) -> Covariance:
+def known_before(search: LoopSearch, fit: LoopFit, names: list[tuple[int, str]]) -> Array:
+    """Inverse variance of each fitted parameter before any recording, (K, K)."""
+    layout = Layout(search.data, search.scales, fit.point, names)
+    return np.diag(precision(layout.problem(search.nominal, {}, search.floor)))
+
+
+def covariance_within(search: LoopSearch, fit: LoopFit, terms: Terms) -> Covariance:
     """Sandwich covariance of the fitted parameters over the windows, all else as it is: what tells an effect from none.
 
     Directions that the windows hardly show are held.
     """
-    terms = terms_of(search, fit)
     bread, size, count = terms.squares.sum(0), len(terms.names), search.data.count
     scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
     held = np.diag([1e-4] * size)
@@ -165,7 +124,8 @@ def free_all(search: LoopSearch, fit: LoopFit) -> LoopFit:
     and with the mass moments of all links where something of the whole arm was fitted."""
     open_at = (_open(search, fit, j, own) for j, own in enumerate(errors_of(search)[:-1]))
     active = tuple((*own, *more) for own, more in zip(fit.active, open_at, strict=True))
-    others = [name for name in search.data.columns if name.startswith("moment") and name not in fit.shared]
+    every = shared_names(search.data.plant.sim.arm)
+    others = [name for name in every if name.startswith("moment") and name not in fit.shared]
     shared = (*fit.shared, *others) if fit.shared else ()
     point = {name: np.zeros(search.data.joints) for name in shared} | fit.point
     return replace(fit, point=point, active=active, shared=shared)
@@ -236,38 +196,15 @@ def _besides(search: LoopSearch, names: Sequence[tuple[int, str]]) -> Array:
     return np.diag(np.square(own))
 
 
-def shifts_of(search: LoopSearch, fit: LoopFit, spread: Covariance, joint: int, name: str) -> tuple[Array, Array]:
-    """Where the other fits have a parameter, from where the fit has it, in its own coordinate, and their odds.
-
-    Fits that have no such effect say nothing of its size.
-    """
-    own = coordinate(fit, search.scales, joint, name)
-    told = [
-        (coordinate(other.fit, search.scales, joint, name) - own, other.odds)
-        for other in spread.others
-        if other.joint in (joint, -1) and name in (other.fit.active[joint] if joint >= 0 else other.fit.shared)
-    ]
-    shifts, odds = np.array(told, float).reshape(-1, 2).T
-    return shifts, odds
-
-
-def undecided_scale(search: LoopSearch, fit: LoopFit, spread: Covariance) -> list[int]:
+def undecided_scale(fit: LoopFit, spread: Covariance) -> list[int]:
     """Joints of which only ratios of gain, friction and inertia can be told."""
     out = []
     for j, own in enumerate(fit.active):
         if "kp" in own:
-            shifts, odds = shifts_of(search, fit, spread, j, "kp")
             within = float(spread.matrix[(at := spread.names.index((j, "kp"))), at])
-            share, mean = odds / (1.0 + odds.sum()), float(odds @ shifts) / (1.0 + float(odds.sum()))
-            if within + float(share @ shifts**2) - mean**2 > LOOSE**2:
+            if within > LOOSE**2:
                 out.append(j)
     return out
-
-
-def vague_limits(spread: Covariance) -> list[tuple[int, str]]:
-    """Fitted limits (joint, name) of which the motion says next to nothing where they are."""
-    deviations = np.sqrt(np.diag(spread.matrix))
-    return [at for at, size in zip(spread.names, deviations, strict=True) if at[1] in LIMITS and size > FARTHEST]
 
 
 def interval(
@@ -279,12 +216,14 @@ def interval(
             value, most = float(fit.point[name][joint]), float(limit.levels[limit.weights > 0.0].max())
             return value, limit.least, max(most, value), PARAMETERS[name].unit
     deviation = float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
-    below, above = quantiles(*shifts_of(search, fit, spread, joint, name), deviation)
+    half = float(norm.isf(0.5 * (1.0 - INSIDE))) * deviation
+    below, above = -half, half
     if joint < 0:
-        value, (least, most) = float(fit.point[name][0]), search.data.ranges[name]
+        value, (least, most) = float(fit.point[name][0]), range_of(search.data.plant.sim.arm, name)
         return value, max(value + below, least), min(value + above, most), UNIT[name.partition(".")[2]]
     value = float(fit.point[name][joint])
-    low, high = (step_parameter(name, value, step, search.scales, joint, ANYTHING) for step in (below, above))
+    ends = (step_parameter(name, value, step, search.scales, joint, ANYTHING) for step in (below, above))
+    low, high = sorted(ends)
     return value, low, high, PARAMETERS[name].unit
 
 

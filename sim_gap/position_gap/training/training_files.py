@@ -13,8 +13,8 @@ from sim_gap.better_model.effects_module import module_path, module_text
 from sim_gap.better_model.samples import write_rows
 from sim_gap.better_model.urdf import URDF, urdf_of, xml_comment
 from sim_gap.model.load import urdf_behind
+from sim_gap.position_gap.choice import effect_there
 from sim_gap.position_gap.identify import Identified
-from sim_gap.position_gap.search import effect_there
 from sim_gap.position_gap.training.draws import draw
 from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, export_fit, native_fit
 

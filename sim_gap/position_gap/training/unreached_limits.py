@@ -1,29 +1,27 @@
 """Limits that no recording reaches: what the training motion leaves open of them.
 
 A limit of the torque or of the command's speed that was never reached is not absent: it lies above what was asked for.
-Its distribution is that of a prior, log-uniform from there up, weighted by what each level costs the fit of the
-training motion; motion that asks for no more is as it was, and motion that asks for more is less sure.
+Its distribution is that of a prior, log-uniform from there up; motion that asks for no more is as it was, and motion
+that asks for more is less sure.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import LoopFit, batch, evaluate, residuals, root_mean_squares
-from sim_gap.position_gap.search import LoopSearch
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit, batch, residuals
 
 HEADROOM = 10.0
 """Ratio of the highest level of the prior to the least that the training motion admits: recordings use between a tenth
 and all of what a drive can do."""
-LEVELS = np.geomspace(0.1, 100.0, 61)
-"""Levels at which a limit is tried, in units of the joint's RMS torque or of the command's highest speed."""
-FINER = np.geomspace(1.0, LEVELS[1] / LEVELS[0], 9)[1:-1]
-"""Levels between two of those, over the lower one: where the least one is looked for."""
-COSTS = 2.0
-"""Loss of the score from which a level contradicts the training motion: 95 % of the likelihood of one parameter."""
+COUNT = 20
+"""Levels of the prior."""
+REACHED = 0.999
+"""Share of the training motion that asks for no more than the least level: what is asked for at single moments is as
+much noise of the readings."""
 LIMITS = {"limit": "actuator.saturation", "slew": "controller.slew"}
 """Parameter that is a limit → its effect."""
 
@@ -42,44 +40,49 @@ class Unreached:
     """Lowest level that the training motion admits."""
 
 
-def find_unreached(search: LoopSearch, fit: LoopFit, vague: Collection[tuple[int, str]] = ()) -> tuple[Unreached, ...]:
-    """The limits that neither the model states nor the fit has, where some level of them is admitted; and of those that
-    the fit has the `vague` ones (joint, name), where no level above it costs much. Nothing of joints that rest."""
+def find_unreached(search: LoopSearch, fit: LoopFit) -> tuple[Unreached, ...]:
+    """The limits that neither the model states nor the fit has. Nothing of joints that rest."""
     out: list[Unreached] = []
+    asked = {"limit": _torques(search, fit), "slew": _command_speeds(search)}
     for name, effect in LIMITS.items():
-        open_at = np.isinf(fit.point[name]) & (effect not in search.excluded)
-        open_at |= np.array([(j, name) in vague for j in range(search.data.joints)])
-        open_at[list(search.resting)] = False
-        if not open_at.any():
-            continue
-        levels = LEVELS[:, None] * search.size_of(name)
-        lost = _losses(search, fit, name, levels)
-        first = _first_admitted(lost)
-        between = levels[np.maximum(first - 1, 0), np.arange(len(first))] * FINER[:, None]
-        finer = _first_admitted(_losses(search, fit, name, between))
-        for j in np.flatnonzero(open_at & (first < len(levels))).tolist():
-            near = first[j] > 0 and finer[j] < len(FINER)
-            least = between[finer[j], j] if near else levels[first[j], j]
-            if least > fit.point[name][j]:
+        for j in range(search.data.joints):
+            least = float(asked[name][j])
+            if np.isfinite(fit.point[name][j]) or effect in search.excluded or j in search.resting or least <= 0.0:
                 continue
-            taken = (np.arange(len(levels)) >= first[j]) & (levels[:, j] <= HEADROOM * least)
-            weights = np.where(taken, np.exp(-np.clip(lost[:, j], -50.0, 50.0)), 0.0)
-            out.append(Unreached(j, name, levels[:, j], weights / weights.sum(), float(least)))
+            levels = np.geomspace(least, HEADROOM * least, COUNT)
+            out.append(Unreached(j, name, levels, np.full(COUNT, 1.0 / COUNT), least))
     return tuple(out)
 
 
-def _first_admitted(lost: Array) -> NDArray[np.intp]:
-    """Index of the first level from which on none costs much, (J,); their number where the highest does."""
-    costly = lost >= COSTS
-    return np.where(costly.any(0), len(lost) - np.argmax(costly[::-1], axis=0), 0)
+def _torques(search: LoopSearch, fit: LoopFit) -> Array:
+    """Torque that each servo is asked for along the training motion, (J,) [N·m]."""
+    data, point = search.data, fit.point
+    error = data.error - residuals(data, batch([point]))[0]
+    kp, inner = (point[name][:, None] for name in ("kp", "kv"))
+    damping = np.minimum(inner, point["viscous"][:, None]) + point["kd"][:, None]
+    return _highest(search, np.abs(kp * error * data.scale - damping * data.v))
 
 
-def _losses(search: LoopSearch, fit: LoopFit, name: str, levels: Array) -> Array:
-    """Loss of each joint's score with a limit at each level, all else as it is, (L, J)."""
-    left = residuals(search.data, batch([{**fit.point, name: level} for level in levels]))
-    base = search.score(evaluate(search.data, fit))
-    each = root_mean_squares(search.data, left)
-    return np.stack([search.score(LoopFit(fit.point, fit.active, rms=rms)) - base for rms in each])
+def _command_speeds(search: LoopSearch) -> Array:
+    """Highest speed of each command along the training motion, (J,) [rad/s]."""
+    out = np.zeros(search.data.joints)
+    for k in np.unique(search.data.piece):
+        piece = search.data.pieces[k]
+        held = np.diff(piece.area, axis=0) / np.diff(piece.ends)[:, None]
+        if len(held) > 1:
+            speed = np.abs(np.diff(held, axis=0)) / np.diff(piece.ends[:-1])[:, None]
+            out = np.maximum(out, np.quantile(speed, REACHED, axis=0))
+    return out
+
+
+def _highest(search: LoopSearch, values: Array) -> Array:
+    counted = search.data.weight * search.data.served > 0.0
+    return np.array(
+        [
+            np.quantile(values[:, j][counted[:, j]], REACHED) if counted[:, j].any() else 0.0
+            for j in range(search.data.joints)
+        ]
+    )
 
 
 def draw_limits(limits: Sequence[Unreached], count: int, random: np.random.Generator) -> list[Array]:
