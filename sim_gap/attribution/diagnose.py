@@ -212,9 +212,9 @@ def _checked(
         findings += [finding for finding in found if finding not in findings]
     names = () if matched[0].names == default_names(matched[0].n) else matched[0].names
     sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n, hinges)
-    for recording, label in zip(matched, labels, strict=False):
-        require_length(recording, label)
-    if all(is_position_only(recording) for recording in matched):
+    alone = all(is_position_only(recording) for recording in matched)
+    require_length(matched, labels, together=alone)
+    if alone:
         checked, found = check_position_only(sim.arm, matched, labels[: len(matched)], stated)
     else:
         checked, found = check_recordings(sim.arm, matched, labels[: len(matched)], stated)

@@ -274,7 +274,8 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     adr, dof = model.jnt_qposadr[list(joints)], model.jnt_dofadr[list(joints)]
     flags, model.opt.disableflags = model.opt.disableflags, model.opt.disableflags | _WITHOUT_CONTACT
-    losses = [(loss, loss.copy()) for loss in (model.dof_frictionloss, model.tendon_frictionloss)]
+    kept = (model.dof_frictionloss, model.tendon_frictionloss, model.body_gravcomp)  # the last is the controller's
+    losses = [(loss, loss.copy()) for loss in kept]
     for loss, _ in losses:
         loss[:] = 0.0
     arm = replace(arm, tendons=replace(arm.tendons, frictionloss=0.0 * arm.tendons.frictionloss))
@@ -291,7 +292,7 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
                 raise BadInput(
                     f"{label}: joint {arm.names[worst]}: the model's torque is {data.qfrc_inverse[dof][worst]:.6g} "
                     f"N·m, its rigid chain gives {ours[worst]:.6g}: expected a plain hinge chain (no springs between "
-                    "joints, gravity compensation, fluid forces or joint equalities)"
+                    "joints, fluid forces or joint equalities)"
                 )
     finally:
         model.opt.disableflags = flags

@@ -14,6 +14,7 @@ from sim_gap.position_gap.fit import (
     Layout,
     LoopFit,
     batch,
+    evaluate,
     improve,
     residuals,
 )
@@ -25,6 +26,8 @@ FOLDS = 6
 """Parts of the windows of which each is held out once."""
 LEAST_FALL = 0.025
 """Least relative fall of a joint's RMS by an effect."""
+QUIET = 1.1
+"""Noise floors up to which nothing is left to explain."""
 ROUNDS = 3
 """Times that effects are chosen and fitted."""
 LEVELS = {
@@ -115,7 +118,7 @@ def with_chosen(search: LoopSearch, fit: LoopFit, names: Sequence[str]) -> LoopF
     active = tuple(tuple(n for j, n in places if j == joint) for joint in range(search.data.joints))
     shared = tuple(n for j, n in places if j < 0)
     point = {name: values.copy() for name, values in fit.point.items()}
-    for _, own in every.items():
+    for own in every.values():
         for j, name in own:
             if j >= 0 and name not in active[j]:
                 point[name][j] = search.nominal[name][j]
@@ -178,7 +181,7 @@ def look_about(search: LoopSearch, fit: LoopFit, names: Sequence[str] | None = N
     effects = {}
     samples = search.samples
     for name in listed:
-        own = tuple(at[place] for place in every[name] if place in at)
+        numbers = tuple(at[place] for place in every[name] if place in at)
         joints = [j for j, _ in every[name]]
         least = LEAST_FALL * float(samples[joints[0]]) if joints[0] >= 0 else LEAST_FALL * float(samples.mean())
         needs = tuple(
@@ -186,7 +189,7 @@ def look_about(search: LoopSearch, fit: LoopFit, names: Sequence[str] | None = N
             for need in (EFFECTS[name.partition("#")[0]].needs if joints[0] >= 0 else ())
             if not active_in(search.nominal, need, joints[0])
         )
-        effects[name] = Effect(name, own, needs, least)
+        effects[name] = Effect(name, numbers, needs, least)
     return About(search, fit, layout, terms_of(problem, about, folds_of(search.data)), effects)
 
 
@@ -213,12 +216,14 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     names = chosen_of(search, fit)
     every = candidates_of(search)
     kept = [n for n in every if n.partition("#")[0] in search.kept]
-    looked: list[str] | None = None
+    looked = [n for n in every if n in names or n in unexplained_at(search, fit)]
+    first = True
     for number in range(ROUNDS):
         progress(f"round {number + 1}: {len(names)} effects of joints and arm")
         about = look_about(search, fit, looked)
         found = choose(about.terms, list(about.effects.values()), names, kept)
-        if looked is None:
+        if first:
+            first = False
             worth = promising(about, names)
             looked = [n for n in every if n in worth or n in found or n in names]
         fit = search.improve(entered(search, about.moved(found)), 4)
@@ -231,6 +236,18 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         fit = search.improve(about.moved(found), 4)
         about = look_about(search, fit, looked)
     return fit, about
+
+
+def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[str]:
+    """Effects of the joints at which a fit leaves more than noise, and of the whole arm if it does anywhere."""
+    fit = fit if fit.rms is not None else evaluate(search.data, fit)
+    assert fit.rms is not None
+    count = search.data.weight.sum(0)
+    rms = np.sqrt((fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0))
+    left = set(np.flatnonzero(rms > QUIET * search.floor).tolist())
+    return [
+        name for name, places in candidates_of(search).items() if (places[0][0] in left if places[0][0] >= 0 else left)
+    ]
 
 
 def promising(about: About, names: Sequence[str]) -> set[str]:

@@ -11,7 +11,7 @@ from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.choice import About, LoopSearch, groups_of, look_about, select, without_group
+from sim_gap.position_gap.choice import QUIET, About, LoopSearch, groups_of, look_about, select, without_group
 from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.judge import Stage, rms_on, stages
 from sim_gap.position_gap.links import shared_effects
@@ -29,8 +29,6 @@ from sim_gap.position_gap.windows import Windows, thin, thin_moving, windows_of
 
 FITTED, JUDGED = 16, 24
 """Most windows of the fit, and of the judgement."""
-QUIET = 1.1
-"""Noise floors that a model leaves that moves as the arm does."""
 TORQUE_MARGIN, SHARE_MARGIN = 0.08, 0.15
 """Torque that matters [N·m], at most this share of a joint's torque; over the gain it is a gap of position, at most
 this share of the tracking error."""

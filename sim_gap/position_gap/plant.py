@@ -27,8 +27,12 @@ from sim_gap.model.load import SimModel, linear_part
 from sim_gap.model.solver_friction import creep_speeds, solver_parameters
 from sim_gap.position_gap.windows import Piece, Windows
 
-LOCKED = 1e12
-"""Armature of what is held [kg·m² or kg]: it moves less than a micrometre in an hour."""
+LOCKED = 1e6
+"""Armature of what is held [kg·m² or kg], which is put back after each step: within a step it moves by next to
+nothing."""
+LOCKED_TOLERANCE = 1e-16
+"""Tolerance of MuJoCo's solver beside what is held: it is relative to the inertia of all, and with MuJoCo's usual 1e-8
+the arm of two joints in `tests/sim_gap/position_gap/test_plant.py` rests 4 mrad off, with this 0.3 µrad."""
 Values = Mapping[str, Array]
 """Parameter → (P, J) of P hypotheses; one of the whole arm has the same value at each joint."""
 SPEED_S = 0.01
@@ -61,7 +65,8 @@ def servos_of(sim: SimModel) -> Servos:
 
     model: Any = sim.mujoco_model
     n = sim.n
-    own = Servos(np.full(n, -1), np.full(n, np.nan), *np.zeros((2, n)), *np.full((2, n), np.inf), np.zeros(n))
+    zero, none = np.zeros(n), np.full(n, np.inf)
+    own = Servos(np.full(n, -1), np.full(n, np.nan), zero.copy(), zero.copy(), none.copy(), none.copy(), zero.copy())
     joints = {int(joint): j for j, joint in enumerate(sim.joints)}
     for i in range(model.nu):
         j = joints.get(int(model.actuator_trnid[i, 0]))
@@ -97,14 +102,49 @@ def held_model(sim: SimModel) -> Any:
     if not len(others):
         return model
     model.dof_armature[others] = LOCKED
+    model.opt.tolerance = min(float(model.opt.tolerance), LOCKED_TOLERANCE)
     for i in range(model.nu):
         joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
         if not joint or int(model.actuator_trnid[i, 0]) not in sim.joints:
             model.actuator_gainprm[i], model.actuator_biasprm[i] = 0.0, 0.0
     outside = ~np.isin(model.geom_bodyid, sorted(moves))
     model.geom_contype[outside], model.geom_conaffinity[outside] = 0, 0
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    refresh(model)
     return model
+
+
+def refresh(model: Any) -> None:
+    """Let a model that was changed have the constants that follow from its fields, by its moving parts alone.
+
+    The solver stops at a residual that is small beside the mean inertia, which must not be that of what is held.
+    """
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    moving = model.dof_armature < LOCKED
+    if not moving.all():
+        model.stat.meaninertia = max(float(np.mean(model.dof_M0[moving])), 1e-10)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldParts:
+    """What is put back after each step."""
+
+    places: NDArray[np.intp]
+    dofs: NDArray[np.intp]
+    at: Array
+
+    @classmethod
+    def of(cls, model: Any, joints: Sequence[int]) -> "HeldParts":
+        arm = [int(model.jnt_qposadr[j]) for j in joints], [int(model.jnt_dofadr[j]) for j in joints]
+        places, dofs = (
+            np.setdiff1d(np.arange(count), own) for count, own in zip((model.nq, model.nv), arm, strict=True)
+        )
+        return cls(places.astype(np.intp), dofs.astype(np.intp), model.qpos0[places].copy())
+
+    def put_back(self, state: Any) -> None:
+        state.qpos[self.places], state.qvel[self.dofs] = self.at, 0.0
 
 
 def held_parts(sim: SimModel) -> list[str]:
@@ -126,13 +166,15 @@ class Plant:
         self.joints, self.n, self.dt = joints, sim.n, float(self.model.opt.timestep)
         self.dofs, self.places = self.model.jnt_dofadr[joints], self.model.jnt_qposadr[joints]
         self.bodies = self.model.jnt_bodyid[joints]
+        self.held = HeldParts.of(self.model, joints)
         self._widen_ranges()
         self.driven = self.servos.actuator >= 0
         self.controls = self.model.actuator_ctrladr[self.servos.actuator[self.driven]]
         self.gear = np.ones(sim.n)
         self.gear[self.driven] = self.model.actuator_gear[self.servos.actuator[self.driven], 0]
-        kinds = self.model.actuator_dyntype[self.servos.actuator]
-        self.pid = self.driven & (kinds == mujoco.mjtDyn.mjDYN_PID)
+        self.pid = np.zeros(sim.n, bool)
+        drives = self.servos.actuator[self.driven]
+        self.pid[self.driven] = self.model.actuator_dyntype[drives] == mujoco.mjtDyn.mjDYN_PID
         self.creep = creep_speeds(self.model, self.dofs)
         shares = self.model.body_gravcomp[self.carried()]
         self.compensated = float(shares[0]) if np.ptp(shares) < 1e-9 else 0.0
@@ -157,8 +199,6 @@ class Plant:
 
     def changed(self, point: Mapping[str, Array]) -> Any:
         """A copy of the model with parameters (J,)."""
-        import mujoco
-
         model, own = copy(self.model), self.servos
         brake = np.minimum(point["kv"], point["viscous"])
         inner = brake + point["back_emf"] + point["kd"] * point["gain"]
@@ -192,7 +232,7 @@ class Plant:
             point["feed"] != self.compensated
         ):  # gravity's torque is made for all, and each joint takes its share
             model.body_gravcomp[self.carried()] = 1.0
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        refresh(model)
         for j, dof in enumerate(self.dofs):
             if point["creep"][j] != self.creep[j]:
                 level = float(point["coulomb"][j] + point["stribeck"][j])
@@ -237,7 +277,7 @@ class Plant:
     def commands(self, piece: Piece, begin: float, steps: int, point: Mapping[str, Array], scale: float) -> Array:
         """What each servo is given at each step of a window, (steps, J) [rad]."""
         late = point["delay"] - self.servos.delay
-        edges = begin + self.dt * np.arange(steps + 1)
+        edges: Array = begin + self.dt * np.arange(steps + 1, dtype=float)
         given = piece.command(edges, late)
         most = np.where(self.pid & np.isfinite(self.servos.slew), np.inf, point["slew"]) * self.dt
         if np.isfinite(most).any():
@@ -330,13 +370,15 @@ class World:
         ctrl, qpos, places, controls, step = d.ctrl, d.qpos, plant.places, plant.controls, mujoco.mj_step
         given = self.given[:, plant.driven] * plant.gear[plant.driven]
         spring = np.where(plant.driven, 0.0, self.point["kp"] * self.point["gain"] * self.scale)
-        loose = not plant.driven.all()
+        loose, held = not plant.driven.all(), bool(plant.held.places.size)
         for k in range(self.steps):
             self.track[k] = qpos[places]
             ctrl[controls] = given[k]
             if loose:
                 d.qfrc_applied[plant.dofs] = self.applied + spring * self.given[k]
             step(model, d)
+            if held:
+                plant.held.put_back(d)
         self.track[self.steps] = qpos[places]
 
     def positions(self) -> Array:
@@ -353,12 +395,12 @@ class World:
 
         plant, data, w = self.plant, self.data, self.w
         mujoco.mj_resetData(model, d)
-        drives = plant.servos.actuator[plant.driven]
+        drives = plant.servos.actuator[plant.driven].tolist()
         if len(drives) and model.na + int(model.actuator_history[drives, 0].sum()):
             d.qpos[plant.places] = data.first[:, w]
             first = self.piece.held[0] if data.begin[w] > 0.0 else self.given[0]
             hold(model, d, drives, (first * plant.gear)[plant.driven])
-            for i, j in zip(drives.tolist(), np.flatnonzero(plant.driven).tolist(), strict=True):
+            for i, j in zip(drives, np.flatnonzero(plant.driven).tolist(), strict=True):
                 count, place = int(model.actuator_history[i, 0]), int(model.actuator_actadr[i])
                 now = self.given[0, j] * plant.gear[j]
                 if count:
@@ -387,7 +429,7 @@ def run_with_laws(plant: Plant, worlds: Sequence[World], point: Mapping[str, Arr
     import mujoco
 
     dofs, places, drives, dt = plant.dofs, plant.places, plant.servos.actuator[plant.driven], plant.dt
-    friction = bool({"stribeck", "load"} & {*laws})
+    friction, held = bool({"stribeck", "load"} & {*laws}), bool(plant.held.places.size)
     switched = [not world.served.all() for world in worlds]
     models = [copy(w.model) if friction or off else w.model for w, off in zip(worlds, switched, strict=True)]
     states = [mujoco.MjData(model) for model in models]
@@ -420,7 +462,7 @@ def run_with_laws(plant: Plant, worlds: Sequence[World], point: Mapping[str, Arr
     for k in range(longest):
         q, v, on, c = now("qpos", places), now("qvel", dofs), served[k], given[k]
         tracks[k] = q
-        for w in np.flatnonzero(switched) if k == 0 or np.any(on != served[k - 1]) else ():
+        for w in np.flatnonzero(switched).tolist() if k == 0 or np.any(on != served[k - 1]) else ():
             model, drive = models[w], on[w][plant.driven][:, None]
             model.actuator_gainprm[drives], model.actuator_biasprm[drives] = kept[w][0] * drive, kept[w][1] * drive
             dampings[w][dofs] = outer[w] + np.where(loose & on[w], inner, 0.0)
@@ -449,6 +491,8 @@ def run_with_laws(plant: Plant, worlds: Sequence[World], point: Mapping[str, Arr
             d.qfrc_applied[dofs] = push
             d.ctrl[plant.controls] = control
             mujoco.mj_step(model, d)
+            if held:
+                plant.held.put_back(d)
         if "load" in laws:
             carried = sum(now(name, dofs) for name in _READ[2:6]) - point["armature"] * now("qacc", dofs)
     tracks[longest] = now("qpos", places)

@@ -6,6 +6,7 @@ that begins afresh, as the short roll-outs of a data set do.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -72,7 +73,7 @@ class Piece:
     def served_at(self, times: Array) -> Mask:
         """Whether each joint is commanded at each time, (T, n)."""
         rows = np.searchsorted(self.ends, times + 1e-9, side="right") - 1
-        return self.served[np.clip(rows, 0, len(self.served) - 1)]
+        return np.asarray(self.served[np.clip(rows, 0, len(self.served) - 1)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,14 +150,14 @@ def pieces_of(recording: Recording) -> list[slice]:
     beside = np.zeros_like(step)
     beside[1:] = step[:-1]
     beside[:-1] = np.maximum(beside[:-1], step[1:])
-    jump = (step > STEP_RATIO * beside + STEP_RAD).any(axis=1)
+    jump = np.asarray((step > STEP_RATIO * beside + STEP_RAD).any(axis=1))
     # a single wild reading makes two steps, there and back, and ends nothing
     back = jump[1:] & jump[:-1]
     jump[1:] &= ~back
     jump[:-1] &= ~back
     ends = np.flatnonzero(gap | jump) + 1
     edges = [0, *ends.tolist(), len(t)]
-    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if t[b - 1] - t[a] >= LEAST_S]
+    return [slice(a, b) for a, b in pairwise(edges) if t[b - 1] - t[a] >= LEAST_S]
 
 
 def windows_of(
@@ -200,12 +201,12 @@ def windows_of(
 PER_SAMPLE = ("at", "measured", "weight", "v", "torque", "error", "served")
 
 
-def _padded(values: Any, longest: int, name: str) -> Array:
+def _padded(given: Any, longest: int, name: str) -> Array:
     """Values of a window with as many samples as the longest has, the last repeated without weight."""
-    values = np.asarray(values, float)
+    values: Array = np.asarray(given, float)
     if name not in PER_SAMPLE or len(values) == longest:
         return values
-    more = np.repeat(values[-1:], longest - len(values), axis=0)
+    more: Array = np.repeat(values[-1:], longest - len(values), axis=0)
     return np.concatenate([values, 0.0 * more if name == "weight" else more])
 
 
@@ -294,7 +295,7 @@ def _smoothed(t: Array, q: Array) -> tuple[Array, Array, Array]:
 
 
 def _beginning(t: Array, q: Array) -> tuple[Array, Array]:
-    """Position and velocity at the first row by a parabola through the first ones; a velocity that is not clear is 0."""
+    """Position and velocity at the first row by a parabola through the first ones; 0 for a velocity in doubt."""
     few, near = q[:BEGINNING_ROWS], t[:BEGINNING_ROWS]
     terms = np.column_stack([np.ones_like(near), near, near**2])
     inverse = np.linalg.pinv(terms)

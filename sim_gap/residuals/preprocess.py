@@ -5,6 +5,7 @@ so that the filter does not change one against the other. Signs, plays and clips
 that filter.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -255,14 +256,15 @@ class Found:
     """Share of `link` that springs across the joints have [N·m], (K, n)."""
 
 
-def require_length(recording: Recording, label: str) -> None:
-    """Raise BadInput if a recording is too short for a diagnosis."""
-    span = float(recording.t[-1] - recording.t[0]) if len(recording.t) else 0.0
-    if len(recording.t) < 4 or span < SHORTEST_S:
-        raise BadInput(
-            f"{label}: {len(recording.t)} rows over {span:.3g} s: too short for a diagnosis; "
-            f"record at least {SHORTEST_S:.0f} s"
-        )
+def require_length(recordings: Sequence[Recording], labels: Sequence[str], *, together: bool) -> None:
+    """Raise BadInput if a recording, or all `together`, is too short for a diagnosis."""
+    spans = [float(recording.t[-1] - recording.t[0]) if len(recording.t) else 0.0 for recording in recordings]
+    for recording, label, span in zip(recordings, labels, spans, strict=False):
+        if len(recording.t) < 4 or (sum(spans) if together else span) < SHORTEST_S:
+            raise BadInput(
+                f"{label}: {len(recording.t)} rows over {span:.3g} s: too short for a diagnosis; "
+                f"record at least {SHORTEST_S:.0f} s" + (", in one recording or in several" if together else "")
+            )
 
 
 def prepare(

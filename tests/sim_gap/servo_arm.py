@@ -8,10 +8,11 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.columns import with_columns
-from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
-from sim_gap.position_gap.fit import LoopFit, improve
-from sim_gap.position_gap.search import LoopSearch
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit
+from sim_gap.position_gap.parameters import PARAMETERS
+from sim_gap.position_gap.plant import Plant, nominal_point
+from sim_gap.position_gap.start import scales_of
 from sim_gap.position_gap.windows import windows_of
 
 JOINTS = ("shoulder", "elbow")
@@ -113,9 +114,15 @@ def fitted(*friction: float, weightless: bool = False) -> tuple[LoopSearch, Loop
             made = made.replace(old, new)
         return made
 
-    sim = load_model(mujoco.MjModel.from_xml_string(text(0.2)))
     made = [record(text(x), seed, 21.0) for seed, x in enumerate(friction, start=1)]
-    data = with_columns(windows_of(sim.arm, made, [f"run {k}" for k in range(len(made))]))
-    search = LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
+    search = search_on(text(0.2), made)
     names = ("kp", "coulomb", "viscous")
-    return search, improve(data, LoopFit(search.nominal, (names, names)), search.scales)
+    return search, search.improve(LoopFit(search.nominal, (names, names)))
+
+
+def search_on(text: str, recordings: Sequence[Recording], floor: float = 3e-4) -> LoopSearch:
+    """Recordings beside a model, of which effects may be chosen; with a noise `floor` [rad]."""
+    plant = Plant(load_model(mujoco.MjModel.from_xml_string(text)))
+    data = windows_of(plant, recordings, [f"run {k}" for k in range(len(recordings))])
+    point = nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()})
+    return LoopSearch(data, scales_of(data), point, np.full(data.joints, floor))

@@ -143,16 +143,16 @@ def export_fit(
     wider = widened_joints(sim)
     for j, joint in enumerate(sim.joints):
         _set_joint(spec.joints[joint], native, j, unit)
-        actuator = _set_actuator(spec, spec.joints[joint].name, native, j)
+        actuator = _set_actuator(spec, spec.joints[joint].name, search, native, j)
         if j in wider:
             write_range(spec.joints[joint], actuator, sim.arm.range[j], unit)
     for link, change in _link_changes(search, native).items():
         _set_body(spec, compiled, sim.joints[link], change)
     angles = [along(native.point, f"tilt.angle_{k}") for k in (1, 2)]
     spec.option.gravity = tilt_gravity(sim.arm.gravity, np.array(angles))
-    spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
-    spec.option.integrator = _implicit()
-    _set_friction(spec, sim, native)
+    if any(actuator.delay > 0.0 for actuator in spec.actuators):
+        spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
+    _set_friction(spec, sim, search, native)
     spec.compile()
     head = "Left out, MJCF has no field for them (the rest was fitted without them):"
     comment = xml_comment([head, *left]) if left else ""
@@ -188,12 +188,6 @@ def _shared_beside(search: LoopSearch, fit: LoopFit, held: Collection[str]) -> l
     ]
 
 
-def _implicit() -> Any:
-    import mujoco
-
-    return mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-
-
 def _set_joint(joint: Any, fit: LoopFit, j: int, unit: float) -> None:
     """Give a joint of a file what the fit has; angles of joints in the file's `unit`."""
     joint.frictionloss, joint.armature = float(fit.point["coulomb"][j]), float(fit.point["armature"][j])
@@ -204,14 +198,18 @@ def _set_joint(joint: Any, fit: LoopFit, j: int, unit: float) -> None:
         joint.springref = -unit * float(fit.point["offset"][j]) / stiffness
 
 
-def _set_friction(spec: Any, sim: SimModel, fit: LoopFit) -> None:
-    """Let the joints of a file rest under friction, or creep as fast as the fit has them: with MuJoCo's usual solver
-    parameters a joint creeps to where no friction is needed, within a tenth of a second on a small arm.
+def _set_friction(spec: Any, sim: SimModel, search: LoopSearch, fit: LoopFit) -> None:
+    """Let the joints of a file rest under friction, or creep as fast as the fit has them, where that is not as fast as
+    in the model: with MuJoCo's usual solver parameters a joint creeps to where no friction is needed, within a tenth of
+    a second on a small arm.
     """
-    made = spec.compile()
+    made, own = spec.compile(), search.data.plant.creep
     for j, number in enumerate(sim.joints):
+        if fit.point["creep"][j] == own[j]:
+            continue
         joint, weight = spec.joints[number], float(made.dof_invweight0[made.jnt_dofadr[number]])
-        values = solver_parameters(float(fit.point["coulomb"][j]), float(fit.point["creep"][j]), weight)
+        level = float(fit.point["coulomb"][j] + fit.point["stribeck"][j])
+        values = solver_parameters(level, float(fit.point["creep"][j]), weight)
         joint.solref_friction, joint.solimp_friction = values
 
 
@@ -220,34 +218,43 @@ def _of_servo(fit: LoopFit, j: int) -> float:
     return float(min(fit.point["kv"][j], fit.point["viscous"][j]))
 
 
-def _set_actuator(spec: Any, joint: str, fit: LoopFit, j: int) -> Any:
-    """One position actuator at a joint, in the place of those that it has."""
+def _set_actuator(spec: Any, joint: str, search: LoopSearch, fit: LoopFit, j: int) -> Any:
+    """One position actuator at a joint: the model's own, or a new one where there is none, several, or where only a PID
+    one holds what was found."""
     import mujoco
 
+    own = search.data.plant
     old = [a for a in spec.actuators if a.target == joint and a.trntype == mujoco.mjtTrn.mjTRN_JOINT]
-    name = old[0].name if old else f"position_{joint}"
-    control = list(old[0].ctrlrange) if old and old[0].ctrlrange[0] < old[0].ctrlrange[1] else None
-    for actuator in old:
-        spec.delete(actuator)
-    made = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     kp, ki = (float(fit.point[name][j] * fit.point["gain"][j]) for name in ("kp", "ki"))
     slew, kv = float(fit.point["slew"][j]), float(fit.point["back_emf"][j]) + _of_servo(fit, j)
-    if ki > 0.0 or np.isfinite(slew):
-        made.set_to_pid(
-            kp=kp,
-            kv=kv,
-            ctrlspec=POSITION_INPUT,
-            **({"ki": ki} if ki > 0.0 else {}),
-            **({"slewmax": slew} if np.isfinite(slew) else {}),
-        )
+    limit, delay = float(fit.point["limit"][j] * fit.point["gain"][j]), float(fit.point["delay"][j])
+    pid = ki > 0.0 or bool(np.isfinite(slew))
+    if len(old) == 1 and own.driven[j] and not pid and not own.pid[j]:
+        made, gear = old[0], float(own.gear[j])
+        made.gainprm[0], made.biasprm[1], made.biasprm[2] = kp / gear**2, -kp / gear**2, -kv / gear**2
+        limit /= abs(gear)
     else:
-        made.set_to_position(kp=kp, kv=kv)
-    limit = float(fit.point["limit"][j])
-    if np.isfinite(limit):
+        name = old[0].name if old else f"position_{joint}"
+        control = list(old[0].ctrlrange) if old and old[0].ctrlrange[0] < old[0].ctrlrange[1] else None
+        for actuator in old:
+            spec.delete(actuator)
+        made = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        if pid:
+            made.set_to_pid(
+                kp=kp,
+                kv=kv,
+                ctrlspec=POSITION_INPUT,
+                **({"ki": ki} if ki > 0.0 else {}),
+                **({"slewmax": slew} if np.isfinite(slew) else {}),
+            )
+        else:
+            made.set_to_position(kp=kp, kv=kv)
+        if control is not None:
+            made.ctrllimited, made.ctrlrange = 1, control
+    if np.isfinite(limit) and limit != own.servos.limit[j]:
         made.forcelimited, made.forcerange = 1, [-limit, limit]
-    if control is not None:
-        made.ctrllimited, made.ctrlrange = 1, control
-    put_delay(made, float(fit.point["delay"][j]))
+    if delay != own.servos.delay[j] or made not in old:
+        put_delay(made, delay)
     return made
 
 

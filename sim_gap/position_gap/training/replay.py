@@ -13,7 +13,7 @@ from sim_gap.better_model.forward_effects import Effects
 from sim_gap.better_model.native_drives import hold
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.choice import Group, LoopSearch, without_group
-from sim_gap.position_gap.plant import held_model, silent
+from sim_gap.position_gap.plant import HeldParts, held_model, silent
 from sim_gap.position_gap.training.export import Exported, export_beside_module
 from sim_gap.position_gap.windows import LEAST_S, pieces_of
 from sim_gap.position_gap.windows import SHORT_S as SHORT_PIECE_S
@@ -94,7 +94,7 @@ def _replay(arm: Simulated, recording: Recording) -> Array:
     drives = [actuator_of(model, joint) for joint in joints]
     hold(model, data, drives, given[0])
     controls = model.actuator_ctrladr[drives]
-    dt = float(model.opt.timestep)
+    dt, held = float(model.opt.timestep), HeldParts.of(model, joints)
     times, out = recording.t, np.empty((rows, len(joints)))
     at = 0
     mujoco.set_mjcb_passive(None if arm.effects is None else arm.effects.passive)
@@ -107,6 +107,8 @@ def _replay(arm: Simulated, recording: Recording) -> Array:
                     at += 1
                 data.ctrl[controls] = given[at]
                 mujoco.mj_step(model, data)
+                if held.places.size:
+                    held.put_back(data)
     finally:
         mujoco.set_mjcb_passive(None)
         if arm.effects is not None:
