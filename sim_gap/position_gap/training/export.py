@@ -33,6 +33,8 @@ from sim_gap.position_gap.parameters import EFFECTS
 
 BEYOND = 0.02
 """Distance beyond the end of its range from which a joint of the model would have to go on [rad]; stops are soft."""
+FELT_NM, ALIKE = 1e-3, 0.03
+"""Torque from which a joint feels gravity [N·m], and difference of two joints' shares of it that are taken for one."""
 BESIDE = 0.01
 """Room beside the positions and commands that were seen [rad]."""
 
@@ -112,16 +114,30 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
                 bare = without_effect(search, bare, effect, j)
     for effect in _shared_beside(search, fit, held):
         bare = without_group(search, bare, (effect, ()))
-    bare = bare.with_values(kd=np.zeros(search.data.joints), feed=np.zeros(search.data.joints))
+    share = compensation(search, fit)
+    if share is None:
+        share = np.full(search.data.joints, search.data.plant.compensated)
+    bare = bare.with_values(kd=np.zeros(search.data.joints), feed=share)
     loaded = fit.point["load"] * np.abs(search.data.torque).mean(axis=(0, 2))
     dry = fit.point["stribeck"] * ("friction.stribeck" not in held) + loaded * ("friction.load" not in held)
     bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
     wanted = [(*own, *(n for n in ("coulomb", "viscous") if n not in own)) for own in bare.active]
     changed = (bare.active, bare.shared) != (fit.active, fit.shared)
-    changed = changed or any(np.any(fit.point[n] != 0.0) for n in ("kd", "feed"))
+    changed = changed or bool(np.any(fit.point["kd"] != 0.0) or np.any(fit.point["feed"] != share))
     if not changed:
         return fit
     return search.improve(replace(bare, active=tuple(wanted), rms=None))
+
+
+def compensation(search: LoopSearch, fit: LoopFit) -> Array | None:
+    """Share of gravity that the controller makes up for, the same at all joints that feel it, (J,); None if it differs,
+    which no body's `gravcomp` holds."""
+    arm, share = search.data.plant.sim.arm, fit.point["feed"]
+    q = search.data.first.T
+    feels = np.abs(arm.torque(q, 0.0 * q, 0.0 * q)).max(0) > FELT_NM
+    if not feels.any() or np.ptp(share[feels]) > ALIKE:
+        return None
+    return np.full(search.data.joints, float(share[feels].mean()))
 
 
 def export_fit(
@@ -136,6 +152,7 @@ def export_fit(
             for effect in EFFECTS
             for j in range(sim.n)
             if effect not in held and effect_there(fit, effect, j)
+            if effect != "controller.feed_forward" or compensation(search, fit) is None
         }
     )
     compiled = spec.compile()
@@ -152,6 +169,9 @@ def export_fit(
     spec.option.gravity = tilt_gravity(sim.arm.gravity, np.array(angles))
     if any(actuator.delay > 0.0 for actuator in spec.actuators):
         spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
+    if (share := float(native.point["feed"][0])) != search.data.plant.compensated:
+        for body in search.data.plant.carried():
+            spec.bodies[body].gravcomp = share
     _set_friction(spec, sim, search, native)
     spec.compile()
     head = "Left out, MJCF has no field for them (the rest was fitted without them):"
@@ -229,7 +249,8 @@ def _set_actuator(spec: Any, joint: str, search: LoopSearch, fit: LoopFit, j: in
     slew, kv = float(fit.point["slew"][j]), float(fit.point["back_emf"][j]) + _of_servo(fit, j)
     limit, delay = float(fit.point["limit"][j] * fit.point["gain"][j]), float(fit.point["delay"][j])
     pid = ki > 0.0 or bool(np.isfinite(slew))
-    if len(old) == 1 and own.driven[j] and not pid and not own.pid[j]:
+    kept = len(old) == 1 and bool(own.driven[j]) and not pid and not bool(own.pid[j])
+    if kept:
         made, gear = old[0], float(own.gear[j])
         made.gainprm[0], made.biasprm[1], made.biasprm[2] = kp / gear**2, -kp / gear**2, -kv / gear**2
         limit /= abs(gear)
@@ -251,9 +272,9 @@ def _set_actuator(spec: Any, joint: str, search: LoopSearch, fit: LoopFit, j: in
             made.set_to_position(kp=kp, kv=kv)
         if control is not None:
             made.ctrllimited, made.ctrlrange = 1, control
-    if np.isfinite(limit) and limit != own.servos.limit[j]:
+    if np.isfinite(limit) and not (kept and fit.point["limit"][j] == own.servos.limit[j]):
         made.forcelimited, made.forcerange = 1, [-limit, limit]
-    if delay != own.servos.delay[j] or made not in old:
+    if not kept or delay != own.servos.delay[j]:
         put_delay(made, delay)
     return made
 

@@ -2,21 +2,17 @@
 
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 import pytest
-from servo_arm import model_text, record
+from servo_arm import model_text, record, search_on
 
-from sim_gap.model.load import load_model
-from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
-from sim_gap.position_gap.fit import LoopFit, improve
-from sim_gap.position_gap.search import LoopSearch
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit
 from sim_gap.position_gap.training import bands, unreached_limits
 from sim_gap.position_gap.training.bands import band
 from sim_gap.position_gap.training.draws import draw
-from sim_gap.position_gap.training.jackknife import leave_out
-from sim_gap.position_gap.training.spread import covariance, interval, vague_limits
-from sim_gap.position_gap.windows import windows_of
+from sim_gap.position_gap.training.jackknife import gaps_left_out, terms_of
+from sim_gap.position_gap.training.spread import covariance, known_before
 
 GAIN, FASTER = 15.0, 2.0
 TEXT = model_text(kp=GAIN, friction=0.2)
@@ -25,10 +21,13 @@ FOUND = ("kp", "coulomb", "viscous")
 
 def of(text: str) -> tuple[LoopSearch, LoopFit]:
     """Search and fit of a training recording of the arm without limits."""
-    sim = load_model(mujoco.MjModel.from_xml_string(text))
-    data = windows_of(sim.arm, [record(TEXT, 1, 14.0)], ["run"])
-    search = LoopSearch(data, scales_of(data), nominal_point(data, nominal_controller(sim)), np.full(2, 3e-4))
-    return search, improve(data, LoopFit(search.nominal, (FOUND, FOUND)), search.scales)
+    search = search_on(text, [record(TEXT, 1, 14.0)])
+    return search, search.improve(LoopFit(search.nominal, (FOUND, FOUND)))
+
+
+def left_out(search: LoopSearch, fit: LoopFit) -> np.ndarray:
+    terms = terms_of(search, fit)
+    return gaps_left_out(search.data, terms, known_before(search, fit, terms.names))
 
 
 @pytest.fixture(scope="module")
@@ -38,20 +37,11 @@ def arm() -> tuple[LoopSearch, LoopFit]:
 
 def test_the_least_limit_is_what_the_training_motion_asks_for(arm) -> None:
     search, fit = arm
-    torque = np.abs(GAIN * (search.data.command - search.data.recorded))[search.data.warm :].max(axis=(0, 2))
+    torque = np.abs(GAIN * search.data.error).max(axis=(0, 2))
     found = {(each.joint, each.name): each.least for each in unreached_limits.find_unreached(search, fit)}
     assert found.keys() == {(j, name) for j in (0, 1) for name in ("limit", "slew")}
     for j in (0, 1):
         assert 0.8 < found[j, "limit"] / torque[j] < 1.05
-
-
-def test_the_least_limit_is_where_the_score_falls_by_what_contradicts_it(arm) -> None:
-    search, fit = arm
-    for each in unreached_limits.find_unreached(search, fit):
-        lost = unreached_limits._losses(search, fit, each.name, np.array([[0.98], [1.0]]) * each.least * np.ones(2))[
-            :, each.joint
-        ]
-        assert lost[1] < unreached_limits.COSTS < lost[0]
 
 
 def test_draws_go_from_there_to_ten_times_as_much(arm) -> None:
@@ -76,17 +66,19 @@ def test_a_limit_that_is_stated_fitted_or_left_out_is_not_drawn(arm) -> None:
         (1, "slew"),
     }
     fitted = fit.with_values(slew=np.array([np.inf, 3.0]))
-    left_out = replace(search, excluded=frozenset({"actuator.saturation"}))
-    assert {(x.joint, x.name) for x in unreached_limits.find_unreached(left_out, fitted)} == {(0, "slew")}
+    withheld = replace(search, excluded=frozenset({"actuator.saturation"}))
+    assert {(x.joint, x.name) for x in unreached_limits.find_unreached(withheld, fitted)} == {(0, "slew")}
 
 
 def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> None:
     search, fit = arm
     spread = replace(covariance(search, fit), limits=unreached_limits.find_unreached(search, fit))
     data = search.data
-    faster = windows_of(data.arm, [record(TEXT, 2, 14.0)], ["other"], data.dt)
-    faster = replace(faster, command=FASTER * faster.command, measured=FASTER * faster.measured)
-    others = leave_out(search, fit)
+    wider = record(TEXT, 2, 14.0)
+    assert wider.position_command is not None
+    wider = replace(wider, position=FASTER * wider.position, position_command=FASTER * wider.position_command)
+    faster = search_on(TEXT, [wider]).data
+    others = left_out(search, fit)
     for heldout, widened in ((data, False), (faster, True)):
         without, within = (
             band(search, fit, replace(spread, limits=x), others, heldout).width for x in ((), spread.limits)
@@ -100,11 +92,11 @@ def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> Non
 def test_the_band_holds_motion_beyond_the_training_whatever_the_limit_is(arm, over) -> None:
     search, fit = arm
     data = search.data
-    torque = np.abs(GAIN * (data.command - data.recorded)).max(axis=(0, 2))
+    torque = np.abs(GAIN * data.error).max(axis=(0, 2))
     real = model_text(kp=GAIN, friction=0.2, limits=over * torque if np.isfinite(over) else ())
-    other = windows_of(data.arm, [record(real, 3, 14.0, wide=1.5, fast=1.7)], ["other"], data.dt)
+    other = search_on(TEXT, [record(real, 3, 14.0, wide=1.5, fast=1.7)]).data
     spread = covariance(search, fit)
-    others = leave_out(search, fit)
+    others = left_out(search, fit)
     known, open_ = (
         band(search, fit, replace(spread, limits=x), others, other)
         for x in ((), unreached_limits.find_unreached(search, fit))
@@ -120,24 +112,3 @@ def test_the_band_about_two_simulations_holds_its_share_with_either(apart: float
     gaps = np.random.default_rng(4).normal(size=200_000)
     about = np.array([[0.0] * 50, [apart] * 50])
     assert 1.645 * bands._narrower(gaps, about, 1.645) == pytest.approx(factor, abs=0.04)
-
-
-def test_a_fitted_limit_that_no_motion_reaches_lies_anywhere_above_what_was_asked_for(arm) -> None:
-    search, fit = arm
-    least = next(
-        each.least for each in unreached_limits.find_unreached(search, fit) if (each.joint, each.name) == (1, "limit")
-    )
-    far = fit.with_values(limit=np.array([np.inf, 3.0 * least]))
-    limited = replace(far, active=(FOUND, (*FOUND, "limit")))
-    spread = covariance(search, limited)
-    assert vague_limits(spread) == [(1, "limit")]
-    told = replace(spread, limits=unreached_limits.find_unreached(search, limited, vague_limits(spread)))
-    value, low, high, _ = interval(search, limited, told, 1, "limit")
-    assert (value, low) == (pytest.approx(3.0 * least), pytest.approx(least))
-    assert 8.0 * least < high < 12.0 * least
-    drawn = np.array([row["elbow.limit"] for row in draw(search, limited, told, 500)])
-    assert 0.7 * least < drawn.min() < 1.2 * least
-    assert 5.0 * least < drawn.max() < 13.0 * least
-    near = fit.with_values(limit=np.array([np.inf, 0.7 * least]))
-    reached = covariance(search, replace(near, active=(FOUND, (*FOUND, "limit"))))
-    assert vague_limits(reached) == []

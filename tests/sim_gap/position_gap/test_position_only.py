@@ -18,8 +18,9 @@ from sim_gap.attribution.position_notes import _beyond, _faster, _released
 from sim_gap.position_gap.identify import gain_scales
 from sim_gap.position_gap.training.bands import band
 from sim_gap.position_gap.training.export import export_with_module
-from sim_gap.position_gap.training.jackknife import leave_out
+from sim_gap.position_gap.training.jackknife import gaps_left_out, terms_of
 from sim_gap.position_gap.training.replay import Simulated, replay_rms
+from sim_gap.position_gap.training.spread import known_before
 from sim_gap.position_gap.training.training_files import (
     batch_path,
     export_batched,
@@ -61,13 +62,14 @@ def test_a_gap_that_matters_nowhere_is_none() -> None:
         *gaps: float,
         sound: SimpleNamespace | None = None,
         moved: tuple[Sequence[float], Sequence[float]] | None = None,
+        left: float | None = None,
     ) -> str:
         gap, search = np.array(gaps), SimpleNamespace(open_controller=sound is None)
-        found = SimpleNamespace(margin=np.full(2, 1e-4), sound=sound, own=None, search=search, train_before=gap)
-        if moved is not None:
-            found.own, found.moved_before = SimpleNamespace(gaps=np.array(moved[:1])), np.array(moved[1])
-        found.heldout_before, found.heldout_after = gap, 0.1 * gap
-        return _verdict(found, [SimpleNamespace(confounded_with=(), confidence=0.75)], 0.01)
+        found = SimpleNamespace(margin=np.full(2, 1e-4), sound=sound, search=search, train_before=gap)
+        found.moved_train, found.moved_before = np.array(moved if moved is not None else np.full((2, 2), np.nan))
+        found.heldout_before, found.heldout_after, found.train_after = gap, 0.1 * gap, (left or 0.1) * gap
+        causes = [SimpleNamespace(confounded_with=(), confidence=0.75)] if left is None else []
+        return _verdict(found, causes, 0.01 if left is None else 1.0)
 
     assert verdict(0.00009, 0.00008) == "no_gap"
     assert verdict(0.0010, 0.0018) == "explained"
@@ -77,6 +79,9 @@ def test_a_gap_that_matters_nowhere_is_none() -> None:
     assert verdict(0.0010, 0.0018, moved=([5e-5, 9e-5], [8e-5, 2e-4])) == "explained"
     assert verdict(0.0010, 0.0018, moved=([5e-5, 2e-4], [8e-5, 7e-5])) == "explained"
     assert verdict(0.0010, 0.0018, moved=([5e-5, 9e-5], [np.nan, np.nan])) == "explained"
+    assert verdict(0.00015, 0.00018, left=1.0) == "no_gap"
+    assert verdict(0.00015, 0.00018, moved=([0.02, 9e-5], [8e-5, 7e-5]), left=1.0) == "unexplained"
+    assert verdict(0.0010, 0.0018, left=1.0) == "unexplained"
 
 
 def test_what_lowers_a_gap_that_is_none_is_no_cause() -> None:
@@ -104,7 +109,7 @@ def test_joints_that_go_further_than_in_training_are_noted() -> None:
 def test_joints_that_go_faster_than_in_training_are_noted() -> None:
     slow, fast = np.linspace(-0.2, 0.2, 50), np.linspace(-1.5, 1.5, 50)
     fitted, other = (
-        SimpleNamespace(v=np.stack(columns, axis=1)[..., None], weight=np.ones((50, 2, 1)), warm=0, stride=1)
+        SimpleNamespace(v=np.stack(columns, axis=1)[..., None], weight=np.ones((50, 2, 1)))
         for columns in ((slow, fast), (fast, slow))
     )
     arm = SimpleNamespace(names=("shoulder", "elbow"))
@@ -219,8 +224,9 @@ def test_the_band_holds_its_share_of_other_motion(answer) -> None:
     assert told["share"] == 0.9
     assert all(0.8 < share <= 0.98 for share in told["holds"])
     found = answer.internals
-    others = leave_out(found.search, found.fit)
-    known = band(found.search, found.fit, replace(found.spread, limits=()), others, found.heldout)
+    terms = terms_of(found.search, found.fit)
+    left = gaps_left_out(found.search.data, terms, known_before(found.search, found.fit, terms.names))
+    known = band(found.search, found.fit, replace(found.spread, limits=()), left, found.heldout)
     assert ((known.width > 0.0) & (known.width < 0.03 * answer.heldout_before)).all()
     assert all(1.0 < width / own < 25.0 for width, own in zip(told["half_width"], known.width, strict=True))
 

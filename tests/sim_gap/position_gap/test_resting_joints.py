@@ -6,15 +6,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from servo_arm import model_text, record, written
+from servo_arm import model_text, record, search_on, written
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.columns import with_columns
-from sim_gap.position_gap.controller import nominal_controller, nominal_point, rests, scales_of, starting_fit
-from sim_gap.position_gap.search import LoopSearch
+from sim_gap.position_gap.plant import Plant
+from sim_gap.position_gap.start import HOLDS_HZ, rests, starting_fit
 from sim_gap.position_gap.windows import windows_of
 
 GAIN, MODEL_GAIN = 15.0, 120.0
@@ -58,9 +57,9 @@ def test_a_joint_rests_by_its_command_and_one_without_a_command_does_not() -> No
     whole = record(text, 1, 14.0)
     held, loose = still(whole), still(whole)
     loose.position_command[:, 1] = np.nan
-    arm = load_model(mujoco.MjModel.from_xml_string(text)).arm
+    plant = Plant(load_model(mujoco.MjModel.from_xml_string(text)))
     for recording, expected in ((whole, False), (held, True), (loose, False)):
-        assert rests(windows_of(arm, [recording], ["run"])).tolist() == [False, expected]
+        assert rests(windows_of(plant, [recording], ["run"])).tolist() == [False, expected]
 
 
 @pytest.mark.long
@@ -83,16 +82,13 @@ def test_a_model_without_servos_gets_one_that_holds_the_resting_joint_and_moves_
     """A gripper that stays open in all episodes had 1.8 MN·m/rad, with which the written model shook its arm."""
     text = model_text(kp=GAIN, friction=0.15)
     bare = text[: text.index("<actuator>")] + "</mujoco>"
-    sim = load_model(mujoco.MjModel.from_xml_string(bare.replace('frictionloss="0.15"', "")))
-    data = with_columns(windows_of(sim.arm, [still(record(text, 1, 18.0))], ["run"]))
-    own = nominal_controller(sim)
-    excluded = frozenset({"actuator.back_emf"})
-    search = LoopSearch(data, scales_of(data), nominal_point(data, own), np.full(2, 3e-4), excluded)
-    search, fit, _ = starting_fit(search, own, lambda text: None)
+    search = search_on(bare.replace('frictionloss="0.15"', ""), [still(record(text, 1, 18.0))])
+    search = replace(search, excluded=frozenset({"actuator.back_emf"}))
+    search, fit = starting_fit(search, search.data.plant.servos, lambda text: None)
     assert search.resting == {1}
     assert search.open_controller
     assert fit.active[1] == ()
     inertia = search.scales.inertia[1]
-    assert 5.0 <= np.sqrt(fit.point["kp"][1] / inertia) / (2.0 * np.pi) <= 30.001
+    assert np.sqrt(fit.point["kp"][1] / inertia) / (2.0 * np.pi) == pytest.approx(HOLDS_HZ)
     assert fit.point["viscous"][1] == pytest.approx(2.0 * np.sqrt(fit.point["kp"][1] * inertia))
     assert fit.point["kp"][0] == pytest.approx(GAIN, rel=0.1)

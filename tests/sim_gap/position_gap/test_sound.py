@@ -1,52 +1,42 @@
-import mujoco
-import numpy as np
-import pytest
-from servo_arm import model_text, record
+from dataclasses import replace
 
-from sim_gap.model.load import load_model
-from sim_gap.position_gap.columns import with_columns
-from sim_gap.position_gap.controller import nominal_controller, nominal_point, scales_of
+import numpy as np
+from servo_arm import model_text, record, search_on
+
 from sim_gap.position_gap.fit import LoopFit, evaluate
-from sim_gap.position_gap.identify import _margin, noise_floor
+from sim_gap.position_gap.identify import _margin
 from sim_gap.position_gap.judge import rms_on
-from sim_gap.position_gap.search import LoopSearch
 from sim_gap.position_gap.sound_arm import probable, split_gap
-from sim_gap.position_gap.windows import windows_of
+from sim_gap.position_gap.start import noise_floor
 
 NOMINAL = model_text(kp=40.0, friction=0.05)
 
 
-@pytest.fixture(scope="module")
-def model():
-    return load_model(mujoco.MjModel.from_xml_string(NOMINAL), (), 2)
-
-
-def split(model, real: str):
+def split(real: str):
     """The gap of the nominal model against an arm, split, with its margin and the RMS that it has [rad]."""
-    train, heldout = (with_columns(windows_of(model.arm, [record(real, seed, 26.0)], ["run"])) for seed in (1, 2))
-    nominal = nominal_point(train, nominal_controller(model))
-    search = LoopSearch(train, scales_of(train), nominal, noise_floor(train))
-    fit = evaluate(train, LoopFit(nominal, ((),) * 2))
+    search, other = (search_on(NOMINAL, [record(real, seed, 26.0)]) for seed in (1, 2))
+    search = replace(search, floor=noise_floor(search.data))
+    fit = evaluate(search.data, LoopFit(search.nominal, ((),) * 2))
     margin = _margin(search, fit)
-    return split_gap(search, heldout, margin), margin, rms_on(train, fit)
+    return split_gap(search, other.data, margin), margin, rms_on(search.data, fit)
 
 
-def test_errors_of_a_hundredth_are_those_of_a_sound_arm(model) -> None:
-    found, margin, gap = split(model, model_text(kp=40.4, friction=0.06, damping=0.808))
+def test_errors_of_a_hundredth_are_those_of_a_sound_arm() -> None:
+    found, margin, gap = split(model_text(kp=40.4, friction=0.06, damping=0.808))
     assert found.explained
     assert (gap < 3.0 * np.maximum(found.usual, margin)).all()
     assert (found.left < 1.3 * margin).all()
 
 
-def test_a_tilt_is_no_error_of_a_sound_arm(model) -> None:
+def test_a_tilt_is_no_error_of_a_sound_arm() -> None:
     """It acts where other poses feel gravity least, as no gain or mass does."""
-    found, margin, _ = split(model, NOMINAL.replace("<option", '<option gravity="2.43 0 -9.5"'))
+    found, margin, _ = split(NOMINAL.replace("<option", '<option gravity="2.43 0 -9.5"'))
     assert not found.explained
     assert (found.left > margin).any()
 
 
-def test_a_gain_that_is_far_off_is_no_error_of_a_sound_arm(model) -> None:
-    found, _, _ = split(model, model_text(kp=36.0, friction=0.05))
+def test_a_gain_that_is_far_off_is_no_error_of_a_sound_arm() -> None:
+    found, _, _ = split(model_text(kp=36.0, friction=0.05))
     assert not found.explained
 
 

@@ -7,11 +7,11 @@ import pytest
 from servo_arm import JOINTS, fitted
 
 from sim_gap.position_gap import sound_arm
-from sim_gap.position_gap.fit import LoopFit, batch, improve, residuals
-from sim_gap.position_gap.search import LoopSearch
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit, batch, residuals
 from sim_gap.position_gap.training import spread
 from sim_gap.position_gap.training.draws import draw
-from sim_gap.position_gap.training.jackknife import Terms, jackknifed
+from sim_gap.position_gap.training.jackknife import Terms, jackknifed, terms_of
 from sim_gap.position_gap.training.spread import Covariance, covariance, covariance_within, interval
 
 FRICTION = 0.15, 0.35
@@ -27,6 +27,10 @@ def weightless() -> tuple[LoopSearch, LoopFit]:
     return fitted(0.2, 0.2, weightless=True)
 
 
+def within(search: LoopSearch, fit: LoopFit) -> Covariance:
+    return covariance_within(search, fit, terms_of(search, fit))
+
+
 def deviations(found: Covariance, name: str) -> np.ndarray:
     return np.array([np.sqrt(found.matrix[k, k]) for k in (found.names.index((j, name)) for j in (0, 1))])
 
@@ -38,14 +42,14 @@ def test_an_interval_holds_what_other_recordings_of_the_arm_show(several) -> Non
         _, low, high, _ = interval(search, fit, covariance(search, fit), joint, "coulomb")
         assert low < FRICTION[0]
         assert FRICTION[1] < high
-        _, own_low, own_high, _ = interval(search, fit, covariance_within(search, fit), joint, "coulomb")
+        _, own_low, own_high, _ = interval(search, fit, within(search, fit), joint, "coulomb")
         assert FRICTION[0] < own_low
         assert own_high < FRICTION[1]
 
 
 def test_recordings_that_agree_leave_the_interval_nearly_as_it_is() -> None:
     search, fit = fitted(0.2, 0.2, 0.2, 0.2)
-    wide, own = covariance(search, fit), covariance_within(search, fit)
+    wide, own = covariance(search, fit), within(search, fit)
     for name in ("kp", "viscous"):
         assert (deviations(wide, name) < 2.0 * deviations(own, name)).all()
 
@@ -53,7 +57,7 @@ def test_recordings_that_agree_leave_the_interval_nearly_as_it_is() -> None:
 def test_the_jackknife_is_that_of_the_text_books() -> None:
     """Of a mean of G values it is their variance over G."""
     values = np.array([0.15, 0.35, 0.2, 0.5])
-    terms = Terms([(0, "coulomb")], np.ones((4, 1, 1)), (0.3 - values)[:, None])
+    terms = Terms([(0, "coulomb")], np.ones((4, 1, 1)), (0.3 - values)[:, None], np.zeros(0), [])
     found = jackknifed(terms, np.zeros(1), np.arange(4))
     assert found[0, 0] == pytest.approx(values.var(ddof=1) / 4.0)
 
@@ -73,9 +77,9 @@ def test_of_an_arm_that_feels_no_weight_ratios_are_told_better_than_their_scale(
 
 
 def test_a_gain_that_may_be_half_as_large_again_has_no_scale(weightless) -> None:
-    search, fit = weightless
+    _, fit = weightless
     found = Covariance([(0, "kp"), (1, "kp")], np.diag([0.5**2, 0.2**2]))
-    assert spread.undecided_scale(search, fit, found) == [0]
+    assert spread.undecided_scale(fit, found) == [0]
 
 
 def test_draws_of_an_undecided_scale_move_the_arm_as_the_fit_does(weightless) -> None:
@@ -123,7 +127,7 @@ def test_a_value_that_the_model_states_is_open_where_a_gain_rests_on_it(weightle
     some = replace(fit, active=(("kp", "coulomb"), ("kp", "coulomb")))
     found = covariance(search, some)
     assert (0, "viscous") in found.names
-    assert (deviations(found, "kp") > 3.0 * deviations(covariance_within(search, some), "kp")).all()
+    assert (deviations(found, "kp") > 3.0 * deviations(within(search, some), "kp")).all()
 
 
 def test_of_a_payload_the_centre_is_told_and_not_the_moment() -> None:
@@ -143,7 +147,7 @@ def test_a_payload_is_no_surer_than_the_masses_of_the_model(several) -> None:
     point = {**fit.point, **{name: np.zeros(2) for name in names}}
     found = covariance(search, replace(fit, point=point, shared=names))
     assert [name for j, name in found.names if j < 0] == list(names)
-    own = float(np.linalg.norm(search.data.arm.inertial[-1, 1:4]))
+    own = float(np.linalg.norm(search.data.plant.sim.arm.inertial[-1, 1:4]))
     at = found.names.index((-1, "payload.x"))
     assert np.sqrt(found.matrix[at, at]) > 0.9 * sound_arm.ERROR * own
 
@@ -152,9 +156,9 @@ def test_what_a_sound_arm_may_have_beside_an_effect_widens_its_interval(several)
     """Friction alone is fitted to an arm whose gain is 3 % off: what the gain takes up is open."""
     search, fit = several
     stiffer = replace(fit, point={**fit.point, "kp": 1.03 * fit.point["kp"]}, active=(("coulomb",), ("coulomb",)))
-    some = improve(search.data, stiffer, search.scales)
+    some = search.improve(stiffer)
     for joint in (0, 1):
-        wide, own = (spread_of(search, some) for spread_of in (covariance, covariance_within))
+        wide, own = covariance(search, some), within(search, some)
         assert deviations(wide, "coulomb")[joint] > deviations(own, "coulomb")[joint]
         _, low, high, _ = interval(search, some, wide, joint, "coulomb")
         assert low < float(fit.point["coulomb"][joint]) < high
