@@ -113,7 +113,7 @@ def main() -> None:
     assert isinstance(found, Identified)
     assert found.export is not None
     model = mujoco.MjModel.from_xml_string((export_batched(found) or found.export).xml)
-    recording = slice_rows(found.recordings[0], commanded_rows(found.recordings[0]))
+    recording = slice_rows(found.recordings[0], commanded_rows(found.recordings[0])[0])
     t, ours, measured = replay(Simulated(model, found.sim.joints), recording)
     rows = int(np.searchsorted(t, t[0] + given.seconds))
     started = time.process_time()

@@ -4,8 +4,7 @@
 
 mujoco.sysid gets gain, friction loss, damping and armature of every joint with bounds, windows of the training
 recordings, and friction that rests as that of a gear does. Both models then run free along the commands of the held-out
-recordings; if the arm touches something there, the gap is printed without those moments, too. `--written` is the model
-of an earlier diagnosis of the same recordings (`--out-model`), which is not repeated then. Exit status 1 if the
+recordings. `--written` is the model of an earlier diagnosis of the same recordings (`--out-model`), which is not repeated then. Exit status 1 if the
 diagnosis leaves more than mujoco.sysid over all joints, or more than 0.4 of the nominal model's gap.
 """
 
@@ -24,7 +23,6 @@ from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.surface import find_surface, rows_of_touch
 from sim_gap.position_gap.training.replay import Simulated, replay_rms
 
 WINDOW_S, STEP_S = 6.0, 0.004
@@ -125,13 +123,6 @@ def main() -> int:
         name: replay_rms(Simulated(model, joints), heldout)
         for name, model in (("diagnosis", ours), ("mujoco.sysid", theirs))
     }
-    surface = find_surface(nominal.arm, [*train, *heldout])
-    apart = [rows_of_touch(surface, nominal.arm, recording) for recording in heldout]
-    if surface is not None:
-        print(f"while the arm presses on nothing ({1.0 - np.concatenate(apart).mean():.0%} of the rows):")
-        for name, model in (("nominal", nominal.mujoco_model), ("diagnosis", ours), ("mujoco.sysid", theirs)):
-            gap = replay_rms(Simulated(model, joints), heldout, apart=apart)
-            print(f"  {name:13s} {' '.join(f'{x:.4f}' for x in gap)} rad, all joints {np.sqrt(np.mean(gap**2)):.4f}")
     whole = {name: float(np.sqrt(np.mean(gap**2))) for name, gap in gaps.items()}
     for name, gap in gaps.items():
         print(f"{name:13s} {' '.join(f'{x:.4f}' for x in gap)} rad, all joints {whole[name]:.4f}")
