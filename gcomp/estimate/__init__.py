@@ -1,5 +1,5 @@
 """Estimation: parameters with priors, robust fits, choice of effects by held-out likelihood, intervals.
 
-Arrays in, values out. A `Problem` says what parameters leave of measurements; rows belong to channels, such as the
-joints of an arm, and to blocks, such as recordings, that can be held out.
+Arrays in, values out. An `EstimationProblem` says what parameters leave of measurements; rows belong to channels, such
+as the joints of an arm, and to blocks, such as recordings, that can be held out.
 """

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gcomp.arrays import Array
-from gcomp.estimate.problem import Index, Linearised, Problem
+from gcomp.estimate.problem import EstimationProblem, Index, Linearised
 from gcomp.estimate.solve import precision, robust_weight, scale_of
 
 PRICE = 4.0
@@ -30,7 +30,7 @@ class Effect:
 
 
 @dataclass(frozen=True, eq=False)
-class Terms:
+class LinearTerms:
     """Normal equations of a problem about a point, of each channel c and fold f."""
 
     theta: Array
@@ -105,7 +105,7 @@ class Terms:
         return self._found[key][1]
 
 
-def terms_of(problem: Problem, about: Linearised, folds: Index) -> Terms:
+def terms_of(problem: EstimationProblem, about: Linearised, folds: Index) -> LinearTerms:
     """Normal equations about a point; `folds` is the fold of each block."""
     fold, count = folds[problem.block], int(folds.max()) + 1
     variance = scale_of(problem, about.residual)
@@ -118,7 +118,7 @@ def terms_of(problem: Problem, about: Linearised, folds: Index) -> Terms:
     own = weight * about.residual**2
     totals, counts = (np.stack([y[:, m].sum(1) for m in members], axis=1) for y in (own, problem.weight))
     away = np.where(np.isfinite(problem.nominal), problem.nominal - about.theta, np.nan)
-    return Terms(
+    return LinearTerms(
         about.theta,
         about.acting,
         tuple(squares),
@@ -133,7 +133,7 @@ def terms_of(problem: Problem, about: Linearised, folds: Index) -> Terms:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class HeldOutEvidence:
     """How much better one set of effects predicts held-out rows than another."""
 
     fall: float
@@ -142,10 +142,10 @@ class Evidence:
     """Its standard error over the folds."""
 
 
-def evidence(terms: Terms, less: Iterable[int], more: Iterable[int]) -> Evidence:
+def evidence(terms: LinearTerms, less: Iterable[int], more: Iterable[int]) -> HeldOutEvidence:
     each = (terms.costs(less) - terms.costs(more)).sum(0)
     fall = float((terms.cost(less) - terms.cost(more)).sum())
-    return Evidence(fall, float(each.std(ddof=1) * np.sqrt(len(each))) if len(each) > 1 else 0.0)
+    return HeldOutEvidence(fall, float(each.std(ddof=1) * np.sqrt(len(each))) if len(each) > 1 else 0.0)
 
 
 def price_of(effect: Effect) -> float:
@@ -153,7 +153,7 @@ def price_of(effect: Effect) -> float:
 
 
 def choose(
-    terms: Terms,
+    terms: LinearTerms,
     effects: Sequence[Effect],
     chosen: Iterable[str],
     kept: Iterable[str] = (),

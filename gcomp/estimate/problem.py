@@ -12,7 +12,7 @@ Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class FittedParameter:
     """A number that a fit may change, in the coordinate in which it is fitted."""
 
     name: str
@@ -28,10 +28,10 @@ class Parameter:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class EstimationProblem:
     """C channels of N rows each; K parameters."""
 
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[FittedParameter, ...]
     predict: Callable[[Array], Array]
     """Parameters (P, K) → residuals (P, C, N)."""
     weight: Array
@@ -62,7 +62,7 @@ class Linearised:
     """Their derivatives there, (k, N) each."""
 
 
-def linearise(problem: Problem, theta: Array, free: Sequence[int]) -> Linearised:
+def linearise(problem: EstimationProblem, theta: Array, free: Sequence[int]) -> Linearised:
     """Derivatives by differences: one evaluation changes a parameter of each channel, for it acts there by far most.
 
     The residual is exact in any case; the derivatives lead to it.

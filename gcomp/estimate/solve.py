@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from gcomp.estimate.problem import Linearised, Problem, linearise
+from gcomp.estimate.problem import EstimationProblem, Linearised, linearise
 
 FREEDOM = 4.0
 """Degrees of freedom of Student's t (Lange, Little and Taylor, JASA 84, 1989)."""
@@ -22,14 +22,14 @@ EASIER, HARDER = 0.2, 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class RobustFit:
     theta: Array
     residual: Array
     """(C, N)."""
     variance: Array
     """Square of the scale of the residuals, (C,)."""
 
-    def robust(self, problem: Problem) -> Array:
+    def robust(self, problem: EstimationProblem) -> Array:
         """Weight of each row beside the others of its channel by Student's t, (C, N)."""
         return robust_weight(self.residual, self.variance)
 
@@ -39,7 +39,7 @@ def robust_weight(residual: Array, variance: Array) -> Array:
     return (FREEDOM + 1.0) / (FREEDOM + residual**2 / variance[:, None])
 
 
-def scale_of(problem: Problem, residual: Array) -> Array:
+def scale_of(problem: EstimationProblem, residual: Array) -> Array:
     """Variance of each channel under Student's t, by fixed-point iteration from the mean square, (C,)."""
     count = np.maximum(problem.weight.sum(1), 1e-300)
     variance = (problem.weight * residual**2).sum(1) / count + problem.floor**2
@@ -49,7 +49,7 @@ def scale_of(problem: Problem, residual: Array) -> Array:
     return np.asarray(variance)
 
 
-def cost_of(problem: Problem, residual: Array, variance: Array) -> Array:
+def cost_of(problem: EstimationProblem, residual: Array, variance: Array) -> Array:
     """Negative logarithm of the likelihood of each channel but for a constant, (C,)."""
     spread = np.log1p(residual**2 / (FREEDOM * variance[:, None]))
     return np.asarray(
@@ -57,7 +57,7 @@ def cost_of(problem: Problem, residual: Array, variance: Array) -> Array:
     )
 
 
-def solve(problem: Problem, theta: Array, free: Sequence[int], iterations: int = 6) -> Solution:
+def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterations: int = 6) -> RobustFit:
     """The most probable values of the free parameters from `theta` (K,) on.
 
     Where no parameter acts on all channels, each channel takes its own steps.
@@ -95,10 +95,10 @@ def solve(problem: Problem, theta: Array, free: Sequence[int], iterations: int =
         if not lower.any():
             break
     residual = problem.predict(theta[None])[0]
-    return Solution(theta, residual, scale_of(problem, residual))
+    return RobustFit(theta, residual, scale_of(problem, residual))
 
 
-def _prior_cost(problem: Problem, theta: Array, channels: int) -> Array:
+def _prior_cost(problem: EstimationProblem, theta: Array, channels: int) -> Array:
     """Cost of parameters away from their nominal values by channel; of those of all channels at the first, (C,)."""
     out = np.zeros(channels)
     for value, p in zip(theta, problem.parameters, strict=True):
@@ -107,12 +107,12 @@ def _prior_cost(problem: Problem, theta: Array, channels: int) -> Array:
     return out
 
 
-def precision(problem: Problem) -> Array:
+def precision(problem: EstimationProblem) -> Array:
     """Inverse variance of each parameter before any measurement, (K,)."""
     return np.array([1.0 / p.prior_std**2 if np.isfinite(p.nominal) else 0.0 for p in problem.parameters])
 
 
-def _step(problem: Problem, about: Linearised, weight: Array, damping: Array) -> Array:
+def _step(problem: EstimationProblem, about: Linearised, weight: Array, damping: Array) -> Array:
     """Step of all free parameters, (K,)."""
     size = len(problem.parameters)
     normal, right, prior = np.zeros((size, size)), np.zeros(size), precision(problem)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from gcomp.estimate.choice import Effect, Terms, choose, price_of, terms_of
+from gcomp.estimate.choice import Effect, LinearTerms, choose, price_of, terms_of
 from gcomp.estimate.problem import linearise
 from sim_gap.position_gap.fit import (
     INDEPENDENT_S,
@@ -134,7 +134,7 @@ class About:
     search: LoopSearch
     fit: LoopFit
     layout: Layout
-    terms: Terms
+    terms: LinearTerms
     effects: dict[str, Effect]
 
     def parameters(self, names: Sequence[str]) -> frozenset[int]:

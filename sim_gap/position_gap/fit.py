@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array
-from gcomp.estimate.problem import Parameter, Problem, linearise
+from gcomp.estimate.problem import EstimationProblem, FittedParameter, linearise
 from gcomp.estimate.solve import solve
 from sim_gap.position_gap.links import range_of, size_of
 from sim_gap.position_gap.parameters import (
@@ -28,7 +28,7 @@ PRIOR, PRIOR_RELATIVE = 10.0, 3.0
 """Standard deviation of any parameter of an effect before any recording: in units of the size at which it is tried, and
 of a logarithm."""
 Point = Mapping[str, Array]
-"""Parameter → (J,)."""
+"""FittedParameter → (J,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ def root_mean_squares(data: Windows, residual: Array) -> Array:
 
 
 def batch(points: Sequence[Point]) -> dict[str, Array]:
-    """Parameter → (P, J) from points that have the same names."""
+    """FittedParameter → (P, J) from points that have the same names."""
     return {name: np.stack([point[name] for point in points]) for name in points[0]}
 
 
@@ -74,7 +74,7 @@ def evaluate(data: Windows, fit: LoopFit) -> LoopFit:
 
 
 class Layout:
-    """Parameters of joints (joint, name) and of the whole arm (−1, name) in the order of a `Problem`."""
+    """Parameters of joints (joint, name) and of the whole arm (−1, name) in the order of a `EstimationProblem`."""
 
     def __init__(self, data: Windows, scales: Scales, point: Point, names: Iterable[tuple[int, str]]) -> None:
         self.data, self.scales, self.point = data, scales, dict(point)
@@ -105,7 +105,7 @@ class Layout:
                 point[name][j] = from_coordinate(name, np.array(x), np.array(self.size(j, name)))
         return point
 
-    def problem(self, nominal: Point, steps: Mapping[tuple[int, str], float], floor: Array) -> Problem:
+    def problem(self, nominal: Point, steps: Mapping[tuple[int, str], float], floor: Array) -> EstimationProblem:
         parameters = tuple(self._parameter(j, name, nominal, steps.get((j, name))) for j, name in self.names)
         shape = (self.data.joints, -1)
 
@@ -115,13 +115,13 @@ class Layout:
 
         weight = self.data.weight.transpose(1, 0, 2).reshape(shape) * min(self.data.judged_s / INDEPENDENT_S, 1.0)
         block = np.broadcast_to(np.arange(self.data.count), (len(self.data.measured), self.data.count)).ravel()
-        return Problem(parameters, predict, weight, block.astype(np.intp), floor)
+        return EstimationProblem(parameters, predict, weight, block.astype(np.intp), floor)
 
-    def _parameter(self, j: int, name: str, nominal: Point, step: float | None) -> Parameter:
+    def _parameter(self, j: int, name: str, nominal: Point, step: float | None) -> FittedParameter:
         if j < 0:
             low, high = range_of(self.data.plant.sim.arm, name)
             size = size_of(self.data.plant.sim.arm, name)
-            return Parameter(name, 0.0, 0.5 * max(-low, high), low, high, -1, step or DIFFERENCE * size)
+            return FittedParameter(name, 0.0, 0.5 * max(-low, high), low, high, -1, step or DIFFERENCE * size)
         size = self.size(j, name)
         low, high = PARAMETERS[name].low, PARAMETERS[name].high
         if name in LOGARITHMIC:
@@ -130,7 +130,7 @@ class Layout:
             ends, own, usual = (0.0, size / low), PRIOR, DIFFERENCE
         else:
             ends, own, usual = (low / size, high / size), PRIOR, DIFFERENCE
-        return Parameter(
+        return FittedParameter(
             name, to_coordinate(name, float(nominal[name][j]), size), own, *ends, channel=j, step=step or usual
         )
 

@@ -16,7 +16,7 @@ from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.judge import Stage, rms_on, stages
 from sim_gap.position_gap.links import shared_effects
 from sim_gap.position_gap.parameters import PARAMETERS
-from sim_gap.position_gap.plant import Plant, held_parts, nominal_point
+from sim_gap.position_gap.plant import MovedModel, held_parts, nominal_point
 from sim_gap.position_gap.sound_arm import SoundGap, split_gap
 from sim_gap.position_gap.start import controller_name, noise_floor, scales_of, starting_fit
 from sim_gap.position_gap.training.bands import Band, band
@@ -89,7 +89,7 @@ def identify(
     scale = gain_scales(gains, labels)
     sim = widen_ranges(sim, [*train, *heldout])
     progress("reading the motion")
-    plant = Plant(sim)
+    plant = MovedModel(sim)
     own = plant.servos
     data = thin_moving(windows_of(plant, train, labels[: len(train)], scale[: len(train)]), FITTED)
     judged = thin(windows_of(plant, heldout, labels[len(train) :], scale[len(train) :]), JUDGED)
@@ -148,10 +148,10 @@ def identify(
 
 def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None]) -> tuple[LoopSearch, LoopFit, About]:
     """The fit, with the effects that it takes; the nominal model as it is where it leaves nothing."""
-    search, fit = starting_fit(search, search.data.plant.servos, progress)
     bare = evaluate(search.data, LoopFit(search.nominal, ((),) * search.data.joints))
     if complete and bool(np.all(rms_on(search.data, bare) < QUIET * search.floor)):
         return search, bare, look_about(search, bare, [])
+    search, fit = starting_fit(search, search.data.plant.servos, progress)
     return search, *select(search, fit, progress)
 
 

@@ -154,7 +154,7 @@ def held_parts(sim: SimModel) -> list[str]:
     return list(dict.fromkeys(str(model.body(int(model.jnt_bodyid[j])).name or "a body") for j in joints))
 
 
-class Plant:
+class MovedModel:
     """The model with parameters of joints, servos and links to be changed."""
 
     def __init__(self, sim: SimModel) -> None:
@@ -291,7 +291,7 @@ class Plant:
         return given
 
 
-def laws_of(point: Mapping[str, Array], plant: Plant) -> set[str]:
+def laws_of(point: Mapping[str, Array], plant: MovedModel) -> set[str]:
     """Names of the parameters of a point that act by a law at each step."""
     found = {name for name in ("dead", "stribeck", "load") if np.any(point[name] != 0.0)}
     if np.any(point["feed"] != plant.compensated):
@@ -326,7 +326,7 @@ def simulate(data: Windows, values: Values) -> Array:
     return out
 
 
-def _moved(plant: Plant, data: Windows, point: Mapping[str, Array]) -> Array:
+def _moved(plant: MovedModel, data: Windows, point: Mapping[str, Array]) -> Array:
     """Positions of one hypothesis, (To, J, W)."""
     laws = laws_of(point, plant)
     models = {
@@ -350,7 +350,7 @@ def _moved(plant: Plant, data: Windows, point: Mapping[str, Array]) -> Array:
 class World:
     """One window of one hypothesis."""
 
-    def __init__(self, plant: Plant, model: Any, data: Windows, w: int, point: Mapping[str, Array]) -> None:
+    def __init__(self, plant: MovedModel, model: Any, data: Windows, w: int, point: Mapping[str, Array]) -> None:
         self.plant, self.model, self.data, self.w, self.point = plant, model, data, w, point
         self.piece, self.scale, self.at = data.pieces[data.piece[w]], float(data.scale[w]), data.at[:, w]
         self.steps = int(np.ceil(self.at.max() / plant.dt - 1e-6)) + 1
@@ -424,7 +424,9 @@ class World:
         return np.asarray((asked / self.point["gain"] - self.point["kp"] * error) / ki + self.data.error_sum[:, self.w])
 
 
-def run_with_laws(plant: Plant, worlds: Sequence[World], point: Mapping[str, Array], laws: Collection[str]) -> None:
+def run_with_laws(
+    plant: MovedModel, worlds: Sequence[World], point: Mapping[str, Array], laws: Collection[str]
+) -> None:
     """Move some worlds together, and evaluate the laws at each step for all of them at once, (W, n)."""
     import mujoco
 
@@ -503,7 +505,7 @@ def run_with_laws(plant: Plant, worlds: Sequence[World], point: Mapping[str, Arr
 _READ = ("qpos", "qvel", "qfrc_applied", "qfrc_actuator", "qfrc_passive", "qfrc_constraint", "qacc", "qfrc_gravcomp")
 
 
-def nominal_point(plant: Plant, neutral: Mapping[str, float]) -> dict[str, Array]:
+def nominal_point(plant: MovedModel, neutral: Mapping[str, float]) -> dict[str, Array]:
     """Parameters of the nominal model at every joint, neutral where it says nothing."""
     arm, own, one = plant.sim.arm, plant.servos, np.ones(plant.n)
     point = {name: value * one for name, value in neutral.items()}

@@ -19,7 +19,7 @@ from sim_gap.model.load import SimModel
 from sim_gap.residuals.resampling import low_pass
 
 if TYPE_CHECKING:
-    from sim_gap.position_gap.plant import Plant
+    from sim_gap.position_gap.plant import MovedModel
 
 WINDOW_S, WARM_S = 3.0, 1.0
 """Judged length of a window, and the simulated time before it that is not judged [s]."""
@@ -80,7 +80,7 @@ class Piece:
 class Windows:
     """W windows of J joints, compared with the model at up to To times; SI units."""
 
-    plant: "Plant"
+    plant: "MovedModel"
     """The model that is moved along the commands."""
     pieces: tuple[Piece, ...]
     piece: NDArray[np.intp]
@@ -161,7 +161,7 @@ def pieces_of(recording: Recording) -> list[slice]:
 
 
 def windows_of(
-    plant: "Plant", recordings: Sequence[Recording], labels: Sequence[str], scales: Sequence[float] = ()
+    plant: "MovedModel", recordings: Sequence[Recording], labels: Sequence[str], scales: Sequence[float] = ()
 ) -> Windows:
     """Cut recordings into windows, the same however they are ordered. Raises BadInput for one that holds no commanded
     position.

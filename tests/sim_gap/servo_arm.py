@@ -11,7 +11,7 @@ from sim_gap.model.load import load_model
 from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import LoopFit
 from sim_gap.position_gap.parameters import PARAMETERS
-from sim_gap.position_gap.plant import Plant, nominal_point
+from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.start import scales_of
 from sim_gap.position_gap.windows import windows_of
 
@@ -122,7 +122,7 @@ def fitted(*friction: float, weightless: bool = False) -> tuple[LoopSearch, Loop
 
 def search_on(text: str, recordings: Sequence[Recording], floor: float = 3e-4) -> LoopSearch:
     """Recordings beside a model, of which effects may be chosen; with a noise `floor` [rad]."""
-    plant = Plant(load_model(mujoco.MjModel.from_xml_string(text)))
+    plant = MovedModel(load_model(mujoco.MjModel.from_xml_string(text)))
     data = windows_of(plant, recordings, [f"run {k}" for k in range(len(recordings))])
     point = nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()})
     return LoopSearch(data, scales_of(data), point, np.full(data.joints, floor))

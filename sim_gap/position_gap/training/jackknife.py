@@ -25,7 +25,7 @@ LEAST_INFORMATION = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Terms:
+class WindowTerms:
     """Normal equations of each window, at all joints; of W windows and K parameters."""
 
     names: list[tuple[int, str]]
@@ -39,7 +39,7 @@ class Terms:
     """Derivatives of each joint, (K_j + S, To, W)."""
 
 
-def terms_of(search: LoopSearch, fit: LoopFit) -> Terms:
+def terms_of(search: LoopSearch, fit: LoopFit) -> WindowTerms:
     """Normal equations of each window of the search about a fit."""
     now, slopes = jacobian(search.data, fit, search.scales, fit.active, fit.shared)
     names = names_of(fit)
@@ -51,7 +51,7 @@ def terms_of(search: LoopSearch, fit: LoopFit) -> Terms:
         counted = x * weight[:, j]
         squares[np.ix_(np.arange(count), index, index)] += weights[j] * np.einsum("atw,btw->wab", counted, x)
         scores[:, index] += weights[j] * np.einsum("atw,tw->wa", counted, now[:, j])
-    return Terms(names, squares, scores, now, slopes)
+    return WindowTerms(names, squares, scores, now, slopes)
 
 
 def acting(names: Sequence[tuple[int, str]], joint: int) -> NDArray[np.intp]:
@@ -59,7 +59,7 @@ def acting(names: Sequence[tuple[int, str]], joint: int) -> NDArray[np.intp]:
     return np.array([k for k, (j, _) in enumerate(names) if j in (joint, -1)], np.intp)
 
 
-def jackknifed(terms: Terms, known: Array, groups: NDArray[np.intp]) -> Array:
+def jackknifed(terms: WindowTerms, known: Array, groups: NDArray[np.intp]) -> Array:
     """Covariance (K, K) by leaving out one group of windows after the other; `known` is what is known beforehand.
 
     Where nearly all that is known of a direction is in one group, such as the limit of a speed that is reached in a
@@ -88,7 +88,7 @@ def recordings_or_thirds(data: Windows) -> NDArray[np.intp]:
     return np.arange(data.count) * FOLDS // data.count if data.of_one_recording else data.recording
 
 
-def gaps_left_out(data: Windows, terms: Terms, known: Array) -> Array:
+def gaps_left_out(data: Windows, terms: WindowTerms, known: Array) -> Array:
     """Gap that a fit without its group leaves of each training window, to first order, (To, J, W) [rad]."""
     groups, out = recordings_or_thirds(data), terms.residual.copy()
     whole = terms.squares.sum(0) + known

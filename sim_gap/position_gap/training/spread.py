@@ -20,7 +20,7 @@ from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.links import UNIT, range_of, shared_names
 from sim_gap.position_gap.parameters import PARAMETERS, relative_step, step_parameter
 from sim_gap.position_gap.sound_arm import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
-from sim_gap.position_gap.training.jackknife import Terms, jackknifed, recordings_or_thirds, terms_of
+from sim_gap.position_gap.training.jackknife import WindowTerms, jackknifed, recordings_or_thirds, terms_of
 from sim_gap.position_gap.training.unreached_limits import Unreached
 
 INSIDE = 0.95
@@ -105,7 +105,7 @@ def known_before(search: LoopSearch, fit: LoopFit, names: list[tuple[int, str]])
     return np.diag(precision(layout.problem(search.nominal, {}, search.floor)))
 
 
-def covariance_within(search: LoopSearch, fit: LoopFit, terms: Terms) -> Covariance:
+def covariance_within(search: LoopSearch, fit: LoopFit, terms: WindowTerms) -> Covariance:
     """Sandwich covariance of the fitted parameters over the windows, all else as it is: what tells an effect from none.
 
     Directions that the windows hardly show are held.

@@ -12,7 +12,7 @@ from sim_gap.model.load import load_model
 from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.judge import rms_on
-from sim_gap.position_gap.plant import HeldParts, Plant, held_model, held_parts, servos_of
+from sim_gap.position_gap.plant import HeldParts, MovedModel, held_model, held_parts, servos_of
 from sim_gap.position_gap.windows import pieces_of
 
 READ = 2.0 * np.pi / 4096 / np.sqrt(12.0)
@@ -197,5 +197,5 @@ def test_a_model_without_servos_is_driven_through_springs() -> None:
     """The same motion as with servos of that gain and damping."""
     bare = TEXT.partition("<actuator>")[0] + "</mujoco>"
     search = search_on(bare, [record(TEXT, 1, 12.0)])
-    assert not Plant(load_model(mujoco.MjModel.from_xml_string(bare))).servos.complete
+    assert not MovedModel(load_model(mujoco.MjModel.from_xml_string(bare))).servos.complete
     assert (left(search, kp=15.0) < 2.2 * READ).all()

@@ -12,7 +12,7 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.plant import Plant
+from sim_gap.position_gap.plant import MovedModel
 from sim_gap.position_gap.start import HOLDS_HZ, rests, starting_fit
 from sim_gap.position_gap.windows import windows_of
 
@@ -57,7 +57,7 @@ def test_a_joint_rests_by_its_command_and_one_without_a_command_does_not() -> No
     whole = record(text, 1, 14.0)
     held, loose = still(whole), still(whole)
     loose.position_command[:, 1] = np.nan
-    plant = Plant(load_model(mujoco.MjModel.from_xml_string(text)))
+    plant = MovedModel(load_model(mujoco.MjModel.from_xml_string(text)))
     for recording, expected in ((whole, False), (held, True), (loose, False)):
         assert rests(windows_of(plant, [recording], ["run"])).tolist() == [False, expected]
 

@@ -11,7 +11,7 @@ from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import LoopFit, batch, residuals
 from sim_gap.position_gap.training import spread
 from sim_gap.position_gap.training.draws import draw
-from sim_gap.position_gap.training.jackknife import Terms, jackknifed, terms_of
+from sim_gap.position_gap.training.jackknife import WindowTerms, jackknifed, terms_of
 from sim_gap.position_gap.training.spread import Covariance, covariance, covariance_within, interval
 
 FRICTION = 0.15, 0.35
@@ -57,7 +57,7 @@ def test_recordings_that_agree_leave_the_interval_nearly_as_it_is() -> None:
 def test_the_jackknife_is_that_of_the_text_books() -> None:
     """Of a mean of G values it is their variance over G."""
     values = np.array([0.15, 0.35, 0.2, 0.5])
-    terms = Terms([(0, "coulomb")], np.ones((4, 1, 1)), (0.3 - values)[:, None], np.zeros(0), [])
+    terms = WindowTerms([(0, "coulomb")], np.ones((4, 1, 1)), (0.3 - values)[:, None], np.zeros(0), [])
     found = jackknifed(terms, np.zeros(1), np.arange(4))
     assert found[0, 0] == pytest.approx(values.var(ddof=1) / 4.0)
 
