@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -367,25 +368,38 @@ class World:
         plant, model = self.plant, self.model
         d = plant.state
         self.begin(model, d)
-        ctrl, qpos, places, controls, step = d.ctrl, d.qpos, plant.places, plant.controls, mujoco.mj_step
-        given = self.given[:, plant.driven] * plant.gear[plant.driven]
         spring = np.where(plant.driven, 0.0, self.point["kp"] * self.point["gain"] * self.scale)
         loose, held = not plant.driven.all(), bool(plant.held.places.size)
-        for k in range(self.steps):
-            self.track[k] = qpos[places]
-            ctrl[controls] = given[k]
+        given = self.given[:, plant.driven] * plant.gear[plant.driven]
+        for first, last in pairwise(self._edges()):  # between them the command does not change
+            self.track[first] = d.qpos[plant.places]
+            d.ctrl[plant.controls] = given[first]
             if loose:
-                d.qfrc_applied[plant.dofs] = self.applied + spring * self.given[k]
-            step(model, d)
-            if held:
+                d.qfrc_applied[plant.dofs] = self.applied + spring * self.given[first]
+            if not held:
+                mujoco.mj_step(model, d, last - first)
+                continue
+            for _ in range(last - first):
+                mujoco.mj_step(model, d)
                 plant.held.put_back(d)
-        self.track[self.steps] = qpos[places]
+        self.track[self.steps] = d.qpos[plant.places]
+
+    def _edges(self) -> list[int]:
+        """Steps at which a command changes or a position is read, the first, and the end."""
+        changes = np.flatnonzero(np.any(np.diff(self.given, axis=0) != 0.0, axis=1)) + 1
+        whole = self._steps_of_comparison()[0]
+        return sorted({0, self.steps, *changes.tolist(), *whole.tolist(), *(whole + 1).tolist()})
+
+    def _steps_of_comparison(self) -> tuple[NDArray[np.intp], Array]:
+        """Step before each time of comparison, and the share of a step that it is later, (To,) each."""
+        steps = self.at / self.plant.dt
+        whole = np.minimum((steps + 1e-6).astype(int), self.steps - 1)
+        return whole, np.maximum(steps - whole, 0.0)
 
     def positions(self) -> Array:
         """Positions at the times of comparison, (To, J)."""
-        steps = self.at / self.plant.dt
-        whole = np.minimum((steps + 1e-6).astype(int), self.steps - 1)
-        share = (steps - whole)[:, None]
+        whole, late = self._steps_of_comparison()
+        share = late[:, None]
         return np.asarray(self.track[whole] * (1.0 - share) + self.track[whole + 1] * share)
 
     def begin(self, model: Any, d: Any) -> None:

@@ -4,8 +4,9 @@
 
 mujoco.sysid gets gain, friction loss, damping and armature of every joint with bounds, windows of the training
 recordings, and friction that rests as that of a gear does. Both models then run free along the commands of the held-out
-recordings. `--written` is the model of an earlier diagnosis of the same recordings (`--out-model`), which is not repeated then. Exit status 1 if the
-diagnosis leaves more than mujoco.sysid over all joints, or more than 0.4 of the nominal model's gap.
+recordings. `--written` is the model of an earlier diagnosis of the same recordings (`--out-model`), which is not
+repeated then. Exit status 1 if the diagnosis leaves more than mujoco.sysid over all joints, or more than 0.4 of the
+nominal model's gap.
 """
 
 import argparse
