@@ -12,16 +12,18 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, batch, residuals
+from sim_gap.position_gap.fit import LoopFit, batch, residuals, root_mean_squares
 
 HEADROOM = 10.0
 """Ratio of the highest level of the prior to the least that the training motion admits: recordings use between a tenth
 and all of what a drive can do."""
 COUNT = 20
 """Levels of the prior."""
-REACHED = 0.999
-"""Share of the training motion that asks for no more than the least level: what is asked for at single moments is as
-much noise of the readings."""
+ABOVE = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
+"""Levels that are tried, over what the training motion asks for: commands are held from row to row, so that a limit of
+their speed shows far above it."""
+COSTS = 2.0
+"""Loss of the score from which a level contradicts the training motion: 95 % of the likelihood of one parameter."""
 LIMITS = {"limit": "actuator.saturation", "slew": "controller.slew"}
 """Parameter that is a limit → its effect."""
 
@@ -45,13 +47,24 @@ def find_unreached(search: LoopSearch, fit: LoopFit) -> tuple[Unreached, ...]:
     out: list[Unreached] = []
     asked = {"limit": _torques(search, fit), "slew": _command_speeds(search)}
     for name, effect in LIMITS.items():
+        admitted = _least_admitted(search, fit, name, asked[name])
         for j in range(search.data.joints):
-            least = float(asked[name][j])
+            least = float(admitted[j])
             if np.isfinite(fit.point[name][j]) or effect in search.excluded or j in search.resting or least <= 0.0:
                 continue
             levels = np.geomspace(least, HEADROOM * least, COUNT)
             out.append(Unreached(j, name, levels, np.full(COUNT, 1.0 / COUNT), least))
     return tuple(out)
+
+
+def _least_admitted(search: LoopSearch, fit: LoopFit, name: str, asked: Array) -> Array:
+    """The least of some levels from which on none contradicts the training motion, (J,)."""
+    levels = np.array(ABOVE)[:, None] * np.maximum(asked, 1e-9)
+    left = residuals(search.data, batch([fit.point, *({**fit.point, name: level} for level in levels)]))
+    scores = [search.score(LoopFit(fit.point, fit.active, rms=x)) for x in root_mean_squares(search.data, left)]
+    costly = np.stack(scores[1:]) - scores[0] >= COSTS
+    first = np.where(costly.any(0), len(ABOVE) - np.argmax(costly[::-1], axis=0), 0)
+    return np.asarray(levels[np.minimum(first, len(ABOVE) - 1), np.arange(len(asked))])
 
 
 def _torques(search: LoopSearch, fit: LoopFit) -> Array:
@@ -71,17 +84,14 @@ def _command_speeds(search: LoopSearch) -> Array:
         held = np.diff(piece.area, axis=0) / np.diff(piece.ends)[:, None]
         if len(held) > 1:
             speed = np.abs(np.diff(held, axis=0)) / np.diff(piece.ends[:-1])[:, None]
-            out = np.maximum(out, np.quantile(speed, REACHED, axis=0))
+            out = np.maximum(out, speed.max(axis=0))
     return out
 
 
 def _highest(search: LoopSearch, values: Array) -> Array:
     counted = search.data.weight * search.data.served > 0.0
     return np.array(
-        [
-            np.quantile(values[:, j][counted[:, j]], REACHED) if counted[:, j].any() else 0.0
-            for j in range(search.data.joints)
-        ]
+        [float(values[:, j][counted[:, j]].max()) if counted[:, j].any() else 0.0 for j in range(search.data.joints)]
     )
 
 

@@ -113,9 +113,19 @@ def test_joint_terms_of_the_model_count_on_the_motor_side_and_springs_beside_it(
 
 def test_a_model_that_is_not_a_plain_chain_is_refused(tmp_path):
     path = tmp_path / "arm.xml"
-    path.write_text(THREE.replace('<body name="link_3"', '<body gravcomp="1" name="link_3"'))
+    path.write_text(THREE.replace("</mujoco>", '<option density="50" viscosity="9"/></mujoco>'))
     with pytest.raises(BadInput, match=r"joint_\d.*expected a plain hinge chain"):
         load_model(path)
+
+
+def test_gravity_compensation_is_the_controllers_and_no_torque_of_the_links(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(THREE)
+    own = load_model(path).arm
+    path.write_text(THREE.replace('<body name="link_3"', '<body gravcomp="1" name="link_3"'))
+    model = load_model(path)
+    np.testing.assert_array_equal(model.arm.torque(*states(3)), own.torque(*states(3)))
+    assert model.mujoco_model.body_gravcomp.max() == 1.0
 
 
 def test_joints_are_found_by_name_and_the_others_stay_locked(tmp_path):
