@@ -229,7 +229,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         fit = search.improve(entered(search, about.moved(found)), 4)
         same, names = set(found) == set(names), found
         if same:
-            break
+            return fit, about
     about = look_about(search, fit, looked)
     found = choose(about.terms, [about.effects[n] for n in names], names, kept)
     if set(found) != set(names):

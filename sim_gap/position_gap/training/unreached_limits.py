@@ -64,7 +64,8 @@ def _least_admitted(search: LoopSearch, fit: LoopFit, name: str, asked: Array) -
     scores = [search.score(LoopFit(fit.point, fit.active, rms=x)) for x in root_mean_squares(search.data, left)]
     costly = np.stack(scores[1:]) - scores[0] >= COSTS
     first = np.where(costly.any(0), len(ABOVE) - np.argmax(costly[::-1], axis=0), 0)
-    return np.asarray(levels[np.minimum(first, len(ABOVE) - 1), np.arange(len(asked))])
+    least = levels[np.minimum(first, len(ABOVE) - 1), np.arange(len(asked))]
+    return np.where(asked > 0.0, least, 0.0)
 
 
 def _torques(search: LoopSearch, fit: LoopFit) -> Array:
