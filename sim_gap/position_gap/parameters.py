@@ -48,6 +48,10 @@ PARAMETERS = {
 }
 
 
+WITH_TORQUE = ("ki", "kd", "coulomb", "viscous", "stribeck", "back_emf", "armature", "spring", "offset")
+"""Parameters that go with the scale of all torques, as a gain does; the others are ratios, times or velocities."""
+
+
 @dataclass(frozen=True)
 class LoopEffect:
     """An effect of one joint: its parameters here, and how each is called in an answer."""

@@ -1,10 +1,13 @@
 """Draws of the parameters from what recordings leave open of them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import Layout, LoopFit, jacobian
+from sim_gap.position_gap.parameters import WITH_TORQUE
 from sim_gap.position_gap.training.jackknife import acting
 from sim_gap.position_gap.training.spread import Covariance
 from sim_gap.position_gap.training.unreached_limits import draw_limits
@@ -28,12 +31,24 @@ def draw(
     layout = Layout(search.data, search.scales, fit.point, spread.names)
     problem = layout.problem(search.nominal, {}, search.floor)
     about = layout.theta(layout.point)
-    points = [layout.at(problem.within(about + step)) for step in steps]
+    points = [layout.at(problem.within(about + step)) for step in _with_gains(spread.names, about, steps)]
     rows = [{_label(search, j, name): float(point[name][max(j, 0)]) for j, name in spread.names} for point in points]
     for each, drawn in zip(spread.limits, draw_limits(spread.limits, count, random), strict=True):
         for row, value in zip(rows, drawn, strict=True):
             row[_label(search, each.joint, each.name)] = float(value)
     return rows
+
+
+def _with_gains(names: Sequence[tuple[int, str]], about: Array, steps: Array) -> Array:
+    """The steps (P, K), in which what goes with a gain is scaled as the gain is and moved by what its step is more than
+    that: however far the scale moves, ratios stay."""
+    out = steps.copy()
+    at = {place: k for k, place in enumerate(names)}
+    for (j, name), k in at.items():
+        if name in WITH_TORQUE and (j, "kp") in at:
+            scale = steps[:, at[j, "kp"]]
+            out[:, k] += (np.exp(scale) - 1.0 - scale) * about[k]
+    return out
 
 
 def _within(search: LoopSearch, fit: LoopFit, spread: Covariance, steps: Array, reach: Array) -> Array:
