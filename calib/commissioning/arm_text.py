@@ -22,8 +22,15 @@ def arm_text(draft: Draft, out: Path) -> str:
         lines.append(yaml_entry("base", draft.base, 2))
     if draft.tip is not None:
         lines.append(yaml_entry("tip", draft.tip, 2))
+    if draft.locked:
+        lines.append("  locked:  # held by other means than these drives [rad, m]")
+        lines += [yaml_entry(name, position, 4) for name, position in draft.locked.items()]
     lines.append(yaml_entry("gravity", list(draft.gravity), 2, "m/s² in the model's frame"))
-    lines += [yaml_comment(f"{name} {why}: set aside, it keeps the model's position", 2) for name, why in draft.aside]
+    lines += [
+        yaml_comment(f"{name} {why}: set aside, it keeps the model's position", 2)
+        for name, why in draft.aside
+        if name not in draft.locked
+    ]
     given = {joint.name: list(joint.stops) for joint in draft.joints if joint.stops is not None}
     if given:
         lines.append(f"  stops:  # {'working range' if draft.servo else 'mechanical stops'} [rad]")

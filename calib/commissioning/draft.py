@@ -74,6 +74,8 @@ class Draft:
     base: str | None = None
     servo: str | None = None
     """Why resting joints are held by their servos rather than pressed on stops; None: they are pressed."""
+    locked: Mapping[str, float] = field(default_factory=dict)
+    """Joints that are held at this position [rad, m] by other means than the arm's drives."""
 
     @property
     def assumed(self) -> list[str]:
@@ -86,10 +88,10 @@ def draft_of_model(
     chain: Chain,
     gravity: tuple[float, float, float],
     stops: Mapping[str, tuple[float, float]],
-    base: str | None = None,
     ratings: Mapping[str, float] | None = None,
+    locked: Mapping[str, float] | None = None,
 ) -> Draft:
-    """The draft for one chain; `stops` [rad], `ratings` [N·m] by joint name and `base` were given by the user.
+    """The draft for one chain; `stops` [rad], `ratings` [N·m] and `locked` [rad, m] by joint name were given.
 
     Raises BadModel.
     """
@@ -98,7 +100,7 @@ def draft_of_model(
     if not np.any(gravity):
         gravity = STANDARD_GRAVITY
         notes.append("gravity: the model has none, assumed to point down")
-    need = _load_torque(path, [joint.name for joint in chain.joints], gravity)
+    need = _load_torque(path, [joint.name for joint in chain.joints], gravity, locked or {})
     rated = _ratings(chain, need, ratings or {})
     doubted: dict[str, list[str]] = {}
     for joint, rating in zip(chain.joints, rated, strict=True):
@@ -110,7 +112,8 @@ def draft_of_model(
     joints = [_joint(place, chain, stops.get(joint.name), rated[place]) for place, joint in enumerate(chain.joints)]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
     servo = f"{', '.join(free)}: no stop to press on" if free else None
-    return Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, base=base, servo=servo)
+    held = {"base": chain.base, "locked": locked or {}, "servo": servo}
+    return Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, **held)
 
 
 def narrow(draft: Draft, found: ClearRange) -> None:
@@ -209,7 +212,7 @@ def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rating: 
     )
 
 
-def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float]) -> Array:
+def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float], locked: Mapping[str, float]) -> Array:
     """Largest torque (n,) [N·m] against gravity and for ACCELERATION of the joint alone, at random poses."""
     import mujoco
 
@@ -217,6 +220,8 @@ def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float]) -> 
         model = compile_model(path)
     model.opt.gravity[:] = gravity
     data = mujoco.MjData(model)
+    for name, position in locked.items():
+        data.joint(name).qpos[:] = position
     joints = [model.joint(name).id for name in names]
     place, dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     free = ~model.jnt_limited[joints].astype(bool)

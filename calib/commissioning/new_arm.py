@@ -13,7 +13,7 @@ from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.chain import Chain, find_chains
-from calib.commissioning.clear_range import find_clear_range
+from calib.commissioning.clear_range import clear_ranges, sweep_problem
 from calib.commissioning.draft import Draft, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
 from calib.commissioning.finding import SetupFinding
@@ -69,6 +69,7 @@ def new_arm(
     tip: str | None = None,
     stops: Mapping[str, tuple[float, float]] | None = None,
     ratings: Mapping[str, float] | None = None,
+    locked: Mapping[str, float] | None = None,
     name: str | None = None,
     questions: Questions | None = None,
 ) -> NewArm:
@@ -76,34 +77,49 @@ def new_arm(
 
     The longest chain of revolute joints is the arm, or the one from body `base` to body `tip`. A gripper, mimic and
     prismatic joints at its end and the joints that carry `base` keep the model's position. Where sweeps within the
-    model's limits would collide, a narrower range is chosen. `ratings` [N·m] by joint name replace the model's efforts.
+    model's limits would collide, a narrower range is chosen. `ratings` [N·m] by joint name replace the model's efforts;
+    joints in `locked` are held at that position [rad, m] and are none of the arm's.
     """
     if model.suffix.lower() not in MODEL_SUFFIXES:
         raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)})")
     if not model.is_file():
         raise BadInput(f"no model file {model}: give the path of a URDF or MJCF file")
-    joints, gravity = model_joints(model)
+    joints, gravity = model_joints(model, locked)
+    _refuse_other_joints("--lock", locked or {}, [joint.name for joint in joints], f"in {model}")
     chains = find_chains(joints, model, base, tip)
     chain = chains[0] if questions is None or len(chains) == 1 else questions.which(chains)
     given = _given_stops(chain, dict(stops or {}), model, questions)
-    _refuse_other_joints("--rated-torque", ratings or {}, chain, model)
-    draft = draft_of_model(model, chain, gravity, given, base, ratings)
+    names = [joint.name for joint in chain.joints]
+    _refuse_other_joints("--rated-torque", ratings or {}, names, f"of the arm in {model}")
+    draft = draft_of_model(model, chain, gravity, given, ratings, locked)
     if len(chains) > 1 and questions is None:
         others = ", ".join(each.tip for each in chains if each is not chain)
         draft.notes.append(f"tip assumed: the model has {len(chains)} arms; the others end in {others} (--tip)")
     draft.name = name or draft.name
     made = NewArm(out, draft)
     refuse_impossible_model(made.parsed())
-    clear = find_clear_range(made.parsed())
-    if clear is not None:
-        narrow(draft, clear)
+    _narrow_until_clear(made)
     return made
+
+
+def _narrow_until_clear(made: NewArm) -> None:
+    """Narrow the ranges until no sweep collides; raises BadInput or Refused as planning does where none is clear."""
+    arm_file = made.parsed()
+    problem = sweep_problem(arm_file)
+    if problem is None:
+        return
+    for clear in clear_ranges(arm_file, problem):
+        narrow(made.draft, clear)
+        if sweep_problem(made.parsed()) is None:
+            return
+    raise problem
 
 
 def _given_stops(
     chain: Chain, stops: dict[str, tuple[float, float]], model: Path, questions: Questions | None
 ) -> dict[str, tuple[float, float]]:
-    _refuse_other_joints("--stops", stops, chain, model)
+    names = [joint.name for joint in chain.joints]
+    _refuse_other_joints("--stops", stops, names, f"of the arm in {model}")
     for joint in chain.joints:
         if joint.limits is None and joint.name not in stops and questions is not None:
             answer = questions.stops(joint.name)
@@ -112,11 +128,10 @@ def _given_stops(
     return stops
 
 
-def _refuse_other_joints(option: str, given: Mapping[str, object], chain: Chain, model: Path) -> None:
-    names = [joint.name for joint in chain.joints]
+def _refuse_other_joints(option: str, given: Mapping[str, object], names: Sequence[str], place: str) -> None:
     for name in given:
         if name not in names:
-            raise BadInput(f"{option} {name}: no joint of the arm in {model}; there are {', '.join(names)}")
+            raise BadInput(f"{option} {name}: no joint {place}; there are {', '.join(names)}")
 
 
 def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -> list[Match]:

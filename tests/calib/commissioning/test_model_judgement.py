@@ -73,7 +73,7 @@ def drafted(model: Path, ratings: Mapping[str, float] | None = None) -> NewArm:
     """As `new` has it before it looks for collisions, which takes long; raises BadInput as it does."""
     joints, gravity = model_joints(model)
     chain = find_chains(joints, model)[0]
-    made = NewArm(model.with_suffix(".yaml"), draft_of_model(model, chain, gravity, {}, None, ratings))
+    made = NewArm(model.with_suffix(".yaml"), draft_of_model(model, chain, gravity, {}, ratings))
     refuse_impossible_model(made.parsed())
     return made
 
