@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -112,8 +112,8 @@ def draft_of_model(
     joints = [_joint(place, chain, stops.get(joint.name), rated[place]) for place, joint in enumerate(chain.joints)]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
     servo = f"{', '.join(free)}: no stop to press on" if free else None
-    held = {"base": chain.base, "locked": locked or {}, "servo": servo}
-    return Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, **held)
+    draft = Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, base=chain.base, servo=servo)
+    return replace(draft, locked=locked or {})
 
 
 def narrow(draft: Draft, found: ClearRange) -> None:
