@@ -94,7 +94,7 @@ def sim(
         server = ArmServer(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
         server.on_wrong = lambda wrong: console.print(f"sim: {wrong}")
         server.on_late = lambda lag, at: console.print(
-            f"sim: this process was {1000 * lag:.0f} ms late at {at:.1f} s: to a host its drives may seem silent or faulty"
+            f"sim: this process was {1000 * lag:.0f} ms late at {at:.1f} s: a host may take its drives for silent"
         )
         return server.run()
     finally:
