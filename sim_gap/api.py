@@ -14,7 +14,7 @@ from sim_gap.attribution.diagnosis import Diagnosis
 RecordingLike: TypeAlias = Recording | str | Path
 """A recording, or its path."""
 Stated: TypeAlias = Mapping[str, str | float] | Sequence[str]
-"""What holds for columns: `{"q": "deg"}`, or in the words of the command, `["q=deg"]`."""
+"""Statements about columns: `{"q": "deg"}`, or in the words of the command, `["q=deg"]`."""
 
 
 def diagnose(

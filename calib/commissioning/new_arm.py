@@ -1,5 +1,6 @@
 """Makes an arm file from a model: chain, ranges, drives; asks where somebody can answer, else assumes and says so."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,7 +8,8 @@ from typing import Any, Protocol
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
 from armlink.content.atomic_file import write_whole
-from armlink.content.file_content import parse_yaml
+from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
+from armlink.content.yaml_text import EditedYaml
 from armlink.drives.findings import FoundDrives
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
@@ -171,11 +173,19 @@ def _doubtful_rating(match: Match, effort: float) -> SetupFinding:
     return SetupFinding("warning", what, f"{match.joint} (node {drive.node})", remedy)
 
 
-def rewired_content(content: dict[str, Any], matches: Sequence[Match], bus: dict[str, str | int]) -> dict[str, Any]:
-    """An arm file's content with the drives found on a bus: nodes, rated torques and the bus itself."""
-    joints = []
-    for row, match in zip(content["link"]["joints"], matches, strict=True):
+def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | int], out: Path) -> str:
+    """An arm file's text, to stand at `out`, with the drives found on a bus; its comments and its order stay.
+
+    Of each joint it writes node, rated torque and identity, and the bus.
+    """
+    edited = EditedYaml(read_whole(arm.path, MOST_YAML).decode())
+    link: Any = edited.content["link"]
+    for row, match in zip(link["joints"], matches, strict=True):
         drive = match.drive
-        most = min(float(row["max_torque"]), drive.max_torque)
-        joints.append({**row, "node": drive.node, "rated_torque": drive.rated_torque, "max_torque": most})
-    return {**content, "link": {**content["link"], "bus": bus, "joints": joints}}
+        row["node"], row["rated_torque"] = drive.node, drive.rated_torque
+        row["max_torque"] = min(float(row["max_torque"]), drive.max_torque)
+        row["identity"] = edited.in_line({"vendor": drive.vendor, "product": drive.product})
+    link["bus"] = edited.in_line(bus)
+    if arm.model_path is not None:
+        edited.content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
+    return edited.text

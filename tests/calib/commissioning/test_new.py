@@ -296,11 +296,21 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
     monkeypatch.chdir(tmp_path)
     real_arm(made, tmp_path, nodes=[7, 8, 9, 10], position_gain=[1.0] * 4)
     made.write()
+    marks = [line for line in Path("arm4.yaml").read_text().splitlines() if line.lstrip().startswith("#")]
     assert cli.run(["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
     assert cli.run(["check", "found.yaml"]) == 0
     assert cli.run(["new", "arm4.yaml", "--out", "rewired.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
     assert cli.run(["check", "rewired.yaml", "--passive"]) == 0
-    assert [joint.node for joint in load_arm("rewired.yaml").require_link().joints] == [7, 8, 9, 10]
+    joints = load_arm("rewired.yaml").require_link().joints
+    assert [joint.node for joint in joints] == [7, 8, 9, 10]
+    assert all(
+        joint.identity == found.identity
+        for joint, found in zip(joints, load_arm("found.yaml").link.joints, strict=True)
+    )
+    assert len(marks) > 10
+    assert [line for line in Path("rewired.yaml").read_text().splitlines() if line.lstrip().startswith("#")][
+        1:
+    ] == marks
     assert cli.run(["new", "arm4.urdf", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
     assert "nobody to ask" in capsys.readouterr().err
 
