@@ -101,7 +101,9 @@ def test_monitor_stats_reports_the_cycle(capsys):
 
 
 def test_convert_says_which_names_the_format_drops(tmp_path, capsys):
-    recording = Recording(t=np.linspace(0, 1, 20), position=np.zeros((20, 2)), torque=np.ones((20, 2)), names=("left/elbow", "left/wrist"))
+    recording = Recording(
+        t=np.linspace(0, 1, 20), position=np.zeros((20, 2)), torque=np.ones((20, 2)), names=("left/elbow", "left/wrist")
+    )
     save_recording(recording, tmp_path / "run.parquet")
     assert run(["convert", str(tmp_path / "run.parquet"), str(tmp_path / "run.csv")]) == 0
     assert "left/elbow is joint_1, left/wrist is joint_2 there" in " ".join(capsys.readouterr().out.split())
