@@ -36,6 +36,9 @@ MOST_RESERVE = 10.0
 drives: published arms have up to 6; placeholders, and limits copied from larger arms, 11 to 5000."""
 FRICTION = 0.02
 """Coulomb friction of the simulated arm, as a share of the torque that its drives need; assumed."""
+ROTOR = 1e-3
+"""Rotor inertia behind the gear of the simulated arm, for the torque that its drives need [s²], where the model has
+none; assumed. Published models have 0.3 (iiwa) to 10 (SO-100) thousandths, the Panda 1.1."""
 
 
 @dataclass
@@ -50,6 +53,8 @@ class JointDraft:
     max_velocity: float
     friction: float
     """Coulomb friction of the simulated arm [N·m]."""
+    rotor: float
+    """Its rotor inertia, at the joint [kg·m²]; 0 where the model has one."""
     stops: tuple[float, float] | None = None
     """Only where the model has none, or others were given [rad]."""
     notes: list[str] = field(default_factory=list)
@@ -207,6 +212,7 @@ def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rating: 
         max_torque_rate=float(f"{effort / RATE_TIME:.3g}"),
         max_velocity=round(speed, 4),
         friction=float(f"{FRICTION * min(effort, rating.needed):.4g}"),
+        rotor=0.0 if joint.armature > 0 else float(f"{ROTOR * min(effort, rating.needed):.2g}"),
         stops=stops,
         notes=notes,
     )

@@ -37,6 +37,8 @@ class ModelJoint:
     """Places of the joints between the base and this one, in the list of all."""
     carried_by: tuple[str, ...]
     """Bodies between the base and the one that it moves."""
+    armature: float = 0.0
+    """Rotor inertia at the joint [kg·m²]."""
     locked: float | None = None
     """Position [rad, m] at which something else than the arm's drives holds it; None: it is not held."""
 
@@ -78,6 +80,7 @@ def model_joints(
                 partner=coupled.get(name),
                 parents=parents,
                 carried_by=tuple(model.body(up).name for up in carriers[1:]),
+                armature=float(model.dof_armature[model.jnt_dofadr[joint]]),
                 locked=(locked or {}).get(name),
             )
         )
