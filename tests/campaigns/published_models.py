@@ -16,10 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import binom
 
 ARMLINK = str(Path(sys.executable).with_name("armlink"))
-LEAST_SHARE = 0.85
-"""Share of the intervals of 95 % that hold, at least: of some tens a model, fewer are chance once in a thousand."""
+CHANCE = 1e-3
+"""So many of a model's intervals of 95 % may fail as chance makes no more often than this."""
 
 
 @dataclass
@@ -34,8 +35,9 @@ class Outcome:
     seconds: float = 0.0
     gain_error: float = float("nan")
     """Largest error of an identified torque gain, as a share."""
-    inside: float = float("nan")
-    """Share of the 95 % intervals of gains and offsets that hold."""
+    inside: int = 0
+    """How many of the 95 % intervals of gains and offsets hold, and how many there are."""
+    intervals: int = 0
     gravity_error: float = float("nan")
     """Largest RMS error of a joint's gravity torque, as a share of the largest torque of any."""
 
@@ -44,7 +46,7 @@ class Outcome:
         """Whether it was refused in time, or reached a sound report."""
         if self.new.startswith("refused") or self.doctor.startswith("refused"):
             return True
-        return self.demo == "report" and not self.inside < LEAST_SHARE
+        return self.demo == "report" and bool(binom.cdf(self.inside, self.intervals, 0.95) > CHANCE)
 
     def row(self) -> str:
         """A line of the table."""
@@ -53,7 +55,7 @@ class Outcome:
             return f"| {self.name} | {self.joints or ''} | {said} | {self.seconds:.0f} | | | |"
         return (
             f"| {self.name} | {self.joints} | report | {self.seconds:.0f} | {100 * self.gain_error:.2f} % | "
-            f"{100 * self.inside:.0f} % | {100 * self.gravity_error:.2f} % |"
+            f"{self.inside} of {self.intervals} | {100 * self.gravity_error:.2f} % |"
         )
 
 
@@ -118,7 +120,7 @@ def take(found: Outcome, summary: dict) -> None:
             inside.append(interval[0] <= true <= interval[1])
             if key == "gain":
                 found.gain_error = float(np.fmax(found.gain_error, abs(estimated / true - 1)))
-    found.inside = float(np.mean(inside)) if inside else float("nan")
+    found.inside, found.intervals = sum(inside), len(inside)
     rms, most = summary["gravity"]["rms_error"], max(summary["gravity"]["max_torque"])
     found.gravity_error = max(rms) / most if most else float("nan")
 
@@ -151,6 +153,8 @@ def main() -> int:
         "|---|---|---|---|---|---|---|"
     )
     table = "\n".join([heading, *(each.row() for each in outcomes)])
+    held, told = (sum(getattr(each, of) for each in outcomes) for of in ("inside", "intervals"))
+    print(f"{sum(each.good for each in outcomes)} of {len(outcomes)} models good; {held} of {told} intervals hold")
     if given.out is not None:
         given.out.write_text(table + "\n", encoding="utf-8")
     return int(not all(each.good for each in outcomes))

@@ -36,7 +36,7 @@ def test_the_demo_reaches_a_sound_report(model: Path) -> None:
 def test_a_model_that_fails_is_told_from_one_that_is_refused() -> None:
     refused = published_models.Outcome("a", doctor="refused: joint: what: remedy")
     failed = published_models.Outcome("b", demo="failed: gate: j4 turns at 13.5 rad/s")
-    doubtful = published_models.Outcome("c", demo="report", inside=0.5)
+    doubtful = published_models.Outcome("c", demo="report", inside=12, intervals=19)
     assert [each.good for each in (refused, failed, doubtful)] == [True, False, False]
     traced = subprocess.CompletedProcess([], 1, "", "Traceback (most recent call last):\nValueError: x")
     assert "traceback" in published_models.one_line(traced)
