@@ -1,7 +1,7 @@
 """Drives on a bus that no arm file describes yet; findings about drives, and results of their self-test."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,15 @@ class FoundDrive:
     """Most that it is set to [N·m]."""
     unit: float
     """One count of its position [rad]."""
+    own_torque: bool = True
+    """Whether it has our torque sensor record (2100h); else its torque is the motor's, and calibrated in the host."""
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """As `link.joints[]` of an arm file names it."""
+        if self.own_torque:
+            return {"node": self.node}
+        return {"drive": {"family": "canopen", "node": self.node, "torque": "motor", "calibration": "host"}}
 
 
 class FoundDrives(Protocol):

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -60,6 +60,8 @@ class JointDraft:
     notes: list[str] = field(default_factory=list)
     identity: dict[str, int] | None = None
     """Vendor and product of the drive found at its node."""
+    drive: dict[str, Any] | None = None
+    """Keys of the drive found, where it is another kind than a bare node id says."""
 
 
 @dataclass

@@ -155,7 +155,7 @@ def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -
         from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
         if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
             made.findings.append(_doubtful_rating(match, joint.rated_torque))
-        joint.node, joint.rated_torque = drive.node, drive.rated_torque
+        joint.node, joint.drive, joint.rated_torque = drive.node, drive.keys.get("drive"), drive.rated_torque
         joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
         joint.max_torque_rate = float(f"{2.5 * joint.max_torque:.3g}")
         joint.identity = {"vendor": drive.vendor, "product": drive.product}
@@ -182,7 +182,14 @@ def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | in
     link: Any = edited.content["link"]
     for row, match in zip(link["joints"], matches, strict=True):
         drive = match.drive
-        row["node"], row["rated_torque"] = drive.node, drive.rated_torque
+        if "drive" in row:
+            row["drive"]["node"] = drive.node
+        elif drive.own_torque:
+            row["node"] = drive.node
+        else:
+            del row["node"]
+            row["drive"] = edited.in_line(drive.keys["drive"])
+        row["rated_torque"] = drive.rated_torque
         row["max_torque"] = min(float(row["max_torque"]), drive.max_torque)
         row["identity"] = edited.in_line({"vendor": drive.vendor, "product": drive.product})
     link["bus"] = edited.in_line(bus)

@@ -337,3 +337,17 @@ def test_an_arm_file_without_a_bus_has_nothing_to_find(tmp_path):
     with pytest.raises(BadInput, match="expected a URDF or MJCF model"):
         new_arm(tmp_path / "arm.yaml", tmp_path / "out.yaml")
     assert cli.run(["new", "sarcos.yaml"]) == 2
+
+
+def test_stock_drives_are_written_as_what_they_are_and_pass_the_check(tmp_path, monkeypatch, capsys):
+    """Without a torque sensor record (2100h) a bare node id would be wrong; an arm file of such drives is taken, too."""
+    monkeypatch.chdir(tmp_path)
+    for model in (["six-cia402"], []):
+        out = f"{len(model)}.yaml"
+        assert cli.run(["new", *model, "--out", out, "--bus", "armlink_sim:six-cia402"]) == 0
+        joints = load_arm(out).require_link().joints
+        assert [joint.settings.node for joint in joints] == [1, 2, 3, 4, 5, 6]
+        assert {joint.settings.calibration for joint in joints} == {"host"}
+        assert all(joint.identity is not None for joint in joints)
+        assert cli.run(["check", out, "--passive"]) == 0
+    assert {joint.settings.torque for joint in joints} == {"motor"}
