@@ -5,6 +5,7 @@ Names come from models and drives, so no line is put together from them by hand.
 
 import io
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import yaml
@@ -71,7 +72,7 @@ class EditedYaml:
         self.content: Any = self._yaml.load(text)
         """Mappings and lists of the text, to be changed in place."""
 
-    def in_line(self, values: dict[str, Any]) -> Any:
+    def in_line(self, values: Mapping[str, Any]) -> Any:
         """A mapping that is written on one line."""
         made = CommentedMap(values)
         made.fa.set_flow_style()

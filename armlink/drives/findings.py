@@ -1,5 +1,6 @@
 """Drives on a bus that no arm file describes yet; findings about drives, and results of their self-test."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -18,15 +19,8 @@ class FoundDrive:
     """Most that it is set to [N·m]."""
     unit: float
     """One count of its position [rad]."""
-    own_torque: bool = True
-    """Whether it has our torque sensor record (2100h); else its torque is the motor's, and calibrated in the host."""
-
-    @property
-    def keys(self) -> dict[str, Any]:
-        """As `link.joints[]` of an arm file names it."""
-        if self.own_torque:
-            return {"node": self.node}
-        return {"drive": {"family": "canopen", "node": self.node, "torque": "motor", "calibration": "host"}}
+    keys: Mapping[str, Any] | None = None
+    """`link.joints[].drive` of an arm file, where its node id alone does not say what it is."""
 
 
 class FoundDrives(Protocol):

@@ -8,6 +8,11 @@ from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from calib.commissioning.draft import FRICTION, Draft, JointDraft
 
 
+def assumed_lines(text: str) -> list[int]:
+    """Numbers of the lines of an arm file whose comment says that a value is assumed."""
+    return [place for place, line in enumerate(text.splitlines(), start=1) if "assumed" in line.partition("#")[2]]
+
+
 def arm_text(draft: Draft, out: Path) -> str:
     """The YAML text of the draft, to stand at `out`: the model's path is relative to it."""
     lines = [
@@ -62,7 +67,7 @@ def _bus(draft: Draft, out: Path) -> list[str]:
 def _joint(joint: JointDraft) -> dict[str, Any]:
     row = {
         "name": joint.name,
-        **({"node": joint.node} if joint.drive is None else {"drive": joint.drive}),
+        **({"node": joint.node} if joint.drive is None else {"drive": dict(joint.drive)}),
         "rated_torque": joint.rated_torque,
         "max_torque": joint.max_torque,
         "max_torque_rate": joint.max_torque_rate,

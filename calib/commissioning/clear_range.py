@@ -47,7 +47,7 @@ def clear_ranges(arm_file: ArmFile, problem: Exception) -> Iterator[ClearRange]:
     drawn = generator.uniform(arm.lower, arm.upper, (CENTRES, arm.n))
     centres = np.concatenate([[(arm.lower + arm.upper) / 2, own], drawn])
     centres = centres[geometry.free(centres)]
-    reason = str(problem).removeprefix(f"{arm_file.name}: ")
+    reason = str(problem).removeprefix(f"{arm_file.name}: ").partition(": narrow")[0]
     for share in WIDTH_SHARES:
         boxes = [_box(arm, centre, share) for centre in centres]
         for low, high in boxes:

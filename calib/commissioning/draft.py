@@ -60,7 +60,7 @@ class JointDraft:
     notes: list[str] = field(default_factory=list)
     identity: dict[str, int] | None = None
     """Vendor and product of the drive found at its node."""
-    drive: dict[str, Any] | None = None
+    drive: Mapping[str, Any] | None = None
     """Keys of the drive found, where it is another kind than a bare node id says."""
 
 

@@ -12,6 +12,7 @@ from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
 from armlink.content.yaml_text import EditedYaml
 from armlink.drives.findings import FoundDrives
 from armlink.errors import BadInput
+from armlink.model_file import read_model
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.chain import Chain, find_chains
@@ -101,6 +102,10 @@ def new_arm(
     made = NewArm(out, draft)
     refuse_impossible_model(made.parsed())
     _narrow_until_clear(made)
+    missing = read_model(model).left_out
+    if missing:
+        what = f"collisions are looked for without {missing}"
+        made.findings.append(SetupFinding("warning", what, str(model), "put them where the model names them"))
     return made
 
 
@@ -155,7 +160,7 @@ def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -
         from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
         if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
             made.findings.append(_doubtful_rating(match, joint.rated_torque))
-        joint.node, joint.drive, joint.rated_torque = drive.node, drive.keys.get("drive"), drive.rated_torque
+        joint.node, joint.drive, joint.rated_torque = drive.node, drive.keys, drive.rated_torque
         joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
         joint.max_torque_rate = float(f"{2.5 * joint.max_torque:.3g}")
         joint.identity = {"vendor": drive.vendor, "product": drive.product}
@@ -184,11 +189,11 @@ def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | in
         drive = match.drive
         if "drive" in row:
             row["drive"]["node"] = drive.node
-        elif drive.own_torque:
+        elif drive.keys is None:
             row["node"] = drive.node
         else:
             del row["node"]
-            row["drive"] = edited.in_line(drive.keys["drive"])
+            row["drive"] = edited.in_line(drive.keys)
         row["rated_torque"] = drive.rated_torque
         row["max_torque"] = min(float(row["max_torque"]), drive.max_torque)
         row["identity"] = edited.in_line({"vendor": drive.vendor, "product": drive.product})

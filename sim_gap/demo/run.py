@@ -15,6 +15,7 @@ from armlink.link.types import Sample
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_section
+from calib.commissioning.arm_text import assumed_lines
 from calib.commissioning.model_judgement import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
 from calib.creep.choice import sweep_motion
@@ -61,7 +62,7 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
     if Path(arm_name).suffix.lower() in MODEL_SUFFIXES:
         made = new_arm(Path(arm_name), out / f"{Path(arm_name).stem}.yaml")
         made.write()
-        arm_name, joints, assumed = str(made.out), len(made.draft.joints), len(made.draft.assumed)
+        arm_name, joints, assumed = str(made.out), len(made.draft.joints), len(assumed_lines(made.text))
         account.say(f"{arm_name} made of the model: {joints} joints, {assumed} assumed values, each says so there")
     arm = load_arm(arm_name)
     if realism is not None:

@@ -179,6 +179,8 @@ def _require_free(out: Path, force: bool, interactive: bool) -> None:
 def _show(console: Any, made: "NewArm") -> None:
     from rich.table import Table
 
+    from calib.commissioning.arm_text import assumed_lines
+
     draft = made.draft
     table = Table("joint", "node", "stops [rad]", "rated [N·m]", "largest [N·m]", title=f"{draft.name}: {made.out}")
     for joint in draft.joints:
@@ -193,7 +195,7 @@ def _show(console: Any, made: "NewArm") -> None:
         console.print(f"resting joints are held by their servos: {draft.servo}", style="yellow")
     for found in made.findings:
         console.print(str(found), style="red" if found.level == "error" else "yellow")
-    console.print(f"{made.out} written; {len(draft.assumed)} values are assumed, each says so in the file")
+    console.print(f"{made.out} written; {len(assumed_lines(made.text))} values are assumed, each says so in the file")
 
 
 def _answer(made: "NewArm", step: str) -> dict[str, Any]:

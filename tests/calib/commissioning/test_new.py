@@ -340,7 +340,7 @@ def test_an_arm_file_without_a_bus_has_nothing_to_find(tmp_path):
 
 
 def test_stock_drives_are_written_as_what_they_are_and_pass_the_check(tmp_path, monkeypatch, capsys):
-    """Without a torque sensor record (2100h) a bare node id would be wrong; an arm file of such drives is taken, too."""
+    """Without a torque sensor record (2100h) a bare node id would be wrong."""
     monkeypatch.chdir(tmp_path)
     for model in (["six-cia402"], []):
         out = f"{len(model)}.yaml"
