@@ -89,6 +89,8 @@ class Kinematics(Section):
     """Body of the model that the chain ends in; by default its last."""
     stops: dict[str, Range] = {}
     """Mechanical stops (lower, upper) [rad] of joints of the model by name, instead of the model's own limits."""
+    locked: dict[str, FiniteFloat] = {}
+    """Joints of the model that are held by other means, at this position [rad, m]: their load is the carrier's."""
 
     @model_validator(mode="after")
     def _one_description(self) -> "Kinematics":
@@ -97,6 +99,8 @@ class Kinematics(Section):
         _no_twins([joint.name for joint in self.joints])
         if self.stops and self.joints:
             raise ValueError("stops is for a model: Denavit-Hartenberg rows have lower and upper")
+        if self.locked and self.joints:
+            raise ValueError("locked is for a model: leave out the Denavit-Hartenberg row of a joint that is held")
         for name, (lower, upper) in self.stops.items():
             if lower >= upper:
                 raise ValueError(f"stops: joint {name}: lower {lower} must be less than upper {upper} [rad]")
@@ -292,8 +296,9 @@ class ArmFile(Section):
     @cached_property
     def description_hash(self) -> str:
         """SHA-256 (hex) of the kinematics, model file included: results of another description are refused."""
-        unset = set() if self.kinematics.stops else {"stops"}  # results of before the key existed keep their hash
-        content = json.dumps(self.kinematics.model_dump(mode="json", exclude=unset), sort_keys=True).encode()
+        kinematics = self.kinematics  # results of before a key existed keep their hash
+        unset = {key for key in ("stops", "locked") if not getattr(kinematics, key)}
+        content = json.dumps(kinematics.model_dump(mode="json", exclude=unset), sort_keys=True).encode()
         if self.model_path is not None:
             content += read_whole(self.model_path, MOST_TEXT)
         return hashlib.sha256(content).hexdigest()

@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os.path import isfile
 from pathlib import Path
@@ -83,8 +83,10 @@ class ModelFile:
         return sum(bool(geom.contype or geom.conaffinity) for geom in self.spec.geoms)
 
 
-def read_model(path: Path) -> ModelFile:
+def read_model(path: Path, locked: Mapping[str, float] | None = None) -> ModelFile:
     """Parse a URDF or MJCF file; raises BadInput if it cannot be read.
+
+    Joints in `locked` have that position [rad, m] in the model's own pose, where joints rest that no arm moves.
 
     A mesh `package://NAME/…` is looked for in the folders above the file, as ROS lays packages out. A mesh that is not
     there or cannot be read costs its shape only: inertials are in the file itself. MuJoCo's warnings go to the log,
@@ -136,6 +138,8 @@ def read_model(path: Path) -> ModelFile:
     if kind == "URDF":
         spec.strippath = False  # the meshes' paths are absolute by now
     unphysical = _negative_inertias_removed(spec) if kind == "URDF" else ()
+    for name, position in (locked or {}).items():
+        _rest_at(spec, name, position, path)
     return ModelFile(spec, tuple(unused), unphysical, kind)
 
 
@@ -156,9 +160,47 @@ def expanded(path: Path, out: Path) -> Path:
     return out
 
 
-def compile_model(path: Path, beside: Sequence[Beside] = ()) -> Any:
-    """The file as a compiled `mujoco.MjModel`, with others beside it; raises BadInput if one cannot be used."""
-    found = read_model(path)
+def _rest_at(spec: Any, name: str, position: float, path: Path) -> None:
+    """Give a joint another position [rad, m] in the model's own pose: its body moves, and the joint's reference."""
+    import mujoco
+    import numpy as np
+
+    joint = spec.joint(name)
+    if joint is None:
+        joints = ", ".join(each.name for each in spec.joints)
+        raise BadInput(f"{path}: no joint {name!r} to lock; there are {joints}")
+    hinge, body = joint.type == mujoco.mjtJoint.mjJNT_HINGE, joint.parent
+    if not hinge and joint.type != mujoco.mjtJoint.mjJNT_SLIDE:
+        raise BadInput(f"{path}: joint {name!r} cannot be locked: it neither turns about one axis nor slides along it")
+    if body.joints[0].name != name:
+        raise BadInput(
+            f"{path}: joint {name!r} cannot be locked: {body.joints[0].name!r} moves the same body before it"
+        )
+    unit = np.pi / 180 if hinge and joint.compiler.degree else 1.0
+    if joint.range[0] < joint.range[1] and not joint.range[0] <= position / unit <= joint.range[1]:
+        low, high = unit * joint.range
+        raise BadInput(f"{path}: joint {name!r} cannot be locked at {position:g}: its range is {low:g} to {high:g}")
+    way, axis = position - unit * joint.ref, joint.axis / np.linalg.norm(joint.axis)
+    if body.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
+        compiler = body.compiler
+        body.quat = spec.resolve_orientation(bool(compiler.degree), compiler.eulerseq, body.alt)
+        body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    shift, turned, turn = np.zeros(3), np.zeros(4), np.array([1.0, 0.0, 0.0, 0.0])
+    if hinge:
+        mujoco.mju_axisAngle2Quat(turn, axis, way)
+        mujoco.mju_rotVecQuat(shift, joint.pos, turn)
+    moved = joint.pos - shift if hinge else way * axis
+    mujoco.mju_rotVecQuat(shift, moved, body.quat)
+    mujoco.mju_mulQuat(turned, body.quat, turn)
+    body.pos, body.quat, joint.ref = body.pos + shift, turned, position / unit
+
+
+def compile_model(path: Path, beside: Sequence[Beside] = (), locked: Mapping[str, float] | None = None) -> Any:
+    """The file as a compiled `mujoco.MjModel`, with others beside it; raises BadInput if one cannot be used.
+
+    `locked` is as in `read_model`.
+    """
+    found = read_model(path, locked)
     for each in beside:
         frame = found.spec.worldbody.add_frame(pos=each.at, quat=_quaternion(each.turned))
         found.spec.attach(read_model(each.path).spec, prefix=each.prefix, frame=frame)

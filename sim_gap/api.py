@@ -1,10 +1,11 @@
 """The diagnosis for programs and notebooks; `import armlink` offers it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from armlink.errors import BadInput
+from armlink.recording.corrections import Corrections, parse_corrections
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from sim_gap.attribution import diagnose as diagnosis
@@ -12,6 +13,8 @@ from sim_gap.attribution.diagnosis import Diagnosis
 
 RecordingLike: TypeAlias = Recording | str | Path
 """A recording, or its path."""
+Stated: TypeAlias = Mapping[str, str | float] | Sequence[str]
+"""Statements about columns: `{"q": "deg"}`, or in the words of the command, `["q=deg"]`."""
 
 
 def diagnose(
@@ -21,6 +24,14 @@ def diagnose(
     *,
     base: str | None = None,
     tip: str | None = None,
+    units: Stated = (),
+    sign: Stated = (),
+    zero: Stated = (),
+    clock: Stated = (),
+    columns: Stated = (),
+    joints: Sequence[str] = (),
+    effort_is: str = "",
+    topic: str = "",
 ) -> Diagnosis:
     """Explain the gap between a simulation model and recordings of the real arm.
 
@@ -30,16 +41,39 @@ def diagnose(
         heldout: recordings to judge on, which the fit does not see; by default the end of each training recording.
         base: body of the model that carries the recorded arm, such as a torso; by default the world.
         tip: body of the model that the recorded arm ends in, if it has several arms.
+        units, sign, zero, clock: of columns or channels, as the options of `armlink gap diagnose` have them:
+            `units={"q": "deg", "tau": "A:2.1"}`, `sign={"tau_3": -1}`, `zero={"q_2": 1.571}` [rad],
+            `clock={"tau": 0.02}` [s].
+        columns: as `--map`, for a table with other names; joints: the recorded joints in the model's order.
+        effort_is: whether the torque channel is of the motor or the link, and whether gravity is missing in it.
+        topic: the joint states in a bag.
 
     Raises BadInput if the recordings cannot be used with the model.
     """
-    trained, judged = _recordings("train", train), _recordings("heldout", heldout)
+    stated = parse_corrections(
+        columns=_texts(columns),
+        sign=_texts(sign),
+        units=_texts(units),
+        zero=_texts(zero),
+        clock=_texts(clock),
+        effort=effort_is,
+        joints=",".join(joints),
+        topic=topic,
+    )
+    trained, judged = (_recordings(*each, stated.of_reading()) for each in (("train", train), ("heldout", heldout)))
     labels = [label for label, _ in (*trained, *judged)]
     recordings = [recording for _, recording in trained], [recording for _, recording in judged]
-    return diagnosis.diagnose(model, *recordings, labels=labels, base=base, tip=tip)
+    return diagnosis.diagnose(model, *recordings, labels=labels, stated=stated, base=base, tip=tip)
 
 
-def _recordings(role: str, given: RecordingLike | Sequence[RecordingLike]) -> list[tuple[str, Recording]]:
+def _texts(stated: Stated) -> Sequence[str]:
+    """In the words of the command."""
+    return [f"{column}={value}" for column, value in stated.items()] if isinstance(stated, Mapping) else stated
+
+
+def _recordings(
+    role: str, given: RecordingLike | Sequence[RecordingLike], reading: Corrections
+) -> list[tuple[str, Recording]]:
     """(Label, recording) of each."""
     items = [given] if isinstance(given, Recording | str | Path) else given
     if not isinstance(items, Sequence):
@@ -49,7 +83,7 @@ def _recordings(role: str, given: RecordingLike | Sequence[RecordingLike]) -> li
         if isinstance(each, Recording):
             found.append((f"{role} {number}", each))
         elif isinstance(each, str | Path):
-            found.append((str(each), load_recording(each)))
+            found.append((str(each), load_recording(each, reading)))
         else:
             raise BadInput(f"diagnose: {role}: expected recordings or their paths, not {type(each).__name__}")
     return found

@@ -1,13 +1,18 @@
-"""Logs of raw CAN frames in the formats of python-can's loggers: Vector ASC and BLF, and candump's log.
+"""Logs of raw CAN frames: Vector ASC and BLF and candump's log, as python-can writes them; and others that people have.
 
-Times have the microsecond resolution that all three formats keep. Frames recorded from a bus (`taps.TappedBus`) and
+Those are only read: what candump prints on a terminal, PEAK's trace, python-can's CSV, and any of these packed by gzip.
+Times have the microsecond resolution that the written formats keep. Frames recorded from a bus (`taps.TappedBus`) and
 replayed from a log (`LogBus`) carry the same times, so that both decode to the same samples bit for bit.
 """
 
+import gzip
+import io
 import math
+import re
 import struct
 import zlib
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -28,10 +33,23 @@ from armlink.bus.port import Frame
 from armlink.errors import BadInput, BusFault
 
 LOG_SUFFIXES = (".asc", ".blf", ".log")
+READ_SUFFIXES = (*LOG_SUFFIXES, ".trc")
+PACKED = ".gz"
+CSV_HEADER = "timestamp,arbitration_id"
+"""Beginning of a CSV file of python-can, which has the suffix of a recording."""
+PRINTED = re.compile(
+    r"\s*(\((?P<time>[^)]+)\))?\s*(?P<channel>[^\s(]\S*)\s+((RX|TX)\s+\S+\s+\S+\s+)?(?P<id>[0-9A-F]{3}|[0-9A-F]{8})"
+    r"\s+\[(?P<length>\d+)\]\s*(?P<data>remote request|([0-9A-F]{2}(\s+|$))*).*",
+    re.IGNORECASE | re.DOTALL,
+)
+"""A line as candump prints it: (time) channel id [length] bytes."""
+SPACING = 1e-4
+"""Time from frame to frame where a log has none [s]: about that of full frames on a bus of 1 Mbit/s."""
 FLUSH_MICROSECONDS = 500_000
 """Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
 MOST_LINE = 1 << 16
 """Characters of a line; one of a CAN FD frame has some hundreds."""
+MOST_IDS = 2000
 MOST_CONTAINER = 1 << 26
 """Bytes that a container of a BLF file holds at most; Vector's and python-can's writers put 128 kB into one."""
 _CONTAINER = 8192  # bytes that the BLF writer buffers
@@ -41,8 +59,27 @@ _BAD_CONTENT = (BLFParseError, ValueError, IndexError, TypeError, OverflowError,
 
 
 def is_log(path: Path) -> bool:
-    """Whether a file has the suffix of a raw frame log."""
-    return path.suffix.lower() in LOG_SUFFIXES
+    """Whether a file has the suffix of a raw frame log that can be read, or the header of python-can's CSV."""
+    return _kind(path) in READ_SUFFIXES or (_kind(path) == ".csv" and _has_csv_header(path))
+
+
+def _kind(path: Path) -> str:
+    """The suffix, without that of packing."""
+    return Path(path.stem if path.suffix.lower() == PACKED else path.name).suffix.lower()
+
+
+def _open_text(path: Path) -> io.TextIOBase:
+    if path.suffix.lower() == PACKED:
+        return gzip.open(path, "rt", encoding="utf-8", errors="replace")
+    return path.open(encoding="utf-8", errors="replace")
+
+
+def _has_csv_header(path: Path) -> bool:
+    try:
+        with _open_text(path) as stream:
+            return stream.read(len(CSV_HEADER)) == CSV_HEADER
+    except (OSError, EOFError):
+        return False
 
 
 class FrameLog:
@@ -50,7 +87,7 @@ class FrameLog:
 
     def __init__(self, path: Path) -> None:
         """Create the file; raises BadInput for another suffix or a file that cannot be written."""
-        if not is_log(path):
+        if path.suffix.lower() not in LOG_SUFFIXES:
             raise BadInput(f"{path}: not the suffix of a frame log, expected {', '.join(LOG_SUFFIXES)}")
         try:
             self._writer = can.Logger(str(path))
@@ -129,15 +166,19 @@ class LogReader:
 
     def __init__(self, path: Path) -> None:
         """Raises BadInput if the file does not exist or has another suffix."""
-        if not is_log(path):
-            raise BadInput(f"{path}: not the suffix of a frame log, expected {', '.join(LOG_SUFFIXES)}")
         if not path.is_file():
-            raise BadInput(f"no frame log {path}: give a {', '.join(LOG_SUFFIXES)} file")
+            raise BadInput(f"no frame log {path}: give a {', '.join(READ_SUFFIXES)} file")
+        if not is_log(path):
+            raise BadInput(f"{path}: not the suffix of a frame log, expected {', '.join(READ_SUFFIXES)}")
+        if _kind(path) == ".blf" and path.suffix.lower() == PACKED:
+            raise BadInput(f"{path}: BLF files are packed already: unpack it first (gunzip)")
         self._path = path
         self.count = 0
         """Frames read."""
+        self.ids = set[int]()
+        """Identifiers of these frames, with flags; not more than `MOST_IDS`."""
         self.warning = ""
-        """Where the log is truncated or unreadable; empty if it is intact."""
+        """Where the log is truncated or unreadable, or that it has no times; empty if it is intact."""
 
     def frames(self) -> Iterator[tuple[int, int, bytes]]:
         """Time since the first message [µs], identifier with flags and data of each data frame."""
@@ -150,19 +191,22 @@ class LogReader:
             first = stamp if first is None else first
             if is_data(message):
                 self.count += 1
-                yield stamp - first, *as_frame(message)
+                can_id, data = as_frame(message)
+                if len(self.ids) < MOST_IDS:
+                    self.ids.add(can_id)
+                yield stamp - first, can_id, data
 
     def _messages(self) -> Iterator[can.Message]:
         why = ""
         try:
-            if self._path.suffix.lower() == ".blf":
+            if _kind(self._path) == ".blf":
                 why = yield from self._from_blf()
             else:
                 why = yield from self._from_lines()
         except _BAD_CONTENT:
             why = "what follows is not readable"
-        except OSError as error:
-            raise BadInput(f"{self._path}: cannot read it: {error.strerror}") from None
+        except (OSError, EOFError) as error:
+            raise BadInput(f"{self._path}: cannot read it: {getattr(error, 'strerror', None) or error}") from None
         if why:
             self.warning = f"cut frame log, {why}: loaded {self.count} frames up to there"
 
@@ -176,14 +220,50 @@ class LogReader:
         return "" if _BLF_SIZE.unpack(stated)[0] == size else "the file ends early"
 
     def _from_lines(self) -> Generator[can.Message, None, str]:
-        with self._path.open(encoding="utf-8", errors="replace") as stream:
+        kind = _kind(self._path)
+        with _open_text(self._path) as stream:
             lines = _WholeLines(stream)
-            yield from (can.ASCReader if self._path.suffix.lower() == ".asc" else can.CanutilsLogReader)(lines)
+            if kind == ".log":
+                yield from can.CanutilsLogReader(self._printed(lines))
+            else:
+                yield from {".asc": can.ASCReader, ".trc": can.TRCReader, ".csv": can.CSVReader}[kind](lines)
         if lines.cut:
             return "its last line is not complete"
-        if self._path.suffix.lower() == ".asc" and not lines.last.strip().lower().startswith(_ASC_END):
+        if kind == ".asc" and not lines.last.strip().lower().startswith(_ASC_END):
             return "it has no End TriggerBlock"
         return ""
+
+    def _printed(self, lines: "_WholeLines") -> "_WholeLines":
+        """Lines of candump's log; those that it printed for people are rewritten so."""
+        timeless = 0
+
+        def rewritten(line: str) -> str:
+            nonlocal timeless
+            found = PRINTED.fullmatch(line)
+            if found is None:
+                return line
+            if found["time"] is None:
+                self.warning = (
+                    f"it has no times (candump -L writes them): frames are taken as {1e3 * SPACING:g} ms apart"
+                )
+                time, timeless = SPACING * timeless, timeless + 1
+            else:
+                time = _seconds(found["time"])
+            remote = found["data"].startswith("r")
+            flexible = "#" if len(found["length"]) == 2 else ""  # [08]: CAN FD
+            data = "R" if remote else (flexible and "#0") + "".join(found["data"].split())
+            return f"({time:.6f}) {found['channel']} {found['id']}#{data}\n"
+
+        lines.rewritten = rewritten
+        return lines
+
+
+def _seconds(text: str) -> float:
+    """A time as candump prints it: seconds, or date and time of day."""
+    try:
+        return float(text)
+    except ValueError:
+        return datetime.fromisoformat(text).timestamp()
 
 
 def _require_containers(stream: Any, path: Path) -> None:
@@ -221,6 +301,8 @@ class _WholeLines:
     def __init__(self, stream: Any) -> None:
         self._stream = stream
         self.cut, self.last = False, ""
+        self.rewritten: Callable[[str], str] = str
+        """Makes of a line what the reader understands."""
 
     def __iter__(self) -> Self:
         return self
@@ -234,7 +316,7 @@ class _WholeLines:
             raise StopIteration
         if line.strip():
             self.last = line
-        return str(line)
+        return self.rewritten(line)
 
     def read(self, size: int = -1) -> str:
         """Not used; python-can requires the attribute of a file."""

@@ -88,8 +88,11 @@ def interface_fault(error: Exception, name: str, doing: str) -> ArmlinkError:
     """The exception for an error of an interface while `doing` something on the bus `name`; our own errors stay."""
     if isinstance(error, ArmlinkError):
         return error
-    down = errno.ENETDOWN in (getattr(error, "error_code", None), getattr(error, "errno", None))
+    numbers = {getattr(error, "error_code", None), getattr(error, "errno", None)}
+    down = errno.ENETDOWN in numbers
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
     if isinstance(error, NameError | AttributeError | ImportError):  # its library is missed this late
         reason = f"{reason}: is the interface's driver installed?"
+    if errno.EAFNOSUPPORT in numbers:
+        reason = f"{reason}: this kernel has no SocketCAN (modprobe can); for trials: --bus udp_multicast:239.74.163.2"
     return (InterfaceDown if down else BusFault)(f"bus {name}: cannot {doing}: {reason}")

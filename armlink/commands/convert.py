@@ -55,7 +55,12 @@ def convert(
         PlainConsole().print(f"{source}: {recording.warning}", style="yellow")
     rows, seconds = int(recording.t.size), float(recording.t[-1] - recording.t[0])
     channels = list(recording.channels())
-    results(json).print(f"{target}: {rows} rows, {seconds:.1f} s, {recording.n} joints, {', '.join(channels)}")
+    out = results(json)
+    out.print(f"{target}: {rows} rows, {seconds:.1f} s, {recording.n} joints, {', '.join(channels)}")
+    kept = load_recording(target).names
+    if kept != recording.names:
+        renamed = ", ".join(f"{name} is {other}" for name, other in zip(recording.names, kept, strict=True))
+        out.print(f"its format keeps no names of joints: {renamed} there (Parquet and MCAP keep them)", style="yellow")
     answer = {"rows": rows, "seconds": seconds, "joints": list(recording.names), "channels": channels}
     write_json(json, {**answer, "warning": recording.warning})
     return 0

@@ -1,7 +1,7 @@
 """Work on an arm that ends early: how its joints were left, and the command that goes on from there."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from armlink.arm_file import ArmFile
@@ -20,10 +20,10 @@ class ArmWork:
 
 
 @contextlib.contextmanager
-def early_end(arm: ArmFile, resume: str | None = None) -> Iterator[ArmWork]:
+def early_end(arm: ArmFile, resume: str | Callable[[], str] | None = None) -> Iterator[ArmWork]:
     """Say both on standard error after Ctrl-C or a stall, once the link inside this context is closed.
 
-    Entered before the link is opened; `resume` is the command that continues the work.
+    Entered before the link is opened; `resume` is the command that continues the work, or tells it then.
     """
     work = ArmWork()
     try:
@@ -36,5 +36,5 @@ def early_end(arm: ArmFile, resume: str | None = None) -> Iterator[ArmWork]:
             holds = all(each.silence == "holds" for each in traits_of(make_groups(arm)))
             PlainConsole().print(f"{arm.name}: {HOLD if holds else PARKED}")
         if resume is not None:
-            suggest(resume)
+            suggest(resume if isinstance(resume, str) else resume())
         raise

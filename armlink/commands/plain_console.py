@@ -121,7 +121,11 @@ def suggest(command: str) -> None:
 def confirm(question: str, *, abort: bool = True, default: bool = False) -> bool:
     """The answer to a question of yes or no; raises typer.Abort where it is no and `abort`."""
     with _question():
-        return typer.confirm(printable_text(question), abort=abort, default=default, err=True)
+        agreed = typer.confirm(printable_text(question), default=default, err=True)
+    if abort and not agreed:
+        PlainConsole().print("no: nothing was done")
+        raise typer.Abort
+    return agreed
 
 
 def ask(question: str, **options: Any) -> Any:

@@ -27,8 +27,8 @@ def scan(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import command_line, results, suggest
-    from armlink.drives.registry import family
+    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
+    from armlink.drives.registry import family, not_looked_for
     from armlink.errors import BadInput
 
     if arm is None and bus is None:
@@ -43,6 +43,8 @@ def scan(
         status = _ask_all(described, bus, json)
     if arm is not None and status == 0:
         suggest(command_line("check", arm, bus=bus))
+    if arm is None:
+        PlainConsole().print(not_looked_for())
     return status
 
 

@@ -3,10 +3,14 @@
 Names come from models and drives, so no line is put together from them by hand.
 """
 
+import io
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
 
 from armlink.content.printable_text import printable_text
 
@@ -56,3 +60,26 @@ def yaml_document(content: Any) -> str:
     """Lines in block style."""
     text: str = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=WIDTH)
     return text
+
+
+class EditedYaml:
+    """A YAML text that is changed in places: comments, order and the rest of the text stay."""
+
+    def __init__(self, text: str) -> None:
+        self._yaml = YAML()
+        self._yaml.preserve_quotes, self._yaml.width = True, 10_000
+        self._yaml.indent(mapping=2, sequence=4, offset=2)
+        self.content: Any = self._yaml.load(text)
+        """Mappings and lists of the text, to be changed in place."""
+
+    def in_line(self, values: Mapping[str, Any]) -> Any:
+        """A mapping that is written on one line."""
+        made = CommentedMap(values)
+        made.fa.set_flow_style()
+        return made
+
+    @property
+    def text(self) -> str:
+        written = io.StringIO()
+        self._yaml.dump(self.content, written)
+        return written.getvalue()

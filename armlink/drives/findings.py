@@ -1,7 +1,8 @@
 """Drives on a bus that no arm file describes yet; findings about drives, and results of their self-test."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,8 @@ class FoundDrive:
     """Most that it is set to [N·m]."""
     unit: float
     """One count of its position [rad]."""
+    keys: Mapping[str, Any] | None = None
+    """`link.joints[].drive` of an arm file, where its node id alone does not say what it is."""
 
 
 class FoundDrives(Protocol):

@@ -34,3 +34,13 @@ def found_drives(bus: CanBus) -> FoundDrives:
     raise BadInput(
         f"drives of the families {', '.join(family_names())} can only be found by an arm file with their ids"
     )
+
+
+def not_looked_for() -> str:
+    """Which families a search without an arm file passes over, and the way to their drives."""
+    by_search = {name: family(name).find is not None for name in family_names()}
+    asked, others = ([name for name in by_search if by_search[name] is found] for found in (True, False))
+    return (
+        f"only {', '.join(asked)} drives were looked for; {', '.join(others)} are found by the ids of an arm file: "
+        "armlink scan ARM.yaml --bus …"
+    )

@@ -9,7 +9,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.bus.frame_log import LogBus, LogReader, is_log
+from armlink.bus.frame_log import READ_SUFFIXES, LogBus, LogReader, is_log
 from armlink.bus.open import is_virtual, open_bus, parse_bus
 from armlink.bus.port import Port, Stamped
 from armlink.clock import Clock, MonotonicClock
@@ -38,12 +38,29 @@ def recording_of_log(arm: ArmFile, path: Path) -> Recording:
             channels.setdefault(name, []).append(values)
     warning = bus.reader.warning
     if len(times) < 2:
-        cut = f"; {warning}" if warning else ""
-        raise BadInput(
-            f"{path}: {len(times)} whole cycles in {bus.reader.count} frames: does it contain SYNCs of {arm.name}?{cut}"
-        )
+        why = "; ".join(each for each in (_why_no_cycle(arm, bus.reader), warning) if each)
+        raise BadInput(f"{path}: {len(times)} whole cycles of {arm.name} in {bus.reader.count} frames: {why}")
     stacked = {name: np.array(rows) for name, rows in channels.items()}
     return Recording(t=np.array(times), names=recorder.names, warning=warning, **stacked).check(str(path))
+
+
+def _why_no_cycle(arm: ArmFile, log: LogReader) -> str:
+    """The frames of an arm that a log lacks, in words."""
+    if not log.ids:
+        return f"no frame is read: it is none of {', '.join(READ_SUFFIXES)}, as their suffix says"
+    names, absent = [joint.name for joint in arm.require_link().joints], []
+    for group in make_groups(arm):
+        owners = group.drives.reading_ids()
+        for drive, place in enumerate(group.places):
+            if not any(can_id in log.ids for can_id, owner in owners.items() if owner == drive):
+                absent.append(f"{names[place]} ({arm.require_link().joints[place].settings.address})")
+        paced = group.drives.cycle_ids()
+        if paced and not any(can_id in log.ids for can_id in paced):
+            absent.append(f"SYNC ({min(paced):03X}h)")
+    if not absent:
+        return "the frames of every joint are there, but never of all of them in one cycle"
+    seen = ", ".join(f"{can_id & 0x1FFFFFFF:03X}h" for can_id in sorted(log.ids)[:12])
+    return f"none is of {', '.join(absent)}; there are frames {seen}{' …' if len(log.ids) > 12 else ''}"
 
 
 def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed: float) -> int:

@@ -8,7 +8,7 @@ from armlink.arm_file import ArmFile
 from armlink.content.model_sizes import model_budget
 from armlink.errors import BadInput
 from gcomp.arm.arm import Arm
-from gcomp.arm.load import ModelArm, load_model
+from gcomp.arm.load import ModelArm, PlacedChain, place_chain
 from gcomp.arrays import Array
 from gcomp.errors import GcompError
 
@@ -42,21 +42,27 @@ def model_arm(arm_file: ArmFile) -> ModelArm:
 
     The arm file's gravity is in the model's world frame; without it the model's own is used.
     """
-    path, kinematics = arm_file.model_path, arm_file.kinematics
-    if path is None:
-        raise BadInput(f"{arm_file.path}: key kinematics.model is missing: this needs a URDF or MJCF file")
-    gravity = kinematics.gravity if "gravity" in kinematics.model_fields_set else None
-    try:
-        with model_budget(path):
-            model = load_model(path, base=kinematics.base, tip=kinematics.tip, gravity=gravity)
-    except GcompError as error:
-        raise BadInput(f"{arm_file.path}: key kinematics.model: {error}") from None
+    model, kinematics = model_chain(arm_file).arm, arm_file.kinematics
     if arm_file.link is not None and arm_file.joint_names != model.arm.names:
         raise BadInput(
             f"{arm_file.path}: link.joints are {list(arm_file.joint_names)}, but the model's chain has "
             f"{list(model.arm.names)}: same names, same order"
         )
     return replace(model, arm=_with_stops(arm_file, model.arm)) if kinematics.stops else model
+
+
+def model_chain(arm_file: ArmFile) -> PlacedChain:
+    """The arm file's chain in its model, with the bodies of each link; raises BadInput."""
+    path, kinematics = arm_file.model_path, arm_file.kinematics
+    if path is None:
+        raise BadInput(f"{arm_file.path}: key kinematics.model is missing: this needs a URDF or MJCF file")
+    gravity = kinematics.gravity if "gravity" in kinematics.model_fields_set else None
+    ends = {"base": kinematics.base, "tip": kinematics.tip}
+    try:
+        with model_budget(path):
+            return place_chain(path, **ends, gravity=gravity, locked=kinematics.locked)
+    except GcompError as error:
+        raise BadInput(f"{arm_file.path}: key kinematics.model: {error}") from None
 
 
 def _with_stops(arm_file: ArmFile, arm: Arm) -> Arm:

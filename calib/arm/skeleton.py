@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.content.model_sizes import model_budget
-from calib.arm.kinematics import gcomp_arm
+from calib.arm.kinematics import gcomp_arm, model_chain
 from gcomp.arm.arm import Arm
-from gcomp.arm.load import PlacedChain, place_chain
+from gcomp.arm.load import PlacedChain
 from gcomp.arrays import Array
 
 
@@ -37,11 +36,7 @@ def skeleton(arm_file: ArmFile) -> Skeleton:
     arm = gcomp_arm(arm_file)  # which also says what is wrong with a model file
     if arm_file.model_path is None:
         return _of_rows(arm)
-    kinematics = arm_file.kinematics
-    gravity = kinematics.gravity if "gravity" in kinematics.model_fields_set else None
-    with model_budget(arm_file.model_path):
-        placed = place_chain(arm_file.model_path, base=kinematics.base, tip=kinematics.tip, gravity=gravity)
-    return _of_model(placed, gravity)
+    return _of_model(model_chain(arm_file))
 
 
 def _of_rows(arm: Arm) -> Skeleton:
@@ -58,14 +53,14 @@ def _of_rows(arm: Arm) -> Skeleton:
     return Skeleton(_up(arm.gravity), axes, points, np.zeros(arm.n), _with_tip(links, axes[-1]))
 
 
-def _of_model(placed: PlacedChain, gravity: tuple[float, ...] | None) -> Skeleton:
+def _of_model(placed: PlacedChain) -> Skeleton:
     """From a model: straight from joint to joint, the last link to the body of it that is farthest away."""
     anchors, data = placed.anchors, placed.data
     ends = [data.xpos[body] for body in placed.bodies[-1]]
     tip = max(ends, key=lambda end: float(np.linalg.norm(end - anchors[-1])))
     links = [_corners(start, end) for start, end in zip(anchors, [*anchors[1:], tip], strict=True)]
     axes = placed.geometry.bar[:, :, 2]
-    up = _up(np.array(placed.model.opt.gravity if gravity is None else gravity))
+    up = _up(placed.model.opt.gravity)
     return Skeleton(up, axes, anchors.copy(), placed.reference, _with_tip(links, axes[-1]))
 
 

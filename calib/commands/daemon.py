@@ -64,7 +64,7 @@ def daemon(
     from armlink.bus.open import resolve_bus
     from armlink.errors import BadInput
     from armlink.extras import require_extra
-    from calib.daemon.logs import log_as_json
+    from calib.daemon.logs import log_to_stderr
     from calib.daemon.loop.loop_process import LoopProcess
     from calib.daemon.options import Options, state_directory
     from calib.records.file_lock import locked_directory
@@ -90,7 +90,7 @@ def daemon(
         store=store,
         work=work,
     )
-    log_as_json()
+    log_to_stderr()
     with locked_directory(directory, f"--state {directory}", patience=TAKE_OVER_SECONDS):
         host = LoopProcess(options.loop(described), fork=True)
         from calib.daemon.main_loop import run_daemon  # takes long to load: the bus process opens the bus meanwhile

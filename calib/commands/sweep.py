@@ -71,7 +71,7 @@ def sweep(
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, warn_late
     from calib.commissioning.model_judgement import refuse_impossible_sweep
-    from calib.sweep.dataset import require_vacant
+    from calib.sweep.dataset import MANIFEST, require_vacant
 
     if picture is not None:
         require_extra("--picture", "reports")
@@ -97,8 +97,11 @@ def sweep(
     if not dry_run and not yes:
         confirm(f"{arm_file.name} will move through its whole range, {reference_mass:g} kg attached. Is it clear?")
     load = reference_mass if dry_run else 0.0
-    words = [arm, "--resume", *["--dry-run"] * dry_run]
-    going_on = command_line("sweep", *words, out=out, reference_mass=reference_mass or None, bus=bus, hold=hold)
+
+    def going_on() -> str:
+        words = [arm, *["--resume"] * (out / MANIFEST).exists(), *["--dry-run"] * dry_run]
+        return command_line("sweep", *words, out=out, reference_mass=reference_mass or None, bus=bus, hold=hold)
+
     opened = open_link(arm_file, None if dry_run else bus, simulated=dry_run, load=load)
     with early_end(arm_file, going_on) as work, opened as link:
         link.start()

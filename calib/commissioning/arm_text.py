@@ -8,6 +8,11 @@ from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from calib.commissioning.draft import FRICTION, Draft, JointDraft
 
 
+def assumed_lines(text: str) -> list[int]:
+    """Numbers of the lines of an arm file whose comment says that a value is assumed."""
+    return [place for place, line in enumerate(text.splitlines(), start=1) if "assumed" in line.partition("#")[2]]
+
+
 def arm_text(draft: Draft, out: Path) -> str:
     """The YAML text of the draft, to stand at `out`: the model's path is relative to it."""
     lines = [
@@ -22,8 +27,15 @@ def arm_text(draft: Draft, out: Path) -> str:
         lines.append(yaml_entry("base", draft.base, 2))
     if draft.tip is not None:
         lines.append(yaml_entry("tip", draft.tip, 2))
+    if draft.locked:
+        lines.append("  locked:  # held by other means than these drives [rad, m]")
+        lines += [yaml_entry(name, position, 4) for name, position in draft.locked.items()]
     lines.append(yaml_entry("gravity", list(draft.gravity), 2, "m/s² in the model's frame"))
-    lines += [yaml_comment(f"{name} {why}: set aside, it keeps the model's position", 2) for name, why in draft.aside]
+    lines += [
+        yaml_comment(f"{name} {why}: set aside, it keeps the model's position", 2)
+        for name, why in draft.aside
+        if name not in draft.locked
+    ]
     given = {joint.name: list(joint.stops) for joint in draft.joints if joint.stops is not None}
     if given:
         lines.append(f"  stops:  # {'working range' if draft.servo else 'mechanical stops'} [rad]")
@@ -35,9 +47,10 @@ def arm_text(draft: Draft, out: Path) -> str:
         lines += ["sweep:", yaml_entry("hold", "servo", 2), yaml_comment(f"assumed: {draft.servo}", 2)]
     lines += [
         "sim:  # the simulated arm, for the command demo: masses are the model's",
-        f"  effects:  # assumed: friction of {FRICTION:.0%} of the torque that its drives need",
+        f"  effects:  # assumed: friction of {FRICTION:.0%} of the torque that its drives need, and a rotor",
     ]
     lines += [yaml_item(_friction(joint), 4) for joint in draft.joints]
+    lines += [yaml_item(_rotor(joint), 4) for joint in draft.joints if joint.rotor]
     lines += [yaml_comment(note) for note in draft.notes]
     return "\n".join(lines) + "\n"
 
@@ -54,13 +67,17 @@ def _bus(draft: Draft, out: Path) -> list[str]:
 def _joint(joint: JointDraft) -> dict[str, Any]:
     row = {
         "name": joint.name,
-        "node": joint.node,
+        **({"node": joint.node} if joint.drive is None else {"drive": dict(joint.drive)}),
         "rated_torque": joint.rated_torque,
         "max_torque": joint.max_torque,
         "max_torque_rate": joint.max_torque_rate,
         "max_velocity": joint.max_velocity,
     }
     return row if joint.identity is None else {**row, "identity": joint.identity}
+
+
+def _rotor(joint: JointDraft) -> dict[str, Any]:
+    return {"effect": "actuator.rotor_inertia", "joint": joint.name, "inertia": joint.rotor}
 
 
 def _friction(joint: JointDraft) -> dict[str, Any]:

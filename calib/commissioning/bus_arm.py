@@ -8,6 +8,7 @@ from typing import Any
 from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from armlink.drives.findings import FoundDrives
+from armlink.drives.registry import not_looked_for
 from armlink.errors import BusFault
 from calib.commissioning.drive_match import Ask, Match, moved_node
 
@@ -30,7 +31,7 @@ def arm_of_bus(drives: FoundDrives, channel: str, bus: Mapping[str, str | int], 
     reads the motion, and its stops are what that reads [rad]. Else the drives are taken in the order of their ids.
     """
     if not drives.found:
-        raise BusFault(f"{channel}: no drive answers: check power, wiring and bit rate")
+        raise BusFault(f"{channel}: no drive answers: check power, wiring and bit rate ({not_looked_for()})")
     if ask is None:
         matches = [Match(f"joint_{i}", drive, by_hand=False) for i, drive in enumerate(drives.found, start=1)]
         stops = [(-pi, pi)] * len(matches)
@@ -88,7 +89,7 @@ def _joint(match: Match) -> dict[str, Any]:
     drive = match.drive
     return {
         "name": match.joint,
-        "node": drive.node,
+        **({"node": drive.node} if drive.keys is None else {"drive": dict(drive.keys)}),
         "rated_torque": float(f"{drive.rated_torque:g}"),
         "max_torque": float(f"{drive.max_torque:g}"),
         "max_torque_rate": float(f"{2.5 * drive.max_torque:.3g}"),

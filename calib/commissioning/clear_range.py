@@ -1,11 +1,12 @@
 """Joint ranges without collision, for an arm that touches itself or its surroundings within its model's limits."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from calib.arm.kinematics import model_arm
+from calib.arm.kinematics import model_arm, model_chain
 from calib.plan.collisions import Geometry, check_plan
 from calib.plan.rough_gravity import guess_of_file
 from calib.plan.sweep_plan import plan_sweep
@@ -15,6 +16,8 @@ from gcomp.errors import GcompError
 
 WIDTH_SHARES = (0.8, 0.65, 0.5, 0.4, 0.3, 0.22, 0.16)
 """Widths of the range that are tried, as shares of the model's."""
+CENTRES = 80
+"""Drawn poses about which a range is looked for, besides the middle of the joints' and the model's own pose."""
 SKETCH, PROOF = 40, 400
 """Poses at which a range is looked at while choosing and in the end; half of them are corners."""
 
@@ -31,37 +34,36 @@ class ClearRange:
     """Why the model's limits are not kept."""
 
 
-def find_clear_range(arm_file: ArmFile) -> ClearRange | None:
-    """A clear range for an arm whose sweeps would collide within the model's limits; None where they would not.
+def clear_ranges(arm_file: ArmFile, problem: Exception) -> Iterator[ClearRange]:
+    """Ranges without collision for an arm whose sweeps end in `problem` within its model's limits, widest first.
 
-    Raises BadInput or Refused as planning does where nothing narrower helps.
+    One of each width; a later one is for those whose sweeps collide all the same, between the poses looked at here.
     """
     geometry = Geometry(arm_file)
-    problem = _problem(arm_file)
-    if problem is None:
-        return None
     if geometry.model.ngeom == 0:
-        raise problem
-    arm = model_arm(arm_file).arm
-    generator = np.random.default_rng(0)
-    centres = np.concatenate([[(arm.lower + arm.upper) / 2], generator.uniform(arm.lower, arm.upper, (80, arm.n))])
+        return
+    arm, generator = model_arm(arm_file).arm, np.random.default_rng(0)
+    own = np.clip(model_chain(arm_file).reference, arm.lower, arm.upper)
+    drawn = generator.uniform(arm.lower, arm.upper, (CENTRES, arm.n))
+    centres = np.concatenate([[(arm.lower + arm.upper) / 2, own], drawn])
     centres = centres[geometry.free(centres)]
+    reason = str(problem).removeprefix(f"{arm_file.name}: ").partition(": narrow")[0]
     for share in WIDTH_SHARES:
         boxes = [_box(arm, centre, share) for centre in centres]
-        clear = [box for box in boxes if geometry.free(_poses(box, SKETCH, generator)).all()]
-        for low, high in clear:
-            if geometry.free(_poses((low, high), PROOF, generator)).all():
-                return ClearRange(low, high, str(problem).removeprefix(f"{arm_file.name}: "))
-    raise problem
+        for low, high in boxes:
+            sketched = geometry.free(_poses((low, high), SKETCH, generator)).all()
+            if sketched and geometry.free(_poses((low, high), PROOF, generator)).all():
+                yield ClearRange(low, high, reason)
+                break
 
 
-def _problem(arm_file: ArmFile) -> Exception | None:
+def sweep_problem(arm_file: ArmFile) -> Exception | None:
     """The error that planning the sweeps ends with, None if it succeeds."""
     from armlink.errors import ArmlinkError
 
     guess = guess_of_file(arm_file)
     try:
-        for seed in (0, 1):  # plans that must be clear for the model's own limits to be kept
+        for seed in (0, 1):  # plans that must be clear for a range to be kept
             check_plan(arm_file, plan_sweep(arm_file, seed=seed))
             check_plan(arm_file, plan_sweep(arm_file, guess, seed=seed))
     except (ArmlinkError, GcompError) as error:

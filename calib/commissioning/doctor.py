@@ -5,6 +5,7 @@ from pathlib import Path
 
 from armlink.arm_file import ArmFile, BadKeys, bundled_arms, load_arm
 from armlink.errors import ArmlinkError
+from calib.commissioning.arm_text import assumed_lines
 from calib.commissioning.bus_checks import bus_findings, turn_findings
 from calib.commissioning.finding import ORDER, SetupFinding
 from calib.commissioning.model_checks import model_findings
@@ -79,8 +80,7 @@ def _assumed(arm: str, arm_file: ArmFile) -> Iterator[SetupFinding]:
     """Values that armlink new assumed and nobody has confirmed yet."""
     if arm in bundled_arms():
         return
-    lines = Path(arm_file.path).read_text(encoding="utf-8").splitlines()
-    assumed = [number for number, line in enumerate(lines, start=1) if "assumed" in line.partition("#")[2]]
+    assumed = assumed_lines(Path(arm_file.path).read_text(encoding="utf-8"))
     if assumed:
         yield SetupFinding(
             "hint",

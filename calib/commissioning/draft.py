@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,6 +36,9 @@ MOST_RESERVE = 10.0
 drives: published arms have up to 6; placeholders, and limits copied from larger arms, 11 to 5000."""
 FRICTION = 0.02
 """Coulomb friction of the simulated arm, as a share of the torque that its drives need; assumed."""
+ROTOR = 1e-3
+"""Rotor inertia behind the gear of the simulated arm, for the torque that its drives need [s²], where the model has
+none; assumed. Published models have 0.3 (iiwa) to 10 (SO-100) thousandths, the Panda 1.1."""
 
 
 @dataclass
@@ -50,11 +53,15 @@ class JointDraft:
     max_velocity: float
     friction: float
     """Coulomb friction of the simulated arm [N·m]."""
+    rotor: float
+    """Its rotor inertia, at the joint [kg·m²]; 0 where the model has one."""
     stops: tuple[float, float] | None = None
     """Only where the model has none, or others were given [rad]."""
     notes: list[str] = field(default_factory=list)
     identity: dict[str, int] | None = None
     """Vendor and product of the drive found at its node."""
+    drive: Mapping[str, Any] | None = None
+    """Keys of the drive found, where it is another kind than a bare node id says."""
 
 
 @dataclass
@@ -74,6 +81,8 @@ class Draft:
     base: str | None = None
     servo: str | None = None
     """Why resting joints are held by their servos rather than pressed on stops; None: they are pressed."""
+    locked: Mapping[str, float] = field(default_factory=dict)
+    """Joints that are held at this position [rad, m] by other means than the arm's drives."""
 
     @property
     def assumed(self) -> list[str]:
@@ -86,10 +95,10 @@ def draft_of_model(
     chain: Chain,
     gravity: tuple[float, float, float],
     stops: Mapping[str, tuple[float, float]],
-    base: str | None = None,
     ratings: Mapping[str, float] | None = None,
+    locked: Mapping[str, float] | None = None,
 ) -> Draft:
-    """The draft for one chain; `stops` [rad], `ratings` [N·m] by joint name and `base` were given by the user.
+    """The draft for one chain; `stops` [rad], `ratings` [N·m] and `locked` [rad, m] by joint name were given.
 
     Raises BadModel.
     """
@@ -98,7 +107,7 @@ def draft_of_model(
     if not np.any(gravity):
         gravity = STANDARD_GRAVITY
         notes.append("gravity: the model has none, assumed to point down")
-    need = _load_torque(path, [joint.name for joint in chain.joints], gravity)
+    need = _load_torque(path, [joint.name for joint in chain.joints], gravity, locked or {})
     rated = _ratings(chain, need, ratings or {})
     doubted: dict[str, list[str]] = {}
     for joint, rating in zip(chain.joints, rated, strict=True):
@@ -110,7 +119,8 @@ def draft_of_model(
     joints = [_joint(place, chain, stops.get(joint.name), rated[place]) for place, joint in enumerate(chain.joints)]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
     servo = f"{', '.join(free)}: no stop to press on" if free else None
-    return Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, base=base, servo=servo)
+    draft = Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, base=chain.base, servo=servo)
+    return replace(draft, locked=locked or {})
 
 
 def narrow(draft: Draft, found: ClearRange) -> None:
@@ -204,12 +214,13 @@ def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rating: 
         max_torque_rate=float(f"{effort / RATE_TIME:.3g}"),
         max_velocity=round(speed, 4),
         friction=float(f"{FRICTION * min(effort, rating.needed):.4g}"),
+        rotor=0.0 if joint.armature > 0 else float(f"{ROTOR * min(effort, rating.needed):.2g}"),
         stops=stops,
         notes=notes,
     )
 
 
-def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float]) -> Array:
+def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float], locked: Mapping[str, float]) -> Array:
     """Largest torque (n,) [N·m] against gravity and for ACCELERATION of the joint alone, at random poses."""
     import mujoco
 
@@ -217,6 +228,8 @@ def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float]) -> 
         model = compile_model(path)
     model.opt.gravity[:] = gravity
     data = mujoco.MjData(model)
+    for name, position in locked.items():
+        data.joint(name).qpos[:] = position
     joints = [model.joint(name).id for name in names]
     place, dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     free = ~model.jnt_limited[joints].astype(bool)

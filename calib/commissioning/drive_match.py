@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from armlink.drives.findings import FoundDrive, FoundDrives
+from armlink.drives.registry import not_looked_for
 from armlink.errors import BadInput, BusFault
 from calib.commissioning.finding import SetupFinding
 
@@ -80,7 +81,7 @@ def _require(names: Sequence[str], found: Sequence[FoundDrive], bus: str) -> Non
         ids = ", ".join(str(each.node) for each in found) or "none"
         raise BusFault(
             f"{bus}: {len(found)} drives answer (nodes {ids}), the arm has {len(names)} joints: check power, wiring,"
-            " bit rate and that every node id is different"
+            f" bit rate and that every node id is different ({not_looked_for()})"
         )
 
 

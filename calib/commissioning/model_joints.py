@@ -1,5 +1,6 @@
 """Joints of a URDF or MJCF model: kind, limits, torque and speed as far as the model states them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,10 +37,19 @@ class ModelJoint:
     """Places of the joints between the base and this one, in the list of all."""
     carried_by: tuple[str, ...]
     """Bodies between the base and the one that it moves."""
+    armature: float = 0.0
+    """Rotor inertia at the joint [kg·m²]."""
+    locked: float | None = None
+    """Position [rad, m] at which something else than the arm's drives holds it; None: it is not held."""
 
 
-def model_joints(path: Path) -> tuple[list[ModelJoint], tuple[float, float, float]]:
-    """All joints of a model in its order, and gravity in its world frame [m/s²]; raises BadModel, BadInput."""
+def model_joints(
+    path: Path, locked: Mapping[str, float] | None = None
+) -> tuple[list[ModelJoint], tuple[float, float, float]]:
+    """All joints of a model in its order, and gravity in its world frame [m/s²]; raises BadModel, BadInput.
+
+    Those in `locked` are held at that position [rad, m].
+    """
     import mujoco
 
     with model_budget(path):
@@ -70,6 +80,8 @@ def model_joints(path: Path) -> tuple[list[ModelJoint], tuple[float, float, floa
                 partner=coupled.get(name),
                 parents=parents,
                 carried_by=tuple(model.body(up).name for up in carriers[1:]),
+                armature=float(model.dof_armature[model.jnt_dofadr[joint]]),
+                locked=(locked or {}).get(name),
             )
         )
     if not joints:

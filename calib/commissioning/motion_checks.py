@@ -2,13 +2,11 @@
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.content.model_sizes import model_budget
-from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm, model_chain
 from calib.arm.sweep_section import sweep_section
 from calib.commissioning.finding import SetupFinding
 from calib.commissioning.model_judgement import gravity_need
@@ -20,7 +18,7 @@ from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
 from calib.plan.sweep_plan import plan_sweep
-from gcomp.arm.load import ModelArm, joint_inertias, place_chain
+from gcomp.arm.load import ModelArm, joint_inertias
 
 TORQUE_RESERVE = 1.2
 """Torque that a drive should have over gravity, as a factor; a choice: friction and acceleration need the rest."""
@@ -46,7 +44,7 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         model = model_arm(arm_file)
         guess = guess_of_model(model.arm, model.beta)
         yield from _strength(arm_file, model)
-        yield from _damping(arm_file, arm_file.model_path)
+        yield from _damping(arm_file)
         if (
             not creeping
             and sweep_section(arm_file).hold == "stops"
@@ -74,14 +72,13 @@ def _strength(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
             yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
 
 
-def _damping(arm_file: ArmFile, model: Path) -> Iterator[SetupFinding]:
+def _damping(arm_file: ArmFile) -> Iterator[SetupFinding]:
     """Joints that their drives hold with kp and kd, and whose kd is too low for what they turn."""
     assert arm_file.link is not None
     joints = [joint for joint in arm_file.link.joints if getattr(joint.settings, "kp", 0.0) > 0]
     if not joints:
         return
-    with model_budget(model):
-        placed = place_chain(model, base=arm_file.kinematics.base, tip=arm_file.kinematics.tip)
+    placed = model_chain(arm_file)
     arm = placed.arm.arm
     low, high = np.nan_to_num([arm.lower, arm.upper], posinf=np.pi, neginf=-np.pi)
     # few: an inertia changes little from pose to pose

@@ -1,5 +1,6 @@
 """Makes an arm file from a model: chain, ranges, drives; asks where somebody can answer, else assumes and says so."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,13 +8,15 @@ from typing import Any, Protocol
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
 from armlink.content.atomic_file import write_whole
-from armlink.content.file_content import parse_yaml
+from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
+from armlink.content.yaml_text import EditedYaml
 from armlink.drives.findings import FoundDrives
 from armlink.errors import BadInput
+from armlink.model_file import read_model
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.chain import Chain, find_chains
-from calib.commissioning.clear_range import find_clear_range
+from calib.commissioning.clear_range import clear_ranges, sweep_problem
 from calib.commissioning.draft import Draft, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
 from calib.commissioning.finding import SetupFinding
@@ -69,6 +72,7 @@ def new_arm(
     tip: str | None = None,
     stops: Mapping[str, tuple[float, float]] | None = None,
     ratings: Mapping[str, float] | None = None,
+    locked: Mapping[str, float] | None = None,
     name: str | None = None,
     questions: Questions | None = None,
 ) -> NewArm:
@@ -76,34 +80,53 @@ def new_arm(
 
     The longest chain of revolute joints is the arm, or the one from body `base` to body `tip`. A gripper, mimic and
     prismatic joints at its end and the joints that carry `base` keep the model's position. Where sweeps within the
-    model's limits would collide, a narrower range is chosen. `ratings` [N·m] by joint name replace the model's efforts.
+    model's limits would collide, a narrower range is chosen. `ratings` [N·m] by joint name replace the model's efforts;
+    joints in `locked` are held at that position [rad, m] and are none of the arm's.
     """
     if model.suffix.lower() not in MODEL_SUFFIXES:
         raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)})")
     if not model.is_file():
         raise BadInput(f"no model file {model}: give the path of a URDF or MJCF file")
-    joints, gravity = model_joints(model)
+    joints, gravity = model_joints(model, locked)
+    _refuse_other_joints("--lock", locked or {}, [joint.name for joint in joints], f"in {model}")
     chains = find_chains(joints, model, base, tip)
     chain = chains[0] if questions is None or len(chains) == 1 else questions.which(chains)
     given = _given_stops(chain, dict(stops or {}), model, questions)
-    _refuse_other_joints("--rated-torque", ratings or {}, chain, model)
-    draft = draft_of_model(model, chain, gravity, given, base, ratings)
+    names = [joint.name for joint in chain.joints]
+    _refuse_other_joints("--rated-torque", ratings or {}, names, f"of the arm in {model}")
+    draft = draft_of_model(model, chain, gravity, given, ratings, locked)
     if len(chains) > 1 and questions is None:
         others = ", ".join(each.tip for each in chains if each is not chain)
         draft.notes.append(f"tip assumed: the model has {len(chains)} arms; the others end in {others} (--tip)")
     draft.name = name or draft.name
     made = NewArm(out, draft)
     refuse_impossible_model(made.parsed())
-    clear = find_clear_range(made.parsed())
-    if clear is not None:
-        narrow(draft, clear)
+    _narrow_until_clear(made)
+    missing = read_model(model).left_out
+    if missing:
+        what = f"collisions are looked for without {missing}"
+        made.findings.append(SetupFinding("warning", what, str(model), "put them where the model names them"))
     return made
+
+
+def _narrow_until_clear(made: NewArm) -> None:
+    """Narrow the ranges until no sweep collides; raises BadInput or Refused as planning does where none is clear."""
+    arm_file = made.parsed()
+    problem = sweep_problem(arm_file)
+    if problem is None:
+        return
+    for clear in clear_ranges(arm_file, problem):
+        narrow(made.draft, clear)
+        if sweep_problem(made.parsed()) is None:
+            return
+    raise problem
 
 
 def _given_stops(
     chain: Chain, stops: dict[str, tuple[float, float]], model: Path, questions: Questions | None
 ) -> dict[str, tuple[float, float]]:
-    _refuse_other_joints("--stops", stops, chain, model)
+    names = [joint.name for joint in chain.joints]
+    _refuse_other_joints("--stops", stops, names, f"of the arm in {model}")
     for joint in chain.joints:
         if joint.limits is None and joint.name not in stops and questions is not None:
             answer = questions.stops(joint.name)
@@ -112,11 +135,10 @@ def _given_stops(
     return stops
 
 
-def _refuse_other_joints(option: str, given: Mapping[str, object], chain: Chain, model: Path) -> None:
-    names = [joint.name for joint in chain.joints]
+def _refuse_other_joints(option: str, given: Mapping[str, object], names: Sequence[str], place: str) -> None:
     for name in given:
         if name not in names:
-            raise BadInput(f"{option} {name}: no joint of the arm in {model}; there are {', '.join(names)}")
+            raise BadInput(f"{option} {name}: no joint {place}; there are {', '.join(names)}")
 
 
 def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -> list[Match]:
@@ -138,7 +160,7 @@ def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -
         from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
         if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
             made.findings.append(_doubtful_rating(match, joint.rated_torque))
-        joint.node, joint.rated_torque = drive.node, drive.rated_torque
+        joint.node, joint.drive, joint.rated_torque = drive.node, drive.keys, drive.rated_torque
         joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
         joint.max_torque_rate = float(f"{2.5 * joint.max_torque:.3g}")
         joint.identity = {"vendor": drive.vendor, "product": drive.product}
@@ -156,11 +178,26 @@ def _doubtful_rating(match: Match, effort: float) -> SetupFinding:
     return SetupFinding("warning", what, f"{match.joint} (node {drive.node})", remedy)
 
 
-def rewired_content(content: dict[str, Any], matches: Sequence[Match], bus: dict[str, str | int]) -> dict[str, Any]:
-    """An arm file's content with the drives found on a bus: nodes, rated torques and the bus itself."""
-    joints = []
-    for row, match in zip(content["link"]["joints"], matches, strict=True):
+def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | int], out: Path) -> str:
+    """An arm file's text, to stand at `out`, with the drives found on a bus; its comments and its order stay.
+
+    Of each joint it writes node, rated torque and identity, and the bus.
+    """
+    edited = EditedYaml(read_whole(arm.path, MOST_YAML).decode())
+    link: Any = edited.content["link"]
+    for row, match in zip(link["joints"], matches, strict=True):
         drive = match.drive
-        most = min(float(row["max_torque"]), drive.max_torque)
-        joints.append({**row, "node": drive.node, "rated_torque": drive.rated_torque, "max_torque": most})
-    return {**content, "link": {**content["link"], "bus": bus, "joints": joints}}
+        if "drive" in row:
+            row["drive"]["node"] = drive.node
+        elif drive.keys is None:
+            row["node"] = drive.node
+        else:
+            del row["node"]
+            row["drive"] = edited.in_line(drive.keys)
+        row["rated_torque"] = drive.rated_torque
+        row["max_torque"] = min(float(row["max_torque"]), drive.max_torque)
+        row["identity"] = edited.in_line({"vendor": drive.vendor, "product": drive.product})
+    link["bus"] = edited.in_line(bus)
+    if arm.model_path is not None:
+        edited.content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
+    return edited.text

@@ -1,4 +1,4 @@
-"""Structured logs: one JSON object per line on stderr, for systemd's journal or any log collector."""
+"""Logs on stderr: one JSON object per line for systemd's journal or any log collector, plain lines on a terminal."""
 
 import atexit
 import logging
@@ -8,7 +8,7 @@ import threading
 from datetime import UTC, datetime
 from typing import TextIO
 
-from armlink.content.printable_text import printable_json
+from armlink.content.printable_text import printable_json, printable_text
 
 MOST_LINES = 10_000
 """Lines that wait for a reader of stderr that takes none; further ones are dropped."""
@@ -32,6 +32,19 @@ class JsonFormatter(logging.Formatter):
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return printable_json(line, default=str)
+
+
+class PlainFormatter(logging.Formatter):
+    """Time of day, level unless it is info, message, and the fields given as `extra`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line for people, or more with an exception."""
+        at = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
+        level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
+        given = {name: value for name, value in vars(record).items() if name not in _KNOWN and value is not None}
+        fields = "".join(f"  {name}={value}" for name, value in given.items())
+        line = f"{at}  {level}{printable_text(record.getMessage() + fields)}"
+        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
 
 
 class LineQueue:
@@ -90,10 +103,10 @@ class LineLimit(logging.Filter):
         return True
 
 
-def log_as_json() -> None:
-    """Send everything that is logged to stderr as JSON."""
+def log_to_stderr() -> None:
+    """Send everything that is logged to stderr: as JSON, or in plain lines to a terminal."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter())
+    handler.setFormatter(PlainFormatter() if sys.stderr.isatty() else JsonFormatter())
     handler.addFilter(LineLimit())
     root = logging.getLogger()
     root.handlers[:] = [handler]
@@ -105,5 +118,5 @@ def log_as_json() -> None:
 def log_in_thread() -> None:
     """From now on a thread writes what is logged; not before a fork, which takes no threads along."""
     for handler in logging.getLogger().handlers:
-        if isinstance(handler, logging.StreamHandler) and isinstance(handler.formatter, JsonFormatter):
+        if isinstance(handler, logging.StreamHandler) and isinstance(handler.formatter, JsonFormatter | PlainFormatter):
             handler.setStream(LineQueue(handler.stream))

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
@@ -37,7 +38,7 @@ class Contact:
 class Geometry:
     """The bodies of the arm file's model, and of arms parked beside it (`sweep.beside`).
 
-    Overlaps that the model has at every pose do not count as collisions.
+    Overlaps that the model has at every pose, and those of a link with what carries it, do not count as collisions.
     """
 
     def __init__(self, arm_file: ArmFile) -> None:
@@ -51,15 +52,24 @@ class Geometry:
         kinematics = gcomp_arm(arm_file)  # checks the chain, with errors in terms of the arm file
         self.left_out = read_model(arm_file.model_path).left_out
         parked = sweep_section(arm_file).beside
-        self.model = compile_model(arm_file.model_path, [_attached(arm_file, each) for each in parked if each.model])
+        beside = [_attached(arm_file, each) for each in parked if each.model]
+        self.model = compile_model(arm_file.model_path, beside, arm_file.kinematics.locked)
         self.data = mujoco.MjData(self.model)
         for each in parked:
             self._park(arm_file, each, kinematics.names)
         self._places = [int(self.model.joint(name).qposadr[0]) for name in kinematics.names]
-        generator = np.random.default_rng(0)
-        poses = generator.uniform(kinematics.lower, kinematics.upper, (12, kinematics.n))
-        always = [{contact.bodies for contact in self._contacts(pose)} for pose in poses]
-        self._own: set[Pair] = set.intersection(*always)
+        self._own = np.zeros((self.model.nbody, self.model.nbody), dtype=bool)
+        poses = np.random.default_rng(0).uniform(kinematics.lower, kinematics.upper, (12, kinematics.n))
+        always = np.ones_like(self._own)
+        for pose in poses:
+            bodies, _ = self._overlaps(pose)
+            at_this = np.zeros_like(always)
+            at_this[bodies[:, 0], bodies[:, 1]] = True
+            always &= at_this
+        carrier = self.model.body_parentid[1:]
+        pairs = np.sort(np.column_stack([np.arange(1, self.model.nbody), carrier])[carrier > 0], axis=1)
+        always[pairs[:, 0], pairs[:, 1]] = True  # MuJoCo tries a fixed base against the link that it carries
+        self._own = always
 
     def _park(self, arm_file: ArmFile, parked: ParkedArm, moving: tuple[str, ...]) -> None:
         """Bring the joints of an arm that is parked to their angles; raises BadInput for a joint that it has not."""
@@ -73,25 +83,26 @@ class Geometry:
 
     def contacts(self, pose: Array) -> list[Contact]:
         """Collisions at a pose (n,) [rad], deepest first."""
-        return [contact for contact in self._contacts(pose) if contact.bodies not in self._own]
+        found: dict[Pair, float] = {}
+        for (first, second), depth in zip(*self._overlaps(pose), strict=True):
+            pair = (self._name(int(first)), self._name(int(second)))
+            found[pair] = max(found.get(pair, 0.0), float(depth))
+        return sorted((Contact(pair, depth) for pair, depth in found.items()), key=lambda each: -each.depth)
 
     def free(self, poses: Array) -> Mask:
         """Poses (K, n) [rad] without collision, as a mask (K,)."""
-        return np.array([not self.contacts(pose) for pose in poses], dtype=bool)
+        return np.array([len(self._overlaps(pose)[1]) == 0 for pose in poses], dtype=bool)
 
-    def _contacts(self, pose: Array) -> list[Contact]:
+    def _overlaps(self, pose: Array) -> tuple[npt.NDArray[np.intp], Array]:
+        """Pairs of bodies that overlap (m, 2), lower id first, and by how much (m,) [m]."""
         data, model = self.data, self.model
         data.qpos[self._places] = pose
         self._mujoco.mj_kinematics(model, data)
         self._mujoco.mj_comPos(model, data)
         self._mujoco.mj_collision(model, data)
-        found: dict[Pair, float] = {}
-        for contact in data.contact[: data.ncon]:
-            if contact.dist < -DEPTH:
-                first, second = sorted(int(model.geom_bodyid[geom]) for geom in contact.geom)
-                pair = (self._name(first), self._name(second))
-                found[pair] = max(found.get(pair, 0.0), -float(contact.dist))
-        return sorted((Contact(pair, depth) for pair, depth in found.items()), key=lambda each: -each.depth)
+        bodies = np.sort(model.geom_bodyid[data.contact.geom], axis=1)
+        counts = (data.contact.dist < -DEPTH) & ~self._own[bodies[:, 0], bodies[:, 1]]
+        return bodies[counts], -data.contact.dist[counts]
 
     def _name(self, body: int) -> str:
         return "the surroundings" if body == 0 else str(self.model.body(body).name or f"body {body}")

@@ -80,7 +80,7 @@ def plan_sweep(
     finer = 1.0 if gain_std is None else float(np.clip(gain_std / goal, 1.0, FINEST))
     if gain_std is not None and gain_std > ENOUGH * FINEST * goal:
         notes.append(
-            f"gains will be known to ± {2 * gain_std / finer:.1%} only, not ± {2 * goal:.1%}, even with long"
+            f"gains will be known to ± {200 * gain_std / finer:.2g} % only, not ± {200 * goal:.2g} %, even with long"
             " averages: use a heavier reference mass, or measure where it hangs (sweep.reference_point)"
         )
     return SweepPlan(

@@ -40,16 +40,22 @@ class ModelArm:
 
 
 def load_model(
-    path: Path, *, base: str | None = None, tip: str | None = None, gravity: ArrayLike | None = None
+    path: Path,
+    *,
+    base: str | None = None,
+    tip: str | None = None,
+    gravity: ArrayLike | None = None,
+    locked: Mapping[str, float] | None = None,
 ) -> ModelArm:
     """The serial arm of revolute joints in a URDF or MJCF file.
 
     The chain begins after body `base`, by default the world, and ends in body `tip`, by default the last body that
     moves. Joints off the chain are refused unless `tip` is given: then they keep the file's position, as do the joints
-    that carry `base`. `gravity` (3,) [m/s²] in the model's world frame replaces the model's own. Raises BadModel,
-    naming the joint, if the chain is not a serial arm of revolute joints.
+    that carry `base`. Joints in `locked` stay at that position [rad, m] and are none of the chain's. `gravity` (3,)
+    [m/s²] in the model's world frame replaces the model's own. Raises BadModel, naming the joint, if the chain is not a
+    serial arm of revolute joints.
     """
-    return place_chain(path, base=base, tip=tip, gravity=gravity).arm
+    return place_chain(path, base=base, tip=tip, gravity=gravity, locked=locked).arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +75,17 @@ class PlacedChain:
 
 
 def place_chain(
-    path: Path, *, base: str | None = None, tip: str | None = None, gravity: ArrayLike | None = None
+    path: Path,
+    *,
+    base: str | None = None,
+    tip: str | None = None,
+    gravity: ArrayLike | None = None,
+    locked: Mapping[str, float] | None = None,
 ) -> PlacedChain:
     """As load_model, with the bodies of each link; raises BadModel likewise."""
     model = compile_model(path)
-    return _place(model, _chain(model, path, base, tip), gravity, path)
+    held = {_joint(model, name, path): position for name, position in (locked or {}).items()}
+    return _place(model, _chain(model, path, base, tip, held), gravity, path, held)
 
 
 def compile_model(path: Path) -> "mujoco.MjModel":
@@ -130,11 +142,24 @@ def _has_negative_moment(inertia: ET.Element) -> bool:
     return bool(np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] < 0.0)
 
 
-def _chain(model: "mujoco.MjModel", path: Path, base: str | None, tip: str | None) -> list[int]:
+def _joint(model: "mujoco.MjModel", name: str, path: Path) -> int:
+    """Id of a joint that is to be locked; raises BadModel."""
+    import mujoco
+
+    joint = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name))
+    if joint < 0:
+        names = ", ".join(model.joint(joint).name for joint in range(model.njnt))
+        raise BadModel(f"{path}: no joint {name!r} to lock; there are {names}")
+    return joint
+
+
+def _chain(
+    model: "mujoco.MjModel", path: Path, base: str | None, tip: str | None, locked: Mapping[int, float]
+) -> list[int]:
     """Ids of the chain's joints, base to tip; every one a hinge."""
     import mujoco
 
-    joints = list(range(model.njnt))
+    joints = [joint for joint in range(model.njnt) if joint not in locked]
     if not joints:
         raise BadModel(f"{path}: no joint: an arm has at least one revolute joint")
     last = int(model.jnt_bodyid[joints[-1]]) if tip is None else _body(model, tip, path, "tip")
@@ -179,15 +204,20 @@ def _refuse_couplings(model: "mujoco.MjModel", chain: list[int], path: Path) -> 
     for equality in range(model.neq):
         coupled = int(model.eq_obj1id[equality])
         if model.eq_type[equality] == mujoco.mjtEq.mjEQ_JOINT and coupled in chain:
-            raise BadModel(f"{path}: joint {model.joint(coupled).name} mimics another: one drive per joint is needed")
+            name = model.joint(coupled).name
+            raise BadModel(f"{path}: joint {name} mimics another: one drive per joint is needed, or lock it")
 
 
-def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None, path: Path) -> PlacedChain:
+def _place(
+    model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None, path: Path, locked: Mapping[int, float]
+) -> PlacedChain:
     """Axes, points and inertials in the model's reference configuration, then Denavit-Hartenberg form."""
     import mujoco
 
     data: Any = mujoco.MjData(model)
     mujoco.mj_resetData(model, data)
+    for joint, position in locked.items():
+        data.qpos[model.jnt_qposadr[joint]] = position
     mujoco.mj_kinematics(model, data)
     limited = np.array([bool(model.jnt_limited[joint]) for joint in chain])
     limits = np.where(limited[:, None], model.jnt_range[chain], [-np.inf, np.inf])
@@ -206,6 +236,8 @@ def _place(model: "mujoco.MjModel", chain: list[int], gravity: ArrayLike | None,
         gravity=np.array(model.opt.gravity) if gravity is None else as_array("gravity", gravity, (3,)),
         limits=limits,
     )
+    if gravity is not None:
+        model.opt.gravity[:] = gravity
     mass, first_moment = np.zeros(len(chain)), np.zeros((len(chain), 3))
     bodies: list[list[int]] = [[] for _ in chain]
     for body, link in link_of.items():

@@ -8,7 +8,7 @@ from xml.parsers import expat
 if TYPE_CHECKING:
     import mujoco
 
-HAND = re.compile(r"grip|finger|hand|jaw|thumb|claw", re.IGNORECASE)
+HAND = re.compile(r"grip|hand|jaw|claw|finger|thumb|(?<![a-z])(index|middle|ring|pinky|little)(?![a-z])", re.IGNORECASE)
 """Names of joints that grasp rather than move the arm."""
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +18,9 @@ from gcomp.identify.sensor_model import expected_readings
 
 MINIMUM_LEVER = 0.3
 """Γ/g of the swept joint below which a combination is used only if none is better (docs/theory.md, section 2.5)."""
+MOST_COMBINATIONS = 256
+"""Combinations of stops that a design chooses from, at most: all of nine joints; time grows with them, and few are
+chosen."""
 SKETCH_STEPS = 7
 """Steps by which a candidate sweep is judged: more than a sinusoid's three unknowns (docs/theory.md, section 5.3)."""
 
@@ -53,16 +55,19 @@ class Design:
 def stop_combinations(arm: Arm, joint: int) -> Array:
     """The 2^(n-1) poses (C, n) [rad] with the other joints at a limit and `joint` in the middle.
 
-    Raises BadArray if a joint has no limits.
+    Of an arm with more than 9 joints, `MOST_COMBINATIONS` of them, drawn. Raises BadArray if a joint has no limits.
     """
     for name, low, high in zip(arm.names, arm.lower, arm.upper, strict=True):
         if not (np.isfinite(low) and np.isfinite(high)):
             raise BadArray(f"joint {name} has no limits ({low} to {high} rad): there is no stop to rest on")
-    choices = [
-        [(low + high) / 2] if i == joint else [low, high]
-        for i, (low, high) in enumerate(zip(arm.lower, arm.upper, strict=True))
-    ]
-    return np.array(list(product(*choices)))
+    others = np.delete(np.arange(arm.n), joint)
+    numbers = np.arange(2 ** len(others))
+    if len(numbers) > MOST_COMBINATIONS:
+        numbers = np.random.default_rng(0).choice(len(numbers), MOST_COMBINATIONS, replace=False)
+    at_upper = (numbers[:, None] >> np.arange(len(others))[::-1]) & 1 == 1  # the last joint changes fastest
+    poses = np.tile((arm.lower + arm.upper) / 2, (len(numbers), 1))
+    poses[:, others] = np.where(at_upper, arm.upper[others], arm.lower[others])
+    return poses
 
 
 def candidate_sweeps(arm: Arm, joint: int, steps: int, margin: float = 0.0) -> list[JointSweep]:

@@ -1,5 +1,6 @@
 """Runs a simulated arm on a bus, in real time or in lock-step with SYNC."""
 
+import math
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -64,6 +65,9 @@ class ArmServer:
                 self._injector.inject(fault)
         self.on_wrong: Callable[[str], None] = lambda wrong: None
         """Called with the error message of a command."""
+        self.on_late: Callable[[float, float], None] = lambda lag, at: None
+        """Called with how late [s] this process was, and when by the arm's time [s]; once a second at most."""
+        self._late_said = -math.inf
         self._synced = now()
         self._drifts = sorted(drifts, key=lambda drift: drift.time)
         self._offset = now() - arm.time
@@ -129,6 +133,9 @@ class ArmServer:
         if self._lockstep and self._arm.operational and self._now() - self._synced < LOCKSTEP_PATIENCE:
             self._offset = self._now() - self._arm.time
         lag = self._now() - self._offset - self._arm.time
+        if lag > LATE and self._now() - self._late_said > 1.0:
+            self._late_said = self._now()
+            self.on_late(lag, self._arm.time)
         if lag > LARGEST_LAG:
             self._offset += lag - LARGEST_LAG
             lag = LARGEST_LAG

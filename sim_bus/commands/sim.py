@@ -27,7 +27,7 @@ def sim(
     control: Annotated[
         Path | None,
         typer.Option(
-            help="Named pipe to create for commands, such as 'effect friction.coulomb:joint_2:1' or 'fault …'."
+            help="Named pipe to create for commands: 'mass 1.9', 'effect friction.coulomb:joint_2:1', 'fault …'."
         ),
     ] = None,
     seed: Annotated[
@@ -46,7 +46,8 @@ def sim(
     """Run a simulated arm on a CAN bus until SIGINT or SIGTERM.
 
     Example: armlink sim sarcos --bus socketcan:vcan0 --effect friction.coulomb:joint_2:1.5 --seed 1 --control arm.pipe
-    Then, from another shell: echo "fault node.silent:joint_2" > arm.pipe
+    Then, from another shell: echo "mass 1.9" > arm.pipe, which hangs the reference mass on the flange ("mass 0" takes
+    it off), or echo "fault node.silent:joint_2" > arm.pipe
     """
     import mujoco
 
@@ -92,6 +93,9 @@ def sim(
         )
         server = ArmServer(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
         server.on_wrong = lambda wrong: console.print(f"sim: {wrong}")
+        server.on_late = lambda lag, at: console.print(
+            f"sim: this process was {1000 * lag:.0f} ms late at {at:.1f} s: a host may take its drives for silent"
+        )
         return server.run()
     finally:
         if pipe is not None:

@@ -82,7 +82,7 @@ def _from_model(arm: ArmFile, section: SimSection) -> Any:
     """The model file's chain, other joints frozen, without contacts and actuators."""
     path = arm.model_path
     assert path is not None
-    spec = read_model(path).spec
+    spec = read_model(path, arm.kinematics.locked).spec
     names = set(arm.joint_names)
     missing = names - {joint.name for joint in spec.joints}
     if missing or not names:

@@ -22,8 +22,6 @@ OPENED = "The fit saw only what came over the bus. What is called true was opene
 
 
 class Account:
-    """Takes what happens as it happens."""
-
     def __init__(self, json_path: Path | None) -> None:
         self.summary: dict[str, Any] = {}
         self.sections: list[Section] = []

@@ -15,6 +15,7 @@ from armlink.link.types import Sample
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_section
+from calib.commissioning.arm_text import assumed_lines
 from calib.commissioning.model_judgement import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
 from calib.creep.choice import sweep_motion
@@ -46,7 +47,6 @@ from sim_gap.report.time_figures import watch_figure
 
 BY = "armlink demo"
 SUFFIX = ".mcap" if has_extra("bags") else ".csv.gz"
-"""Form of the recordings that are kept."""
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
 """Shorter and faster creeps than on a real arm, for two minutes: they cost a factor of two in precision."""
 DRIFT_GAIN, DRIFT_OFFSET, DRIFT_OFFSET_SHARE = 1.03, 0.3, 0.05
@@ -62,7 +62,7 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
     if Path(arm_name).suffix.lower() in MODEL_SUFFIXES:
         made = new_arm(Path(arm_name), out / f"{Path(arm_name).stem}.yaml")
         made.write()
-        arm_name, joints, assumed = str(made.out), len(made.draft.joints), len(made.draft.assumed)
+        arm_name, joints, assumed = str(made.out), len(made.draft.joints), len(assumed_lines(made.text))
         account.say(f"{arm_name} made of the model: {joints} joints, {assumed} assumed values, each says so there")
     arm = load_arm(arm_name)
     if realism is not None:
@@ -149,7 +149,8 @@ class Demo:
     def _passes(self) -> list[SweepData]:
         """Without, with and, of drives that warm up, again without the mass, which hangs where the fit is not told."""
         bench, passes = self.bench, list[SweepData]()
-        steps = "sweeping each joint, tip to base, the others pressed on their stops"
+        held = "held by their servos" if sweep_section(bench.arm).hold == "servo" else "pressed on their stops"
+        steps = f"sweeping each joint, tip to base, the others {held}"
         motion = "creeping through each joint's range both ways" if bench.creeping else steps
         for name in ("unloaded", "loaded", "unloaded-again")[: 3 if bench.creeping else 2]:
             plan, folder = passes[0].plan if passes else None, self.folder / name
@@ -181,7 +182,6 @@ class Demo:
             return verify(self.bench.link, model, record, poses=poses, seed=self.seed, progress=screen.count)
 
     def _recordings(self, record: CalibrationRecord, *seconds: float) -> list[Recording]:
-        """Two different motions, to learn from and to judge on."""
         made = []
         with self.account.stage("recording motion for the gap diagnosis") as screen:
             for number, name in enumerate(("train", "heldout")):
@@ -209,7 +209,7 @@ class Demo:
                 bench.simulated.drift(joint, DRIFT_GAIN, offset)
                 before = bench.sensor_error(joint)
             written = [t for t, outcome in history.recalibrations if outcome.applied]
-            state = "put right" if written else "the arm works" if began == np.inf else "the sensor has drifted"
+            state = "recalibrated" if written else "the arm works" if began == np.inf else "the sensor has drifted"
             screen.update(int(sample.t - start), int(WORK_SECONDS), WORK_SECONDS - sample.t + start, state)
             return bool(written) and sample.t - written[-1] >= WATCHED_SECONDS
 
@@ -219,12 +219,18 @@ class Demo:
             history = watch(link, observer, targets, WORK_SECONDS, recalibrator, course)
         times = [t - began for kind in ("alarm", "outliers") if (t := history.first(kind, name, began)) is not None]
         noticed = min(times, default=None)
-        written = next((t - began for t, done in history.recalibrations if done.joint == name and done.applied), None)
+        made = [(t - began, done.record) for t, done in history.recalibrations if done.joint == name and done.applied]
+        written = made[0][0] if made else None
         after, ended = bench.sensor_error(joint), history.t[-1] if written is None else began + written
         seen = "not noticed" if noticed is None else f"noticed after {noticed:.1f} s"
+        drifted = f"{name} drifted by {DRIFT_GAIN - 1:+.0%} gain and {offset:+.2f} N·m: {seen}"
+        error = f"error now {after[0]:+.2%} and {after[1]:+.3f} N·m"
+        if made:
+            half = [1.96 * float(made[-1][1].std(of)[joint]) for of in ("gain", "offset")]
+            inside = "inside" if np.all(np.abs(after) <= half) else "outside"
+            error += f", {inside} its 95 % interval of ±{half[0]:.2%} and ±{half[1]:.3f} N·m"
         right = "not recalibrated" if written is None else f"recalibrated by itself after {written:.0f} s of work"
-        drifted = f"{name} drifted by {DRIFT_GAIN - 1:+.0%} gain and {offset:+.2f} N·m: {seen}, {right}"
-        account.find(f"{drifted}; error now {after[0]:+.2%} and {after[1]:+.3f} N·m")
+        account.find(f"{drifted}, {right}; {error}")
         truth = np.repeat([(1.0, 0.0), (1.0 + before[0], before[1]), (1.0 + after[0], after[1])], 2, axis=0).T
         marks = [(began, f"drifts, {seen}"), *([] if written is None else [(ended, "recalibrated")])]
         figure = watch_figure(history, joint, ([history.t[0], began, began, ended, ended, history.t[-1]], truth), marks)
@@ -234,22 +240,19 @@ class Demo:
         account.note(drift=summary | {"gain_error_after": abs(after[0]), "offset_error_after": abs(after[1])})
 
     def _tell_sensors(self, passes: list[SweepData], fit: Calibrated, record: CalibrationRecord, truth: Truth) -> None:
-        """Estimates beside the truth, which is opened only for this."""
         account, true = self.account, {**vars(truth), "coulomb": self.bench.simulated.true_friction}
         names: tuple[Any, ...] = ("gain", "offset", "position_offset" if self.bench.creeping else "position_gain")
         account.note(sensors={name: {"true": true[name], **_estimate(fit, name)} for name in names}, drift=None)
         account.note(not_identifiable={f"{joint}.{name}": why for (joint, name), why in fit.reasons.items()})
+        text = "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
         if isinstance(fit, CreepCalibration):
-            text = (
-                "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
-            )
             parts = [ReportSection("Creep sweeps", paragraph(text) + paragraphs(fit.findings), [creep_figure(fit.fit)])]
             friction = {name: _estimate(fit.fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
             friction["coulomb"]["true"] = true["coulomb"]
             account.note(friction=friction, disturbed=fit.findings, sag=None)
             names += ("coulomb", "load", "viscous")
         else:
-            text = f"The reference mass hung at ({', '.join(f'{x:.4f}' for x in truth.attachment)}) m of the last link."
+            text = "Each joint was swept without and with a reference mass; the true values were hidden from the fit."
             parts = calibration.sections(calibration.Calibrated(self.bench.arm, passes, fit, record, None))
         columns: dict[str, tuple[Array, Array]] = {}
         for name in names:
@@ -264,7 +267,6 @@ class Demo:
         account.find(f"{known}; not observable on {unseen}" if unseen else known)
 
     def _tell_gravity(self, check: Verification, errors: dict[str, Any], sags: dict[str, Array]) -> None:
-        """The model against the sensors, and against the plant's own gravity."""
         account, poses, largest = self.account, len(check.position), errors["max_torque"]
         account.note(verify={"poses": poses, "rms": check.rms}, gravity=errors)
         columns = {"RMS to sensor": check.rms, "RMS to truth": errors["rms_error"]}
@@ -274,8 +276,8 @@ class Demo:
         table = account.table(title, check.names, {name: (each, 0 * each) for name, each in columns.items()})
         html = paragraph(f"Torque of model and arm at {poses} poses that were not used for any fit.")
         account.sections.append(ReportSection("Gravity model", html, [verify_figure(check)], [table]))
-        share = (errors["rms_error"][largest > 1e-6] / largest[largest > 1e-6]).max()
-        account.find(f"Gravity torque of the model within {share:.2%} RMS of each joint's largest")
+        share = errors["rms_error"].max() / largest.max()
+        account.find(f"Gravity torque of the model within {share:.2%} RMS of the arm's largest, at every joint")
         if sags:
             before, after = (np.degrees(sag.max()) for sag in sags.values())
             account.find(f"Held by a tenth of the gains, the worst joint sags by {after:.1f}° instead of {before:.1f}°")

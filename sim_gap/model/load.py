@@ -170,14 +170,15 @@ def compile_model(path: Path) -> Any:
 
 def read_spec(path: Path) -> Any:
     """Read an MJCF, URDF or arm file (by path or bundled name) as a `mujoco.MjSpec`. Raises BadInput."""
+    locked: dict[str, float] = {}
     if is_arm_file(path):
         nominal = nominal_model(path)
         if not isinstance(nominal, Path):
             return nominal
-        path = nominal
+        path, locked = nominal, load_arm(str(path)).kinematics.locked
     if not path.is_file():
         raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
-    return read_model(path).spec
+    return read_model(path, locked).spec
 
 
 def urdf_behind(path: Path | None) -> Path | None:

@@ -45,7 +45,7 @@ def _verdict(answer: Diagnosis) -> Section:
             ReportTable(
                 ("effect", "joint", "parameter", "value", "95 % interval", "unit"),
                 [row for cause in answer.causes for row in parameter_rows(cause)],
-                "Fitted parameters.",
+                "Fitted parameters, each as a difference to what the model has.",
                 texts=3,
             )
         )

@@ -23,7 +23,8 @@ SIGNATURES = {
     "identify": "(*sweeps, arm=None, sensors=None)",
     "verify": "(arm, gravity, sensors=None, *, bus=None, simulated=False, poses=24, seed=0, progress=None)",
     "observe": "(arm, recording, gravity, sensors, *, config=None)",
-    "diagnose": "(model, train, heldout=(), *, base=None, tip=None)",
+    "diagnose": "(model, train, heldout=(), *, base=None, tip=None, units=(), sign=(), zero=(), clock=(), columns=(), "
+    "joints=(), effort_is='', topic='')",
 }
 CLASSES = {"ArmFile", "ArmlinkError", "Recording"}
 SCRIPT = """

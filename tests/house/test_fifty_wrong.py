@@ -91,7 +91,7 @@ WRONG = [
     # models
     (nothing, NEW, ["no model file arm4.urdf", "give the path"]),
     (model("<robot", "<robto"), NEW, ["arm4.urdf", "not a URDF or MJCF"]),
-    (model('type="revolute"', 'type="prismatic"'), NEW, ["j1 is prismatic", 'type="fixed"']),
+    (model('"j2" type="revolute"', '"j2" type="prismatic"'), NEW, ["j2 is prismatic", "--lock j2:POSITION"]),
     (model("j1", "j1"), [*NEW, "--tip", "l9"], ["--tip l9", "l4"]),
     (model("j1", "j1"), [*NEW, "--stops", "j4:2:1"], ["j4:2:1", "JOINT:LOWER:UPPER"]),
     (model("j1", "j1"), [*NEW, "--stops", "wrist:-1:1"], ["wrist", "j1, j2, j3, j4"]),

@@ -9,7 +9,7 @@ from armlink.bus.port import Frame
 from armlink.drives.damiao import frames
 from armlink.drives.damiao.frames import READ, WRITE, DamiaoRegister, DamiaoStatus
 from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_position, read_registers
-from armlink.drives.damiao.settings import DamiaoSettings, delivered
+from armlink.drives.damiao.settings import MODELS, DamiaoSettings
 from armlink.drives.family import Ask, Family
 from armlink.drives.mit_drives import MitDrives, MitKnown
 from armlink.drives.mit_packing import Ranges, Special, feedback_in, special, unwrap
@@ -60,7 +60,7 @@ class DamiaoDrives(MitDrives):
         self._known: list[_DamiaoState] = [_DamiaoState() for _ in joints]
         super().__init__(joints, TRAITS, self._known)
         for known, settings in zip(self._known, self._settings, strict=True):
-            known.use(delivered(settings.model))
+            known.use(MODELS.get(settings.model))
         self._replies = {(each.reply, each.id & 0xF): joint for joint, each in reversed([*enumerate(self._settings)])}
         """Joint by reply id and by the id in a reply."""
         self._asked: tuple[int, int, int] | None = None

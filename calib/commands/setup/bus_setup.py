@@ -36,12 +36,13 @@ def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", 
 
 def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
     """An arm file with the drives of a bus."""
-    from armlink.arm_file import load_arm, parse_arm, read_yaml
-    from armlink.content.yaml_text import yaml_comment, yaml_document
+    from armlink.arm_file import load_arm, parse_arm
+    from armlink.content.file_content import parse_yaml
+    from armlink.content.yaml_text import yaml_comment
     from armlink.drives.registry import found_drives
     from calib.arm.kinematics import gcomp_arm
     from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
-    from calib.commissioning.new_arm import rewired_content
+    from calib.commissioning.new_arm import rewired_text
 
     arm = load_arm(model)
     arm.require_link()
@@ -57,14 +58,10 @@ def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path 
             matches, findings = match_by_hand(turned, drives, channel, ask)
     finally:
         opened.shutdown()
-    content = rewired_content(read_yaml(arm.path), matches, bus_keys(bus, out))
-    if arm.model_path is not None:
-        import os
-
-        content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
-    parse_arm(dict(content), out)
-    title = yaml_comment(f"{arm.name} with the drives on {channel}, from {model.name}, by the command new.")
-    write_whole(out, title + "\n" + yaml_document(content))
+    text = rewired_text(arm, matches, bus_keys(bus, out), out)
+    parse_arm(parse_yaml(text, out), out)
+    title = f"{arm.name} with the drives on {channel}, from {model.name}, by the command new."
+    write_whole(out, yaml_comment(f"{title} Nodes, rated torques and identities are the drives' own.") + "\n" + text)
     told = f"nodes {', '.join(str(match.drive.node) for match in matches)}"
     return _tell(out, told, "check", arm.name, _matched(matches), findings, json_file)
 

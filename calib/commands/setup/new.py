@@ -44,6 +44,14 @@ def new(
             help="JOINT:TORQUE [N·m], instead of the model's effort limit; may be repeated.", rich_help_panel="Model"
         ),
     ] = None,
+    lock: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="JOINT:POSITION [rad, m]: held by other means than these drives, such as a lift; default position 0;"
+            " may be repeated.",
+            rich_help_panel="Model",
+        ),
+    ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the arm; default: the model's.")] = None,
     bus: Annotated[
         str | None,
@@ -67,10 +75,10 @@ def new(
     """Write an arm file that demo, sweep and check take as it is.
 
     The arm is the longest chain of revolute joints; gripper, mimic and prismatic joints at its end are set aside, as
-    are those that carry --base. Limits and torques are the model's. What the model does not state is asked on a
-    terminal, else assumed; every assumed value says so in a comment. Drives on the bus are only read. Exit status 1
-    where a joint turns the other way or has another gear than the model. Without a model, the drives on --bus make an
-    arm file of which only the geometry is missing: enough to check, monitor and record.
+    are those that carry --base or that --lock names. Limits and torques are the model's. What the model does not state
+    is asked on a terminal, else assumed; every assumed value says so in a comment. Drives on the bus are only read.
+    Exit status 1 where a joint turns the other way or has another gear than the model. Without a model, the drives on
+    --bus make an arm file of which only the geometry is missing: enough to check, monitor and record.
 
     Example: armlink new arm.urdf --out arm.yaml
     """
@@ -80,7 +88,7 @@ def new(
     from armlink.errors import BadInput
     from armlink.model_file import expanded
     from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
-    from calib.commands.setup.terminal import Terminal, hand, parse_ratings, parse_stops
+    from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
     from calib.commissioning.new_arm import new_arm
 
     console = PlainConsole()
@@ -92,9 +100,9 @@ def new(
             raise BadInput(
                 "new: give a URDF or MJCF model of the arm, or --bus INTERFACE:CHANNEL to begin with its drives"
             )
-        if base or tip or stops or rated_torque:
+        if base or tip or stops or rated_torque or lock:
             raise BadInput(
-                "--base, --tip, --stops and --rated-torque are for a model: give one, or change the arm file itself"
+                "--base, --tip, --stops, --rated-torque and --lock are for a model: give one, or change the arm file"
             )
         out = out or Path("arm.yaml")
         _require_free(out, force, interactive)
@@ -103,8 +111,8 @@ def new(
     is_arm_file = bundled is not None or model.suffix.lower() in (".yaml", ".yml")
     if is_arm_file and bus is None:
         raise BadInput(f"{model}: is an arm file already: give --bus to find its drives, or armlink doctor {model}")
-    if is_arm_file and (base or tip or stops or rated_torque or name):
-        options = "--base, --tip, --stops, --rated-torque and --name"
+    if is_arm_file and (base or tip or stops or rated_torque or lock or name):
+        options = "--base, --tip, --stops, --rated-torque, --lock and --name"
         raise BadInput(f"{model}: {options} are for a model: change the arm file itself")
     is_xacro = model.suffix.lower() == ".xacro"
     if not is_arm_file and not is_xacro and model.suffix.lower() not in MODEL_SUFFIXES:
@@ -132,6 +140,7 @@ def new(
             tip=tip,
             stops=parse_stops(stops or []),
             ratings=parse_ratings(rated_torque or []),
+            locked=parse_locks(lock or []),
             name=name,
             questions=asked,
         )
@@ -170,6 +179,8 @@ def _require_free(out: Path, force: bool, interactive: bool) -> None:
 def _show(console: Any, made: "NewArm") -> None:
     from rich.table import Table
 
+    from calib.commissioning.arm_text import assumed_lines
+
     draft = made.draft
     table = Table("joint", "node", "stops [rad]", "rated [N·m]", "largest [N·m]", title=f"{draft.name}: {made.out}")
     for joint in draft.joints:
@@ -184,7 +195,7 @@ def _show(console: Any, made: "NewArm") -> None:
         console.print(f"resting joints are held by their servos: {draft.servo}", style="yellow")
     for found in made.findings:
         console.print(str(found), style="red" if found.level == "error" else "yellow")
-    console.print(f"{made.out} written; {len(draft.assumed)} values are assumed, each says so in the file")
+    console.print(f"{made.out} written; {len(assumed_lines(made.text))} values are assumed, each says so in the file")
 
 
 def _answer(made: "NewArm", step: str) -> dict[str, Any]:

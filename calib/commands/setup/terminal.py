@@ -44,6 +44,21 @@ def parse_ratings(texts: Sequence[str]) -> dict[str, float]:
     return found
 
 
+def parse_locks(texts: Sequence[str]) -> dict[str, float]:
+    """Positions [rad, m] by joint from texts JOINT or JOINT:POSITION; raises BadInput."""
+    found = {}
+    for text in texts:
+        joint, _, number = text.rpartition(":") if ":" in text else (text, "", "0")
+        try:
+            position = float(number)
+        except ValueError:
+            position = math.nan
+        if not joint or not math.isfinite(position):
+            raise BadInput(f"--lock {text}: expected JOINT:POSITION in rad or m, such as lift:0.2")
+        found[joint] = position
+    return found
+
+
 def hand(by_hand: bool | None, interactive: bool) -> "Ask | None":
     """How a person is asked to turn a joint; None where drives are taken in order. Raises BadInput."""
     if by_hand and not interactive:

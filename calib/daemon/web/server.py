@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import logging
 import os
 import resource
 import socket as sockets
@@ -20,6 +21,7 @@ from calib.daemon.web.app import make_app
 from calib.daemon.web.guard import Access, names_of_host
 from calib.daemon.web.peer import protocol_of
 
+log = logging.getLogger(__name__)
 SOCKET_MODE = 0o660
 """Access for owner and group only."""
 SHORTEST_TOKEN = 16
@@ -42,11 +44,14 @@ async def serve(view: DaemonView, *, socket: Path | None, tcp: tuple[str, int] |
     if socket is None and tcp is None:
         raise BadInput("neither a Unix socket nor a TCP address to serve on")
     with contextlib.ExitStack() as opened:
-        listening = []
+        listening, places = [], []
         if socket is not None:
             listening.append(opened.enter_context(unix_socket(socket)))
+            places.append(f"socket {socket}")
         if tcp is not None:
             listening.append(opened.enter_context(tcp_socket(*tcp)))
+            places.append(f"http://{f'[{tcp[0]}]' if ':' in tcp[0] else tcp[0]}:{tcp[1]}/ (with the token)")
+        log.info(f"page and API: {', '.join(places)}")
         await _run(view, listening, Access(token, names_of_host(tcp[0]) if tcp else frozenset()))
 
 

@@ -1,7 +1,9 @@
 """Raw frame logs: replayed they give the samples that were recorded live; cut anywhere they load up to the cut."""
 
+import gzip
 import json
 import struct
+from datetime import datetime
 
 import can
 import numpy as np
@@ -9,7 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from armlink.bus.frame_log import FrameLog, LogReader
+from armlink.arm_file import load_arm
+from armlink.bus.frame_log import FrameLog, LogReader, is_log
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.taps import TappedBus
 from armlink.cli import run
@@ -184,3 +187,71 @@ def test_a_time_that_is_infinite_ends_the_log(tmp_path):
     reader = LogReader(path)
     assert len(list(reader.frames())) == 2
     assert "a time that is no number" in reader.warning
+
+
+def printed(message: can.Message, time: str) -> str:
+    """As can-utils' candump prints a frame."""
+    can_id = f"{message.arbitration_id:08X}" if message.is_extended_id else f"{message.arbitration_id:03X}"
+    stamp = f" ({time})" if time else ""
+    return f"{stamp}  can0  {can_id}   [{message.dlc}]  {message.data.hex(' ').upper()}\n"
+
+
+@pytest.mark.parametrize("kind", ["candump -ta", "candump -tA", "pcan", "csv", "candump -L, packed", "pcan, packed"])
+def test_logs_that_others_write_give_the_same_samples(arm_of, tmp_path, kind):
+    arm = arm_of(2)
+    record(arm, tmp_path / "run.log")
+    with can.CanutilsLogReader(str(tmp_path / "run.log")) as reader:
+        messages = [each for each in reader if not each.is_error_frame]
+    if kind.startswith("candump -t"):
+        path = tmp_path / "other.log"
+        dates = "A" in kind
+        path.write_text(
+            "".join(
+                printed(
+                    each,
+                    str(datetime.fromtimestamp(each.timestamp)).ljust(26, "0") if dates else f"{each.timestamp:.6f}",
+                )
+                for each in messages
+            )
+        )
+    elif kind == "candump -L, packed":
+        path = tmp_path / "run.log.gz"
+        path.write_bytes(gzip.compress((tmp_path / "run.log").read_bytes()))
+    else:
+        path = tmp_path / ("other.csv" if kind == "csv" else "other.trc")
+        with (can.CSVWriter if kind == "csv" else can.TRCWriter)(str(path)) as writer:
+            for message in messages:
+                writer(message)
+        if "packed" in kind:
+            packed = tmp_path / "other.trc.gz"
+            packed.write_bytes(gzip.compress(path.read_bytes()))
+            path = packed
+    assert is_log(path)
+    expected, found = (recording_of_log(arm, each) for each in (tmp_path / "run.log", path))
+    for name, values in expected.channels().items():
+        np.testing.assert_array_equal(getattr(found, name), values)
+    np.testing.assert_allclose(found.t, expected.t, atol=2e-4 if "pcan" in kind else 2e-6)
+
+
+def test_a_log_without_times_says_so_and_keeps_its_cycles(arm_of, tmp_path):
+    arm = arm_of(2)
+    record(arm, tmp_path / "run.log")
+    with can.CanutilsLogReader(str(tmp_path / "run.log")) as reader:
+        (tmp_path / "plain.log").write_text("".join(printed(each, "") for each in reader if not each.is_error_frame))
+    expected, found = (recording_of_log(arm, tmp_path / name) for name in ("run.log", "plain.log"))
+    assert "no times" in found.warning
+    np.testing.assert_array_equal(found.position, expected.position)
+
+
+@pytest.mark.parametrize("text", ["(1.0) can0 7FF#00\n(1.1) can0 7FF#01\n", "nothing\n"])
+def test_what_a_log_lacks_of_the_arm_is_named(arm_of, tmp_path, text):
+    (tmp_path / "other.log").write_text(text)
+    with pytest.raises(BadInput) as refused:
+        recording_of_log(load_arm("six-damiao"), tmp_path / "other.log")
+    said = str(refused.value)
+    if "7FF" in text:
+        assert "none is of base (id 01h), shoulder (id 02h)" in said
+        assert "there are frames 7FFh" in said
+    else:
+        assert "no frame is read" in said
+    assert "SYNC" not in said

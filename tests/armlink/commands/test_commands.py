@@ -2,9 +2,12 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from armlink.cli import run
+from armlink.recording.files import save_recording
+from armlink.recording.recording import Recording
 
 BUS = "armlink_sim:sarcos"
 
@@ -95,3 +98,14 @@ def test_monitor_stats_reports_the_cycle(capsys):
     assert cycle["period_ms"] == pytest.approx(4.0)
     assert cycle["load"] == pytest.approx(0.25, rel=0.15)
     assert "p99.9" in captured.err
+
+
+def test_convert_says_which_names_the_format_drops(tmp_path, capsys):
+    recording = Recording(
+        t=np.linspace(0, 1, 20), position=np.zeros((20, 2)), torque=np.ones((20, 2)), names=("left/elbow", "left/wrist")
+    )
+    save_recording(recording, tmp_path / "run.parquet")
+    assert run(["convert", str(tmp_path / "run.parquet"), str(tmp_path / "run.csv")]) == 0
+    assert "left/elbow is joint_1, left/wrist is joint_2 there" in " ".join(capsys.readouterr().out.split())
+    assert run(["convert", str(tmp_path / "run.parquet"), str(tmp_path / "two.parquet")]) == 0
+    assert "keeps no names" not in capsys.readouterr().out

@@ -4,9 +4,11 @@ import json
 
 import pytest
 import yaml
+from pydantic import ValidationError
 
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.cli import run
+from armlink.drives.damiao.settings import DamiaoSettings
 from armlink.errors import BadInput
 
 
@@ -67,3 +69,24 @@ def test_the_families_are_listed_with_their_traits(capsys):
     assert all(
         set(traits) == {"torque", "calibration", "silence", "bounds", "cadence", "frame"} for traits in found.values()
     )
+
+
+@pytest.mark.parametrize(
+    ("label", "model"),
+    [
+        ("DM-J8009P-2EC", "DM8009"),
+        ("dm-j4340p-2ec v1.1", "DM4340P"),
+        ("DM4310", "DM4310"),
+        ("DM-J10010L-2EC", "DM10010L"),
+        ("DM-H6215", "DMH6215"),
+        ("DM-J6248P-2EC", "DM6248P"),
+    ],
+)
+def test_a_label_is_known_however_it_is_printed(label, model):
+    assert DamiaoSettings(id=1, reply=0x11, model=label, kp=10, kd=1).model == model
+
+
+def test_an_unknown_label_is_refused_with_those_there_are():
+    with pytest.raises(ValidationError, match=r"no Damiao model 'DM-J9999P-2EC'; there are DM3507, DM4310"):
+        DamiaoSettings(id=1, reply=0x11, model="DM-J9999P-2EC", kp=10, kd=1)
+    assert DamiaoSettings(id=1, reply=0x11, kp=10, kd=1).model == ""

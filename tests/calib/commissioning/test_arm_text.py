@@ -29,7 +29,7 @@ STOPS = (-1.0, 1.0)
 
 def drafted(name: str, other: str, note: str = "") -> Draft:
     joints = [
-        JointDraft(each, node, 40.0, 30.0, 200.0, 1.0, 0.8, STOPS) for node, each in enumerate([name, "j-2.a"], 1)
+        JointDraft(each, node, 40.0, 30.0, 200.0, 1.0, 0.8, 0.01, STOPS) for node, each in enumerate([name, "j-2.a"], 1)
     ]
     joints[0].notes = [note] if note else []
     aside = ((other, "is a gripper"),)
@@ -40,7 +40,8 @@ def drafted(name: str, other: str, note: str = "") -> Draft:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_is_read_back_as_it_is(name, tmp_path):
-    joints = [JointDraft(each, node, 40.0, 30.0, 200.0, 1.0, 0.8) for node, each in enumerate([name, "j-2.a"], start=1)]
+    rows = enumerate([name, "j-2.a"], start=1)
+    joints = [JointDraft(each, node, 40.0, 30.0, 200.0, 1.0, 0.8, 0.0) for node, each in rows]
     draft = Draft(name, Path("arm.urdf"), name, (0.0, 0.0, -9.81), joints, aside=(), notes=[])
     text = arm_text(draft, tmp_path / "arm.yaml")
     content = yaml.safe_load(text)

@@ -1,6 +1,7 @@
 """Models that no arm can have are named before anything moves, in the same words by every command."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from calib.commissioning.model_checks import model_findings
 from calib.commissioning.model_joints import model_joints
 from calib.commissioning.model_judgement import gravity_need, model_errors, refuse_impossible_model
 from calib.commissioning.new_arm import NewArm, new_arm
-from gcomp.arm.load import load_model
+from gcomp.arm.load import ModelArm, load_model
+from gcomp.gravity.torque import gravity_torque
 
 
 @dataclass
@@ -73,7 +75,7 @@ def drafted(model: Path, ratings: Mapping[str, float] | None = None) -> NewArm:
     """As `new` has it before it looks for collisions, which takes long; raises BadInput as it does."""
     joints, gravity = model_joints(model)
     chain = find_chains(joints, model)[0]
-    made = NewArm(model.with_suffix(".yaml"), draft_of_model(model, chain, gravity, {}, None, ratings))
+    made = NewArm(model.with_suffix(".yaml"), draft_of_model(model, chain, gravity, {}, ratings))
     refuse_impossible_model(made.parsed())
     return made
 
@@ -167,3 +169,67 @@ def test_every_command_refuses_in_the_words_of_doctor(tmp_path: Path, capsys: py
         assert run(words) == 2
         assert capsys.readouterr().err.strip() == f"armlink: {error}"
         assert not Path(out).exists()
+
+
+def scaled_lengths(text: str, factor: float) -> str:
+    return re.sub(
+        r'xyz="([^"]+)"(?=/><mass|/><axis)',
+        lambda found: f'xyz="{" ".join(str(factor * float(each)) for each in found[1].split())}"',
+        text,
+    )
+
+
+DEFECTS: dict[str, tuple[Callable[[DrawnModel], None], Callable[[str], str], str]] = {
+    "grams": (lambda drawn: setattr(drawn, "mass_factor", 1e3), str, "state masses in kg"),
+    "tonnes": (lambda drawn: setattr(drawn, "mass_factor", 1e-3), str, "state masses in kg"),
+    "massless": (lambda drawn: setattr(drawn, "massless", True), str, "states no masses"),
+    "placeholder": (lambda drawn: setattr(drawn, "effort", 100.0), str, "is a placeholder"),
+    "far stronger": (lambda drawn: setattr(drawn, "effort_factor", 40.0), str, "more than 10 times the load"),
+    "far weaker": (lambda drawn: setattr(drawn, "effort_factor", 0.1), str, "less than the load"),
+    "millimetres": (lambda drawn: None, lambda text: scaled_lengths(text, 1e3), "lengths in m"),
+    "tiny": (lambda drawn: None, lambda text: scaled_lengths(text, 1e-3), "lengths in m|times the load|placeholder"),
+}
+
+
+@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.sample(8)
+def test_a_drawn_defect_is_named_before_anything_moves(seed: int, tmp_path: Path) -> None:
+    random = np.random.default_rng([771, seed])
+    change, rewrite, said = DEFECTS[str(random.choice(list(DEFECTS)))]
+    drawn = DrawnModel(int(random.integers(1 << 30)))
+    change(drawn)
+    model = drawn.write(tmp_path)
+    model.write_text(rewrite(model.read_text()))
+    try:
+        named = " ".join(drafted(model).draft.assumed)
+    except BadInput as error:
+        named = str(error)
+    assert re.search(said, named), named
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_rounded_angles_and_mirrored_axes_are_no_defects(seed: int, tmp_path: Path) -> None:
+    """Gravity is that of the exact model, with the sign of each joint that turns the other way."""
+    random = np.random.default_rng([772, seed])
+    model = DrawnModel(seed).write(tmp_path)
+    exact = load_model(model)
+    mirrored = random.random(exact.arm.n) < 0.5
+    turn = np.pi * random.integers(-1, 2, exact.arm.n) / 2
+
+    def read(angles: Callable[[float], float], mirror: bool) -> ModelArm:
+        parts = text.split("<joint ")
+        for i, turned in enumerate(turn):
+            part = parts[i + 1].replace('xyz="', f'rpy="0 0 {angles(float(turned))!r}" xyz="', 1)
+            axis = "0 1 0" if i % 2 == 0 else "0 0 1"
+            flipped = axis.replace("1", "-1") if mirror and mirrored[i] else axis
+            parts[i + 1] = part.replace(f'axis xyz="{axis}"', f'axis xyz="{flipped}"')
+        model.write_text("<joint ".join(parts))
+        return load_model(model)
+
+    text, sign = model.read_text(), np.where(mirrored, -1.0, 1.0)
+    poses = random.uniform(-1.4, 1.4, (20, exact.arm.n))
+    plain, rounded = read(float, mirror=False), read(lambda angle: round(angle, 4), mirror=True)
+    expected = gravity_torque(plain.arm, plain.beta, poses)
+    found = sign * gravity_torque(rounded.arm, rounded.beta, sign * poses)
+    assert np.abs(found - expected).max() < 3e-4 * np.abs(expected).max()
+    assert not list(model_errors(drafted(model).parsed()))

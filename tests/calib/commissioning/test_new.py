@@ -83,7 +83,7 @@ def test_prismatic_fingers_are_set_aside_and_a_range_is_chosen_where_nothing_tou
 
 
 def test_limits_more_than_a_turn_apart_are_no_stops(tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.commissioning.new_arm.find_clear_range", lambda arm_file: None)
+    monkeypatch.setattr("calib.commissioning.new_arm.sweep_problem", lambda arm_file: None)
     made = new_arm(MODELS / "ur10e.urdf", tmp_path / "ur10e.yaml")
     assert made.parsed().sweep.hold == "servo"
     limits = gcomp_arm(made.parsed())
@@ -91,7 +91,7 @@ def test_limits_more_than_a_turn_apart_are_no_stops(tmp_path, monkeypatch):
 
 
 def test_two_arms_in_a_model(tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.commissioning.new_arm.find_clear_range", lambda arm_file: None)
+    monkeypatch.setattr("calib.commissioning.new_arm.sweep_problem", lambda arm_file: None)
     text = (MODELS / "own.xml").read_text()
     body = text[text.index('<body name="turret"') : text.index("  </worldbody>")]
     second = body
@@ -122,7 +122,7 @@ def test_two_arms_in_a_model(tmp_path, monkeypatch):
 
 
 def test_a_lift_and_a_waist_before_the_arm(tmp_path, monkeypatch):
-    """The arm begins after --base: after a lift, which is none of its joints, or after a waist, which may be one."""
+    """The arm begins after a lift, which is none of its joints, and after a waist with --base, which may be one."""
     monkeypatch.chdir(tmp_path)
     Path("m.xml").write_text(
         '<mujoco><worldbody><body name="column"><joint name="lift" type="slide" axis="0 0 1" range="0 0.3"/>'
@@ -138,14 +138,14 @@ def test_a_lift_and_a_waist_before_the_arm(tmp_path, monkeypatch):
         assert parsed.kinematics.base == base
         assert gcomp_arm(parsed).names == tuple(names)
         assert ("lift", "is prismatic") in made.draft.aside
-    with pytest.raises(BadInput, match=r"lift is prismatic and lies .* begin after it \(--base column\)"):
-        new_arm(Path("m.xml"), Path("a.yaml"))
+    made = new_arm(Path("m.xml"), Path("a.yaml"))
+    assert (list(made.parsed().joint_names), made.parsed().kinematics.base) == (["waist", "shoulder"], "column")
     with pytest.raises(BadInput, match="--base shoulder: no such body carries a joint; there are world, column, torso"):
         new_arm(Path("m.xml"), Path("a.yaml"), base="shoulder")
 
 
 def test_joints_of_an_attached_model_keep_the_slash_in_their_names(tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.commissioning.new_arm.find_clear_range", lambda arm_file: None)
+    monkeypatch.setattr("calib.commissioning.new_arm.sweep_problem", lambda arm_file: None)
     text = (MODELS / "own.xml").read_text()
     (tmp_path / "left.xml").write_text(text.replace('name="yaw', 'name="left/yaw'))
     made = new_arm(tmp_path / "left.xml", tmp_path / "left.yaml")
@@ -155,7 +155,7 @@ def test_joints_of_an_attached_model_keep_the_slash_in_their_names(tmp_path, mon
 
 def test_a_small_arm_has_drives_of_its_own_strength(tmp_path, monkeypatch):
     """0.06 N·m of load, not the 2 N·m that a wrist of a larger arm has at least: friction is a share of that."""
-    monkeypatch.setattr("calib.commissioning.new_arm.find_clear_range", lambda arm_file: None)
+    monkeypatch.setattr("calib.commissioning.new_arm.sweep_problem", lambda arm_file: None)
     (tmp_path / "small.xml").write_text(
         '<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 1 0" range="-1 1"/>'
         '<inertial pos="0.1 0 0" mass="0.05" diaginertia="1e-5 1e-5 1e-5"/><body pos="0.1 0 0">'
@@ -296,11 +296,21 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
     monkeypatch.chdir(tmp_path)
     real_arm(made, tmp_path, nodes=[7, 8, 9, 10], position_gain=[1.0] * 4)
     made.write()
+    marks = [line for line in Path("arm4.yaml").read_text().splitlines() if line.lstrip().startswith("#")]
     assert cli.run(["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
     assert cli.run(["check", "found.yaml"]) == 0
     assert cli.run(["new", "arm4.yaml", "--out", "rewired.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
     assert cli.run(["check", "rewired.yaml", "--passive"]) == 0
-    assert [joint.node for joint in load_arm("rewired.yaml").require_link().joints] == [7, 8, 9, 10]
+    joints = load_arm("rewired.yaml").require_link().joints
+    assert [joint.node for joint in joints] == [7, 8, 9, 10]
+    assert all(
+        joint.identity == found.identity
+        for joint, found in zip(joints, load_arm("found.yaml").link.joints, strict=True)
+    )
+    assert len(marks) > 10
+    assert [line for line in Path("rewired.yaml").read_text().splitlines() if line.lstrip().startswith("#")][
+        1:
+    ] == marks
     assert cli.run(["new", "arm4.urdf", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
     assert "nobody to ask" in capsys.readouterr().err
 
@@ -327,3 +337,17 @@ def test_an_arm_file_without_a_bus_has_nothing_to_find(tmp_path):
     with pytest.raises(BadInput, match="expected a URDF or MJCF model"):
         new_arm(tmp_path / "arm.yaml", tmp_path / "out.yaml")
     assert cli.run(["new", "sarcos.yaml"]) == 2
+
+
+def test_stock_drives_are_written_as_what_they_are_and_pass_the_check(tmp_path, monkeypatch, capsys):
+    """Without a torque sensor record (2100h) a bare node id would be wrong."""
+    monkeypatch.chdir(tmp_path)
+    for model in (["six-cia402"], []):
+        out = f"{len(model)}.yaml"
+        assert cli.run(["new", *model, "--out", out, "--bus", "armlink_sim:six-cia402"]) == 0
+        joints = load_arm(out).require_link().joints
+        assert [joint.settings.node for joint in joints] == [1, 2, 3, 4, 5, 6]
+        assert {joint.settings.calibration for joint in joints} == {"host"}
+        assert all(joint.identity is not None for joint in joints)
+        assert cli.run(["check", out, "--passive"]) == 0
+    assert {joint.settings.torque for joint in joints} == {"motor"}

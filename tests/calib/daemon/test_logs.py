@@ -3,13 +3,14 @@
 import io
 import json
 import logging
+import sys
 import threading
 from collections.abc import Iterator
 
 import pytest
 
 from calib.daemon import logs
-from calib.daemon.logs import log_as_json
+from calib.daemon.logs import log_to_stderr
 
 
 @pytest.fixture
@@ -26,7 +27,7 @@ def root() -> Iterator[logging.Logger]:
 
 
 def test_what_is_logged_is_json_on_standard_error(root: logging.Logger, capsys: pytest.CaptureFixture[str]) -> None:
-    log_as_json()
+    log_to_stderr()
     logs.log_in_thread()
     logging.getLogger("calib.test").info("hello %s", "you")
     logging.getLogger("calib.test").debug("not this")
@@ -35,6 +36,18 @@ def test_what_is_logged_is_json_on_standard_error(root: logging.Logger, capsys: 
     handler.stream.drain(60.0)  # type: ignore[attr-defined]
     (line,) = capsys.readouterr().err.splitlines()
     assert "hello you" in json.loads(line).values()
+
+
+def test_a_terminal_gets_plain_lines(
+    root: logging.Logger, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    log_to_stderr()
+    logging.getLogger("calib.test").info("hello %s", "you\x1b[31m")
+    logging.getLogger("calib.test").warning("too warm", extra={"joint": "elbow"})
+    hello, warning = capsys.readouterr().err.splitlines()
+    assert hello.endswith("  hello you\\x1b[31m")
+    assert warning.endswith("  warning: too warm  joint=elbow")
 
 
 class NobodyReads(io.StringIO):

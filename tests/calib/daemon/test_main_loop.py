@@ -275,7 +275,7 @@ def test_a_second_daemon_on_a_state_directory_does_not_start(
     """It neither opens the bus nor touches the first one's journal."""
     begun: list[object] = []
     monkeypatch.setattr("calib.commands.daemon.TAKE_OVER_SECONDS", 0.0)
-    monkeypatch.setattr("calib.daemon.logs.log_as_json", lambda: None)
+    monkeypatch.setattr("calib.daemon.logs.log_to_stderr", lambda: None)
     monkeypatch.setattr("calib.daemon.loop.loop_process.LoopProcess", lambda *given, **options: begun.append(given))
     with locked_directory(tmp_path, "--state of the first"):
         status = cli.run(["daemon", "sarcos", "--bus", "armlink_sim:sarcos", "--state", str(tmp_path)])

@@ -42,6 +42,16 @@ def test_only_frames_and_timers_that_need_it_advance_the_physics(ends: tuple[can
     assert arm.time >= due
 
 
+def test_a_late_arm_says_so_itself_and_not_twice_in_a_second(ends: tuple[can.BusABC, can.BusABC]) -> None:
+    described, hand, said = one_joint(), Hand(), list[tuple[float, float]]()
+    server = ArmServer(SimulatedArm(described, Truth.of(described)), as_bus(ends[0]), now=hand.now)
+    server.on_late = lambda lag, at: said.append((lag, at))
+    for pause in (TICK, 0.6, 0.1, TICK, 1.0):
+        hand.time += pause
+        server.turn()
+    assert [lag for lag, _ in said] == pytest.approx([0.6, 1.0])
+
+
 @pytest.mark.parametrize("pieces", [[0.004], [0.002, 0.002], [0.0005, 0.003, 0.0005], [0.0038, 0.0005], [0.004, 0.009]])
 def test_a_position_target_is_reached_in_its_time_and_passed_for_one_more(pieces: list[float]) -> None:
     rig = Rig(one_joint())

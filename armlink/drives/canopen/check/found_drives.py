@@ -47,4 +47,7 @@ class FoundNodes:
         except ValueError as error:
             raise BusFault(f"node {identity.node}: no units: {error}: set up the drive first") from None
         most = int(read(objects.MAX_TORQUE)) * units.torque
-        return FoundDrive(identity.node, identity.vendor, identity.product, rated * 1e-3, most, units.position)
+        own = self._services[identity.node].has(objects.TORQUE_READING)
+        keys = {"family": "canopen", "node": identity.node, "torque": "motor", "calibration": "host"}
+        ratings = rated * 1e-3, most, units.position
+        return FoundDrive(identity.node, identity.vendor, identity.product, *ratings, None if own else keys)
