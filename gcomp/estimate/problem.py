@@ -1,4 +1,4 @@
-"""What parameters leave of measurements, and its derivatives."""
+"""Residuals of measurements as a function of parameters, and their derivatives."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -136,7 +136,7 @@ class Layout:
 
 
 def names_of(fit: LoopFit) -> list[tuple[int, str]]:
-    """What was fitted: joint and name, then the whole arm's."""
+    """Fitted parameters: joint and name, then the whole arm's."""
     return [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
 
 

@@ -130,7 +130,7 @@ def refresh(model: Any) -> None:
 
 @dataclass(frozen=True, eq=False)
 class HeldParts:
-    """What is put back after each step."""
+    """Places and degrees of freedom that are put back after each step."""
 
     places: NDArray[np.intp]
     dofs: NDArray[np.intp]
@@ -276,7 +276,7 @@ class MovedModel:
     # ---- commands
 
     def commands(self, piece: Piece, begin: float, steps: int, point: Mapping[str, Array], scale: float) -> Array:
-        """What each servo is given at each step of a window, (steps, J) [rad]."""
+        """Input of each servo at each step of a window, (steps, J) [rad]."""
         late = point["delay"] - self.servos.delay
         edges: Array = begin + self.dt * np.arange(steps + 1, dtype=float)
         given = piece.command(edges, late)
