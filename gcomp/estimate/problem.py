@@ -25,6 +25,10 @@ class FittedParameter:
     """The only channel that it acts on, as far as derivatives count; −1 if it acts on all."""
     step: float = 0.01
     """Step of a finite difference."""
+    along: tuple[tuple[int, float], ...] = ()
+    """Parameters that are changed with it in a difference, and by how much over its own change; their own derivatives
+    are taken off again. The motion hardly depends on the common scale of all torques, and differences by one of them
+    alone, which sticking and slipping roughen, do not add up to that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +80,9 @@ def linearise(problem: EstimationProblem, theta: Array, free: Sequence[int]) -> 
     for some in (*together, *([k] for k in shared)):
         moved = theta.copy()
         moved[some] += steps[some]
+        for k in some:
+            for other, share in problem.parameters[k].along:
+                moved[other] += share * steps[k]
         points.append(moved)
     answers = problem.predict(np.stack(points))
     acting, slopes = [], []
@@ -83,5 +90,10 @@ def linearise(problem: EstimationProblem, theta: Array, free: Sequence[int]) -> 
         rows = [*range(1, 1 + len(each)), *range(1 + len(together), 1 + len(together) + len(shared))]
         index = np.array([*each, *shared], np.intp)
         acting.append(index)
-        slopes.append((answers[rows, c] - answers[0, c]) / steps[index, None])
+        own_slopes = (answers[rows, c] - answers[0, c]) / steps[index, None]
+        place = {int(k): row for row, k in enumerate(index)}
+        for k, row in place.items():
+            for other, share in problem.parameters[k].along:
+                own_slopes[row] -= share * own_slopes[place[other]]
+        slopes.append(own_slopes)
     return Linearised(theta, answers[0], tuple(acting), tuple(slopes))

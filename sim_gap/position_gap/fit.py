@@ -13,6 +13,7 @@ from sim_gap.position_gap.parameters import (
     INVERSE,
     LOGARITHMIC,
     PARAMETERS,
+    WITH_TORQUE,
     Scales,
     from_coordinate,
     to_coordinate,
@@ -146,9 +147,14 @@ def jacobian(
     """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the parameters' own coordinates."""
     listed = [(j, name) for j, own in enumerate(names) for name in own] + [(-1, name) for name in shared]
     layout = Layout(data, scales, fit.point, listed)
-    about = linearise(
-        layout.problem(fit.point, {}, np.zeros(data.joints)), layout.theta(layout.point), range(len(listed))
-    )
+    problem, theta = layout.problem(fit.point, {}, np.zeros(data.joints)), layout.theta(layout.point)
+    at = {place: k for k, place in enumerate(listed)}
+    parameters = list(problem.parameters)
+    for (j, name), k in at.items():
+        if name == "kp":
+            others = tuple((at[j, each], float(theta[at[j, each]])) for each in WITH_TORQUE if (j, each) in at)
+            parameters[k] = replace(parameters[k], along=others)
+    about = linearise(replace(problem, parameters=tuple(parameters)), theta, range(len(listed)))
     shape = (len(data.measured), data.count)
     now = about.residual.reshape(data.joints, *shape).transpose(1, 0, 2)
     return now, [x.reshape(len(x), *shape) for x in about.slopes]

@@ -183,7 +183,8 @@ def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
 def _bare(search: LoopSearch, fit: LoopFit, about: About, complete: bool) -> LoopFit:
     """The nominal model with its own controller, or with that of the fit, fitted again without any effect."""
     if complete:
-        return LoopFit({name: values.copy() for name, values in search.nominal.items()}, ((),) * search.data.joints)
+        own = {name: values.copy() for name, values in search.nominal.items()}
+        return LoopFit(own | {"creep": search.data.plant.creep}, ((),) * search.data.joints)
     for group in groups_of(fit, search):
         fit = without_group(search, fit, group)
     return search.improve(replace(fit, rms=None), 4)
