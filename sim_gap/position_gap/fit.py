@@ -18,7 +18,7 @@ from sim_gap.position_gap.parameters import (
     from_coordinate,
     to_coordinate,
 )
-from sim_gap.position_gap.plant import simulate
+from sim_gap.position_gap.simulation import simulate
 from sim_gap.position_gap.windows import Windows
 
 INDEPENDENT_S = 0.5

@@ -7,19 +7,18 @@ that begins afresh, as the short roll-outs of a data set do.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording, slice_rows
-from gcomp.arrays import Array, Mask
+from gcomp.arrays import Array
 from sim_gap.model.load import SimModel
+from sim_gap.position_gap.pieces import Piece
+from sim_gap.position_gap.plant import MovedModel
 from sim_gap.residuals.resampling import low_pass
-
-if TYPE_CHECKING:
-    from sim_gap.position_gap.plant import MovedModel
 
 WINDOW_S, WARM_S = 3.0, 1.0
 """Judged length of a window, and the simulated time before it that is not judged [s]."""
@@ -44,43 +43,10 @@ MOVES, FAST = 0.5, 0.8
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
-    """A part of a recording without a break: commands as they were held from row to row."""
-
-    ends: Array
-    """Times at which each command begins, and the last ends [s], (K + 1,)."""
-    area: Array
-    """Integral of the command up to each of them [rad·s], (K + 1, n)."""
-    served: Mask
-    """Whether each row is commanded, (K, n)."""
-
-    def command(self, edges: Array, delay: Array) -> Array:
-        """Mean command between the times `edges` (T + 1,), each joint's later by its `delay` (n,) [s]; (T, n)."""
-        made = [np.interp(edges - late, self.ends, column) for late, column in zip(delay, self.area.T, strict=True)]
-        # before the first row the first command held, after the last one the last
-        outside = [
-            np.minimum(edges - late - self.ends[0], 0.0) * first + np.maximum(edges - late - self.ends[-1], 0.0) * last
-            for late, first, last in zip(delay, *self.held, strict=True)
-        ]
-        return np.asarray(np.diff(np.column_stack(made) + np.column_stack(outside), axis=0) / np.diff(edges)[:, None])
-
-    @property
-    def held(self) -> tuple[Array, Array]:
-        """First and last command, (n,) each."""
-        rates = np.diff(self.area, axis=0) / np.diff(self.ends)[:, None]
-        return rates[0], rates[-1]
-
-    def served_at(self, times: Array) -> Mask:
-        """Whether each joint is commanded at each time, (T, n)."""
-        rows = np.searchsorted(self.ends, times + 1e-9, side="right") - 1
-        return np.asarray(self.served[np.clip(rows, 0, len(self.served) - 1)])
-
-
-@dataclass(frozen=True, eq=False)
 class Windows:
     """W windows of J joints, compared with the model at up to To times; SI units."""
 
-    plant: "MovedModel"
+    plant: MovedModel
     """The model that is moved along the commands."""
     pieces: tuple[Piece, ...]
     piece: NDArray[np.intp]
@@ -161,7 +127,7 @@ def pieces_of(recording: Recording) -> list[slice]:
 
 
 def windows_of(
-    plant: "MovedModel", recordings: Sequence[Recording], labels: Sequence[str], scales: Sequence[float] = ()
+    plant: MovedModel, recordings: Sequence[Recording], labels: Sequence[str], scales: Sequence[float] = ()
 ) -> Windows:
     """Cut recordings into windows, the same however they are ordered. Raises BadInput for one that holds no commanded
     position.

@@ -16,7 +16,7 @@ from gcomp.arrays import Array
 from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import LoopFit, batch, jacobian, root_mean_squares
 from sim_gap.position_gap.judge import joint_rms
-from sim_gap.position_gap.plant import simulate
+from sim_gap.position_gap.simulation import simulate
 from sim_gap.position_gap.training.jackknife import recordings_or_thirds
 from sim_gap.position_gap.training.spread import Covariance
 from sim_gap.position_gap.training.unreached_limits import LIMITS, Unreached

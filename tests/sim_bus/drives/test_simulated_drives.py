@@ -241,9 +241,9 @@ def test_a_fault_that_a_drive_cannot_have(drive, fault):
         injected(fault, drive)
 
 
-def test_a_model_that_is_not_simulated():
-    with pytest.raises(BadInput, match=r"hinge: drive\.model is 'X1'; simulated are DM3507"):
-        simulated({**DAMIAO, "model": "X1"})
+def test_a_drive_without_a_model_on_its_label_is_not_simulated():
+    with pytest.raises(BadInput, match=r"hinge: drive\.model is ''; simulated are DM3507"):
+        simulated({**DAMIAO, "model": ""})
 
 
 # ---- the command

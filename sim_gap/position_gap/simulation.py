@@ -1,0 +1,233 @@
+"""Windows of recorded motion, simulated from the parameters of a hypothesis; laws that MuJoCo lacks at each step."""
+
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcomp.arrays import Array
+from sim_gap.better_model.native_drives import hold
+from sim_gap.model.load import linear_part
+from sim_gap.position_gap.plant import MovedModel, Values, silent
+from sim_gap.position_gap.windows import Windows
+
+WORLDS = 64
+"""Simulations that are stepped together where laws are evaluated at each step."""
+
+
+def simulate(data: Windows, values: Values) -> Array:
+    """Positions at the times of comparison for P hypotheses [rad], (P, To, J, W)."""
+    count = max(len(x) for x in values.values())
+    out = np.empty((count, *data.measured.shape))
+    with silent():
+        for p in range(count):
+            point = {name: x[p if len(x) > 1 else 0] for name, x in values.items()}
+            out[p] = _moved(data.plant, data, point)
+    return out
+
+
+def _moved(plant: MovedModel, data: Windows, point: Mapping[str, Array]) -> Array:
+    """Positions of one hypothesis, (To, J, W)."""
+    laws = laws_of(point, plant)
+    models = {
+        float(scale): plant.changed({**point, **{name: point[name] * scale for name in ("kp", "kd", "ki")}})
+        for scale in np.unique(data.scale)
+    }
+    worlds = [World(plant, models[float(data.scale[w])], data, w, point) for w in range(data.count)]
+    by_law = [bool(laws) or not world.served.all() for world in worlds]
+    out = np.empty_like(data.measured)
+    for world, lawful in zip(worlds, by_law, strict=True):
+        if not lawful:
+            world.run()
+    together = [world for world, lawful in zip(worlds, by_law, strict=True) if lawful]
+    for first in range(0, len(together), WORLDS):
+        run_with_laws(plant, together[first : first + WORLDS], point, laws)
+    for w, world in enumerate(worlds):
+        out[..., w] = world.positions()
+    return out
+
+
+class World:
+    """One window of one hypothesis."""
+
+    def __init__(self, plant: MovedModel, model: Any, data: Windows, w: int, point: Mapping[str, Array]) -> None:
+        self.plant, self.model, self.data, self.w, self.point = plant, model, data, w, point
+        self.piece, self.scale, self.at = data.pieces[data.piece[w]], float(data.scale[w]), data.at[:, w]
+        self.steps = int(np.ceil(self.at.max() / plant.dt - 1e-6)) + 1
+        self.given = plant.commands(self.piece, float(data.begin[w]), self.steps, point, self.scale)
+        self.served = self.piece.served_at(data.begin[w] + plant.dt * np.arange(self.steps))
+        self.track = np.empty((self.steps + 1, plant.n))
+        self.applied = -point["offset"] - point["asymmetry"] * point["coulomb"]
+        """Torques that do not change [N·m], (J,)."""
+
+    def run(self) -> None:
+        """Move the model without a law."""
+        import mujoco
+
+        plant, model = self.plant, self.model
+        d = plant.state
+        self.begin(model, d)
+        spring = np.where(plant.driven, 0.0, self.point["kp"] * self.point["gain"] * self.scale)
+        loose, held = not plant.driven.all(), bool(plant.held.places.size)
+        given = self.given[:, plant.driven] * plant.gear[plant.driven]
+        for first, last in pairwise(self._edges()):  # between them the command does not change
+            self.track[first] = d.qpos[plant.places]
+            d.ctrl[plant.controls] = given[first]
+            if loose:
+                d.qfrc_applied[plant.dofs] = self.applied + spring * self.given[first]
+            if not held:
+                mujoco.mj_step(model, d, last - first)
+                continue
+            for _ in range(last - first):
+                mujoco.mj_step(model, d)
+                plant.held.put_back(d)
+        self.track[self.steps] = d.qpos[plant.places]
+
+    def _edges(self) -> list[int]:
+        """Steps at which a command changes or a position is read, the first, and the end."""
+        changes = np.flatnonzero(np.any(np.diff(self.given, axis=0) != 0.0, axis=1)) + 1
+        whole = self._steps_of_comparison()[0]
+        return sorted({0, self.steps, *changes.tolist(), *whole.tolist(), *(whole + 1).tolist()})
+
+    def _steps_of_comparison(self) -> tuple[NDArray[np.intp], Array]:
+        """Step before each time of comparison, and the share of a step that it is later, (To,) each."""
+        steps = self.at / self.plant.dt
+        whole = np.minimum((steps + 1e-6).astype(int), self.steps - 1)
+        return whole, np.maximum(steps - whole, 0.0)
+
+    def positions(self) -> Array:
+        """Positions at the times of comparison, (To, J)."""
+        whole, late = self._steps_of_comparison()
+        share = late[:, None]
+        return np.asarray(self.track[whole] * (1.0 - share) + self.track[whole + 1] * share)
+
+    def begin(self, model: Any, d: Any) -> None:
+        """The recorded state; actuators as if the command had been there for long, an integral part with what gathered
+        since the start."""
+        import mujoco
+
+        plant, data, w = self.plant, self.data, self.w
+        mujoco.mj_resetData(model, d)
+        drives = plant.servos.actuator[plant.driven].tolist()
+        if len(drives) and model.na + int(model.actuator_history[drives, 0].sum()):
+            d.qpos[plant.places] = data.first[:, w]
+            first = self.piece.held[0] if data.begin[w] > 0.0 else self.given[0]
+            hold(model, d, drives, (first * plant.gear)[plant.driven])
+            for i, j in zip(drives, np.flatnonzero(plant.driven).tolist(), strict=True):
+                count, place = int(model.actuator_history[i, 0]), int(model.actuator_actadr[i])
+                now = self.given[0, j] * plant.gear[j]
+                if count:
+                    mujoco.mj_initCtrlHistory(model, d, i, None, np.full((count, 1), now))
+                if plant.pid[j]:
+                    if model.actuator_dynprm[i, 1] > 0.0:
+                        d.act[place] = now
+                    if model.actuator_gainprm[i, 0] > 0.0:
+                        d.act[place + int(model.actuator_actnum[i]) - 1] += data.error_sum[j, w] * plant.gear[j]
+                elif model.actuator_actnum[i]:
+                    d.act[place] = now
+        d.qpos[plant.places], d.qvel[plant.dofs] = data.start[:, :, w]
+        d.qfrc_applied[plant.dofs] = self.applied
+
+    def integral(self) -> Array:
+        """Integral of the error of servos whose integral part is a law, (J,): what holds at first and what came."""
+        ki = np.maximum(self.point["ki"], 1e-9)
+        q = self.data.first[:, self.w]
+        error = self.piece.held[0] - q
+        asked = self.plant.sim.arm.torque(q[None], 0 * q[None], 0 * q[None])[0]
+        return np.asarray((asked / self.point["gain"] - self.point["kp"] * error) / ki + self.data.error_sum[:, self.w])
+
+
+def run_with_laws(
+    plant: MovedModel, worlds: Sequence[World], point: Mapping[str, Array], laws: Collection[str]
+) -> None:
+    """Move some worlds together, and evaluate the laws at each step for all of them at once, (W, n)."""
+    import mujoco
+
+    dofs, places, drives, dt = plant.dofs, plant.places, plant.servos.actuator[plant.driven], plant.dt
+    friction, held = bool({"stribeck", "load"} & {*laws}), bool(plant.held.places.size)
+    switched = [not world.served.all() for world in worlds]
+    models = [copy(w.model) if friction or off else w.model for w, off in zip(worlds, switched, strict=True)]
+    states = [mujoco.MjData(model) for model in models]
+    for world, model, d in zip(worlds, models, states, strict=True):
+        world.begin(model, d)
+    scale = np.array([world.scale for world in worlds])[:, None]
+    inner = np.minimum(point["kv"], point["viscous"]) + point["back_emf"] + point["kd"] * point["gain"]
+    kp, ki = point["kp"] * point["gain"] * scale, point["ki"] * scale * ~plant.pid
+    loose, gear = ~plant.driven, plant.gear
+    total = np.stack([world.integral() for world in worlds]) if "ki" in laws else np.zeros((len(worlds), plant.n))
+    carried, longest = np.zeros((len(worlds), plant.n)), max(world.steps for world in worlds)
+
+    def whole(rows: Sequence[Array], steps: int) -> Array:
+        return np.stack([np.concatenate([x, np.repeat(x[-1:], steps - len(x), axis=0)]) for x in rows], axis=1)
+
+    given = whole([world.given for world in worlds], longest)
+    served = whole([world.served for world in worlds], longest)
+    applied = worlds[0].applied
+    tracks = np.empty((longest + 1, len(worlds), plant.n))
+
+    views = {name: [getattr(d, name) for d in states] for name in _READ}
+    dampings = [linear_part(model.dof_damping, model.nv) for model in models]
+    springs = [linear_part(model.jnt_stiffness, model.njnt) for model in models]
+    kept = [(m.actuator_gainprm[drives].copy(), m.actuator_biasprm[drives].copy()) for m in models]
+    outer = [damping[dofs] - np.where(plant.driven, 0.0, inner) for damping in dampings]
+
+    def now(name: str, at: Array) -> Array:
+        return np.concatenate(views[name]).reshape(len(states), -1)[:, at]
+
+    for k in range(longest):
+        q, v, on, c = now("qpos", places), now("qvel", dofs), served[k], given[k]
+        tracks[k] = q
+        for w in np.flatnonzero(switched).tolist() if k == 0 or np.any(on != served[k - 1]) else ():
+            model, drive = models[w], on[w][plant.driven][:, None]
+            model.actuator_gainprm[drives], model.actuator_biasprm[drives] = kept[w][0] * drive, kept[w][1] * drive
+            dampings[w][dofs] = outer[w] + np.where(loose & on[w], inner, 0.0)
+            springs[w][plant.joints] = point["spring"] + np.where(loose & on[w], kp[w], 0.0)
+        if "dead" in laws:
+            c = c - np.minimum(np.maximum(c - q, -point["dead"]), point["dead"])
+        torque = np.zeros_like(q) + applied
+        if "ki" in laws:
+            total += dt * on * (c - q)
+            torque += ki * total * on
+        if loose.any():
+            pushed = kp * c
+            if "limit" in laws:
+                wish = kp * (c - q) - inner * v
+                pushed = pushed + np.clip(wish, -point["limit"], point["limit"]) - wish
+            torque += loose * on * pushed
+        if "feed" in laws:
+            torque += (point["feed"] * on - 1.0) * now("qfrc_gravcomp", dofs)
+        if friction:
+            level = point["coulomb"] + point["stribeck"] * np.exp(-((v / point["stribeck_velocity"]) ** 2))
+            level = level + point["load"] * np.abs(carried)
+            for model, each in zip(models, level, strict=True):
+                model.dof_frictionloss[dofs] = each
+        controls = (c * gear)[:, plant.driven]
+        for model, d, push, control in zip(models, states, torque, controls, strict=True):
+            d.qfrc_applied[dofs] = push
+            d.ctrl[plant.controls] = control
+            mujoco.mj_step(model, d)
+            if held:
+                plant.held.put_back(d)
+        if "load" in laws:
+            carried = sum(now(name, dofs) for name in _READ[2:6]) - point["armature"] * now("qacc", dofs)
+    tracks[longest] = now("qpos", places)
+    for w, world in enumerate(worlds):
+        world.track = tracks[: world.steps + 1, w]
+
+
+_READ = ("qpos", "qvel", "qfrc_applied", "qfrc_actuator", "qfrc_passive", "qfrc_constraint", "qacc", "qfrc_gravcomp")
+
+
+def laws_of(point: Mapping[str, Array], plant: MovedModel) -> set[str]:
+    """Names of the parameters of a point that act by a law at each step."""
+    found = {name for name in ("dead", "stribeck", "load") if np.any(point[name] != 0.0)}
+    if np.any(point["feed"] != plant.compensated):
+        found.add("feed")
+    if np.any((point["ki"] > 0.0) & ~plant.pid):
+        found.add("ki")
+    if np.any(np.isfinite(point["limit"]) & ~plant.driven):
+        found.add("limit")
+    return found
