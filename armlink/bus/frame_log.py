@@ -38,11 +38,11 @@ PACKED = ".gz"
 CSV_HEADER = "timestamp,arbitration_id"
 """Beginning of a CSV file of python-can, which has the suffix of a recording."""
 PRINTED = re.compile(
-    r"\s*(\((?P<time>[^)]+)\))?\s*(?P<channel>[^\s(]\S*)\s+((RX|TX)\s+\S+\s+\S+\s+)?(?P<id>[0-9A-F]{3}|[0-9A-F]{8})"
+    r"(\((?P<time>[^)]+)\)\s*)?(?P<channel>[^\s(]\S*)\s+((RX|TX)\s+\S+\s+\S+\s+)?(?P<id>[0-9A-F]{3}|[0-9A-F]{8})"
     r"\s+\[(?P<length>\d+)\]\s*(?P<data>remote request|([0-9A-F]{2}(\s+|$))*).*",
     re.IGNORECASE | re.DOTALL,
 )
-"""A line as candump prints it: (time) channel id [length] bytes."""
+"""A line as candump prints it, without the space about it: (time) channel id [length] bytes."""
 SPACING = 1e-4
 """Time from frame to frame where a log has none [s]: about that of full frames on a bus of 1 Mbit/s."""
 FLUSH_MICROSECONDS = 500_000
@@ -50,6 +50,7 @@ FLUSH_MICROSECONDS = 500_000
 MOST_LINE = 1 << 16
 """Characters of a line; one of a CAN FD frame has some hundreds."""
 MOST_IDS = 2000
+"""Identifiers that a log is remembered to hold: about all of 11 bits."""
 MOST_CONTAINER = 1 << 26
 """Bytes that a container of a BLF file holds at most; Vector's and python-can's writers put 128 kB into one."""
 _CONTAINER = 8192  # bytes that the BLF writer buffers
@@ -172,7 +173,7 @@ class LogReader:
             raise BadInput(f"{path}: not the suffix of a frame log, expected {', '.join(READ_SUFFIXES)}")
         if _kind(path) == ".blf" and path.suffix.lower() == PACKED:
             raise BadInput(f"{path}: BLF files are packed already: unpack it first (gunzip)")
-        self._path = path
+        self._path, self._timeless = path, 0
         self.count = 0
         """Frames read."""
         self.ids = set[int]()
@@ -205,8 +206,10 @@ class LogReader:
                 why = yield from self._from_lines()
         except _BAD_CONTENT:
             why = "what follows is not readable"
-        except (OSError, EOFError) as error:
-            raise BadInput(f"{self._path}: cannot read it: {getattr(error, 'strerror', None) or error}") from None
+        except EOFError:
+            why = "the file ends early"
+        except OSError as error:
+            raise BadInput(f"{self._path}: cannot read it: {error.strerror or error}") from None
         if why:
             self.warning = f"cut frame log, {why}: loaded {self.count} frames up to there"
 
@@ -222,40 +225,28 @@ class LogReader:
     def _from_lines(self) -> Generator[can.Message, None, str]:
         kind = _kind(self._path)
         with _open_text(self._path) as stream:
-            lines = _WholeLines(stream)
-            if kind == ".log":
-                yield from can.CanutilsLogReader(self._printed(lines))
-            else:
-                yield from {".asc": can.ASCReader, ".trc": can.TRCReader, ".csv": can.CSVReader}[kind](lines)
+            lines = _WholeLines(stream, self._as_logged if kind == ".log" else str)
+            readers = {".asc": can.ASCReader, ".trc": can.TRCReader, ".csv": can.CSVReader}
+            yield from readers.get(kind, can.CanutilsLogReader)(lines)
         if lines.cut:
             return "its last line is not complete"
         if kind == ".asc" and not lines.last.strip().lower().startswith(_ASC_END):
             return "it has no End TriggerBlock"
         return ""
 
-    def _printed(self, lines: "_WholeLines") -> "_WholeLines":
-        """Lines of candump's log; those that it printed for people are rewritten so."""
-        timeless = 0
-
-        def rewritten(line: str) -> str:
-            nonlocal timeless
-            found = PRINTED.fullmatch(line)
-            if found is None:
-                return line
-            if found["time"] is None:
-                self.warning = (
-                    f"it has no times (candump -L writes them): frames are taken as {1e3 * SPACING:g} ms apart"
-                )
-                time, timeless = SPACING * timeless, timeless + 1
-            else:
-                time = _seconds(found["time"])
-            remote = found["data"].startswith("r")
-            flexible = "#" if len(found["length"]) == 2 else ""  # [08]: CAN FD
-            data = "R" if remote else (flexible and "#0") + "".join(found["data"].split())
-            return f"({time:.6f}) {found['channel']} {found['id']}#{data}\n"
-
-        lines.rewritten = rewritten
-        return lines
+    def _as_logged(self, line: str) -> str:
+        """A line of candump's log: as it is, or made of what it printed for people."""
+        found = PRINTED.fullmatch(line.strip())
+        if found is None:
+            return line
+        if found["time"] is None:
+            self.warning = f"it has no times (candump -L writes them): frames are taken as {1e3 * SPACING:g} ms apart"
+            time, self._timeless = SPACING * self._timeless, self._timeless + 1
+        else:
+            time = _seconds(found["time"])
+        flexible = "#0" if len(found["length"]) == 2 else ""  # [08]: CAN FD
+        data = "R" if found["data"].startswith("r") else flexible + "".join(found["data"].split())
+        return f"({time:.6f}) {found['channel']} {found['id']}#{data}\n"
 
 
 def _seconds(text: str) -> float:
@@ -298,11 +289,10 @@ def _at(stream: Any, place: int, count: int) -> bytes:
 class _WholeLines:
     """Lines of a text file up to the first one without newline, as python-can's readers expect them."""
 
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
+    def __init__(self, stream: Any, rewritten: Callable[[str], str]) -> None:
+        """`rewritten` makes of a line what the reader understands."""
+        self._stream, self._rewritten = stream, rewritten
         self.cut, self.last = False, ""
-        self.rewritten: Callable[[str], str] = str
-        """Makes of a line what the reader understands."""
 
     def __iter__(self) -> Self:
         return self
@@ -316,7 +306,7 @@ class _WholeLines:
             raise StopIteration
         if line.strip():
             self.last = line
-        return self.rewritten(line)
+        return self._rewritten(line)
 
     def read(self, size: int = -1) -> str:
         """Not used; python-can requires the attribute of a file."""

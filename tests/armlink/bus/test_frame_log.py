@@ -255,3 +255,18 @@ def test_what_a_log_lacks_of_the_arm_is_named(arm_of, tmp_path, text):
     else:
         assert "no frame is read" in said
     assert "SYNC" not in said
+
+
+def test_a_packed_log_that_was_cut_loads_up_to_the_cut_and_says_so(arm_of, tmp_path):
+    record(arm_of(2), tmp_path / "run.log", cycles=2000)
+    whole = gzip.compress((tmp_path / "run.log").read_bytes())
+    (tmp_path / "cut.log.gz").write_bytes(whole[: len(whole) * 2 // 3])
+    found = recording_of_log(arm_of(2), tmp_path / "cut.log.gz")
+    assert "the file ends early" in found.warning
+    assert 500 < found.t.size < 1900
+
+
+@pytest.mark.parametrize("line", [" " * 60_000, "(1) " + " " * 60_000, "a " * 30_000, "can0 001 [8] " + "00 " * 20_000])
+def test_a_long_line_that_is_no_frame_takes_no_time(tmp_path, line):
+    (tmp_path / "a.log").write_text(line + "\n")
+    LogReader(tmp_path / "a.log")._as_logged(line)  # in quadratic time some minutes
