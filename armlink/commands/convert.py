@@ -29,7 +29,8 @@ def convert(
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from armlink.recording.corrections import parse_corrections
-    from armlink.recording.files import load_recording, save_recording
+    from armlink.recording.files import keeps_names, load_recording, save_recording
+    from armlink.recording.recording import default_names
 
     stated = parse_corrections(
         columns=columns or (),
@@ -57,7 +58,7 @@ def convert(
     channels = list(recording.channels())
     out = results(json)
     out.print(f"{target}: {rows} rows, {seconds:.1f} s, {recording.n} joints, {', '.join(channels)}")
-    kept = load_recording(target).names
+    kept = recording.names if keeps_names(target) else default_names(recording.n)
     if kept != recording.names:
         renamed = ", ".join(f"{name} is {other}" for name, other in zip(recording.names, kept, strict=True))
         out.print(f"its format keeps no names of joints: {renamed} there (Parquet and MCAP keep them)", style="yellow")

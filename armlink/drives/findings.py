@@ -19,8 +19,13 @@ class FoundDrive:
     """Most that it is set to [N·m]."""
     unit: float
     """One count of its position [rad]."""
-    keys: Mapping[str, Any] | None = None
+    drive: Mapping[str, Any] | None = None
     """`link.joints[].drive` of an arm file, where its node id alone does not say what it is."""
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """As a row of `link.joints` names it."""
+        return {"node": self.node} if self.drive is None else {"drive": dict(self.drive)}
 
 
 class FoundDrives(Protocol):

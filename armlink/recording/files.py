@@ -104,6 +104,11 @@ def _chosen(recording: Recording, stated: Corrections, label: str) -> Recording:
     return replace(chosen, warning="; ".join(filter(None, (recording.warning, note))))
 
 
+def keeps_names(path: Path) -> bool:
+    """Whether a recording written there keeps the names of its joints."""
+    return _suffix(path) in (".mcap", ".parquet")
+
+
 def save_recording(recording: Recording, path: str | Path) -> None:
     """Save by suffix (see load_recording); raises BadInput if the recording is not valid."""
     path = Path(path)

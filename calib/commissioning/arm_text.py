@@ -67,7 +67,7 @@ def _bus(draft: Draft, out: Path) -> list[str]:
 def _joint(joint: JointDraft) -> dict[str, Any]:
     row = {
         "name": joint.name,
-        **({"node": joint.node} if joint.drive is None else {"drive": dict(joint.drive)}),
+        **({"node": joint.node} if joint.drive is None else joint.drive.keys),
         "rated_torque": joint.rated_torque,
         "max_torque": joint.max_torque,
         "max_torque_rate": joint.max_torque_rate,

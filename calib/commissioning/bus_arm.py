@@ -89,7 +89,7 @@ def _joint(match: Match) -> dict[str, Any]:
     drive = match.drive
     return {
         "name": match.joint,
-        **({"node": drive.node} if drive.keys is None else {"drive": dict(drive.keys)}),
+        **drive.keys,
         "rated_torque": float(f"{drive.rated_torque:g}"),
         "max_torque": float(f"{drive.max_torque:g}"),
         "max_torque_rate": float(f"{2.5 * drive.max_torque:.3g}"),

@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.model_sizes import model_budget
+from armlink.drives.findings import FoundDrive
 from calib.commissioning.chain import Chain
 from calib.commissioning.clear_range import ClearRange
 from gcomp.arm.load import compile_model
@@ -60,8 +61,8 @@ class JointDraft:
     notes: list[str] = field(default_factory=list)
     identity: dict[str, int] | None = None
     """Vendor and product of the drive found at its node."""
-    drive: Mapping[str, Any] | None = None
-    """Keys of the drive found, where it is another kind than a bare node id says."""
+    drive: FoundDrive | None = None
+    """The drive found at its node."""
 
 
 @dataclass
@@ -119,8 +120,8 @@ def draft_of_model(
     joints = [_joint(place, chain, stops.get(joint.name), rated[place]) for place, joint in enumerate(chain.joints)]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
     servo = f"{', '.join(free)}: no stop to press on" if free else None
-    draft = Draft(path.stem, path, tip, gravity, joints, chain.aside, notes, base=chain.base, servo=servo)
-    return replace(draft, locked=locked or {})
+    ends = path.stem, path, tip, gravity, joints, chain.aside, notes
+    return Draft(*ends, base=chain.base, servo=servo, locked=locked or {})
 
 
 def narrow(draft: Draft, found: ClearRange) -> None:

@@ -33,7 +33,7 @@ def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             "give a URDF or MJCF under kinematics.model, or keep the workspace clear",
         )
     else:
-        yield from _file_findings(arm_file)
+        yield from file_findings(arm_file)
         yield from _massless_links(arm_file)
     yield from _lever_findings(arm_file)
 
@@ -47,7 +47,8 @@ def _massless_links(arm_file: ArmFile) -> Iterator[SetupFinding]:
         yield SetupFinding("warning", what, str(arm_file.model_path), remedy)
 
 
-def _file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+def file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Inertias and collision shapes of the arm file's model that are ignored or missing."""
     assert arm_file.model_path is not None
     where = str(arm_file.model_path)
     model = read_model(arm_file.model_path)

@@ -12,7 +12,6 @@ from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
 from armlink.content.yaml_text import EditedYaml
 from armlink.drives.findings import FoundDrives
 from armlink.errors import BadInput
-from armlink.model_file import read_model
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
 from calib.commissioning.chain import Chain, find_chains
@@ -20,6 +19,7 @@ from calib.commissioning.clear_range import clear_ranges, sweep_problem
 from calib.commissioning.draft import Draft, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
 from calib.commissioning.finding import SetupFinding
+from calib.commissioning.model_checks import file_findings
 from calib.commissioning.model_joints import model_joints
 from calib.commissioning.model_judgement import refuse_impossible_model
 
@@ -102,10 +102,7 @@ def new_arm(
     made = NewArm(out, draft)
     refuse_impossible_model(made.parsed())
     _narrow_until_clear(made)
-    missing = read_model(model).left_out
-    if missing:
-        what = f"collisions are looked for without {missing}"
-        made.findings.append(SetupFinding("warning", what, str(model), "put them where the model names them"))
+    made.findings += file_findings(made.parsed())
     return made
 
 
@@ -160,7 +157,7 @@ def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -
         from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
         if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
             made.findings.append(_doubtful_rating(match, joint.rated_torque))
-        joint.node, joint.drive, joint.rated_torque = drive.node, drive.keys, drive.rated_torque
+        joint.node, joint.drive, joint.rated_torque = drive.node, drive, drive.rated_torque
         joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
         joint.max_torque_rate = float(f"{2.5 * joint.max_torque:.3g}")
         joint.identity = {"vendor": drive.vendor, "product": drive.product}
@@ -189,11 +186,11 @@ def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | in
         drive = match.drive
         if "drive" in row:
             row["drive"]["node"] = drive.node
-        elif drive.keys is None:
+        elif drive.drive is None:
             row["node"] = drive.node
         else:
             del row["node"]
-            row["drive"] = edited.in_line(drive.keys)
+            row["drive"] = edited.in_line(drive.drive)
         row["rated_torque"] = drive.rated_torque
         row["max_torque"] = min(float(row["max_torque"]), drive.max_torque)
         row["identity"] = edited.in_line({"vendor": drive.vendor, "product": drive.product})
