@@ -1,6 +1,6 @@
 """Which effects of joints and of the whole arm: chosen about a fit, fitted, and chosen again until nothing changes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -148,11 +148,11 @@ class About:
         return with_chosen(self.search, replace(self.fit, point=point), names)
 
 
-def look_about(search: LoopSearch, fit: LoopFit, names: Sequence[str] | None = None) -> About:
+def look_about(search: LoopSearch, fit: LoopFit, names: Container[str] | None = None) -> About:
     """Derivatives by all candidates, or those named; an effect that is not there by the difference that one of the size
     at which it is tried makes."""
     every = candidates_of(search)
-    listed = list(every) if names is None else list(names)
+    listed = [name for name in every if names is None or name in names]
     places = list(dict.fromkeys(place for name in listed for place in every[name]))
     steps = dict[tuple[int, str], float]()
     levels = {name: best_level(search, fit, name) for name in LEVELS if any(p[1] == name for p in places)}
@@ -174,8 +174,7 @@ def look_about(search: LoopSearch, fit: LoopFit, names: Sequence[str] | None = N
     stuck = [(j, n) for j, n in places if n == "stribeck_velocity"]  # says nothing without the friction that it is of
     places = [p for p in places if p not in stuck or "stribeck" in fit.active[p[0]]]
     layout = Layout(search.data, search.scales, point, places)
-    nominal = {**search.nominal}
-    problem = layout.problem(nominal, steps, search.floor)
+    problem = layout.problem(search.nominal, steps, search.floor)
     about = linearise(problem, layout.theta(layout.point), range(len(places)))
     at = {place: k for k, place in enumerate(places)}
     effects = {}
@@ -216,16 +215,13 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     names = chosen_of(search, fit)
     every = candidates_of(search)
     kept = [n for n in every if n.partition("#")[0] in search.kept]
-    looked = [n for n in every if n in names or n in unexplained_at(search, fit)]
-    first = True
+    looked = {*names, *unexplained_at(search, fit)}
     for number in range(ROUNDS):
         progress(f"round {number + 1}: {len(names)} effects of joints and arm")
         about = look_about(search, fit, looked)
         found = choose(about.terms, list(about.effects.values()), names, kept)
-        if first:
-            first = False
-            worth = promising(about, names)
-            looked = [n for n in every if n in worth or n in found or n in names]
+        if number == 0:
+            looked = {*promising(about, names), *found, *names}
         fit = search.improve(entered(search, about.moved(found)), 4)
         same, names = set(found) == set(names), found
         if same:
@@ -252,7 +248,7 @@ def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[str]:
 
 def promising(about: About, names: Sequence[str]) -> set[str]:
     """Effects that would pay beside those there, whatever else does."""
-    own, base = about.parameters(names), 0.0
+    own = about.parameters(names)
     base = float(about.terms.cost(own).sum())
     return {
         name

@@ -29,7 +29,7 @@ PRIOR, PRIOR_RELATIVE = 10.0, 3.0
 """Standard deviation of any parameter of an effect before any recording: in units of the size at which it is tried, and
 of a logarithm."""
 Point = Mapping[str, Array]
-"""FittedParameter → (J,)."""
+"""Parameter → (J,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def root_mean_squares(data: Windows, residual: Array) -> Array:
 
 
 def batch(points: Sequence[Point]) -> dict[str, Array]:
-    """FittedParameter → (P, J) from points that have the same names."""
+    """Parameter → (P, J) from points that have the same names."""
     return {name: np.stack([point[name] for point in points]) for name in points[0]}
 
 
@@ -75,7 +75,7 @@ def evaluate(data: Windows, fit: LoopFit) -> LoopFit:
 
 
 class Layout:
-    """Parameters of joints (joint, name) and of the whole arm (−1, name) in the order of a `EstimationProblem`."""
+    """Parameters of joints (joint, name) and of the whole arm (−1, name) in the order of an `EstimationProblem`."""
 
     def __init__(self, data: Windows, scales: Scales, point: Point, names: Iterable[tuple[int, str]]) -> None:
         self.data, self.scales, self.point = data, scales, dict(point)

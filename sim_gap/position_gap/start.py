@@ -9,7 +9,7 @@ from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
 from sim_gap.position_gap.choice import LoopSearch, Progress
 from sim_gap.position_gap.fit import LoopFit, batch, residuals
-from sim_gap.position_gap.parameters import EFFECTS, Scales
+from sim_gap.position_gap.parameters import Scales
 from sim_gap.position_gap.plant import Servos
 from sim_gap.position_gap.windows import Windows, thin_moving
 
@@ -149,6 +149,3 @@ def controller_name(fit: LoopFit) -> str:
     names = {name for own in fit.active for name in own}
     kind = "P" + "I" * ("ki" in names) + "D" * ("kd" in names)
     return kind + " with feed-forward" * ("feed" in names)
-
-
-CONTROLLER = frozenset(effect.id for effect in EFFECTS.values() if effect.controller)
