@@ -296,7 +296,7 @@ class ArmFile(Section):
     @cached_property
     def description_hash(self) -> str:
         """SHA-256 (hex) of the kinematics, model file included: results of another description are refused."""
-        unset = {key for key in ("stops", "locked") if not getattr(self.kinematics, key)}  # older results keep their hash
+        unset = {key for key in ("stops", "locked") if not getattr(self.kinematics, key)}  # as in older results
         content = json.dumps(self.kinematics.model_dump(mode="json", exclude=unset), sort_keys=True).encode()
         if self.model_path is not None:
             content += read_whole(self.model_path, MOST_TEXT)
