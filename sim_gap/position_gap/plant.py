@@ -177,6 +177,15 @@ class MovedModel:
         self.compensated = float(shares[0]) if np.ptp(shares) < 1e-9 else 0.0
         """Share of gravity that the model compensates, where it is the same for all bodies of the arm."""
         self.state = mujoco.MjData(self.model)
+        self._states: list[Any] = []
+
+    def states(self, count: int) -> list[Any]:
+        """States to be stepped together; the same ones at each call."""
+        import mujoco
+
+        while len(self._states) < count:
+            self._states.append(mujoco.MjData(self.model))
+        return self._states[:count]
 
     def _widen_ranges(self) -> None:
         """Where the arm was seen beyond its range, the model may go there too."""

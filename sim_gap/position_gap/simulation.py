@@ -17,6 +17,9 @@ from sim_gap.position_gap.windows import Windows
 WORLDS = 64
 """Simulations that are stepped together where laws are evaluated at each step."""
 
+SAME_RAD = 1e-9
+"""Difference of two commands that rounding makes [rad]."""
+
 
 def simulate(data: Windows, values: Values) -> Array:
     """Positions at the times of comparison for P hypotheses [rad], (P, To, J, W)."""
@@ -88,7 +91,7 @@ class World:
 
     def _edges(self) -> list[int]:
         """Steps at which a command changes or a position is read, the first, and the end."""
-        changes = np.flatnonzero(np.any(np.diff(self.given, axis=0) != 0.0, axis=1)) + 1
+        changes = np.flatnonzero(np.any(np.abs(np.diff(self.given, axis=0)) > SAME_RAD, axis=1)) + 1
         whole = self._steps_of_comparison()[0]
         return sorted({0, self.steps, *changes.tolist(), *whole.tolist(), *(whole + 1).tolist()})
 
@@ -150,7 +153,7 @@ def run_with_laws(
     friction, held = bool({"stribeck", "load"} & {*laws}), bool(plant.held.places.size)
     switched = [not world.served.all() for world in worlds]
     models = [copy(w.model) if friction or off else w.model for w, off in zip(worlds, switched, strict=True)]
-    states = [mujoco.MjData(model) for model in models]
+    states = plant.states(len(worlds))
     for world, model, d in zip(worlds, models, states, strict=True):
         world.begin(model, d)
     scale = np.array([world.scale for world in worlds])[:, None]
@@ -158,67 +161,99 @@ def run_with_laws(
     kp, ki = point["kp"] * point["gain"] * scale, point["ki"] * scale * ~plant.pid
     loose, gear = ~plant.driven, plant.gear
     total = np.stack([world.integral() for world in worlds]) if "ki" in laws else np.zeros((len(worlds), plant.n))
-    carried, longest = np.zeros((len(worlds), plant.n)), max(world.steps for world in worlds)
+    longest = max(world.steps for world in worlds)
 
     def whole(rows: Sequence[Array], steps: int) -> Array:
         return np.stack([np.concatenate([x, np.repeat(x[-1:], steps - len(x), axis=0)]) for x in rows], axis=1)
 
     given = whole([world.given for world in worlds], longest)
     served = whole([world.served for world in worlds], longest)
+    switches = np.any(served[1:] != served[:-1], axis=(1, 2))
+    changes = np.any(np.abs(np.diff(given, axis=0)) > SAME_RAD, axis=(1, 2))
     applied = worlds[0].applied
+    pushes, dead = bool({"ki", "feed"} & {*laws}) or bool(loose.any()), "dead" in laws
     tracks = np.empty((longest + 1, len(worlds), plant.n))
 
-    views = {name: [getattr(d, name) for d in states] for name in _READ}
     dampings = [linear_part(model.dof_damping, model.nv) for model in models]
     springs = [linear_part(model.jnt_stiffness, model.njnt) for model in models]
     kept = [(m.actuator_gainprm[drives].copy(), m.actuator_biasprm[drives].copy()) for m in models]
     outer = [damping[dofs] - np.where(plant.driven, 0.0, inner) for damping in dampings]
-
-    def now(name: str, at: Array) -> Array:
-        return np.concatenate(views[name]).reshape(len(states), -1)[:, at]
+    at, places_at, controls_at = _slice_of(dofs), _slice_of(places), _slice_of(plant.controls)
+    now = {name: _Gathered([getattr(d, name) for d in states]) for name in _READ}
+    losses = [model.dof_frictionloss for model in models]
+    pushed_at, controlled = [d.qfrc_applied for d in states], [d.ctrl for d in states]
+    dry: Array = np.tile(point["coulomb"], (len(worlds), 1))
+    carried = np.zeros((len(worlds), plant.n))
 
     for k in range(longest):
-        q, v, on, c = now("qpos", places), now("qvel", dofs), served[k], given[k]
+        q, on, c = now["qpos"].read(places_at), served[k], given[k]
         tracks[k] = q
-        for w in np.flatnonzero(switched).tolist() if k == 0 or np.any(on != served[k - 1]) else ():
+        for w in np.flatnonzero(switched).tolist() if k == 0 or switches[k - 1] else ():
             model, drive = models[w], on[w][plant.driven][:, None]
             model.actuator_gainprm[drives], model.actuator_biasprm[drives] = kept[w][0] * drive, kept[w][1] * drive
             dampings[w][dofs] = outer[w] + np.where(loose & on[w], inner, 0.0)
             springs[w][plant.joints] = point["spring"] + np.where(loose & on[w], kp[w], 0.0)
-        if "dead" in laws:
+        if dead:
             c = c - np.minimum(np.maximum(c - q, -point["dead"]), point["dead"])
-        torque = np.zeros_like(q) + applied
-        if "ki" in laws:
-            total += dt * on * (c - q)
-            torque += ki * total * on
-        if loose.any():
-            pushed = kp * c
-            if "limit" in laws:
-                wish = kp * (c - q) - inner * v
-                pushed = pushed + np.clip(wish, -point["limit"], point["limit"]) - wish
-            torque += loose * on * pushed
-        if "feed" in laws:
-            torque += (point["feed"] * on - 1.0) * now("qfrc_gravcomp", dofs)
+        if dead or k == 0 or changes[k - 1]:
+            for x, control in zip(controlled, (c * gear)[:, plant.driven], strict=True):
+                x[controls_at] = control
+        if pushes:
+            torque = np.zeros_like(q) + applied
+            if "ki" in laws:
+                total += dt * on * (c - q)
+                torque += ki * total * on
+            if loose.any():
+                pushed = kp * c
+                if "limit" in laws:
+                    wish = kp * (c - q) - inner * now["qvel"].read(at)
+                    pushed = pushed + np.clip(wish, -point["limit"], point["limit"]) - wish
+                torque += loose * on * pushed
+            if "feed" in laws:
+                torque += (point["feed"] * on - 1.0) * now["qfrc_gravcomp"].read(at)
+            for x, push in zip(pushed_at, torque, strict=True):
+                x[at] = push
         if friction:
-            level = point["coulomb"] + point["stribeck"] * np.exp(-((v / point["stribeck_velocity"]) ** 2))
-            level = level + point["load"] * np.abs(carried)
-            for model, each in zip(models, level, strict=True):
-                model.dof_frictionloss[dofs] = each
-        controls = (c * gear)[:, plant.driven]
-        for model, d, push, control in zip(models, states, torque, controls, strict=True):
-            d.qfrc_applied[dofs] = push
-            d.ctrl[plant.controls] = control
+            level = dry
+            if "stribeck" in laws:
+                v = now["qvel"].read(at)
+                level = level + point["stribeck"] * np.exp(-((v / point["stribeck_velocity"]) ** 2))
+            if "load" in laws:
+                level = level + point["load"] * np.abs(carried)
+            for x, each in zip(losses, level, strict=True):
+                x[at] = each
+        for model, d in zip(models, states, strict=True):
             mujoco.mj_step(model, d)
             if held:
                 plant.held.put_back(d)
-        if "load" in laws:
-            carried = sum(now(name, dofs) for name in _READ[2:6]) - point["armature"] * now("qacc", dofs)
-    tracks[longest] = now("qpos", places)
+        if "load" in laws:  # applied, actuator, passive and constraint force less that of the rotor
+            carried = now["qfrc_smooth"].read(at) + now["qfrc_bias"].read(at) + now["qfrc_constraint"].read(at)
+            carried -= point["armature"] * now["qacc"].read(at)
+    tracks[longest] = now["qpos"].read(places_at)
     for w, world in enumerate(worlds):
         world.track = tracks[: world.steps + 1, w]
 
 
-_READ = ("qpos", "qvel", "qfrc_applied", "qfrc_actuator", "qfrc_passive", "qfrc_constraint", "qacc", "qfrc_gravcomp")
+class _Gathered:
+    """One field of many states, gathered without a new array each time."""
+
+    def __init__(self, views: Sequence[Array]) -> None:
+        self.views = views
+        self.flat = np.empty(sum(map(len, views)))
+        self.rows = self.flat.reshape(len(views), -1)
+
+    def read(self, at: Any) -> Array:
+        np.concatenate(self.views, out=self.flat)
+        return self.rows[:, at]
+
+
+def _slice_of(index: NDArray[np.intp]) -> Any:
+    """An index as a slice, where it is one."""
+    whole = len(index) > 0 and np.array_equal(index, np.arange(index[0], index[0] + len(index)))
+    return slice(int(index[0]), int(index[0]) + len(index)) if whole else index
+
+
+_READ = ("qpos", "qvel", "qfrc_smooth", "qfrc_bias", "qfrc_constraint", "qacc", "qfrc_gravcomp")
 
 
 def laws_of(point: Mapping[str, Array], plant: MovedModel) -> set[str]:
