@@ -66,17 +66,19 @@ class Linearised:
     """Their derivatives there, (k, N) each."""
 
 
-def linearise(problem: EstimationProblem, theta: Array, free: Sequence[int]) -> Linearised:
+def linearise(
+    problem: EstimationProblem, theta: Array, free: Sequence[int], residual: Array | None = None
+) -> Linearised:
     """Derivatives by differences: one evaluation changes a parameter of each channel, for it acts there by far most.
 
-    The residual is exact in any case; the derivatives lead to it.
+    The residual is exact in any case, and given (C, N) where it is known; the derivatives lead to it.
     """
     own = [[k for k in free if problem.parameters[k].channel == c] for c in range(len(problem.weight))]
     shared = [k for k in free if problem.parameters[k].channel < 0]
     together = [[each[i] for each in own if i < len(each)] for i in range(max(map(len, own), default=0))]
     steps = np.array([p.step for p in problem.parameters])
     steps = np.where(theta + steps > [p.high for p in problem.parameters], -steps, steps)
-    points = [theta]
+    points = [theta] if residual is None else []
     for some in (*together, *([k] for k in shared)):
         moved = theta.copy()
         moved[some] += steps[some]
@@ -84,7 +86,9 @@ def linearise(problem: EstimationProblem, theta: Array, free: Sequence[int]) -> 
             for other, share in problem.parameters[k].along:
                 moved[other] += share * steps[k]
         points.append(moved)
-    answers = problem.predict(np.stack(points))
+    answers = problem.predict(np.stack(points)) if points else np.empty((0, *problem.weight.shape))
+    if residual is not None:
+        answers = np.concatenate([residual[None], answers])
     acting, slopes = [], []
     for c, each in enumerate(own):
         rows = [*range(1, 1 + len(each)), *range(1 + len(together), 1 + len(together) + len(shared))]

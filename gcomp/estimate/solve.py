@@ -67,13 +67,13 @@ def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterati
     channels = len(problem.weight)
     damping, busy = np.full(channels, 1e-3), np.ones(channels, bool)
     theta = problem.within(np.array(theta, float))
-    best: Linearised | None = None
+    now: Array | None = None  # residual at theta, where it is known
     for _ in range(iterations):
         moving = [k for k in free if shared or busy[problem.parameters[k].channel]]
         if not moving:
             break
-        about = linearise(problem, theta, moving) if best is None else best
-        best = None
+        about = linearise(problem, theta, moving, now)
+        now = about.residual
         variance = scale_of(problem, about.residual)
         before = cost_of(problem, about.residual, variance) + _prior_cost(problem, theta, channels)
         weight = problem.weight * robust_weight(about.residual, variance) / variance[:, None]
@@ -86,15 +86,15 @@ def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterati
             if lower[busy].any():
                 break
         fall = before - after
-        for k in moving:
-            c = problem.parameters[k].channel
-            if lower[c if c >= 0 else 0]:
-                theta[k] = trial[k]
+        if lower.any():
+            taken = [k for k in moving if lower[max(problem.parameters[k].channel, 0)]]
+            theta[taken] = trial[taken]
+            now = left if np.array_equal(theta, trial) else None
         still = ~lower | (fall < STILL * np.maximum(problem.weight.sum(1), 1.0))
         busy = np.full(channels, not still.all()) if shared else busy & ~(still & lower) & ~(~lower & (damping > 1e3))
         if not lower.any():
             break
-    residual = problem.predict(theta[None])[0]
+    residual = problem.predict(theta[None])[0] if now is None else now
     return RobustFit(theta, residual, scale_of(problem, residual))
 
 

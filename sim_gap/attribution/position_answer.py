@@ -229,9 +229,10 @@ def _where(found: Identified) -> tuple[Location, ...]:
 def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout | None:
     """Free-running replay of the nominal model, of what is exported, with its module if it has one, and of each cause
     that is in it alone and left out; those whose absence costs most first."""
-    if found.export is None:
+    made = found.beside or found.export
+    if made is None:
         return None
-    made, groups = found.beside or found.export, groups_of(found.fit, found.search)
+    groups = groups_of(found.fit, found.search)
 
     def gap(arm: Simulated, longest: float = LONGEST_S) -> Array:
         return replay_rms(arm, found.recordings, found.gains, longest)

@@ -6,7 +6,7 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Rollout
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.training.bands import SHARE
-from sim_gap.position_gap.training.export import Exported, widened_joints
+from sim_gap.position_gap.training.export import Exported, effects_left_out, widened_joints
 from sim_gap.position_gap.training.spread import interval, undecided_scale
 from sim_gap.position_gap.training.unreached_limits import describe
 from sim_gap.position_gap.windows import Windows
@@ -44,9 +44,10 @@ def notes(found: Identified) -> list[str]:
     if limits := describe(found.spread.limits, names):
         out.append(f"limits that the training motion does not reach: {limits}")
     out += [*_early(found), *_held(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
-    if found.export is not None and found.export.lines:
+    left = effects_left_out(found.search, found.fit) if found.sim.path is not None else []
+    if left:
         module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
-        out.append(f"the corrected model leaves out: {', '.join(found.export.lines)}{module}")
+        out.append(f"the corrected model leaves out: {', '.join(left)}{module}")
     return out
 
 

@@ -20,7 +20,7 @@ from sim_gap.position_gap.fit import (
 )
 from sim_gap.position_gap.links import shared_effects, size_of
 from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, Scales
-from sim_gap.position_gap.windows import Windows
+from sim_gap.position_gap.windows import Windows, thin_moving
 
 FOLDS = 6
 """Parts of the windows of which each is held out once."""
@@ -30,6 +30,8 @@ QUIET = 1.1
 """Noise floors up to which nothing is left to explain."""
 ROUNDS = 3
 """Times that effects are chosen and fitted."""
+FEW = 8
+"""Windows on which levels of a limit, or first gains, are compared: those are steps of a factor, not values."""
 LEVELS = {
     "slew": (0.2, 0.35, 0.5, 0.65, 0.8, 0.9),
     "limit": (0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0),
@@ -155,7 +157,8 @@ def look_about(search: LoopSearch, fit: LoopFit, names: Container[str] | None = 
     listed = [name for name in every if names is None or name in names]
     places = list(dict.fromkeys(place for name in listed for place in every[name]))
     steps = dict[tuple[int, str], float]()
-    levels = {name: best_level(search, fit, name) for name in LEVELS if any(p[1] == name for p in places)}
+    absent = {name for j, name in places if name not in (fit.active[j] if j >= 0 else fit.shared)}
+    levels = {name: best_level(search, fit, name) for name in LEVELS if name in absent}
     point = {name: values.copy() for name, values in fit.point.items()}
     for j, name in places:
         there = name in (fit.active[j] if j >= 0 else fit.shared)
@@ -202,8 +205,9 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
     """The best of some levels of a limit at every joint, (J,): one that is never reached has no slope to follow, and
     one that is always reached leads nowhere."""
     levels = np.minimum(np.array(LEVELS[name])[:, None] * search.size_of(name), fit.point[name])
-    gaps = residuals(search.data, batch([{**fit.point, name: level} for level in levels]))
-    squares = np.einsum("ptjw,tjw->pj", gaps**2, search.data.weight)
+    few = thin_moving(search.data, FEW)
+    gaps = residuals(few, batch([{**fit.point, name: level} for level in levels]))
+    squares = np.einsum("ptjw,tjw->pj", gaps**2, few.weight)
     return np.asarray(levels[squares.argmin(axis=0), np.arange(search.data.joints)])
 
 

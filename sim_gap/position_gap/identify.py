@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -62,15 +63,27 @@ class Identified:
     """The same along the held-out commands [rad]."""
     held: tuple[str, ...]
     """Bodies outside of the arm that are held."""
-    native: LoopFit
-    export: Exported | None
-    """The model to be used alone; None if the model did not come from a file."""
-    beside: Exported | None
-    """The model to be used with a module; None if a module would have nothing to do."""
     recordings: tuple[Recording, ...]
     """Held-out recordings."""
     gains: tuple[float, ...]
     """The controller's gains in each of them over those in the first training recording."""
+
+    @cached_property
+    def native(self) -> LoopFit:
+        """What a simulator holds alone, fitted when somebody wants it."""
+        return native_fit(self.search, self.fit)
+
+    @cached_property
+    def export(self) -> Exported | None:
+        """The model to be used alone; None if the model did not come from a file."""
+        if self.sim.path is None:
+            return None
+        return export_fit(self.sim, self.search, self.fit, self.native)
+
+    @cached_property
+    def beside(self) -> Exported | None:
+        """The model to be used with a module; None if a module would have nothing to do."""
+        return export_with_module(self.sim, self.search, self.fit) if self.sim.path is not None else None
 
 
 def identify(
@@ -114,7 +127,6 @@ def identify(
     matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
     found = tuple(stages(search, fit, about, judged, matters))
     before = _bare(search, fit, about, own.complete)
-    native = native_fit(search, fit)
     terms = terms_of(search, fit)
     spread = replace(covariance(search, fit), limits=find_unreached(search, fit))
     left = gaps_left_out(data, terms, known_before(search, fit, terms.names))
@@ -138,9 +150,6 @@ def identify(
         moved_train=moved_train,
         moved_before=moved,
         held=tuple(held_parts(sim)),
-        native=native,
-        export=export_fit(sim, search, fit, native) if sim.path is not None else None,
-        beside=export_with_module(sim, search, fit) if sim.path is not None else None,
         recordings=tuple(heldout),
         gains=tuple(scale[len(train) :]),
     )

@@ -59,7 +59,8 @@ def stages(search: LoopSearch, fit: LoopFit, about: About, heldout: Windows, mat
     fits = [fit]
     for group in reversed(order):
         fits.append(without_group(search, fits[-1], group))
-    courses = [rms_on(heldout, each) for each in reversed(fits)]
+    known = [final, *(alone[group] for group in order[-1:])]
+    courses = [*known, *(rms_on(heldout, each) for each in fits[len(known) :])][::-1]
     out = []
     for group, before, after in zip(order, courses[:-1], courses[1:], strict=True):
         falls = [1.0 - np.hypot(b, floor) / np.hypot(a, floor) for a, b in ((before, after), (alone[group], final))]

@@ -7,7 +7,7 @@ import numpy as np
 
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
-from sim_gap.position_gap.choice import LoopSearch, Progress
+from sim_gap.position_gap.choice import FEW, LoopSearch, Progress
 from sim_gap.position_gap.fit import LoopFit, batch, residuals
 from sim_gap.position_gap.parameters import Scales
 from sim_gap.position_gap.plant import Servos
@@ -23,8 +23,6 @@ LEAST_DAMPING = 0.2
 """Least damping that is tried with each gain, over the root of gain times inertia (2 is critical)."""
 TURNS = 0.02
 """Speed over which friction changes its direction there [rad/s]."""
-FEW = 8
-"""Windows on which they are tried."""
 RESTS_RAD = 0.002
 """Way of a command over all recordings below which it rests [rad]."""
 HOLDS_HZ = 10.0

@@ -58,14 +58,14 @@ def position_sections(answer: Diagnosis) -> list[Section]:
 def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
     """One row a joint: measured, nominal and corrected motion, and without each cause; None without a model's
     file or without a command."""
-    if found.export is None:
+    made = found.beside or found.export
+    if made is None:
         return None
     recording, names, gain = found.recordings[0], found.sim.arm.names, found.gains[0]
 
     def moved(arm: Simulated) -> tuple[Array, Array, Array]:
         return replay(arm.with_gain(gain), recording, SHOWN_S)
 
-    made = found.beside or found.export
     t, after, measured = moved(simulated_model(found.sim, made))
     if not len(t):
         return None

@@ -140,21 +140,26 @@ def compensation(search: LoopSearch, fit: LoopFit) -> Array | None:
     return np.full(search.data.joints, float(share[feels].mean()))
 
 
-def export_fit(
-    sim: SimModel, search: LoopSearch, fit: LoopFit, native: LoopFit, held: Collection[str] = NATIVE
-) -> Exported:
-    """MJCF of the native fit, which has the effects `held`, and the effects of the whole fit that it leaves out."""
-    spec = spec_of(sim)
-    left = sorted(
+def effects_left_out(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE) -> list[str]:
+    """Effects of a fit that a simulator which has those `held` lacks, with their joints."""
+    names = search.data.plant.sim.arm.names
+    return sorted(
         {effect.replace("@", " ") for effect in _shared_beside(search, fit, held)}
         | {
-            f"{effect} {sim.arm.names[j]}"
+            f"{effect} {name}"
             for effect in EFFECTS
-            for j in range(sim.n)
+            for j, name in enumerate(names)
             if effect not in held and effect_there(fit, effect, j)
             if effect != "controller.feed_forward" or compensation(search, fit) is None
         }
     )
+
+
+def export_fit(
+    sim: SimModel, search: LoopSearch, fit: LoopFit, native: LoopFit, held: Collection[str] = NATIVE
+) -> Exported:
+    """MJCF of the native fit, which has the effects `held`, and the effects of the whole fit that it leaves out."""
+    spec, left = spec_of(sim), effects_left_out(search, fit, held)
     compiled = spec.compile()
     unit = float(np.degrees(1.0)) if spec.compiler.degree else 1.0
     wider = widened_joints(sim)

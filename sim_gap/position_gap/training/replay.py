@@ -96,24 +96,24 @@ def _replay(arm: Simulated, recording: Recording) -> Array:
     controls = model.actuator_ctrladr[drives]
     dt, held = float(model.opt.timestep), HeldParts.of(model, joints)
     times, out = recording.t, np.empty((rows, len(joints)))
-    at = 0
     mujoco.set_mjcb_passive(None if arm.effects is None else arm.effects.passive)
     try:
         with silent():
-            for k in range(int((times[-1] - times[0]) / dt) + 1):
-                now = times[0] + k * dt
-                while at + 1 < rows and times[at + 1] <= now + 1e-9:
-                    out[at + 1] = data.qpos[adr]
-                    at += 1
-                data.ctrl[controls] = given[at]
-                mujoco.mj_step(model, data)
-                if held.places.size:
+            # each row is read, and acts, at the first step that is not before it
+            counts = np.diff(np.ceil((times - times[0] - 1e-9) / dt).astype(int), append=0)
+            for row in range(rows):
+                out[row] = data.qpos[adr]
+                data.ctrl[controls] = given[row]
+                if not held.places.size and counts[row] > 0:
+                    mujoco.mj_step(model, data, counts[row])
+                    continue
+                for _ in range(counts[row]):
+                    mujoco.mj_step(model, data)
                     held.put_back(data)
     finally:
         mujoco.set_mjcb_passive(None)
         if arm.effects is not None:
             model.dof_frictionloss[arm.effects.dofs] = arm.effects.coulomb
-    out[0], out[at + 1 :] = recording.position[0], data.qpos[adr]
     return out
 
 

@@ -16,7 +16,7 @@ from sim_gap.model.load import urdf_behind
 from sim_gap.position_gap.choice import effect_there
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.training.draws import draw
-from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, export_fit, native_fit
+from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, effects_left_out, export_fit, native_fit
 
 DELAY_DRAWS = 400
 """Draws of the parameters from which the range of a delay is taken."""
@@ -94,7 +94,7 @@ def write_actuators(found: Identified, path: Path, step: float = 0.005) -> None:
     """Write the entries for Isaac Lab and mjlab; delays are counted in `step` [s]. Raises BadInput."""
     drawn = draw(found.search, found.fit, found.spread, DELAY_DRAWS, reach=found.band.reach)
     rows = {name: _entry(found, j, step, drawn) for j, name in enumerate(found.sim.arm.names)}
-    left = found.export.lines if found.export is not None else ()
+    left = effects_left_out(found.search, found.fit) if found.sim.path is not None else ()
     write_entries(rows, path, step, about=ABOUT, left=left)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, batch, residuals, root_mean_squares
+from sim_gap.position_gap.fit import LoopFit, Point, batch, residuals, root_mean_squares
 
 HEADROOM = 10.0
 """Ratio of the highest level of the prior to the least that the training motion admits: recordings use between a tenth
@@ -58,14 +58,21 @@ def find_unreached(search: LoopSearch, fit: LoopFit) -> tuple[Unreached, ...]:
 
 
 def _least_admitted(search: LoopSearch, fit: LoopFit, name: str, asked: Array) -> Array:
-    """The least of some levels from which on none contradicts the training motion, (J,)."""
+    """The least of some levels from which on none contradicts the training motion, by halving, (J,)."""
     levels = np.array(ABOVE)[:, None] * np.maximum(asked, 1e-9)
-    left = residuals(search.data, batch([fit.point, *({**fit.point, name: level} for level in levels)]))
-    scores = [search.score(LoopFit(fit.point, fit.active, rms=x)) for x in root_mean_squares(search.data, left)]
-    costly = np.stack(scores[1:]) - scores[0] >= COSTS
-    first = np.where(costly.any(0), len(ABOVE) - np.argmax(costly[::-1], axis=0), 0)
-    least = levels[np.minimum(first, len(ABOVE) - 1), np.arange(len(asked))]
-    return np.where(asked > 0.0, least, 0.0)
+    joints = np.arange(len(asked))
+
+    def score(point: Point) -> Array:
+        left = residuals(search.data, batch([point]))
+        return search.score(LoopFit(dict(point), fit.active, rms=root_mean_squares(search.data, left)[0]))
+
+    bare = score(fit.point)
+    low, high = np.zeros(len(asked), int), np.full(len(asked), len(ABOVE) - 1)  # the highest is admitted in any case
+    while np.any(low < high):
+        middle = (low + high) // 2
+        costly = score({**fit.point, name: levels[middle, joints]}) - bare >= COSTS
+        low, high = np.where(costly & (low < high), middle + 1, low), np.where(costly, high, middle)
+    return np.where(asked > 0.0, levels[low, joints], 0.0)
 
 
 def _torques(search: LoopSearch, fit: LoopFit) -> Array:
