@@ -19,6 +19,7 @@ from sim_gap.position_gap.judge import LEAST_SHRINK, Stage
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.training.export import WRITTEN
 from sim_gap.position_gap.training.replay import (
+    EACH_S,
     LONGEST_S,
     SHORT_S,
     Simulated,
@@ -239,13 +240,13 @@ def _rollout(found: Identified, taken: Sequence[tuple[Cause, Stage]]) -> Rollout
 
     after = gap(simulated_model(found.sim, made))
     longest = max(float(r.t[-1] - r.t[0]) for r in found.recordings)
-    effects = []
+    effects, short = [], max(SHORT_S / len(found.recordings), EACH_S)
     for cause, stage in taken:
         if cause.effect not in WRITTEN or np.isnan(after).all():
             continue
         others = [group for group in groups if group != stage.group]
         alone, without = (
-            gap(without_groups(found.sim, found.search, made, some), SHORT_S) for some in (others, [stage.group])
+            gap(without_groups(found.sim, found.search, made, some), short) for some in (others, [stage.group])
         )
         effects.append(EffectRollout(cause.effect, cause.joints, alone, without))
     effects.sort(key=lambda each: -float(np.nanmax(each.without)))

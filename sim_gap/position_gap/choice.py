@@ -1,6 +1,6 @@
 """Which effects of joints and of the whole arm: chosen about a fit, fitted, and chosen again until nothing changes."""
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -150,15 +150,18 @@ class About:
         return with_chosen(self.search, replace(self.fit, point=point), names)
 
 
-def look_about(search: LoopSearch, fit: LoopFit, names: Container[str] | None = None) -> About:
+def look_about(
+    search: LoopSearch, fit: LoopFit, names: Container[str] | None = None, levels: Mapping[str, Array] | None = None
+) -> About:
     """Derivatives by all candidates, or those named; an effect that is not there by the difference that one of the size
-    at which it is tried makes."""
+    at which it is tried makes, a limit by that of its level."""
     every = candidates_of(search)
     listed = [name for name in every if names is None or name in names]
     places = list(dict.fromkeys(place for name in listed for place in every[name]))
     steps = dict[tuple[int, str], float]()
     absent = {name for j, name in places if name not in (fit.active[j] if j >= 0 else fit.shared)}
-    levels = {name: best_level(search, fit, name) for name in LEVELS if name in absent}
+    if levels is None:
+        levels = {name: best_level(search, fit, name) for name in LEVELS if name in absent}
     point = {name: values.copy() for name, values in fit.point.items()}
     for j, name in places:
         there = name in (fit.active[j] if j >= 0 else fit.shared)
@@ -220,9 +223,10 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     every = candidates_of(search)
     kept = [n for n in every if n.partition("#")[0] in search.kept]
     looked = {*names, *unexplained_at(search, fit)}
+    levels = {name: best_level(search, fit, name) for name in LEVELS}
     for number in range(ROUNDS):
         progress(f"round {number + 1}: {len(names)} effects of joints and arm")
-        about = look_about(search, fit, looked)
+        about = look_about(search, fit, looked, levels)
         found = choose(about.terms, list(about.effects.values()), names, kept)
         if number == 0:
             looked = {*promising(about, names), *found, *names}
@@ -230,11 +234,11 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         same, names = set(found) == set(names), found
         if same:
             return fit, about
-    about = look_about(search, fit, looked)
+    about = look_about(search, fit, looked, levels)
     found = choose(about.terms, [about.effects[n] for n in names], names, kept)
     if set(found) != set(names):
         fit = search.improve(about.moved(found), 4)
-        about = look_about(search, fit, looked)
+        about = look_about(search, fit, looked, levels)
     return fit, about
 
 

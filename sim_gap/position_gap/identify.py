@@ -28,7 +28,7 @@ from sim_gap.position_gap.training.spread import Covariance, covariance, covaria
 from sim_gap.position_gap.training.unreached_limits import find_unreached
 from sim_gap.position_gap.windows import Windows, thin, thin_moving, windows_of
 
-FITTED, JUDGED = 16, 24
+FITTED, JUDGED = 12, 24
 """Most windows of the fit, and of the judgement."""
 TORQUE_MARGIN, SHARE_MARGIN = 0.08, 0.15
 """Torque that matters [N·m], at most this share of a joint's torque; over the gain it is a gap of position, at most

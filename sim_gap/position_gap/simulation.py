@@ -1,6 +1,6 @@
 """Windows of recorded motion, simulated from the parameters of a hypothesis; laws that MuJoCo lacks at each step."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from itertools import pairwise
 from typing import Any
@@ -14,8 +14,9 @@ from sim_gap.model.load import linear_part
 from sim_gap.position_gap.plant import MovedModel, Values, silent
 from sim_gap.position_gap.windows import Windows
 
-WORLDS = 64
-"""Simulations that are stepped together where laws are evaluated at each step."""
+WORLDS = 32
+"""Simulations that are stepped together where laws are evaluated at each step: with more their states leave the
+processor's cache, with fewer the laws cost as much as the steps (benchmarks/positions_peer.py times them)."""
 
 SAME_RAD = 1e-9
 """Difference of two commands that rounding makes [rad]."""
@@ -25,32 +26,37 @@ def simulate(data: Windows, values: Values) -> Array:
     """Positions at the times of comparison for P hypotheses [rad], (P, To, J, W)."""
     count = max(len(x) for x in values.values())
     out = np.empty((count, *data.measured.shape))
+    lawful: list[tuple[int, World]] = []
+
+    def run(least: int) -> None:
+        while len(lawful) > least:
+            together = lawful[:WORLDS]
+            del lawful[:WORLDS]
+            run_with_laws(data.plant, [world for _, world in together])
+            for p, world in together:
+                out[p, ..., world.w] = world.positions()
+
     with silent():
         for p in range(count):
             point = {name: x[p if len(x) > 1 else 0] for name, x in values.items()}
-            out[p] = _moved(data.plant, data, point)
+            for world in _worlds(data.plant, data, point):
+                if world.laws or not world.served.all():
+                    lawful.append((p, world))
+                else:
+                    world.run()
+                    out[p, ..., world.w] = world.positions()
+            run(WORLDS)
+        run(0)
     return out
 
 
-def _moved(plant: MovedModel, data: Windows, point: Mapping[str, Array]) -> Array:
-    """Positions of one hypothesis, (To, J, W)."""
-    laws = laws_of(point, plant)
+def _worlds(plant: MovedModel, data: Windows, point: Mapping[str, Array]) -> "list[World]":
+    """The windows of one hypothesis."""
     models = {
         float(scale): plant.changed({**point, **{name: point[name] * scale for name in ("kp", "kd", "ki")}})
         for scale in np.unique(data.scale)
     }
-    worlds = [World(plant, models[float(data.scale[w])], data, w, point) for w in range(data.count)]
-    by_law = [bool(laws) or not world.served.all() for world in worlds]
-    out = np.empty_like(data.measured)
-    for world, lawful in zip(worlds, by_law, strict=True):
-        if not lawful:
-            world.run()
-    together = [world for world, lawful in zip(worlds, by_law, strict=True) if lawful]
-    for first in range(0, len(together), WORLDS):
-        run_with_laws(plant, together[first : first + WORLDS], point, laws)
-    for w, world in enumerate(worlds):
-        out[..., w] = world.positions()
-    return out
+    return [World(plant, models[float(data.scale[w])], data, w, point) for w in range(data.count)]
 
 
 class World:
@@ -63,6 +69,7 @@ class World:
         self.given = plant.commands(self.piece, float(data.begin[w]), self.steps, point, self.scale)
         self.served = self.piece.served_at(data.begin[w] + plant.dt * np.arange(self.steps))
         self.track = np.empty((self.steps + 1, plant.n))
+        self.laws = laws_of(point, plant)
         self.applied = -point["offset"] - point["asymmetry"] * point["coulomb"]
         """Torques that do not change [N·m], (J,)."""
 
@@ -143,13 +150,13 @@ class World:
         return np.asarray((asked / self.point["gain"] - self.point["kp"] * error) / ki + self.data.error_sum[:, self.w])
 
 
-def run_with_laws(
-    plant: MovedModel, worlds: Sequence[World], point: Mapping[str, Array], laws: Collection[str]
-) -> None:
+def run_with_laws(plant: MovedModel, worlds: Sequence[World]) -> None:
     """Move some worlds together, and evaluate the laws at each step for all of them at once, (W, n)."""
     import mujoco
 
     dofs, places, drives, dt = plant.dofs, plant.places, plant.servos.actuator[plant.driven], plant.dt
+    laws = {law for world in worlds for law in world.laws}
+    point = {name: np.stack([world.point[name] for world in worlds]) for name in worlds[0].point}
     friction, held = bool({"stribeck", "load"} & {*laws}), bool(plant.held.places.size)
     switched = [not world.served.all() for world in worlds]
     models = [copy(w.model) if friction or off else w.model for w, off in zip(worlds, switched, strict=True)]
@@ -170,19 +177,19 @@ def run_with_laws(
     served = whole([world.served for world in worlds], longest)
     switches = np.any(served[1:] != served[:-1], axis=(1, 2))
     changes = np.any(np.abs(np.diff(given, axis=0)) > SAME_RAD, axis=(1, 2))
-    applied = worlds[0].applied
+    applied = np.stack([world.applied for world in worlds])
     pushes, dead = bool({"ki", "feed"} & {*laws}) or bool(loose.any()), "dead" in laws
     tracks = np.empty((longest + 1, len(worlds), plant.n))
 
     dampings = [linear_part(model.dof_damping, model.nv) for model in models]
     springs = [linear_part(model.jnt_stiffness, model.njnt) for model in models]
     kept = [(m.actuator_gainprm[drives].copy(), m.actuator_biasprm[drives].copy()) for m in models]
-    outer = [damping[dofs] - np.where(plant.driven, 0.0, inner) for damping in dampings]
+    outer = [damping[dofs] - np.where(plant.driven, 0.0, own) for damping, own in zip(dampings, inner, strict=True)]
     at, places_at, controls_at = _slice_of(dofs), _slice_of(places), _slice_of(plant.controls)
     now = {name: _Gathered([getattr(d, name) for d in states]) for name in _READ}
     losses = [model.dof_frictionloss for model in models]
     pushed_at, controlled = [d.qfrc_applied for d in states], [d.ctrl for d in states]
-    dry: Array = np.tile(point["coulomb"], (len(worlds), 1))
+    dry = point["coulomb"]
     carried = np.zeros((len(worlds), plant.n))
 
     for k in range(longest):
@@ -191,8 +198,8 @@ def run_with_laws(
         for w in np.flatnonzero(switched).tolist() if k == 0 or switches[k - 1] else ():
             model, drive = models[w], on[w][plant.driven][:, None]
             model.actuator_gainprm[drives], model.actuator_biasprm[drives] = kept[w][0] * drive, kept[w][1] * drive
-            dampings[w][dofs] = outer[w] + np.where(loose & on[w], inner, 0.0)
-            springs[w][plant.joints] = point["spring"] + np.where(loose & on[w], kp[w], 0.0)
+            dampings[w][dofs] = outer[w] + np.where(loose & on[w], inner[w], 0.0)
+            springs[w][plant.joints] = point["spring"][w] + np.where(loose & on[w], kp[w], 0.0)
         if dead:
             c = c - np.minimum(np.maximum(c - q, -point["dead"]), point["dead"])
         if dead or k == 0 or changes[k - 1]:

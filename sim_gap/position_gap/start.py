@@ -79,14 +79,15 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     active = tuple(() if rest else names for rest in at_rest)
     kept = {"controller.stiffness"} if not own.complete else set()
     search = replace(search, kept=frozenset(kept))
-    fit = search.improve(LoopFit(point, active), 5)
+    few = replace(few, nominal=search.nominal)
+    fit = few.improve(LoopFit(point, active), 5)
     if np.any(search.nominal["creep"] > 0.0):
         rest = {"creep": np.zeros(search.data.joints)}
-        at_rest_fit = search.improve(fit.with_values(**rest), 4)
+        at_rest_fit = few.improve(fit.with_values(**rest), 4)
         # gears hold what rests: a model's solver that lets it creep is no statement about the arm
-        if float((search.score(at_rest_fit) - search.score(fit)).sum()) < PRICE:
+        if float((few.score(at_rest_fit) - few.score(fit)).sum()) < PRICE:
             search, fit = replace(search, nominal={**search.nominal, **rest}), at_rest_fit
-    return search, fit
+    return search, replace(fit, rms=None)
 
 
 def _points(search: LoopSearch, own: Servos) -> list[dict[str, Array]]:

@@ -20,8 +20,10 @@ from sim_gap.position_gap.windows import SHORT_S as SHORT_PIECE_S
 
 OPENING_S = 1.0
 """Time at the start that is not judged [s]."""
-LONGEST_S, SHORT_S = 60.0, 15.0
-"""Longest part of a recording that is replayed [s], and that is for an effect alone or left out."""
+LONGEST_S = 60.0
+"""Longest part of a recording that is replayed [s]."""
+SHORT_S, EACH_S = 15.0, 5.0
+"""Part of all recordings that is replayed for an effect alone or left out, and least part of each [s]."""
 
 
 @dataclass(frozen=True)
