@@ -5,13 +5,14 @@ from typing import Annotated
 
 import typer
 
-from armlink.commands.options import Clock, Columns, EffortIs, Joints, Json, Sign, Topic, Units, Zero
+from armlink.commands.options import Clock, Columns, EffortIs, Header, Joints, Json, Sign, Topic, Units, Zero
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(help="Recording: .csv, .csv.gz, .parquet or .mcap (a ROS 2 bag too).")],
+    source: Annotated[Path, typer.Argument(help="Recording: .csv, .csv.gz, .parquet or .mcap (bags of ROS too).")],
     target: Annotated[Path, typer.Argument(help="File to write; its suffix says the format.")],
     columns: Columns = None,
+    header: Header = "",
     joints: Joints = "",
     units: Units = None,
     sign: Sign = None,
@@ -34,6 +35,7 @@ def convert(
 
     stated = parse_corrections(
         columns=columns or (),
+        header=header,
         sign=sign or (),
         units=units or (),
         zero=zero or (),

@@ -20,6 +20,9 @@ Columns = Annotated[
     list[str] | None,
     _of_reading("Column of the file for one of ours: t=time,q_1=pos_a or q_1=q_2,q_2=q_1.", "--map"),
 ]
+Header = Annotated[
+    str, _of_reading("Columns of a table without a header row: t,q_1,q_cmd_1; - is one to leave out.", "--columns")
+]
 Joints = Annotated[str, _of_reading("Joints of the recordings to take, base to tip: a,b,c.")]
 UNITS = "q=deg, q=counts:4096 (a turn), q=percent:110 (degrees at 100), t=ms, tau_motor=A:12.5 (N·m/A)"
 Units = Annotated[list[str] | None, _of_reading(f"Unit of a channel: {UNITS}.")]

@@ -1,7 +1,11 @@
-"""Sizes of a ROS 2 bag, asked before rosbags reads it: that unpacks whatever it finds, files onto the disk."""
+"""Sizes of a bag, asked before rosbags reads it: that unpacks whatever it finds, files onto the disk."""
 
+import bz2
+import struct
 from pathlib import Path
+from typing import Any
 
+import lz4.frame
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from zstandard import ZstdDecompressor, ZstdError
@@ -30,6 +34,56 @@ def require_bag_sizes(path: Path) -> None:
             _require_unpacked(each)
         elif each.suffix == ".mcap":
             _require_chunks(each)
+        elif each.suffix == ".bag":
+            _require_ros1_chunks(each)
+
+
+def _require_ros1_chunks(path: Path) -> None:
+    """Unpack the chunks of a ROS 1 bag piece by piece, and keep nothing; a damaged bag is told by who reads it."""
+    size = 0
+    unpackers: dict[bytes, Any] = {b"bz2": bz2.BZ2Decompressor, b"lz4": lz4.frame.LZ4FrameDecompressor}
+    try:
+        with path.open("rb") as stream:
+            stream.readline()
+            while len(length := stream.read(4)) == 4:
+                header = _ros1_fields(stream.read(_length(length, path)))
+                left = _length(stream.read(4), path)
+                if header.get(b"op") != CHUNK or header.get(b"compression") not in unpackers:
+                    stream.seek(left, 1)
+                    continue
+                unpacker, packed = unpackers[header[b"compression"]](), b""
+                while not unpacker.eof and (left or not unpacker.needs_input):
+                    if unpacker.needs_input:
+                        packed, left = stream.read(min(left, PIECE)), max(left - PIECE, 0)
+                    size += len(unpacker.decompress(packed, PIECE))
+                    packed = b""
+                    require_size(size, str(path))
+                stream.seek(left, 1)
+    except (OSError, EOFError, RuntimeError, struct.error):
+        return
+
+
+CHUNK = b"\x05"
+"""Kind of the records of a ROS 1 bag that hold others."""
+
+
+def _length(field: bytes, path: Path) -> int:
+    """A length of a ROS 1 bag, of which the file must hold as much."""
+    length = int(struct.unpack("<I", field)[0])
+    if length > path.stat().st_size:
+        raise EOFError
+    return length
+
+
+def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
+    """Fields of the header of a record."""
+    found, at = dict[bytes, bytes](), 0
+    while at + 4 <= len(header):
+        (length,) = struct.unpack_from("<I", header, at)
+        name, _, value = header[at + 4 : at + 4 + length].partition(b"=")
+        found[name] = value
+        at += 4 + length
+    return found
 
 
 def _require_unpacked(path: Path) -> None:

@@ -26,6 +26,8 @@ class Corrections:
 
     columns: Mapping[str, str] = field(default_factory=dict)
     """Column of docs/formats.md → the file's own name of the column that holds it."""
+    header: tuple[str, ...] = ()
+    """Names of the columns of a table that has no header row; empty: it has one."""
     order: Mapping[str, str] = field(default_factory=dict)
     """Column of docs/formats.md → the one of these whose values it takes."""
     sign: Mapping[str, float] = field(default_factory=dict)
@@ -53,7 +55,7 @@ class Corrections:
     def of_reading(self) -> "Corrections":
         """Those that say what of a file is read. The others number the joints from base to tip, in which order a file
         whose joints have names need not have them."""
-        return Corrections(columns=self.columns, joints=self.joints, topic=self.topic)
+        return Corrections(columns=self.columns, header=self.header, joints=self.joints, topic=self.topic)
 
     def apply(self, recording: Recording, source: str) -> Recording:
         """The corrected recording; raises BadInput for a column that it does not have."""
@@ -92,6 +94,7 @@ WITHOUT_GRAVITY = "without-gravity"
 def parse_corrections(
     *,
     columns: Sequence[str] = (),
+    header: str = "",
     sign: Sequence[str] = (),
     units: Sequence[str] = (),
     zero: Sequence[str] = (),
@@ -113,6 +116,7 @@ def parse_corrections(
     mapped = _pairs("--map", columns)
     return Corrections(
         columns={column: other for column, other in mapped if channel_column(other) is None},
+        header=_header(header),
         order={column: other for column, other in mapped if channel_column(other) is not None},
         sign={column: _sign(column, text) for column, text in _pairs("--sign", sign)},
         units={column: _factors(column, text) for column, text in _pairs("--units", units)},
@@ -123,6 +127,19 @@ def parse_corrections(
         joints=tuple(name.strip() for name in joints.split(",") if name.strip()),
         topic=topic,
     )
+
+
+def _header(text: str) -> tuple[str, ...]:
+    """Names of columns, separated by commas; those to leave out (`-`) have none."""
+    names = [name.strip() for name in text.split(",")] if text else []
+    for name in names:
+        if name not in ("t", "-") and channel_column(name) is None:
+            raise BadInput(
+                f"--columns {name}: not a column of a recording: t, q_1, q_cmd_1, tau_1, …, or - to leave out"
+            )
+        if name != "-" and names.count(name) > 1:
+            raise BadInput(f"--columns {name}: occurs twice")
+    return tuple("" if name == "-" else name for name in names)
 
 
 def _pairs(option: str, texts: Sequence[str]) -> list[tuple[str, str]]:

@@ -47,21 +47,27 @@ class CsvLayout:
         return self.first[column] if column < len(self.first) else ""
 
 
-def layout_of(content: bytes | bytearray, source: str) -> CsvLayout:
+def layout_of(content: bytes | bytearray, source: str, header: tuple[str, ...] = ()) -> CsvLayout:
     """Layout of a file's content, of which the first lines are looked at. Raises BadInput where it has no header row.
 
-    Lines of comment (`#`) may stand above the header row, or the last of them is it.
+    Lines of comment (`#`) may stand above the header row, or the last of them is it. `header` are the columns of a file
+    that has none.
     """
     try:
         lines = [line.decode("utf-8-sig") for line in content[: 1 << 18].split(b"\n")]
     except UnicodeDecodeError as error:
         raise BadInput(f"{source}: not a readable CSV file: {error}") from None
     above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    if header:
+        return _layout_without_header(lines[above] if above < len(lines) else "", above, source, header)
     if above and above < len(lines) and _is_values(lines[above]):
         above -= 1
     text = lines[above] if above < len(lines) else ""
     if _is_values(text):
-        raise BadInput(f"{source}: its first row holds numbers, expected a header row with the names of the columns")
+        raise BadInput(
+            f"{source}: its first row holds numbers, expected a header row with the names of the columns"
+            ": state them with --columns t,q_1,…"
+        )
     text = text.lstrip("# ") if text.startswith("#") else text
     separator = _separator(text)
     following = lines[above + 1] if above + 1 < len(lines) else ""
@@ -73,6 +79,18 @@ def layout_of(content: bytes | bytearray, source: str) -> CsvLayout:
         "," if comma else ".",
         tuple(_cells(following, separator, source)),
     )
+
+
+def _layout_without_header(text: str, above: int, source: str, header: tuple[str, ...]) -> CsvLayout:
+    """Layout of a file whose first row of values is `text`, below so many lines of comment."""
+    if not _is_values(text):
+        raise BadInput(f"{source}: --columns: its first row holds no numbers, but names: leave it out, or use --map")
+    separator = _separator(text)
+    cells = tuple(_cells(text, separator, source))
+    if len(cells) != len(header):
+        raise BadInput(f"{source}: --columns names {len(header)} columns, its rows have {len(cells)}")
+    comma = separator != "," and re.search(r"\d,\d", text) is not None
+    return CsvLayout(header, above, separator, "," if comma else ".", cells)
 
 
 def _separator(header: str) -> str:

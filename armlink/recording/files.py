@@ -45,7 +45,7 @@ def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
         from armlink.recording.lerobot import load_lerobot
 
         return load_lerobot(path)
-    if (path / "metadata.yaml").is_file() or path.suffix == ".db3":
+    if (path / "metadata.yaml").is_file() or path.suffix in (".db3", ".bag"):
         require_extra(str(path), "bags")
         from armlink.recording.ros_bag import load_bag
 
@@ -73,7 +73,7 @@ def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
         return {str(path): load_parquet(path, stated.columns)}
     from armlink.recording.tables import load_csv
 
-    return {str(path): load_csv(path, stated.columns)}
+    return {str(path): load_csv(path, stated.columns, stated.header)}
 
 
 def _of_folder(path: Path, stated: Corrections) -> dict[str, Recording]:

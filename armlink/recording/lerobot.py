@@ -1,7 +1,8 @@
 """LeRobot data sets (format 2 and 3): one recording an episode, positions and position commands.
 
-A data set is a folder with `meta/info.json` and Parquet files under `data/`; `observation.state` holds the positions
-and `action` the commands, in degrees, radians, or a normalised range of the recorder's own calibration.
+A data set is a folder with `meta/info.json` and Parquet files under `data/`; `observation.state` (or `state`) holds the
+positions and `action` (or `actions`) the commands, in degrees, radians, or a normalised range of the recorder's own
+calibration.
 """
 
 import json
@@ -17,58 +18,80 @@ from armlink.arrays import Array
 from armlink.content.file_content import MOST_JSON, read_whole
 from armlink.errors import BadInput
 from armlink.recording.parquet import THREADS, has_lists, numbers, require_numbers
-from armlink.recording.recording import MOST_JOINTS, Recording, require_size
+from armlink.recording.recording import MOST_JOINTS, Recording, default_names, require_size
 
-STATE, ACTION = "observation.state", "action"
-_COLUMNS = ("episode_index", "timestamp", STATE, ACTION)
+STATES, ACTIONS = ("observation.state", "state"), ("action", "actions")
+"""Names of the columns of positions and of commands, as recorders and converters write them."""
 
 
 def load_lerobot(path: Path) -> dict[str, Recording]:
     """Recordings of all episodes by label (`FOLDER#EPISODE`). Raises BadInput that names what is missing."""
-    names = _names(path)
+    features = _features(path)
+    state, action = (next((name for name in known if name in features), known[0]) for known in (STATES, ACTIONS))
+    names, columns = _names(path, features, state), ("episode_index", "timestamp", state, action)
     if len(names) > MOST_JOINTS:
-        raise BadInput(f"{path}: {len(names)} joints in {STATE}, expected at most {MOST_JOINTS}")
+        raise BadInput(f"{path}: {len(names)} joints in {state}, expected at most {MOST_JOINTS}")
     size, parts = 0, []
     for file in sorted((path / "data").rglob("*.parquet")):
         try:
             with pa_parquet.ParquetFile(file) as content:
                 size += 8 * (2 * len(names) + 2) * content.metadata.num_rows
                 require_size(size, str(path))
-                require_numbers(content, _COLUMNS, str(file))
-                table = content.read(columns=list(_COLUMNS), use_threads=THREADS)
+                require_numbers(content, columns, str(file))
+                table = content.read(columns=list(columns), use_threads=THREADS)
         except (pa.ArrowException, KeyError, ValueError, OSError) as error:
             raise BadInput(f"{file}: not the data of a LeRobot data set: {str(error).partition(chr(10))[0]}") from None
-        missing = [column for column in _COLUMNS if column not in table.column_names]
+        missing = [column for column in columns if column not in table.column_names]
         if missing:
-            raise BadInput(f"{file}: column {missing[0]} is missing: expected {', '.join(_COLUMNS)}")
-        parts.append([_values(table[column], file, column, len(names)) for column in _COLUMNS])
+            raise BadInput(f"{file}: column {missing[0]} is missing: expected {', '.join(columns)}")
+        parts.append(
+            [_values(table[column], file, column, len(names) if column in (state, action) else 0) for column in columns]
+        )
     if not sum(len(part[0]) for part in parts):
         raise BadInput(f"{path}: no row in Parquet files under data/: download the data set with its data")
-    episodes, times, state, action = (np.concatenate(column) for column in zip(*parts, strict=True))
+    episodes, times, positions, commands = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = {}
     for episode in np.unique(episodes):
         rows = np.flatnonzero(episodes == episode)
         rows = rows[np.argsort(times[rows], kind="stable")]
         found[f"{path}#{episode:.0f}"] = Recording(
-            t=times[rows], position=state[rows], position_command=action[rows], names=names
+            t=times[rows], position=positions[rows], position_command=commands[rows], names=names
         )
     return found
 
 
-def _names(path: Path) -> tuple[str, ...]:
-    """Joint names of the state, without the suffix `.pos`."""
+def _features(path: Path) -> dict[str, Any]:
+    """Descriptions of the columns by name."""
     try:
-        info = json.loads(read_whole(path / "meta" / "info.json", MOST_JSON))
-        names: Any = info["features"][STATE]["names"]
+        features = json.loads(read_whole(path / "meta" / "info.json", MOST_JSON))["features"]
     except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
-        raise BadInput(f"{path}/meta/info.json: no names of {STATE} ({type(error).__name__} {error})") from None
-    while isinstance(names, dict):
-        names = next(iter(names.values()), [])
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BadInput(f"{path}/meta/info.json: no features ({type(error).__name__} {error})") from None
+    if not isinstance(features, dict) or not any(name in features for name in STATES):
+        raise BadInput(f"{path}/meta/info.json: no names of {' or '.join(STATES)} among its features")
+    return features
+
+
+def _names(path: Path, features: dict[str, Any], state: str) -> tuple[str, ...]:
+    """Joint names of the state, without the suffix `.pos`; numbered where it has a width and no names."""
+    described = features[state] if isinstance(features[state], dict) else {}
+    given, shape = described.get("names"), described.get("shape")
+    names = _flat(given)
+    if not names and isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int) and shape[0] > 0:
+        return default_names(min(shape[0], MOST_JOINTS + 1))
+    if not names or not all(isinstance(name, str) for name in names):
         raise BadInput(
-            f"{path}/meta/info.json: names of {STATE} are {str(names)[:100]!r}: expected a list of joint names"
+            f"{path}/meta/info.json: names of {state} are {str(given)[:100]!r}: expected a list of joint names"
         )
+    if len({*names}) < len(names):
+        raise BadInput(f"{path}/meta/info.json: names of {state} occur twice: {str(given)[:100]!r}")
     return tuple(name.removesuffix(".pos") for name in names)
+
+
+def _flat(names: Any) -> list[Any]:
+    """Names in lists and groups, such as those of two arms, one after the other."""
+    if isinstance(names, dict | list):
+        return [each for part in (names.values() if isinstance(names, dict) else names) for each in _flat(part)]
+    return [] if names is None else [names]
 
 
 def _lengths(column: pa.ChunkedArray) -> Array:
@@ -78,9 +101,8 @@ def _lengths(column: pa.ChunkedArray) -> Array:
     return numbers(pa_compute.list_value_length(column).fill_null(0).cast(pa.float64()))
 
 
-def _values(column: pa.ChunkedArray, file: Path, name: str, joints: int) -> Array:
-    """The numbers of a column (K,), for state and action (K, joints)."""
-    width = joints if name in (STATE, ACTION) else 0
+def _values(column: pa.ChunkedArray, file: Path, name: str, width: int) -> Array:
+    """The numbers of a column (K,), for state and action (K, width)."""
     if width:
         lengths = _lengths(column)
         if (lengths != width).any():

@@ -1,4 +1,5 @@
-"""Bags of ROS 2 as drivers record them: a folder, `.db3` or `.mcap`, any topic, several message types.
+"""Bags of ROS as drivers record them: of ROS 2 a folder, `.db3` or `.mcap`, of ROS 1 `.bag`; any topic, several message
+types.
 
 `JointState` gives position, velocity and effort; `JointTrajectoryControllerState` also the commanded position;
 `DynamicJointState` the interfaces named position, velocity and effort. `/motor_states`, `/joint_commands` and

@@ -33,13 +33,14 @@ _MOST_RATIO, _SURELY_MUCH = 200, 1 << 28
 """A file that unpacks to more than _SURELY_MUCH bytes must not be smaller than this share of them."""
 
 
-def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({})) -> Recording:
+def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({}), stated: tuple[str, ...] = ()) -> Recording:
     """Load `.csv` or `.csv.gz` with a header row (docs/formats.md), up to a truncation; raises BadInput.
 
-    `columns`: column of docs/formats.md → the file's name for it.
+    `columns`: column of docs/formats.md → the file's name for it. `stated`: names of the columns of a file without a
+    header row; empty for one to leave out.
     """
     _require_header(path)
-    content, cut, layout = _content(path)
+    content, cut, layout = _content(path, stated)
     require_each_once(layout.header, path)
     require_width(layout.header, str(path))
     header = renamed_header(list(layout.header), columns, path)
@@ -70,7 +71,7 @@ def renamed_header(header: list[str], columns: Mapping[str, str], path: Path) ->
     if missing:
         raise BadInput(f"{path}: --map {foreign[missing[0]]}={missing[0]}: no such column; it has {', '.join(header)}")
     header = [foreign.get(name, name) for name in header]
-    twins = sorted({column for column in header if header.count(column) > 1})
+    twins = sorted({column for column in header if column and header.count(column) > 1})
     if twins:
         raise BadInput(f"{path}: column {twins[0]!r} occurs twice in the header row or after --map")
     try:
@@ -107,7 +108,7 @@ def recording_of_columns(
     return Recording(t=columns["t"], names=names or default_names(n), warning=warning, **channels)  # type: ignore[arg-type]
 
 
-def _content(path: Path) -> tuple[bytearray, str, CsvLayout]:
+def _content(path: Path, stated: tuple[str, ...]) -> tuple[bytearray, str, CsvLayout]:
     """Complete lines of the file, uncompressed, why it is truncated (empty if it is not), and how it is written."""
     try:
         require_size(path.stat().st_size, str(path))
@@ -120,7 +121,7 @@ def _content(path: Path) -> tuple[bytearray, str, CsvLayout]:
         del packed
     except (OSError, zlib.error) as error:
         raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
-    layout = layout_of(content, str(path))
+    layout = layout_of(content, str(path), stated)
     if content.endswith((b"\n", b"\r")) or not content:
         return content, cut, layout
     whole = content.rfind(b"\n") + 1

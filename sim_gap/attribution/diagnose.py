@@ -34,7 +34,8 @@ from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joints import match_joints
 from sim_gap.checks.position_command import check_position_only, is_position_only
 from sim_gap.effects.registry import library_without
-from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model
+from sim_gap.model.known_gains import KnownGains
+from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
 from sim_gap.residuals.disregarded_rows import without_disturbances
 from sim_gap.residuals.preprocess import prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
@@ -63,6 +64,7 @@ def diagnose(
     stated: Corrections = AS_IT_IS,
     groups: Sequence[str] = (),
     gains: Sequence[str] = (),
+    known_gains: KnownGains | None = None,
     base: str | None = None,
     tip: str | None = None,
     progress: Callable[[str], None] = lambda stage: None,
@@ -79,6 +81,7 @@ def diagnose(
         stated: corrections that the user states, not made yet, with joints numbered from base to tip; the check looks
             into none of them again.
         gains: `RECORDING=VALUE`: gain of the position controller in recordings that differ in it; only without torque.
+        known_gains: those of the position controllers, where the model lacks them; only without torque.
         base: body of the model that carries the recorded arm; by default the world, or that of the arm file.
         tip: body of the model that the recorded arm ends in, where it has several arms.
         progress: gets the stage that begins; used where no recording has a torque channel.
@@ -90,7 +93,7 @@ def diagnose(
     if not train:
         raise BadInput("no training recording: give at least one (--train FILE)")
     labels = list(labels) or [f"recording {i + 1}" for i in range(len(train) + len(heldout))]
-    sim, recordings, findings = _checked(model, [*train, *heldout], labels, stated, base, tip)
+    sim, recordings, findings = checked_recordings(model, [*train, *heldout], labels, stated, base, tip)
     train, heldout = recordings[: len(train)], recordings[len(train) :]
     heldout_is = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
     numbers = list(range(1, len(train) + len(heldout) + 1))
@@ -100,7 +103,7 @@ def diagnose(
         train, heldout, labels, numbers, named, starts = *_split(train), labels * 2, numbers * 2, named * 2, starts * 2
     if all(is_position_only(recording) for recording in [*train, *heldout]):
         return diagnose_positions(
-            sim,
+            sim if known_gains is None else with_gains(sim, known_gains),
             train,
             heldout,
             labels,
@@ -110,6 +113,8 @@ def diagnose(
             gains=gains,
             progress=progress,
         )
+    if known_gains is not None:
+        raise BadInput("--gains: the recordings have a torque channel, which is compared with the model's torque")
     ready = [
         prepare(recording, sim.arm, label, number, names, start)
         for recording, label, number, names, start in zip(
@@ -193,7 +198,7 @@ def _lent(
     return *residual_sets(train, rest), recordings
 
 
-def _checked(
+def checked_recordings(
     source: Any,
     recordings: Sequence[Recording],
     labels: Sequence[str],

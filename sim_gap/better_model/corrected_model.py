@@ -11,7 +11,7 @@ from armlink.errors import BadInput
 from gcomp.arrays import Array
 from sim_gap.effects.base import tilt_gravity
 from sim_gap.effects.link import mount_matrix, pseudo_inertia
-from sim_gap.model.load import SimModel, linear_part, read_spec
+from sim_gap.model.load import SimModel, linear_part, named_spec
 from sim_gap.model.rigid_body import inertial_of
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.search.estimate import EffectEstimate
@@ -221,17 +221,13 @@ def _base(sim: SimModel, motors: list[CoupledMotor]) -> tuple[Any, bool]:
 
 
 def spec_of(sim: SimModel) -> Any:
-    """The nominal model's file as a `mujoco.MjSpec`, its elements numbered and its joints named.
+    """The nominal model's file as a `mujoco.MjSpec` (`named_spec`).
 
     Raises BadInput if the model did not come from a file.
     """
     if sim.path is None:
         raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
-    spec = read_spec(sim.path)
-    spec.compile()
-    for name, joint in zip(sim.arm.names, sim.joints, strict=True):
-        spec.joints[joint].name = spec.joints[joint].name or name
-    return spec
+    return named_spec(sim)
 
 
 def compiled_copy(spec: Any) -> Any:

@@ -6,6 +6,7 @@ import typer
 
 from armlink.commands.options import GroupedCommand
 from sim_gap.commands.gap_bench import bench
+from sim_gap.commands.gap_compare import compare
 from sim_gap.commands.gap_diagnose import diagnose
 from sim_gap.commands.gap_fleet import diagnose_fleet, trend
 from sim_gap.commands.gap_motion import collect, plan
@@ -23,6 +24,7 @@ def gap() -> None:
 
 SUMMARIES: dict[Callable[..., object], str] = {
     diagnose: "Find the causes of the gap and how far they close it.",
+    compare: "Rank several models on the same recordings.",
     plan: "Plan the motion that separates effects; nothing moves.",
     collect: "Move the arm along a plan and record it.",
     diagnose_fleet: "Diagnose the recordings of many arms.",

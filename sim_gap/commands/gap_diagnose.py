@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armlink.commands.options import Clock, Columns, EffortIs, Joints, Sign, Topic, Units, Zero
+from armlink.commands.options import Clock, Columns, EffortIs, Header, Joints, Sign, Topic, Units, Zero
+from sim_gap.commands.gap_options import Base, KnownGain, Tip
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,21 +23,11 @@ def diagnose(
         typer.Option(help="Held-out recording to judge on; may be repeated. Default: the end of each --train."),
     ] = None,
     columns: Columns = None,
+    header: Header = "",
     joints: Joints = "",
-    base: Annotated[
-        str | None,
-        typer.Option(
-            help="Body of the model that carries the recorded arm; default: the world.",
-            rich_help_panel="About the arm and the recordings",
-        ),
-    ] = None,
-    tip: Annotated[
-        str | None,
-        typer.Option(
-            help="Body of the model that the recorded arm ends in, where it has several arms.",
-            rich_help_panel="About the arm and the recordings",
-        ),
-    ] = None,
+    base: Base = None,
+    tip: Tip = None,
+    gains: KnownGain = "",
     units: Units = None,
     sign: Sign = None,
     zero: Zero = None,
@@ -112,6 +103,7 @@ def diagnose(
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
     from sim_gap.commands.gap_tables import show
+    from sim_gap.model.known_gains import parse_known_gains
     from sim_gap.report.effect_text import sentence
 
     console = PlainConsole()
@@ -125,6 +117,7 @@ def diagnose(
         require_extra("--out-samples", "parquet")
     stated = parse_corrections(
         columns=columns or (),
+        header=header,
         sign=sign or (),
         units=units or (),
         zero=zero or (),
@@ -146,6 +139,7 @@ def diagnose(
             stated=stated,
             groups=group or (),
             gains=gain or (),
+            known_gains=parse_known_gains(gains),
             base=base,
             tip=tip,
             progress=lambda stage: _progress(console, status, stage),

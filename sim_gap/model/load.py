@@ -12,6 +12,7 @@ from armlink.errors import BadInput
 from armlink.model_file import compile_spec, is_urdf, read_model
 from gcomp.arm.model_file import HAND, coupled_joints, upwards
 from gcomp.arrays import Array
+from sim_gap.model.known_gains import KnownGains, put_gains
 from sim_gap.model.rigid_body import RigidArm, Tendons, inertial_of
 from sim_gap.model.solver_friction import creep_speeds
 
@@ -117,6 +118,8 @@ class SimModel:
     """MuJoCo joint ids, base to tip."""
     arm: RigidArm
     path: Path | None = None
+    gains: KnownGains | None = None
+    """Gains of the position controller that the user states in place of the file's."""
 
     @property
     def n(self) -> int:
@@ -156,6 +159,27 @@ def load_model(
         raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: reorder them")
     _check(model, joints, arm, label)
     return SimModel(model, tuple(joints), arm, path)
+
+
+def with_gains(sim: SimModel, gains: KnownGains) -> SimModel:
+    """The model with position controllers of these gains at its joints. Raises BadInput for a model without a file."""
+    if sim.path is None:
+        raise BadInput("--gains: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+    sim = replace(sim, gains=gains.of_joints(sim.n))
+    return replace(sim, mujoco_model=named_spec(sim).compile())
+
+
+def named_spec(sim: SimModel) -> Any:
+    """The nominal model's file as a `mujoco.MjSpec`, with the stated gains, its elements numbered and joints named."""
+    assert sim.path is not None
+    spec = read_spec(sim.path)
+    spec.compile()
+    for name, joint in zip(sim.arm.names, sim.joints, strict=True):
+        spec.joints[joint].name = spec.joints[joint].name or name
+    if sim.gains is not None:
+        put_gains(spec, sim.joints, sim.gains)
+        spec.compile()
+    return spec
 
 
 def load_compiled(source: Any) -> Any:

@@ -1,0 +1,91 @@
+"""Compares several models on the same recordings."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from armlink.commands.options import Clock, Columns, EffortIs, Header, Joints, Json, Sign, Topic, Units, Zero
+from sim_gap.commands.gap_options import Base, KnownGain, Tip
+
+
+def compare(
+    sim: Annotated[list[str], typer.Option(help="Model to compare: MJCF, URDF or arm file; two or more.")],
+    heldout: Annotated[list[Path], typer.Option(help="Recording that no model was fitted to; may be repeated.")],
+    columns: Columns = None,
+    header: Header = "",
+    joints: Joints = "",
+    base: Base = None,
+    tip: Tip = None,
+    gains: KnownGain = "",
+    units: Units = None,
+    sign: Sign = None,
+    zero: Zero = None,
+    clock: Clock = None,
+    effort_is: EffortIs = "",
+    topic: Topic = "",
+    json: Json = None,
+) -> None:
+    """Rank models by the gap that they leave: running free and in windows, joint by joint, with intervals.
+
+    Example: armlink gap compare --sim mine.xml --sim published.xml --heldout run.csv
+    """
+    from rich.table import Table
+
+    from armlink.commands.output import write_json
+    from armlink.commands.plain_console import PlainConsole, results
+    from armlink.errors import BadInput
+    from armlink.recording.corrections import parse_corrections
+    from armlink.recording.files import load_recordings
+    from sim_gap.compare import compare_models
+    from sim_gap.model.known_gains import parse_known_gains
+
+    if len(sim) < 2:
+        raise BadInput("--sim: give two models or more")
+    stated = parse_corrections(
+        columns=columns or (),
+        header=header,
+        sign=sign or (),
+        units=units or (),
+        zero=zero or (),
+        clock=clock or (),
+        effort=effort_is,
+        joints=joints,
+        topic=topic,
+    )
+    with PlainConsole().status("moving the models along the recordings"):
+        judged = {name: each for path in heldout for name, each in load_recordings(path, stated.of_reading()).items()}
+        found = compare_models(
+            sim,
+            list(judged.values()),
+            labels=list(judged),
+            stated=stated,
+            known_gains=parse_known_gains(gains),
+            base=base,
+            tip=tip,
+        )
+    out = results(json)
+    scale, unit = (1e3, "mrad") if found.unit == "rad" else (1.0, found.unit)
+    table = Table(
+        "model", "all joints", "95 % interval", *found.names, title=f"gap in {found.count} windows, RMS in {unit}"
+    )
+    short = {Path(name).name for name in sim}
+    for each in found.models:
+        value, low, high = (scale * x for x in each.overall)
+        cells = (
+            f"{scale * x:.3g}" + ("" if each.free is None else f" ({scale * each.free[j]:.3g})")
+            for j, x in enumerate(each.windows)
+        )
+        table.add_row(
+            Path(each.model).name if len(short) == len(sim) else each.model,
+            f"{value:.3g}",
+            f"{low:.3g} to {high:.3g}",
+            *cells,
+        )
+    out.print(table)
+    if found.unit == "rad":
+        out.print("in brackets: running free")
+    write_json(json, found.to_json())
+    alike = [each.model for each in found.models[1:] if each.alike]
+    told = f"; these recordings do not tell it from {', '.join(alike)}" if alike else ""
+    out.print(f"{found.models[0].model} leaves the least{told}", style="bold")
