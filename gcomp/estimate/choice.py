@@ -109,7 +109,7 @@ def terms_of(problem: EstimationProblem, about: Linearised, folds: Index) -> Lin
     """Normal equations about a point; `folds` is the fold of each block."""
     fold, count = folds[problem.block], int(folds.max()) + 1
     variance = scale_of(problem, about.residual)
-    weight = problem.weight * robust_weight(about.residual, variance)
+    weight = problem.weight * robust_weight(about.residual, variance, problem.freedom)
     members = [np.flatnonzero(fold == f) for f in range(count)]
     squares, products = [], []
     for c, x in enumerate(about.slopes):

@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 from gcomp.arrays import Array
 
 Index = NDArray[np.intp]
+FREEDOM = 4.0
+"""Degrees of freedom of Student's t (Lange, Little and Taylor, JASA 84, 1989)."""
+NORMAL = 1e6
+"""Degrees of freedom from which Student's t is a normal distribution, to all digits that count."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class EstimationProblem:
     """Block of each row, (N,)."""
     floor: Array
     """Standard deviation below which a residual shows nothing, (C,)."""
+    freedom: float = FREEDOM
+    """Degrees of freedom of the residuals' distribution."""
 
     def within(self, theta: Array) -> Array:
         return np.clip(theta, [p.low for p in self.parameters], [p.high for p in self.parameters])

@@ -11,8 +11,6 @@ import numpy as np
 from gcomp.arrays import Array
 from gcomp.estimate.problem import EstimationProblem, Linearised, linearise
 
-FREEDOM = 4.0
-"""Degrees of freedom of Student's t (Lange, Little and Taylor, JASA 84, 1989)."""
 STILL = 1e-3
 """Relative fall of a channel's cost below which its fit ends."""
 LONGEST_STEP = 1.5
@@ -31,12 +29,12 @@ class RobustFit:
 
     def robust(self, problem: EstimationProblem) -> Array:
         """Weight of each row beside the others of its channel by Student's t, (C, N)."""
-        return robust_weight(self.residual, self.variance)
+        return robust_weight(self.residual, self.variance, problem.freedom)
 
 
-def robust_weight(residual: Array, variance: Array) -> Array:
+def robust_weight(residual: Array, variance: Array, freedom: float) -> Array:
     """1 for a row well within the scale and less for one far off, (C, N)."""
-    return (FREEDOM + 1.0) / (FREEDOM + residual**2 / variance[:, None])
+    return (freedom + 1.0) / (freedom + residual**2 / variance[:, None])
 
 
 def scale_of(problem: EstimationProblem, residual: Array) -> Array:
@@ -44,16 +42,16 @@ def scale_of(problem: EstimationProblem, residual: Array) -> Array:
     count = np.maximum(problem.weight.sum(1), 1e-300)
     variance = (problem.weight * residual**2).sum(1) / count + problem.floor**2
     for _ in range(20):
-        weight = problem.weight * robust_weight(residual, variance)
+        weight = problem.weight * robust_weight(residual, variance, problem.freedom)
         variance = (weight * residual**2).sum(1) / count + problem.floor**2
     return np.asarray(variance)
 
 
 def cost_of(problem: EstimationProblem, residual: Array, variance: Array) -> Array:
     """Negative logarithm of the likelihood of each channel but for a constant, (C,)."""
-    spread = np.log1p(residual**2 / (FREEDOM * variance[:, None]))
+    spread = np.log1p(residual**2 / (problem.freedom * variance[:, None]))
     return np.asarray(
-        (0.5 * (FREEDOM + 1.0) * problem.weight * spread).sum(1) + 0.5 * problem.weight.sum(1) * np.log(variance)
+        (0.5 * (problem.freedom + 1.0) * problem.weight * spread).sum(1) + 0.5 * problem.weight.sum(1) * np.log(variance)
     )
 
 
@@ -76,7 +74,7 @@ def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterati
         now = about.residual
         variance = scale_of(problem, about.residual)
         before = cost_of(problem, about.residual, variance) + _prior_cost(problem, theta, channels)
-        weight = problem.weight * robust_weight(about.residual, variance) / variance[:, None]
+        weight = problem.weight * robust_weight(about.residual, variance, problem.freedom) / variance[:, None]
         for _ in range(3):
             trial = problem.within(theta + _step(problem, about, weight, damping))
             left = problem.predict(trial[None])[0]

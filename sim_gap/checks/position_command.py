@@ -1,6 +1,7 @@
 """Checks of recordings without a torque channel: times, units, and commanded against measured positions."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import chain
 
 import numpy as np
@@ -13,6 +14,7 @@ from sim_gap.checks.finding import RecordingFinding, exchange_option
 from sim_gap.checks.joint_range import find_beyond_range, find_counts, find_far
 from sim_gap.checks.sampling import drop_repeats, even_times, find_dropped
 from sim_gap.model.rigid_body import RigidArm
+from sim_gap.residuals.preprocess import SHORTEST_S
 
 FOLLOWS = 0.5
 """Correlation of a command with its joint's position below which they do not belong together."""
@@ -38,13 +40,14 @@ def check_position_only(
     Raises BadInput where commands and positions do not belong together, with the option that settles it.
     """
     checked, found = [], []
+    for several, label in _judged_together(recordings, labels):
+        _require_pairs(several, label, stated)
     for recording, label in zip(recordings, labels, strict=True):
         if recording.position_command is None or not np.isfinite(recording.position_command).any():
             raise BadInput(
                 f"{label}: neither a torque channel nor a commanded position holds a number: record tau_1 …, "
                 "tau_motor_1 … or tau_cmd_1 …, or q_cmd_1 …"
             )
-        _require_pairs(recording, label, stated)
         looks = (
             find_counts(recording, stated),
             find_beyond_range(arm, recording, stated),
@@ -58,6 +61,19 @@ def check_position_only(
         checked.append(recording)
         found += [finding for finding in (*repeated, *jitter, *dropped) if finding not in found]
     return checked, found
+
+
+def _judged_together(recordings: Sequence[Recording], labels: Sequence[str]) -> list[tuple[Recording, str]]:
+    """Long recordings as they are, and short ones in one: a lag turns what a single step seems to follow."""
+    long = [(r, label) for r, label in zip(recordings, labels, strict=True) if r.t[-1] - r.t[0] >= SHORTEST_S]
+    short = [(r, label) for r, label in zip(recordings, labels, strict=True) if r.t[-1] - r.t[0] < SHORTEST_S]
+    given = [r.position_command for r, _ in short if r.position_command is not None]
+    if not given:
+        return long
+    position = np.concatenate([r.position for r, _ in short if r.position_command is not None])
+    first, label = short[0]
+    several = replace(first, position=position, position_command=np.concatenate(given))
+    return [*long, (several, label if len(short) == 1 else f"{label} and {len(short) - 1} more")]
 
 
 def _require_pairs(recording: Recording, label: str, stated: Corrections) -> None:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from gcomp.estimate.choice import Effect, LinearTerms, choose, price_of, terms_of
-from gcomp.estimate.problem import linearise
+from gcomp.estimate.choice import PRICE, Effect, LinearTerms, choose, price_of, terms_of
+from gcomp.estimate.problem import FREEDOM, linearise
 from sim_gap.position_gap.fit import (
     INDEPENDENT_S,
     Layout,
@@ -79,8 +79,8 @@ class LoopSearch:
             return self.scales.of(name)
         return np.asarray(np.maximum(np.abs(self.data.v).max(axis=(0, 2)), PARAMETERS["slew"].low))
 
-    def improve(self, fit: LoopFit, iterations: int = 5) -> LoopFit:
-        return improve(self.data, fit, self.scales, self.floor, self.nominal, iterations)
+    def improve(self, fit: LoopFit, iterations: int = 5, freedom: float = FREEDOM) -> LoopFit:
+        return improve(self.data, fit, self.scales, self.floor, self.nominal, iterations, freedom)
 
 
 def folds_of(data: Windows) -> NDArray[np.intp]:
@@ -230,16 +230,27 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         found = choose(about.terms, list(about.effects.values()), names, kept)
         if number == 0:
             looked = {*promising(about, names), *found, *names}
-        fit = search.improve(entered(search, about.moved(found)), 4)
-        same, names = set(found) == set(names), found
+        made = search.improve(entered(search, about.moved(found)), 4)
+        if worth(search, made) < worth(search, fit) and not {*names} <= {*found}:
+            # what was taken out mattered more than the linear terms say: only what comes in does so
+            found = [*names, *(name for name in found if name not in names)]
+            made = search.improve(entered(search, about.moved(found)), 4)
+        same, names, fit = set(found) == set(names), found, made
         if same:
             return fit, about
     about = look_about(search, fit, looked, levels)
     found = choose(about.terms, [about.effects[n] for n in names], names, kept)
     if set(found) != set(names):
-        fit = search.improve(about.moved(found), 4)
-        about = look_about(search, fit, looked, levels)
+        made = search.improve(about.moved(found), 4)
+        if worth(search, made) >= worth(search, fit):
+            fit, about = made, look_about(search, made, looked, levels)
     return fit, about
+
+
+def worth(search: LoopSearch, fit: LoopFit) -> float:
+    """Logarithm of the likelihood of a fit less the price of its parameters, but for a constant."""
+    fit = fit if fit.rms is not None else evaluate(search.data, fit)
+    return -float(search.score(fit).sum()) - PRICE * (sum(map(len, fit.active)) + len(fit.shared))
 
 
 def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[str]:

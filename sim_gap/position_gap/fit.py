@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array
-from gcomp.estimate.problem import EstimationProblem, FittedParameter, linearise
+from gcomp.estimate.problem import FREEDOM, EstimationProblem, FittedParameter, linearise
 from gcomp.estimate.solve import solve
 from sim_gap.position_gap.links import range_of, size_of
 from sim_gap.position_gap.parameters import (
@@ -160,13 +160,22 @@ def jacobian(
     return now, [x.reshape(len(x), *shape) for x in about.slopes]
 
 
-def improve(data: Windows, fit: LoopFit, scales: Scales, floor: Array, nominal: Point, iterations: int = 6) -> LoopFit:
-    """The most probable values of what is active, from a fit on."""
+def improve(
+    data: Windows,
+    fit: LoopFit,
+    scales: Scales,
+    floor: Array,
+    nominal: Point,
+    iterations: int = 6,
+    freedom: float = FREEDOM,
+) -> LoopFit:
+    """The most probable values of what is active, from a fit on; `freedom` is that of the residuals' distribution."""
     names = names_of(fit)
     if not names:
         return evaluate(data, fit)
     layout = Layout(data, scales, fit.point, names)
-    found = solve(layout.problem(nominal, {}, floor), layout.theta(layout.point), range(len(names)), iterations)
+    problem = replace(layout.problem(nominal, {}, floor), freedom=freedom)
+    found = solve(problem, layout.theta(layout.point), range(len(names)), iterations)
     shape = (data.joints, len(data.measured), data.count)
     left = found.residual.reshape(shape).transpose(1, 0, 2)
     return replace(fit, point=layout.at(found.theta), rms=root_mean_squares(data, left))

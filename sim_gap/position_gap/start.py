@@ -7,6 +7,7 @@ import numpy as np
 
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
+from gcomp.estimate.problem import NORMAL
 from sim_gap.position_gap.choice import FEW, LoopSearch, Progress
 from sim_gap.position_gap.fit import LoopFit, batch, residuals
 from sim_gap.position_gap.parameters import Scales
@@ -80,10 +81,11 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     kept = {"controller.stiffness"} if not own.complete else set()
     search = replace(search, kept=frozenset(kept))
     few = replace(few, nominal=search.nominal)
-    fit = few.improve(LoopFit(point, active), 5)
+    # all rows count at first: far from the arm's motion a robust fit would take the motion for outliers
+    fit = few.improve(LoopFit(point, active), 5, NORMAL)
     if np.any(search.nominal["creep"] > 0.0):
         rest = {"creep": np.zeros(search.data.joints)}
-        at_rest_fit = few.improve(fit.with_values(**rest), 4)
+        at_rest_fit = few.improve(fit.with_values(**rest), 4, NORMAL)
         # gears hold what rests: a model's solver that lets it creep is no statement about the arm
         if float((few.score(at_rest_fit) - few.score(fit)).sum()) < PRICE:
             search, fit = replace(search, nominal={**search.nominal, **rest}), at_rest_fit
@@ -126,11 +128,15 @@ def _friction(search: LoopSearch, j: int, kp: float, stuck: float) -> tuple[floa
 
 
 def rests(data: Windows) -> Mask:
-    """Joints whose command rests in all windows, (J,): any controller holds them there."""
-    on = (data.served > 0.5) & (data.weight > 0.0)
-    command = data.measured + data.error
-    ends = [find(np.where(on, command, fill), axis=(0, 2)) for find, fill in ((np.max, -np.inf), (np.min, np.inf))]
-    return np.asarray(on.any(axis=(0, 2)) & (ends[0] - ends[1] < RESTS_RAD))
+    """Joints whose command rests in all windows, (J,): any controller holds them there; not those that move while the
+    servo is off."""
+    on, told = data.served > 0.5, data.weight > 0.0
+
+    def way(values: Array, where: Mask) -> Array:
+        return np.where(where, values, -np.inf).max((0, 2)) - np.where(where, values, np.inf).min((0, 2))
+
+    commanded, free = way(data.measured + data.error, on & told), way(data.measured, ~on & told)
+    return np.asarray((on & told).any(axis=(0, 2)) & (commanded < RESTS_RAD) & ~(free >= RESTS_RAD))
 
 
 def _holding(search: LoopSearch, own: Servos) -> dict[str, Array]:

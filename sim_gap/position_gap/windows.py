@@ -283,8 +283,15 @@ def _in_one_order(recordings: Sequence[Recording]) -> list[int]:
     return sorted(range(len(recordings)), key=content)
 
 
+def as_many(data: Windows, count: int) -> int:
+    """Number of windows of these recordings that last as long as so many whole ones."""
+    seconds = (data.weight > 0.0).any(axis=1).sum() * data.judged_s
+    return max(count, round(count * WINDOW_S * data.count / max(float(seconds), WINDOW_S)))
+
+
 def thin(data: Windows, count: int) -> Windows:
-    """At most `count` of the windows, evenly spread over the recordings."""
+    """As much of the windows as `count` whole ones, evenly spread over the recordings."""
+    count = as_many(data, count)
     return data if data.count <= count else choose_windows(data, _even(data.count, count))
 
 
@@ -294,6 +301,7 @@ def thin_moving(data: Windows, count: int) -> Windows:
     Of a joint that rests in all windows anything fits: no gain, and any friction. Of one that is slow in all of them
     nothing follows for fast motion.
     """
+    count = as_many(data, count)
     if data.count <= count:
         return data
     chosen = _even(data.count, count)
