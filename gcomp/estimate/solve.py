@@ -51,7 +51,8 @@ def cost_of(problem: EstimationProblem, residual: Array, variance: Array) -> Arr
     """Negative logarithm of the likelihood of each channel but for a constant, (C,)."""
     spread = np.log1p(residual**2 / (problem.freedom * variance[:, None]))
     return np.asarray(
-        (0.5 * (problem.freedom + 1.0) * problem.weight * spread).sum(1) + 0.5 * problem.weight.sum(1) * np.log(variance)
+        (0.5 * (problem.freedom + 1.0) * problem.weight * spread).sum(1)
+        + 0.5 * problem.weight.sum(1) * np.log(variance)
     )
 
 

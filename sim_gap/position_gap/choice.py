@@ -96,7 +96,7 @@ def candidates_of(search: LoopSearch) -> dict[str, tuple[tuple[int, str], ...]]:
     for effect in EFFECTS.values():
         if effect.id not in search.excluded:
             for j in range(search.data.joints):
-                if j not in search.resting:
+                if j not in search.resting and (effect.id != "controller.lag" or search.nominal["lag"][j] > 0.0):
                     out[f"{effect.id}#{j}"] = tuple((j, name) for name in effect.parameters)
     for name, parameters in shared_effects(search.data.plant.sim.arm).items():
         if name.partition("@")[0] not in search.excluded:

@@ -34,6 +34,8 @@ LOCKED_TOLERANCE = 1e-16
 the arm of two joints in `tests/sim_gap/position_gap/test_plant.py` rests 4 mrad off, with this 0.3 µrad."""
 Values = Mapping[str, Array]
 """Parameter → (P, J) of P hypotheses; one of the whole arm has the same value at each joint."""
+FILTERS = 2, 3
+"""MuJoCo's codes of actuators that filter their input (`mjDYN_FILTER`, `mjDYN_FILTEREXACT`)."""
 SPEED_S = 0.01
 """Time over which the derivative of a command is taken [s]."""
 
@@ -50,6 +52,8 @@ class Servos:
     limit: Array
     slew: Array
     delay: Array
+    lag: Array
+    """Time constant of the filter of its command [s]; 0 without one."""
 
     @property
     def complete(self) -> bool:
@@ -63,7 +67,9 @@ def servos_of(sim: SimModel) -> Servos:
     model: Any = sim.mujoco_model
     n = sim.n
     zero, none = np.zeros(n), np.full(n, np.inf)
-    own = Servos(np.full(n, -1), np.full(n, np.nan), zero.copy(), zero.copy(), none.copy(), none.copy(), zero.copy())
+    own = Servos(
+        np.full(n, -1), np.full(n, np.nan), zero.copy(), zero.copy(), none.copy(), none.copy(), zero.copy(), zero.copy()
+    )
     joints = {int(joint): j for j, joint in enumerate(sim.joints)}
     for i in range(model.nu):
         j = joints.get(int(model.actuator_trnid[i, 0]))
@@ -82,6 +88,8 @@ def servos_of(sim: SimModel) -> Servos:
             own.ki[j], slew = model.actuator_gainprm[i, 0] * gear**2, float(model.actuator_dynprm[i, 1])
             own.slew[j] = slew / abs(gear) if slew > 0.0 else np.inf
         own.delay[j] = model.actuator_delay[i]
+        if model.actuator_dyntype[i] in FILTERS:
+            own.lag[j] = model.actuator_dynprm[i, 0]
     return own
 
 
@@ -225,6 +233,8 @@ class MovedModel:
                     model.actuator_dynprm[i, 1] = point["slew"][j] * abs(gear) if own.slew[j] < np.inf else 0.0
                 else:
                     model.actuator_gainprm[i, 0] = stiff[j] / gear**2
+                if own.lag[j] > 0.0:
+                    model.actuator_dynprm[i, 0] = max(point["lag"][j], self.dt)
                 limit = point["limit"][j] * point["gain"][j]
                 if np.isfinite(limit) and (limit != own.limit[j]):
                     model.actuator_forcelimited[i] = 1
@@ -317,6 +327,12 @@ def nominal_point(plant: MovedModel, neutral: Mapping[str, float]) -> dict[str, 
     point["viscous"] = arm.damping + np.where(np.isfinite(own.kp), own.kv, 0.0)
     point["kp"] = np.where(np.isfinite(own.kp), own.kp, 1.0)
     point["kv"] = np.where(np.isfinite(own.kp), own.kv, 0.0)
-    point |= {"ki": own.ki.copy(), "limit": own.limit.copy(), "slew": own.slew.copy(), "delay": own.delay.copy()}
+    point |= {
+        "ki": own.ki.copy(),
+        "limit": own.limit.copy(),
+        "slew": own.slew.copy(),
+        "delay": own.delay.copy(),
+        "lag": own.lag.copy(),
+    }
     point["spring"], point["offset"] = arm.stiffness.copy(), -arm.stiffness * arm.rest
     return point | {"creep": plant.creep.copy(), "feed": plant.compensated * one}

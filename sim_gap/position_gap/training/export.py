@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from armlink.recording.recording import Recording
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.better_model.corrected_model import (
     body_parameters,
     closest_possible,
@@ -67,6 +67,7 @@ def write_range(joint: Any, actuator: Any, ends: Array, unit: float) -> None:
 NATIVE = {
     "controller.stiffness": "actuator kp",
     "controller.delay": "actuator delay",
+    "controller.lag": "actuator dynprm",
     "controller.slew": "actuator slewmax",
     "controller.integral": "actuator ki",
     "actuator.saturation": "actuator forcerange",
@@ -121,12 +122,26 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
     loaded = fit.point["load"] * np.abs(search.data.torque).mean(axis=(0, 2))
     dry = fit.point["stribeck"] * ("friction.stribeck" not in held) + loaded * ("friction.load" not in held)
     bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
-    wanted = [(*own, *(n for n in ("coulomb", "viscous") if n not in own)) for own in bare.active]
-    changed = (bare.active, bare.shared) != (fit.active, fit.shared)
+    # a PID actuator, which holds slew limit and integral part, has no filter: a delay takes its place
+    unfiltered = (search.data.plant.servos.lag > 0.0) & needs_pid(bare, held)
+    late = bare.point["delay"] + np.where(unfiltered, bare.point["lag"], 0.0)
+    bare = bare.with_values(lag=np.where(unfiltered, 0.0, bare.point["lag"]), delay=late)
+    again = [("coulomb", "viscous", "delay") if lost else ("coulomb", "viscous") for lost in unfiltered]
+    wanted = [
+        (*(n for n in own if n != "lag" or not lost), *(n for n in more if n not in own))
+        for own, more, lost in zip(bare.active, again, unfiltered, strict=True)
+    ]
+    changed = (bare.active, bare.shared) != (fit.active, fit.shared) or bool(unfiltered.any())
     changed = changed or bool(np.any(fit.point["kd"] != 0.0) or np.any(fit.point["feed"] != share))
     if not changed:
         return fit
     return search.improve(replace(bare, active=tuple(wanted), rms=None), 4)
+
+
+def needs_pid(fit: LoopFit, held: Collection[str] = NATIVE) -> Mask:
+    """Joints at which only a PID actuator holds what was found, (J,)."""
+    found = (fit.point["ki"] > 0.0) | np.isfinite(fit.point["slew"])
+    return found & ("controller.slew" in held)
 
 
 def compensation(search: LoopSearch, fit: LoopFit) -> Array | None:
@@ -259,6 +274,8 @@ def _set_actuator(spec: Any, joint: str, search: LoopSearch, fit: LoopFit, j: in
         made, gear = old[0], float(own.gear[j])
         made.gainprm[0], made.biasprm[1], made.biasprm[2] = kp / gear**2, -kp / gear**2, -kv / gear**2
         limit /= abs(gear)
+        if own.servos.lag[j] > 0.0:
+            made.dynprm[0] = max(float(fit.point["lag"][j]), own.dt)
     else:
         name = old[0].name if old else f"position_{joint}"
         control = list(old[0].ctrlrange) if old and old[0].ctrlrange[0] < old[0].ctrlrange[1] else None
