@@ -13,9 +13,11 @@ from gcomp.estimate.problem import EstimationProblem, Index, Linearised
 from gcomp.estimate.solve import precision, robust_weight, scale_of
 
 PRICE = 4.0
-"""Fall of the negative logarithm of the likelihood that a parameter has to pay for."""
+"""Fall of the negative logarithm of the held-out likelihood that a parameter has to pay for: the best of m useless ones
+brings log m of rows that are fitted (risk inflation criterion, Foster and George, Annals of Statistics 22, 1994), and
+one less of rows that are held out. A six-joint arm has m = 150: log 150 − 1 = 4.0."""
 SIGNIFICANT = 2.0
-"""Standard errors over the blocks by which an effect has to pay."""
+"""Standard errors over the blocks by which an effect has to pay: 98 % of a normal distribution, one-sided."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,8 @@ from sim_gap.search.estimate import Value
 STRUCTURE = 2.0
 """Remaining gap, in margins, from which an unknown controller may not be of the kind that was fitted."""
 ALMOST = 0.75
-"""Highest confidence that positions alone give: it is not calibrated on sealed cases, as that from torques is."""
+"""Highest confidence that positions alone give, below the 0.8 from which a cause is no hint: the sealed cases that
+calibrate confidence all have torques."""
 SEPARATE = {
     "controller.stiffness": "hold a known load with the joint, or record the motor's current",
     "controller.dead_zone": "measure the play by hand with the servo holding, or read the motor's encoder",

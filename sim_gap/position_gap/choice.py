@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, Effect, LinearTerms, choose, price_of, terms_of
 from gcomp.estimate.problem import FREEDOM, linearise
+from gcomp.estimate.solve import cost_of, scale_of
 from sim_gap.position_gap.fit import (
     INDEPENDENT_S,
     Layout,
@@ -16,6 +17,7 @@ from sim_gap.position_gap.fit import (
     batch,
     evaluate,
     improve,
+    names_of,
     residuals,
 )
 from sim_gap.position_gap.links import shared_effects, size_of
@@ -25,7 +27,8 @@ from sim_gap.position_gap.windows import Windows, thin_moving
 FOLDS = 6
 """Parts of the windows of which each is held out once."""
 LEAST_FALL = 0.025
-"""Least relative fall of a joint's RMS by an effect."""
+"""Least relative fall of a joint's RMS by an effect: half of what makes a cause (`judge.LEAST_SHRINK`), which may come
+as two effects at first."""
 QUIET = 1.1
 """Noise floors up to which nothing is left to explain."""
 ROUNDS = 3
@@ -96,12 +99,21 @@ def candidates_of(search: LoopSearch) -> dict[str, tuple[tuple[int, str], ...]]:
     for effect in EFFECTS.values():
         if effect.id not in search.excluded:
             for j in range(search.data.joints):
-                if j not in search.resting and (effect.id != "controller.lag" or search.nominal["lag"][j] > 0.0):
+                if j not in search.resting and _may_act(search, effect.id, j):
                     out[f"{effect.id}#{j}"] = tuple((j, name) for name in effect.parameters)
     for name, parameters in shared_effects(search.data.plant.sim.arm).items():
         if name.partition("@")[0] not in search.excluded:
             out[name] = tuple((-1, each) for each in parameters)
     return out
+
+
+def _may_act(search: LoopSearch, effect: str, joint: int) -> bool:
+    """Whether the model has what an effect changes: a filter, or what tells a gain of all torques from that of the
+    position, a limit or an integral part."""
+    nominal = search.nominal
+    if effect == "actuator.gain":
+        return bool(np.isfinite(nominal["limit"][joint]) or nominal["ki"][joint] > 0.0)
+    return effect != "controller.lag" or bool(nominal["lag"][joint] > 0.0)
 
 
 def chosen_of(search: LoopSearch, fit: LoopFit) -> list[str]:
@@ -231,7 +243,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         if number == 0:
             looked = {*promising(about, names), *found, *names}
         made = search.improve(entered(search, about.moved(found)), 4)
-        if worth(search, made) < worth(search, fit) and not {*names} <= {*found}:
+        if not {*names} <= {*found} and worth(search, made) < worth(search, fit):
             # what was taken out mattered more than the linear terms say: only what comes in does so
             found = [*names, *(name for name in found if name not in names)]
             made = search.improve(entered(search, about.moved(found)), 4)
@@ -249,8 +261,10 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
 
 def worth(search: LoopSearch, fit: LoopFit) -> float:
     """Logarithm of the likelihood of a fit less the price of its parameters, but for a constant."""
-    fit = fit if fit.rms is not None else evaluate(search.data, fit)
-    return -float(search.score(fit).sum()) - PRICE * (sum(map(len, fit.active)) + len(fit.shared))
+    layout = Layout(search.data, search.scales, fit.point, names_of(fit))
+    problem = layout.problem(search.nominal, {}, search.floor)
+    residual = problem.predict(layout.theta(layout.point)[None])[0]
+    return -float(cost_of(problem, residual, scale_of(problem, residual)).sum()) - PRICE * len(layout.names)
 
 
 def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[str]:

@@ -133,7 +133,8 @@ def rests(data: Windows) -> Mask:
     on, told = data.served > 0.5, data.weight > 0.0
 
     def way(values: Array, where: Mask) -> Array:
-        return np.where(where, values, -np.inf).max((0, 2)) - np.where(where, values, np.inf).min((0, 2))
+        high, low = np.where(where, values, -np.inf).max((0, 2)), np.where(where, values, np.inf).min((0, 2))
+        return np.asarray(high - low)
 
     commanded, free = way(data.measured + data.error, on & told), way(data.measured, ~on & told)
     return np.asarray((on & told).any(axis=(0, 2)) & (commanded < RESTS_RAD) & ~(free >= RESTS_RAD))

@@ -110,12 +110,19 @@ def test_friction_that_a_simulator_cannot_hold_is_added_to_coulombs(monkeypatch)
         "viscous": 0.0,
         "kd": 0.0,
         "feed": 0.0,
+        "ki": 0.0,
+        "slew": np.inf,
+        "delay": 0.0,
+        "lag": 0.0,
     }
     fit = LoopFit({name: np.array([value]) for name, value in own.items()}, (("coulomb", "stribeck", "load"),))
-    plant = SimpleNamespace(compensated=0.0, sim=SimpleNamespace(arm=SimpleNamespace(names=())))
+    servos = SimpleNamespace(lag=nothing)
+    plant = SimpleNamespace(compensated=0.0, servos=servos, sim=SimpleNamespace(arm=SimpleNamespace(names=())))
     data = SimpleNamespace(joints=1, torque=np.full((5, 1, 2), 4.0), plant=plant)
     monkeypatch.setattr(export, "compensation", lambda search, fit: None)
-    search = SimpleNamespace(data=data, nominal=dict.fromkeys(own, nothing), scales=None, improve=lambda fit: fit)
+    search = SimpleNamespace(
+        data=data, nominal=dict.fromkeys(own, nothing), scales=None, improve=lambda fit, iterations: fit
+    )
     held = export.native_fit(search, fit)
     assert held.point["coulomb"] == pytest.approx([0.2 + 0.3 + 0.4])
     assert held.point["stribeck"] == held.point["load"] == 0.0

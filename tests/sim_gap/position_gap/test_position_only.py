@@ -151,7 +151,9 @@ def test_a_model_with_a_slew_limit_is_written_without_pid_too(answer, tmp_path: 
     found = answer.internals
     limited = found.native.with_values(slew=np.array([1.5, np.inf]))
     limited = replace(limited, active=(("kp", "slew", "coulomb", "viscous"), limited.active[1]))
-    other = export_batched(replace(found, native=limited))
+    changed = replace(found)
+    vars(changed)["native"] = limited
+    other = export_batched(changed)
     assert other is not None
     model = mujoco.MjModel.from_xml_string(other.xml)
     assert not (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_PID).any()
@@ -163,7 +165,9 @@ def test_a_module_is_written_with_its_model_and_removed_with_it(answer, tmp_path
     rubs = found.fit.with_values(load=np.array([0.3, 0.0]))
     rubs = replace(rubs, active=((*rubs.active[0], "load"), rubs.active[1]))
     beside = export_with_module(found.sim, found.search, rubs)
-    write_exported(replace(found, beside=beside), tmp_path / "closed.xml")
+    changed = replace(found)
+    vars(changed)["beside"] = beside
+    write_exported(changed, tmp_path / "closed.xml")
     text = (tmp_path / "closed_effects.xml").read_text()
     assert text.startswith("<!-- To be used with closed_effects.py, which applies:\n  friction.load shoulder\n-->")
     mujoco.MjModel.from_xml_string(text)
