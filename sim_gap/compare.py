@@ -70,7 +70,7 @@ class ModelComparison:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "schema": "armlink.gap_comparison/1",
+            "schema": "armlink.gap-comparison/1",
             "unit": self.unit,
             "joints": list(self.names),
             "windows": self.count,

@@ -65,7 +65,7 @@ def _features(path: Path) -> dict[str, Any]:
     try:
         features = json.loads(read_whole(path / "meta" / "info.json", MOST_JSON))["features"]
     except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
-        raise BadInput(f"{path}/meta/info.json: no features ({type(error).__name__} {error})") from None
+        raise BadInput(f"{path}/meta/info.json: no names of {STATES[0]} ({type(error).__name__} {error})") from None
     if not isinstance(features, dict) or not any(name in features for name in STATES):
         raise BadInput(f"{path}/meta/info.json: no names of {' or '.join(STATES)} among its features")
     return features

@@ -77,7 +77,11 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
     names = ("kp", "viscous", "coulomb")
-    active = tuple(() if rest else names for rest in at_rest)
+    # a joint that swings with its servo off shows friction and inertia against gravity, and only both together
+    free = ((search.data.served < 0.5) & (search.data.weight > 0.0)).any(axis=(0, 2))
+    active = tuple(
+        () if rest else (*names, "armature") if swings else names for rest, swings in zip(at_rest, free, strict=True)
+    )
     kept = {"controller.stiffness"} if not own.complete else set()
     search = replace(search, kept=frozenset(kept))
     few = replace(few, nominal=search.nominal)

@@ -99,3 +99,32 @@ def test_numbers_alone_are_no_joint_names():
         "wrist_1",
     )
     assert suggested_map(["t", "q_1", "tau_1"]) == ""
+
+
+@pytest.mark.parametrize("separator", [",", ";", " ", "\t"])
+def test_a_table_without_a_header_row(tmp_path, separator):
+    values = np.random.default_rng().uniform(-1.0, 1.0, (20, 4))
+    values[:, 0] = 0.02 * np.arange(20)
+    text = "\n".join(separator.join(f"{x:.9f}" for x in row) for row in values) + "\n"
+    (tmp_path / "run.csv").write_text(text)
+    with pytest.raises(BadInput, match=r"--columns t,q_1"):
+        load_recording(tmp_path / "run.csv")
+    loaded = load_recording(tmp_path / "run.csv", parse_corrections(header="t,-,q_1,q_cmd_1"))
+    np.testing.assert_allclose(loaded.t, values[:, 0])
+    np.testing.assert_allclose(loaded.position[:, 0], values[:, 2], atol=1e-8)
+    np.testing.assert_allclose(loaded.position_command[:, 0], values[:, 3], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("header", "text", "said"),
+    [
+        ("t,q_1", "0,1,2\n1,2,3\n", "names 2 columns, its rows have 3"),
+        ("t,q_1,tau_1", "t,q,tau\n0,1,2\n1,2,3\n", "its first row holds no numbers"),
+        ("t,angle", "0,1\n1,2\n", "--columns angle: not a column"),
+        ("t,q_1,q_1", "0,1,2\n1,2,3\n", "--columns q_1: occurs twice"),
+    ],
+)
+def test_columns_that_do_not_fit_a_table_are_one_error(tmp_path, header, text, said):
+    (tmp_path / "run.csv").write_text(text)
+    with pytest.raises(BadInput, match=said):
+        load_recording(tmp_path / "run.csv", parse_corrections(header=header))

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pa_parquet
 import pytest
 from mcap_ros2.writer import Writer as RosWriter
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -296,3 +297,94 @@ def test_options_that_do_not_fit_are_one_line(tmp_path, options, message):
     path.write_text("t,q_1,q_2,tau_1,tau_2\n0,1,2,3,4\n0.1,1,2,3,4\n")
     with pytest.raises(BadInput, match=message):
         load_recording(path, parse_corrections(**options))
+
+
+def ros1_bag(path, rows, compression=None):
+    types = get_typestore(Stores.ROS1_NOETIC)
+    kind = "sensor_msgs/msg/JointState"
+    bag = Ros1Writer(path)
+    if compression is not None:
+        bag.set_compression(compression)
+    with bag:
+        connection = bag.add_connection("/joint_states", kind, typestore=types)
+        for k, position in enumerate(rows):
+            stamp = types.types["builtin_interfaces/msg/Time"](sec=7 + k // 100, nanosec=k % 100 * 10**7)
+            head = types.types["std_msgs/msg/Header"](seq=k, stamp=stamp, frame_id="")
+            effort = np.array([0.5 * k, -1.0])
+            message = types.types[kind](head, ["b", "a"], np.array(position), np.zeros(0), effort)
+            bag.write(connection, 7 * 10**9 + k * 10**7, types.serialize_ros1(message, kind))
+
+
+@pytest.mark.parametrize("compression", [None, *Ros1Writer.CompressionFormat])
+def test_a_bag_of_ros_1(tmp_path, compression):
+    rows = np.random.default_rng().uniform(-1.0, 1.0, (30, 2))
+    ros1_bag(tmp_path / "run.bag", rows, compression)
+    loaded = load_recording(tmp_path / "run.bag")
+    assert loaded.names == ("b", "a")
+    np.testing.assert_allclose(loaded.position, rows)
+    np.testing.assert_allclose(loaded.torque[:, 0], 0.5 * np.arange(30))
+    np.testing.assert_allclose(loaded.t, 0.01 * np.arange(30))
+
+
+@pytest.mark.parametrize("compression", [*Ros1Writer.CompressionFormat])
+def test_a_bag_of_ros_1_that_unpacks_to_too_much_is_refused(tmp_path, compression, monkeypatch):
+    ros1_bag(tmp_path / "run.bag", np.zeros((3000, 2)), compression)
+    monkeypatch.setattr("armlink.recording.bag_sizes.require_size", refuse_above(100_000))
+    with pytest.raises(BadInput, match=r"run\.bag.*too much"):
+        load_recording(tmp_path / "run.bag")
+
+
+def refuse_above(most):
+    def require(size, source):
+        if size > most:
+            raise BadInput(f"{source}: too much")
+
+    return require
+
+
+def test_a_damaged_bag_of_ros_1_is_one_error(tmp_path):
+    ros1_bag(tmp_path / "run.bag", np.zeros((50, 2)))
+    whole = (tmp_path / "run.bag").read_bytes()
+    random = np.random.default_rng()
+    for cut in random.integers(1, len(whole), 12).tolist():
+        (tmp_path / "cut.bag").write_bytes(whole[:cut])
+        with pytest.raises(BadInput, match=r"cut\.bag"):
+            load_recording(tmp_path / "cut.bag")
+
+
+def lerobot_with(path, state, action, described):
+    values = np.random.default_rng().uniform(-1.0, 1.0, (2, 40, 2))
+    (path / "meta").mkdir(parents=True)
+    (path / "data").mkdir()
+    (path / "meta" / "info.json").write_text(json.dumps({"features": {state: described, action: described}}))
+    columns = {
+        "episode_index": np.zeros(40, int),
+        "timestamp": 0.02 * np.arange(40),
+        state: list(values[0]),
+        action: list(values[1]),
+    }
+    pa_parquet.write_table(pa.table(columns), path / "data" / "a.parquet")
+    return values
+
+
+@pytest.mark.parametrize(
+    ("state", "action", "described", "names"),
+    [
+        ("state", "actions", {"names": ["a.pos", "b.pos"], "shape": [2]}, ("a", "b")),
+        ("observation.state", "action", {"names": {"left": ["a"], "right": ["b"]}, "shape": [2]}, ("a", "b")),
+        ("observation.state", "action", {"names": [["a", "b"]], "shape": [2]}, ("a", "b")),
+        ("state", "actions", {"names": None, "shape": [2]}, ("joint_1", "joint_2")),
+    ],
+)
+def test_data_sets_of_other_recorders(tmp_path, state, action, described, names):
+    values = lerobot_with(tmp_path / "set", state, action, described)
+    (loaded,) = load_recordings(tmp_path / "set").values()
+    assert loaded.names == names
+    np.testing.assert_allclose(loaded.position, values[0])
+    np.testing.assert_allclose(loaded.position_command, values[1])
+
+
+def test_joint_names_of_a_data_set_occur_once(tmp_path):
+    lerobot_with(tmp_path / "set", "state", "actions", {"names": {"left": ["a"], "right": ["a"]}, "shape": [2]})
+    with pytest.raises(BadInput, match="occur twice"):
+        load_recordings(tmp_path / "set")
