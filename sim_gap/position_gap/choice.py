@@ -31,8 +31,8 @@ LEAST_FALL = 0.025
 as two effects at first."""
 QUIET = 1.1
 """Noise floors up to which nothing is left to explain."""
-ROUNDS = 3
-"""Times that effects are chosen and fitted."""
+ROUNDS, FITTING = 3, 3
+"""Times that effects are chosen and fitted, and Gauss-Newton steps of each of these fits."""
 FEW = 8
 """Windows on which levels of a limit, or first gains, are compared: those are steps of a factor, not values."""
 LEVELS = {
@@ -242,11 +242,11 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         found = choose(about.terms, list(about.effects.values()), names, kept)
         if number == 0:
             looked = {*promising(about, names), *found, *names}
-        made = search.improve(entered(search, about.moved(found)), 4)
+        made = search.improve(entered(search, about.moved(found)), FITTING)
         if not {*names} <= {*found} and worth(search, made) < worth(search, fit):
             # what was taken out mattered more than the linear terms say: only what comes in does so
             found = [*names, *(name for name in found if name not in names)]
-            made = search.improve(entered(search, about.moved(found)), 4)
+            made = search.improve(entered(search, about.moved(found)), FITTING)
         same, names, fit = set(found) == set(names), found, made
         if same:
             return fit, about

@@ -78,7 +78,7 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
     names = ("kp", "viscous", "coulomb")
     # a joint that swings with its servo off shows friction and inertia against gravity, and only both together
-    free = ((search.data.served < 0.5) & (search.data.weight > 0.0)).any(axis=(0, 2))
+    free = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2)).tolist()
     active = tuple(
         () if rest else (*names, "armature") if swings else names for rest, swings in zip(at_rest, free, strict=True)
     )

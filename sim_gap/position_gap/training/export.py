@@ -135,7 +135,7 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
     changed = changed or bool(np.any(fit.point["kd"] != 0.0) or np.any(fit.point["feed"] != share))
     if not changed:
         return fit
-    return search.improve(replace(bare, active=tuple(wanted), rms=None), 4)
+    return search.improve(replace(bare, active=tuple(wanted), rms=None), 3)
 
 
 def needs_pid(fit: LoopFit, held: Collection[str] = NATIVE) -> Mask:
