@@ -38,7 +38,7 @@ ALIKE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class ModelGap:
-    """What one model leaves of the recordings, by joint (n,) and over all joints, RMS."""
+    """The gap that one model leaves, by joint (n,) and over all joints, RMS."""
 
     model: str
     windows: Array
@@ -103,7 +103,7 @@ def compare_models(
     base: str | None = None,
     tip: str | None = None,
 ) -> ModelComparison:
-    """What each model leaves of the same recordings. Raises BadInput for a model or recording that cannot be used."""
+    """The gap that each model leaves of the same recordings. Raises BadInput for a model or recording that cannot be used."""
     labels = list(labels) or [f"recording {i + 1}" for i in range(len(recordings))]
     squares: list[Array] = []
     free: list[Array] = []

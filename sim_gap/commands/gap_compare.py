@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from armlink.commands.options import Clock, Columns, EffortIs, Header, Joints, Json, Sign, Topic, Units, Zero
-from sim_gap.commands.gap_options import Base, KnownGain, Tip
+from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip
 
 
 def compare(

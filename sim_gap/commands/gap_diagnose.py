@@ -1,18 +1,33 @@
 """Explains the gap between a simulation model and recordings of the real arm."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from armlink.commands.options import Clock, Columns, EffortIs, Header, Joints, Sign, Topic, Units, Zero
-from sim_gap.commands.gap_options import Base, KnownGain, Tip
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
 
     from sim_gap.attribution.diagnosis import Diagnosis
+
+
+def _about(help_text: str, **more: Any) -> Any:
+    return typer.Option(help=help_text, rich_help_panel="About the arm and the recordings", **more)
+
+
+Base = Annotated[str | None, _about("Body of the model that carries the recorded arm; default: the world.")]
+Tip = Annotated[str | None, _about("Body of the model that the recorded arm ends in, where it has several arms.")]
+KnownGain = Annotated[
+    str,
+    _about(
+        "Gains of the position controllers, where the model lacks them: kp=20,kd=1.5 or kp=A;B;… by joint "
+        "(N·m/rad, N·m·s/rad).",
+        metavar="kp=…,kd=…",
+    ),
+]
 
 
 def diagnose(

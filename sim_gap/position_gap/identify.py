@@ -70,7 +70,7 @@ class Identified:
 
     @cached_property
     def native(self) -> LoopFit:
-        """What a simulator holds alone, fitted when somebody wants it."""
+        """The fit of what a simulator holds alone, made when somebody wants it."""
         return native_fit(self.search, self.fit)
 
     @cached_property
