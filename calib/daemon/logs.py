@@ -21,7 +21,6 @@ class JsonFormatter(logging.Formatter):
     """time, level, logger, message, the fields given as `extra`, and the exception if there is one."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line of JSON."""
         line = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),

@@ -42,7 +42,6 @@ class Candidates:
         return len(self.stops)
 
     def kept(self, which: Mask) -> "Candidates":
-        """These combinations alone."""
         return Candidates(self.joint, self.stops[which], self.poses[which], self.lever[which])
 
 

@@ -460,7 +460,6 @@ class Journal:
         return sum(row.state == "pending" for row in self.proposals())
 
     def proposal(self, number: int) -> ProposalRow | None:
-        """The proposal of that id."""
         return self._rows.get(number)
 
     def proposal_numbered(self, number: int) -> ProposalRow | None:

@@ -70,13 +70,9 @@ class Decisions(Protocol):
 class Subscription(Protocol):
     """One client's stream: bounded; a client that is too slow loses the oldest items and never delays the daemon."""
 
-    async def get(self) -> JointsItem | EventItem:
-        """The next item."""
-        ...
+    async def get(self) -> JointsItem | EventItem: ...
 
-    def close(self) -> None:
-        """No more items."""
-        ...
+    def close(self) -> None: ...
 
 
 class DaemonView(Protocol):

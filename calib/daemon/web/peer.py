@@ -61,7 +61,6 @@ UNKNOWN = Peer("unknown", "unknown", tcp=True)
 
 
 def peer_of(scope: Scope) -> Peer:
-    """The peer of a request."""
     found = scope.get(PEER, UNKNOWN)
     return found if isinstance(found, Peer) else UNKNOWN
 
@@ -140,7 +139,6 @@ class BoundedProtocol(H11Protocol):
             self.cut()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the deadlines."""
         self._stop_the_clock()
         self._stop_waiting()
         self.admission.leave(self)
