@@ -90,7 +90,6 @@ class LineLimit(logging.Filter):
         self._buckets: dict[str, tuple[float, float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a line is written."""
         left, since, missing = self._buckets.get(record.name, (self._burst, record.created, 0))
         left = min(self._burst, left + max(record.created - since, 0.0) * self._per_second)
         if left < 1.0:

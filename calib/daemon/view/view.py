@@ -83,9 +83,7 @@ class DaemonView(Protocol):
         """Approval and rejection of proposals."""
         ...
 
-    def status(self) -> Status:
-        """State, bus and records."""
-        ...
+    def status(self) -> Status: ...
 
     def joints(self) -> tuple[JointNow, ...]:
         """Every joint as of the newest snapshot, base to tip."""
@@ -125,9 +123,7 @@ class DaemonView(Protocol):
         """Likewise in pieces that fit in memory; what it raises it raises at the first."""
         ...
 
-    def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
-        """Newest first."""
-        ...
+    def proposals(self, limit: int = 200) -> tuple[Proposal, ...]: ...
 
     def subscribe(self) -> Subscription:
         """A new client of the stream, which begins with the present joints."""

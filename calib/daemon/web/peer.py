@@ -112,7 +112,6 @@ class BoundedProtocol(H11Protocol):
             self.loop.call_later(FIRST_SECONDS, self.admission.admit)
 
     def begin(self) -> None:
-        """It is this connection's turn."""
         self.transport.resume_reading()
 
     def give_way(self) -> None:
@@ -152,7 +151,6 @@ class BoundedProtocol(H11Protocol):
         self.admission.stuck(self)
 
     def resume_writing(self) -> None:
-        """As uvicorn's."""
         self._stop_waiting()
         self.admission.moves(self)
         super().resume_writing()
