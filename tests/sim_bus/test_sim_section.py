@@ -76,7 +76,7 @@ def test_torque_ends_where_the_drives_of_the_arm_file_end_not_the_effort_of_the_
     plant = SimulatedArm(described, Truth.of(described)).plant
     plant.set_servo(np.zeros(2), np.zeros(2), np.full(2, 30.0))
     plant.step(np.array([25.0, 20.0]), np.array([25.0, 20.0]), 0.004)
-    np.testing.assert_allclose(plant.drive_torque, [25.0, 20.0], atol=1e-9)
+    np.testing.assert_allclose(plant.data.qfrc_actuator, [25.0, 20.0], atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", ["radian", "degree"])
