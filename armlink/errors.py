@@ -21,6 +21,12 @@ class Refused(ArmlinkError):
     exit_status = 1
 
 
+class Declined(ArmlinkError):
+    """A person answered a question with no."""
+
+    exit_status = 130
+
+
 class BusFault(ArmlinkError):
     """The bus or a device on it failed; the joints were left safe."""
 

@@ -35,11 +35,9 @@ class BusGroup:
         return self.members[self.tags[name] >> BUS_SHIFT]
 
     def open_port(self, as_node: bool = False) -> "GroupPort":
-        """See CanBus."""
         return GroupPort([member.open_port(as_node) for member in self.members])
 
     def open_listening_port(self) -> "GroupPort":
-        """See CanBus."""
         ports = [member.open_listening_port() for member in self.members]
         return StampedGroup(ports) if all(isinstance(port, StampedPort) for port in ports) else GroupPort(ports)
 
@@ -57,7 +55,6 @@ class BusGroup:
             wait = min(_SLICE, max(0.0, end - time.monotonic()))
 
     def shutdown(self) -> None:
-        """Close every bus."""
         for member in self.members:
             member.shutdown()
 
@@ -77,7 +74,6 @@ class GroupPort:
 
     @property
     def dropped(self) -> int:
-        """Frames lost on all buses."""
         return sum(port.dropped for port in self.members)
 
     def send(self, can_id: int, data: bytes) -> None:

@@ -38,9 +38,7 @@ class CanBus(Protocol):
         """A port for a listener: a StampedPort if the interface timestamps frames."""
         ...
 
-    def shutdown(self) -> None:
-        """Close the bus and its ports."""
-        ...
+    def shutdown(self) -> None: ...
 
 
 class MessageSource(Protocol):
@@ -60,9 +58,7 @@ class MessageSource(Protocol):
         """The next message, or None after `timeout` seconds (None: wait without limit)."""
         ...
 
-    def shutdown(self) -> None:
-        """Close the bus."""
-        ...
+    def shutdown(self) -> None: ...
 
 
 class MessageBus(CanBus, MessageSource, Protocol):

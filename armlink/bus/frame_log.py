@@ -99,11 +99,9 @@ class FrameLog:
         self._flushed = 0
 
     def __enter__(self) -> Self:
-        """The log itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Complete the file."""
         self._writer.stop()
 
     def write(self, message: can.Message, stamp: int) -> None:
@@ -313,5 +311,4 @@ class _WholeLines:
         raise NotImplementedError
 
     def close(self) -> None:
-        """Close the file."""
         self._stream.close()

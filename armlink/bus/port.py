@@ -35,9 +35,7 @@ class Port(Protocol):
     """Frames with their flags; error frames are counted."""
 
     @property
-    def errors(self) -> int:
-        """Error frames received."""
-        ...
+    def errors(self) -> int: ...
 
     @property
     def dropped(self) -> int:

@@ -23,7 +23,6 @@ class DriveEvent(NamedTuple):
 
     @property
     def text(self) -> str:
-        """In words."""
         return f"emergency {self.code}, {self.meaning}" if self.code else self.meaning
 
 

@@ -24,7 +24,6 @@ class BusLoad:
 
     @property
     def what(self) -> str:
-        """In words."""
         joints, load = ("1 joint", "loads") if self.joints == 1 else (f"{self.joints} joints", "load")
         return f"{joints} at {self.rate:g} Hz {load} the bus by up to {self.share:.0%} of {self.bus.bitrate} bit/s"
 

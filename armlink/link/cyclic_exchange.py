@@ -125,7 +125,6 @@ class Loop:
                 self._others[can_id | tag] = take
 
     def reset_counters(self) -> None:
-        """Restart the counters."""
         self.stats, self.bits, self._first, self._counted = Stats(), 0, None, 0
         self.board.came, self.board.errors = [0] * self.n, 0
         self._dropped = self._port.dropped

@@ -22,7 +22,6 @@ class ReadingBounds:
 
     @classmethod
     def none(cls, n: int) -> "ReadingBounds":
-        """No bounds."""
         return cls(np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf))
 
     def check(self, names: tuple[str, ...], position: Array, target: Array) -> None:

@@ -109,7 +109,6 @@ class CycleStats:
         )
 
     def as_json(self) -> dict[str, object]:
-        """The report by field name."""
         return asdict(self.report())
 
 

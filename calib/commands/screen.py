@@ -91,7 +91,7 @@ class SweepScreen:
 
 
 def confirm(question: str) -> None:
-    """Ask a person at the terminal; without a terminal nobody is asked. Raises typer.Abort where the answer is no."""
+    """Ask a person at the terminal; without a terminal nobody is asked. Raises Declined where the answer is no."""
     if sys.stdin is not None and sys.stdin.isatty():
         ask_to_confirm(question)
 

@@ -36,7 +36,6 @@ class CubeMarsDrive(SimulatedDrive):
 
     @property
     def patience(self) -> float:
-        """See SimulatedDrive."""
         return self.can_timeout / LOOP_RATE
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -85,7 +84,6 @@ class CubeMarsDrive(SimulatedDrive):
         self.motor.free()
 
     def reboot(self) -> None:
-        """See SimulatedDrive."""
         self.motor_mode, self.command, self.error = False, NO_COMMAND, 0
         self.motor.free()
 

@@ -83,7 +83,6 @@ class MoteusDrive(SimulatedDrive):
 
     @property
     def watches(self) -> bool:
-        """See SimulatedDrive."""
         return super().watches and self.mode is MoteusMode.POSITION
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -221,12 +220,10 @@ class MoteusDrive(SimulatedDrive):
             self._damp()
 
     def reboot(self) -> None:
-        """See SimulatedDrive."""
         self.mode, self.fault_code, self.command = MoteusMode.STOPPED, 0, dict(COMMANDS)
         self.motor.free()
 
     def inject(self, fault: str, value: float) -> None:
-        """See SimulatedDrive."""
         super().inject(fault, value)
         if fault == "drive.mode":
             self.mode = MoteusMode.BRAKE
@@ -261,5 +258,4 @@ class MoteusFront(AddressedFront[MoteusDrive]):
             drive_at.on_frame(number, data)
 
     def joint_of(self, can_id: int) -> int | None:
-        """See Front."""
         return self.joint_at(can_id >> 8 & 0x7F) if can_id & 0x1FFFFFFF < 0x10000 else None

@@ -80,12 +80,10 @@ class RobStrideDrive(SimulatedDrive):
 
     @property
     def patience(self) -> float:
-        """See SimulatedDrive."""
         return self.parameters[RobStrideParameter.TIMEOUT] * TIMEOUT_UNIT
 
     @property
     def due(self) -> float:
-        """See SimulatedDrive."""
         return min(super().due, self._reports_at)
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -182,13 +180,11 @@ class RobStrideDrive(SimulatedDrive):
         self._stop()
 
     def reboot(self) -> None:
-        """See SimulatedDrive."""
         self.parameters = dict(self._stored)
         self.fault_bits, self._reports_at, self._host = 0, math.inf, HOST
         self._stop()
 
     def inject(self, fault: str, value: float) -> None:
-        """See SimulatedDrive."""
         super().inject(fault, value)
         if fault == "drive.mode":
             self.parameters[RobStrideParameter.RUN_MODE] = int(value)
@@ -211,5 +207,4 @@ class RobStrideFront(AddressedFront[RobStrideDrive]):
             drive.on_frame(can_id & 0x1FFFFFFF, data)
 
     def joint_of(self, can_id: int) -> int | None:
-        """See Front."""
         return self.joint_at(can_id >> 8 & 0xFF) if can_id & EXTENDED else None

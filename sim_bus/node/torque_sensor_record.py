@@ -34,7 +34,6 @@ class SensorRecord:
 
     @property
     def content(self) -> bytes:
-        """Bytes covered by the CRC."""
         return struct.pack("<ffII", self.gain, self.offset, self.record_id, self.date)
 
 
@@ -53,7 +52,6 @@ class TorqueRecord:
         self._crc = zlib.crc32(self.active.content)
 
     def store(self) -> None:
-        """Store the active record."""
         self._kept = self.active
 
     def forget(self) -> None:

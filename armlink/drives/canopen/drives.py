@@ -77,7 +77,6 @@ class CanopenDrives:
     # ---- what they are
 
     def traits(self, joint: int) -> Traits:
-        """See Drives."""
         settings, profile = self.rows[joint].settings, self.wires[joint].profile
         if settings.torque == "record" and settings.calibration is None:
             return self._traits
@@ -94,7 +93,6 @@ class CanopenDrives:
         )
 
     def routes(self) -> Mapping[int, int]:
-        """See Drives."""
         services = (
             TPDO1.cob_base,
             TPDO2.cob_base,
@@ -106,7 +104,6 @@ class CanopenDrives:
         return {base + node: joint for joint, node in enumerate(self.nodes) for base in services}
 
     def commands(self) -> Mapping[int, str]:
-        """See Drives."""
         return self._host_frames.by_id
 
     def intrusion(self, can_id: int, data: bytes) -> str:
@@ -120,7 +117,6 @@ class CanopenDrives:
         return self.m * (each + slow) + longest_frame_bits(0)
 
     def cycle_ids(self) -> frozenset[int]:
-        """See Drives."""
         return frozenset((objects.SYNC_ID,))
 
     def services(self, ask: Ask) -> tuple[NodeServices, ...]:
@@ -131,11 +127,9 @@ class CanopenDrives:
         return self._services
 
     def missing(self, ask: Ask) -> list[int]:
-        """See Drives."""
         return [joint for joint, services in enumerate(self.services(ask)) if not services.present()]
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
-        """See Drives."""
         found = []
         for joint, services in enumerate(self.services(ask)):
             address = self.rows[joint].settings.address
@@ -149,7 +143,6 @@ class CanopenDrives:
         return found
 
     def positions(self, ask: Ask) -> list[float]:
-        """See TellsPosition."""
         found = []
         for services, row in zip(self.services(ask), self.rows, strict=True):
             try:
@@ -244,11 +237,9 @@ class CanopenDrives:
         return self.cycle.frames(orders, now)
 
     def sent(self, joint: int) -> Order | None:
-        """See Drives."""
         return self.cycle.sent(joint)
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives."""
         joint = self._joint_of.get(can_id - RPDO1.cob_base)
         order = None if joint is None else self.cycle.decoded(joint, data)
         if joint is None or order is None:
@@ -258,7 +249,6 @@ class CanopenDrives:
     # ---- frames to readings
 
     def fill(self, board: Board, places: Sequence[int]) -> dict[int, Callable[[bytes], None]]:
-        """See FillsBoard."""
         return self._readings.fill(board, places)
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
@@ -303,7 +293,6 @@ class CanopenDrives:
     # ---- states
 
     def power(self, joint: int) -> Power:
-        """See Drives."""
         return _POWERS.get(state_of(self.known.statuses[joint]), Power.UNKNOWN)
 
     def state_request(self, joint: int) -> list[Frame]:
@@ -311,21 +300,17 @@ class CanopenDrives:
         return []
 
     def lets_go(self, joint: int) -> bool:
-        """See Drives."""
         return self.power(joint) in (Power.OFF, Power.READY, Power.FAULT)
 
     def ready(self, joint: int) -> bool:
-        """See Drives."""
         displayed = self.wires[joint].entries.get(TPDO3.name, ())
         told = len(displayed) < 2 or self.known.displays[joint] == self.cycle.modes[joint]
         return self.power(joint) is Power.ON and told
 
     def alarm(self) -> BusFault | None:
-        """See Drives."""
         return faults.alarm(self.known)
 
     def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
-        """See Drives."""
         known, own = self.known, self.cycle.own_modes(modes)
         if self._sound == (own, known.displays, known.statuses):
             return None
@@ -335,19 +320,15 @@ class CanopenDrives:
         return fault
 
     def has_restarted(self, joint: int) -> bool:
-        """See Drives."""
         return joint in self.known.restarted
 
     def own_stop(self, joint: int) -> str:
-        """See Drives."""
         return faults.stopped_itself(self.known, joint)
 
     def stuck(self, joint: int, target: Power, seconds: float) -> str:
-        """See Drives."""
         return faults.stuck(self.known, joint, TARGETS[target], self.cycle.modes[joint], seconds)
 
     def forget(self, restarts: bool = False) -> None:
-        """See Drives."""
         if restarts:
             self.known.restarted.clear()
         self.cycle.forget_walk()
@@ -355,21 +336,17 @@ class CanopenDrives:
         self.known.node_states.clear()
 
     def temperature(self, joint: int, ask: Ask) -> float:
-        """See Drives."""
         return device.read_temperature(self.services(ask)[joint])
 
     def serial_number(self, joint: int, ask: Ask) -> str:
-        """See TellsSerialNumber."""
         return device.serial_number(self.services(ask)[joint])
 
     # ---- calibration in the controller
 
     def read_calibration(self, joint: int, ask: Ask) -> Calibration:
-        """See KeepsCalibration."""
         return torque_sensor_record.read_record(self.services(ask)[joint])
 
     def write_calibration(self, joint: int, ask: Ask, calibration: Calibration, store: bool = False) -> Calibration:
-        """See KeepsCalibration."""
         return torque_sensor_record.write_record(self.services(ask)[joint], calibration, store)
 
 

@@ -49,7 +49,6 @@ class Mounting:
 
     @classmethod
     def of(cls, arm: ArmFile) -> "Mounting":
-        """From the arm file."""
         settings = [joint.settings for joint in arm.require_link().joints]
         direction, zero, gear = (
             np.array([float(getattr(each, key)) for each in settings]) for key in ("direction", "zero", "gear")
