@@ -1,5 +1,6 @@
 """CiA 402 drives on one bus: what they are, their set-up by SDO, states and calibration; cycles are in `cyclic`."""
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -21,13 +22,14 @@ from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.pdo import RPDO1, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
 from armlink.drives.canopen.profile import Profile, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
-from armlink.drives.canopen.units import assumed_units, read_units
+from armlink.drives.canopen.units import assumed_units, read_units, unit_doubt
 from armlink.drives.family import Ask
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
 from armlink.errors import ArmlinkError, BusFault
 from armlink.torque_calibration import Calibration
 
+log = logging.getLogger("armlink")
 SDO_RESPONSE_ID = 0x580
 _POWERS = {
     DriveState.ENABLED: Power.ON,
@@ -190,6 +192,8 @@ class CanopenDrives:
     def _set_up(self, joint: int, services: NodeServices, limits: Limits, profile: Profile) -> tuple[Wire, Setup]:
         row, known = self.rows[joint], self.known
         unit = read_units(services, row)
+        if doubt := unit_doubt(services, row):
+            log.warning(doubt)
         check_fits(row, limits, unit)
         supported = self.offered(services, joint)
         device.configure(services, row, unit, limits, self.protection, supported, profile)
