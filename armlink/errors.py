@@ -46,7 +46,6 @@ class HostLate(Stall):
         self.late, self.limit, self.then = late, limit, then
 
     def __reduce__(self) -> tuple[type["HostLate"], tuple[float, float, str]]:
-        """Passes from process to process."""
         return type(self), (self.late, self.limit, self.then)
 
 

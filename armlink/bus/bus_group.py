@@ -31,7 +31,6 @@ class BusGroup:
         self.channel_info = " and ".join(member.channel_info for member in self.members)
 
     def member(self, name: str) -> MessageBus:
-        """The bus of this name in the arm file."""
         return self.members[self.tags[name] >> BUS_SHIFT]
 
     def open_port(self, as_node: bool = False) -> "GroupPort":
@@ -63,7 +62,6 @@ class GroupPort:
     """The ports of several buses as one."""
 
     def __init__(self, members: Sequence[Port]) -> None:
-        """In the order of the buses."""
         self.members = tuple(members)
         self._numbers = [port.fileno() for port in self.members if isinstance(port, Selectable)]
 

@@ -17,9 +17,7 @@ class CanBus(Protocol):
     """An open bus."""
 
     @property
-    def channel_info(self) -> str:
-        """Its name for messages."""
-        ...
+    def channel_info(self) -> str: ...
 
     @property
     def clock(self) -> Clock | None:
@@ -45,9 +43,7 @@ class MessageSource(Protocol):
     """A bus that gives access to all messages, extended, remote and error frames too, with their timestamps."""
 
     @property
-    def channel_info(self) -> str:
-        """Its name for messages."""
-        ...
+    def channel_info(self) -> str: ...
 
     @property
     def clock(self) -> Clock | None:
@@ -70,9 +66,7 @@ class TimedBus(Protocol):
     """A bus whose frames have their own timestamps, such as a log."""
 
     @property
-    def ended(self) -> bool:
-        """Whether no more frames will come."""
-        ...
+    def ended(self) -> bool: ...
 
     def stamp(self) -> float:
         """Time of the newest frame since the first [s]."""

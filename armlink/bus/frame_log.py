@@ -127,7 +127,6 @@ class LogBus(InProcessBus):
 
     @property
     def ended(self) -> bool:
-        """Whether every frame has been taken."""
         return self._next is None
 
     def now(self) -> float:

@@ -38,7 +38,6 @@ class InProcessBus(ABC):
         return InProcessPort(self)
 
     def open_listening_port(self) -> Port:
-        """A port without timestamps."""
         return InProcessPort(self)
 
     @abstractmethod

@@ -61,9 +61,7 @@ class Port(Protocol):
 class Selectable(Protocol):
     """A port that `select` can wait for."""
 
-    def fileno(self) -> int:
-        """File descriptor of its socket."""
-        ...
+    def fileno(self) -> int: ...
 
 
 @runtime_checkable

@@ -92,7 +92,6 @@ class Field:
         self._room, self._at = self.slack, -math.inf
 
     def see(self, value: float, now: float) -> None:
-        """A reading came from the wire."""
         self._readings = [*self._readings[-1:], (value, now)]
 
     def refusal(self, data: bytes, now: float, power: bool = True) -> str:

@@ -53,7 +53,6 @@ def overload(arm: ArmFile, spec: str | None = None) -> str:
 
 
 def _buses(link: LinkSection, spec: str | None) -> Iterator[tuple[Bus, list[LinkJoint]]]:
-    """Each bus with its joints."""
     if spec is not None:
         yield resolve_bus(spec, link.bus), list(link.joints)
         return

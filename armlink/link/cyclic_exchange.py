@@ -135,7 +135,6 @@ class Loop:
         return self._port.dropped - self._dropped
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame and count it."""
         self._port.send(can_id, data)
         self.count(1, len(data))
 

@@ -48,5 +48,4 @@ class Crossed(Refused):
         """The Sample that showed it."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Passes from process to process."""
         return type(self), (self.name, self.joint, self.bound, self.position, self.target), {"sample": self.sample}

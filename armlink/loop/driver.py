@@ -50,9 +50,7 @@ class ArmDriver(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(self, *error: Any) -> None:
-        """Stop the joints and close the bus."""
-        ...
+    def __exit__(self, *error: Any) -> None: ...
 
     def scan(self) -> list[DriveIdentity]:
         """Identity and state of each joint's controller."""

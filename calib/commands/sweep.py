@@ -168,7 +168,6 @@ def _run(
     seed: int,
     check_stops: bool,
 ) -> "tuple[Preflight, SweepData]":
-    """Enable the arm, check it and sweep it."""
     from calib.creep.choice import sweep_motion
     from calib.creep.run import run_creep
     from calib.sweep.preflight import find_stops, listen

@@ -38,7 +38,6 @@ class Candidates:
 
     @property
     def count(self) -> int:
-        """Number of combinations, C."""
         return len(self.stops)
 
     def kept(self, which: Mask) -> "Candidates":

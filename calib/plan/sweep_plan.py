@@ -159,7 +159,6 @@ def _lightest(
 
 
 def _sweep(planned: PlannedArm, name: str, options: Candidates, pick: int) -> Sweep:
-    """The sweep at one of the combinations."""
     section, limits = planned.section, planned.limits
     joint, stops = options.joint, options.stops[pick]
     steps = np.linspace(*sweep_range(section, limits, joint), section.steps)

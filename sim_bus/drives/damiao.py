@@ -181,7 +181,6 @@ class DamiaoFront:
         }
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
         if can_id & (EXTENDED | REMOTE):
             return
         if can_id == REGISTERS_ID:

@@ -247,7 +247,6 @@ class MoteusFront(AddressedFront[MoteusDrive]):
     """All moteus controllers on one bus: which of them a frame is for."""
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
         if can_id & REMOTE:
             return
         number = can_id & 0x1FFFFFFF

@@ -70,7 +70,6 @@ class ODriveAxis(SimulatedDrive):
         return min(super().due, *self._next.values())
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """A message to this axis."""
         command = can_id & 0x1F
         if can_id & REMOTE:
             self._send_message(command)
@@ -209,7 +208,6 @@ class ODriveFront(AddressedFront[ODriveAxis]):
     """All ODrive axes on one bus: which of them a frame is for."""
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
         if can_id & EXTENDED:
             return
         drive = self._addressed.get((can_id & 0x7FF) >> 5)

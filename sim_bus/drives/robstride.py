@@ -87,7 +87,6 @@ class RobStrideDrive(SimulatedDrive):
         return min(super().due, self._reports_at)
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """A frame whose target is this drive."""
         kind = kind_of(can_id)
         if len(data) != 8:
             return
@@ -199,7 +198,6 @@ class RobStrideFront(AddressedFront[RobStrideDrive]):
     """All RobStride drives on one bus: which of them a frame is for."""
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
         if not can_id & EXTENDED or can_id & REMOTE:
             return
         drive = self._addressed.get(can_id & 0xFF)

@@ -88,7 +88,6 @@ class Node:
         return self._values[index, sub]
 
     def value(self, index: int, sub: int = 0) -> int:
-        """Current value of an integer object."""
         entry = variable(index, sub)
         assert entry is not None
         return int(np.frombuffer(self.raw(index, sub), DTYPES[entry.data_type])[0])

@@ -41,7 +41,6 @@ class TorqueRecord:
     """The active record, the staged one, and the one in non-volatile memory."""
 
     def __init__(self) -> None:
-        """Records of a new controller."""
         self._kept = SensorRecord()
         self.reset()
 

@@ -74,7 +74,6 @@ class DamiaoDrives(MitDrives):
         return {frames.REGISTERS_ID: "register request", **super().commands(), **others}
 
     def poll(self, first: bool) -> list[Frame]:
-        """Requests for the state alone."""
         return [(frames.REGISTERS_ID, frames.refresh_request(settings.id)) for settings in self._settings]
 
     # ---- set-up

@@ -124,7 +124,6 @@ class MoteusDrives(BasicDrives):
         return self.m * (2 * NOMINAL_BITS + (8 * payload + 2 * FAST_BITS) * 1.25 / FASTER)
 
     def poll(self, first: bool) -> list[Frame]:
-        """Queries alone."""
         return [
             (_flagged(frames.identifier(settings.source, settings.id, True)), frames.pack({}, QUERY))
             for settings in self._settings

@@ -85,7 +85,6 @@ def by_joint(groups: Sequence[Group]) -> tuple[tuple[Group, int], ...]:
 
 
 def traits_of(groups: Sequence[Group]) -> list[Traits]:
-    """Traits of every joint, in joint order."""
     return [group.drives.traits(number) for group, number in by_joint(groups)]
 
 

@@ -79,9 +79,7 @@ class DaemonView(Protocol):
     """Everything that the web layer can reach. Nothing here commands torque or motion."""
 
     @property
-    def decisions(self) -> Decisions:
-        """Approval and rejection of proposals."""
-        ...
+    def decisions(self) -> Decisions: ...
 
     def status(self) -> Status: ...
 
