@@ -59,7 +59,7 @@ def calibrate(
     if all_creep(data):
         if apply:
             raise BadInput("--apply: the host keeps the calibration of these drives: the record is in force without it")
-        calibrate_creep(data, arm_file, store, json_file)
+        calibrate_creep(data, arm_file, store, json_file, report)
         suggest(command_line("identify", *map(str, directories), arm=arm, store=store))
         return
     drives = drives_of(data)

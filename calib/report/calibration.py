@@ -50,7 +50,7 @@ def write_report(done: Calibrated, path: Path) -> None:
 
 def sections(done: Calibrated) -> list[ReportSection]:
     """The results, for a part of another report."""
-    return [_sensors(done), _comparison(done), *_sweeps(done), _left_out(done)]
+    return [_comparison(done), _sensors(done), *_sweeps(done), _left_out(done)]
 
 
 def _identity(done: Calibrated) -> ReportSection:
