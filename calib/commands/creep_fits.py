@@ -29,9 +29,9 @@ def calibrate_creep(
     out = results(json_file)
     _show(fit, data, out)
     if report is not None:
-        from calib.report.creep import write_report
+        from calib.report.calibration import write_creep_report
 
-        write_report(fit, record, [each.reason for one in data for each in contacts(one)], report)
+        write_creep_report(fit, record, [each.reason for one in data for each in contacts(one)], report)
     out.print(f"record {record.id} is current: it corrects readings and commands when the arm is opened next")
     write_json(json_file, {"schema": "armlink.creep/1", "record": record.id, **_answer(fit, data)})
 

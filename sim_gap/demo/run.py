@@ -31,7 +31,7 @@ from calib.observer.watch_loop import WatchHistory, watch
 from calib.plan.types import SweepPlan
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
-from calib.report import calibration, creep
+from calib.report import calibration
 from calib.report.figures import verify_figure
 from calib.report.page import ReportSection, paragraph
 from calib.sweep.dataset import SweepData
@@ -248,7 +248,10 @@ class Demo:
         account.note(not_identifiable={f"{joint}.{name}": why for (joint, name), why in fit.reasons.items()})
         swept = "was swept without and with"
         if isinstance(fit, CreepCalibration):
-            swept, parts = "crept through its range without, with and again without", creep.sections(fit.fit)
+            swept, parts = (
+                "crept through its range without, with and again without",
+                calibration.creep_sections(fit.fit),
+            )
             friction = {name: _estimate(fit.fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
             friction["coulomb"]["true"] = true["coulomb"]
             account.note(friction=friction, disturbed=fit.findings, sag=None)
