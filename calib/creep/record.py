@@ -153,7 +153,6 @@ def gravity_fit(fit: CreepFit) -> GravityFit:
 
 
 def gravity_record(fit: CreepFit, arm_file: ArmFile, calibration: CalibrationRecord | None) -> GravityRecord:
-    """The same as a record."""
     return gravity_fit(fit).record(arm_file, calibration)
 
 
@@ -196,7 +195,6 @@ class CreepCalibration:
         return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
 
     def record(self, arm_file: ArmFile) -> CalibrationRecord:
-        """The calibration record, with friction."""
         return calibration_record(self.fit, arm_file)
 
     @staticmethod

@@ -100,7 +100,6 @@ def _final_plan(
 
 
 def sparkline(values: Sequence[float]) -> str:
-    """A curve of one character a value."""
     low, high = min(values), max(values)
     steps = (len(BARS) - 1) / max(high - low, 1e-12)
     return "".join(BARS[round((value - low) * steps)] for value in values)
@@ -139,7 +138,6 @@ class _StepPass(SweepPass):
         self.refuge = mover.position.copy()
 
     def save(self, reading: StaticReading) -> None:
-        """Put a reading on disk and report."""
         self.writer.append(reading)
         self.readings.append(reading)
         made = len(self.readings) - self._at_start

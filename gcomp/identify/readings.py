@@ -65,11 +65,9 @@ class StaticReadings:
         return ~np.isnan(self.torque)
 
     def __len__(self) -> int:
-        """Number of readings, K."""
         return len(self.position)
 
     def rows(self, which: Mask | slice) -> "StaticReadings":
-        """These readings alone."""
         return StaticReadings(*(column[which] for column in self._columns()))
 
     def blocks(self, size: int = 2048) -> Iterator["StaticReadings"]:

@@ -395,7 +395,6 @@ class Journal:
     def add_event(
         self, time: datetime, t: float, kind: str, joint: str | None, text: str, evidence: dict[str, Any]
     ) -> int:
-        """Append an event and return its id."""
         number, self._next_event = self._next_event, self._next_event + 1
         statement = "INSERT INTO events(id, time, t, kind, joint, text, evidence) VALUES (?, ?, ?, ?, ?, ?, ?)"
         with self.transaction():
@@ -453,18 +452,15 @@ class Journal:
         self._write(statement, proposal, _iso(time), state, by, note, proposal, proposal=proposal)
 
     def proposals(self, limit: int = 200) -> list[ProposalRow]:
-        """Those on disk, newest first."""
         return list(self._rows.values())[:limit]
 
     def pending(self) -> int:
         return sum(row.state == "pending" for row in self.proposals())
 
     def proposal(self, number: int) -> ProposalRow | None:
-        """The proposal of that id."""
         return self._rows.get(number)
 
     def proposal_numbered(self, number: int) -> ProposalRow | None:
-        """The newest proposal of that number."""
         return next((row for row in self._rows.values() if row.number == number), None)
 
     # ---- belief and history
@@ -485,7 +481,6 @@ class Journal:
             return None
 
     def add_history(self, time: datetime, t: float, record: str | None, estimate: dict[str, Any]) -> None:
-        """Append the estimates of all joints."""
         statement = "INSERT INTO history(time, t, record, estimate) VALUES (?, ?, ?, ?)"
         self._write(statement, _iso(time), t, record, json.dumps(estimate))
 

@@ -27,7 +27,6 @@ class LingeringTransport:
         return getattr(self._plain, name)
 
     def is_closing(self) -> bool:
-        """Whether nothing more can be sent."""
         return self._lingers or self._plain.is_closing()
 
     def write(self, data: bytes) -> None:
@@ -67,12 +66,10 @@ class _Drain(asyncio.Protocol):
         self._end = self._loop.call_later(LINGER_SECONDS, self._transport.abort)
 
     def data_received(self, data: bytes) -> None:
-        """Discard it."""
         self._bytes_left -= len(data)
         if self._bytes_left < 0:
             self._transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Pass on to the connection's own protocol."""
         self._end.cancel()
         self._owner.connection_lost(exc)
