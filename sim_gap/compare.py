@@ -103,7 +103,7 @@ def compare_models(
     base: str | None = None,
     tip: str | None = None,
 ) -> ModelComparison:
-    """The gap that each model leaves of the same recordings. Raises BadInput for a model or recording that cannot be used."""
+    """The gap that each model leaves of the same recordings. Raises BadInput where one cannot be used."""
     labels = list(labels) or [f"recording {i + 1}" for i in range(len(recordings))]
     squares: list[Array] = []
     free: list[Array] = []
