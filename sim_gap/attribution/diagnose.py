@@ -41,7 +41,7 @@ from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.model_selection import select_model
-from sim_gap.search.stepwise_search import StepwiseSearch
+from sim_gap.search.term_equations import TermChoice
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
@@ -151,7 +151,7 @@ def _placed(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
     return without_disturbances(judge, estimate.predict(judge))
 
 
-def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch, EffectEstimate]:
+def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[TermChoice, EffectEstimate]:
     """The search of the library and the fit (`_searched`); again without what disturbed the arm, if anything did."""
     search, estimate = _searched(fit, library)
     data = estimate.store.data
@@ -159,10 +159,10 @@ def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch, E
     return (search, estimate) if undisturbed is data else _searched(undisturbed, library)
 
 
-def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch, EffectEstimate]:
+def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[TermChoice, EffectEstimate]:
     """The search of the library and the fit; again if a body is mounted in different ways, kept if that is better."""
     search = select_model(ColumnStore(fit), library)
-    estimate = EffectEstimate(search.normal.store, search.active)
+    estimate = EffectEstimate(search.equations.store, search.current)
     for _ in range(MOUNTED):
         signals = estimate.store.data.signals
         angles = mounts(estimate)
@@ -170,9 +170,9 @@ def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch,
             break
         turned = tuple(replace(s, mount=angle) for s, angle in zip(signals, angles, strict=True))
         again = select_model(ColumnStore(ResidualSet(turned, fit.layout)), library)
-        if again.score > search.score - CLEARLY:
+        if again.score > search.score - CLEARLY * search.equations.measurements:
             break
-        search, estimate = again, EffectEstimate(again.normal.store, again.active)
+        search, estimate = again, EffectEstimate(again.equations.store, again.current)
     return search, estimate
 
 

@@ -13,18 +13,17 @@ from sim_gap.effects.effect import (
     InverseEffect,
     Key,
     Plausibility,
+    Ratings,
     SearchHints,
     Shape,
     Signature,
-    added_or_taken_off,
     as_fitted_and_shape,
+    between,
 )
 from sim_gap.residuals.layout import ChannelLayout
 from sim_gap.residuals.preprocess import PreparedSignals
 
 COULOMB = ("friction.coulomb",)
-NOISE = 0.01
-"""Coulomb friction below zero that is noise [N·m]."""
 SLOWEST = 0.05
 """Usual speed of a joint from which dry friction in the model may be taken for viscous [rad/s]."""
 VELOCITIES = (0.03, 0.06, 0.12, 0.25, 0.5)
@@ -41,28 +40,22 @@ def dry(beneath: Beneath) -> float:
     return float(beneath["friction.coulomb"][0] + beneath["nominal"][0])
 
 
-def _dry_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+def _dry_above_nominal(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
     """The arm may have less friction than the model, of both kinds: one alone stands for both at the usual speed."""
-    loss, damping, _, speed = beneath["nominal"]
-    return added_or_taken_off(float(coefficients[0]), float(loss + damping * speed), beneath, NOISE)
+    return -ratings.friction - ratings.damping * ratings.speed, ratings.torque
 
 
-def _viscous_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
-    loss, damping, _, speed = beneath["nominal"]
-    return added_or_taken_off(float(coefficients[0]), float(damping + loss / max(speed, SLOWEST)), beneath)
+def _viscous_above_nominal(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
+    speed = max(ratings.speed, SLOWEST)
+    return -ratings.damping - ratings.friction / speed, ratings.torque / speed
 
 
-def _below_self_locking(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
-    return bool(0.0 <= coefficients[0] < SELF_LOCKING)
+def _up_to_rated(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
+    return 0.0, ratings.torque
 
 
-def _above_minus_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
-    """Real gears can have less friction at low speed than Coulomb's: breakaway is then negative."""
-    return bool(coefficients[0] > -dry(beneath))
-
-
-def _below_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
-    return bool(abs(coefficients[0]) < dry(beneath))
+def _below_dry(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
+    return -ratings.dry, ratings.dry
 
 
 def _stribeck(s: PreparedSignals, joint: int, shape: Shape) -> Array:
@@ -91,17 +84,17 @@ EFFECTS = (
     InverseEffect(
         "friction.coulomb",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.03, background_nm=True, allows=_dry_above_nominal),
+        Plausibility(prior_penalty=0, background_std=0.03, background_nm=True, bounds=_dry_above_nominal),
     ),
     InverseEffect(
         "friction.viscous",
         Signature.at_motor(lambda s, joint, _: s.v[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.02, background_nm=True, allows=_viscous_above_nominal),
+        Plausibility(prior_penalty=0, background_std=0.02, background_nm=True, bounds=_viscous_above_nominal),
     ),
     InverseEffect(
         "friction.stribeck",
         Signature.at_motor(_stribeck),
-        Plausibility(allows=_above_minus_dry),
+        Plausibility(bounds=_up_to_rated),
         SearchHints(shapes_for=_velocities, alternatives=_viscous_or_load),
         needs=COULOMB,
         parameters_of=as_fitted_and_shape,
@@ -109,13 +102,13 @@ EFFECTS = (
     InverseEffect(
         "friction.asymmetric",
         Signature.at_motor(lambda s, joint, _: np.abs(s.direction[:, joint])),
-        Plausibility(allows=_below_dry),
+        Plausibility(bounds=_below_dry),
         needs=COULOMB,
         parameters_of=_ratio,
     ),
     InverseEffect(
         "friction.load",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint] * np.abs(s.model[:, joint])),
-        Plausibility(allows=_below_self_locking),
+        Plausibility(bounds=between(0.0, SELF_LOCKING)),
     ),
 )
