@@ -232,9 +232,11 @@ class LinearTerms:
         floor = 1e-6 * np.diag(gram) + 1e-300
         if len(index):
             change = self.fit(index.tolist())[index]
-            through = np.linalg.lstsq(gram[np.ix_(index, index)], gram[index], 1e-12)[0]
+            scale = 1.0 / np.sqrt(np.maximum(np.diag(gram)[index], 1e-300))
+            own = gram[np.ix_(index, index)] * scale * scale[:, None] + RIDGE * np.eye(len(index))
+            half = np.linalg.solve(np.linalg.cholesky(own), scale[:, None] * gram[index])
             left = side - gram[:, index] @ change
-            gram = gram - gram[:, index] @ through
+            gram = gram - half.T @ half
         else:
             left = side
         out = np.zeros(len(candidates))

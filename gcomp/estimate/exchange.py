@@ -18,6 +18,8 @@ MOST_EFFECTS = 60
 """Largest number of effects of a choice."""
 AS_GOOD = 1e-3
 """Fall of the cost that is none."""
+PAIRED = 5
+"""Candidates that are tried together with another one, where none pays alone."""
 ROUNDS = 4
 """Times that steps and exchanges follow one another."""
 
@@ -123,6 +125,19 @@ class EffectChoice(Generic[Name]):
             if parts:
                 yield self.pruned([*rest, *parts], parts)
 
+    def pair(self) -> bool:
+        """Add two effects of which neither pays without the other, such as friction that grows with a load beside a
+        mass that the model lacks."""
+        return self.step(self._pairs(), self.score - 2.0 * self.least)
+
+    def _pairs(self) -> Iterator[list[Name]]:
+        offered = self._rest(self.current)
+        for name in self.shortlist(self.current, offered, PAIRED) if offered else ():
+            more = self.with_needs(name, self.current)
+            rest = [n for n in self._rest(more) if n not in self.effects[name].excludes]
+            for other in self.shortlist(more, rest, PAIRED) if rest else ():
+                yield self.with_needs(other, more)
+
     def pruned(self, names: Sequence[Name], doubtful: Sequence[Name]) -> list[Name]:
         """These effects without those of the doubtful ones that do not pay."""
         best, kept = self.judge(names), list(names)
@@ -141,6 +156,6 @@ class EffectChoice(Generic[Name]):
                     pass
             while self.backward():
                 pass
-            if not self.exchange():
+            if not self.exchange() and not self.pair():
                 break
         return self.current

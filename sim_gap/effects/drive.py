@@ -26,6 +26,9 @@ from sim_gap.effects.effect import (
 )
 from sim_gap.residuals.preprocess import PreparedSignals
 
+ROTOR = 0.3
+"""Usual size of a reflected rotor inertia, as a share of the stretched arm's inertia about its base: geared drives are
+matched to their load within a factor of some."""
 LONGEST = 0.2
 """Longest time that counts as a lag or delay [s]."""
 
@@ -81,7 +84,11 @@ EFFECTS = (
     InverseEffect(
         "actuator.rotor_inertia",
         Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
-        Plausibility(prior_penalty=0, bounds=_above_nominal),
+        Plausibility(
+            every_joint=True,
+            prior_std=lambda signals, _place: np.full(1, ROTOR * signals.arm.stretched_inertia),
+            bounds=_above_nominal,
+        ),
     ),
     delay_effect("actuator.lag", _missing(_lag), 0.01, LONGEST),
     delay_effect("actuator.delay", _missing(_delay), 0.01, LONGEST),

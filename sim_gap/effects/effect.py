@@ -141,8 +141,10 @@ def between(low: float, high: float) -> Bounds:
 class Plausibility:
     """Priors of an effect, and the values that can exist."""
 
+    every_joint: bool = False
+    """Whether every joint has it, as all gears rub: then only its size is in question, and it costs nothing."""
     prior_penalty: int = 3
-    """Number of extra coefficients that the effect is charged for: 0 if every arm has it, more if few have."""
+    """Number of extra coefficients that the effect is charged for: 0 if many arms have it, more if few have."""
     prior_mean: float = 0.0
     """Prior mean of the coefficients: 1 if the shape alone determines the effect."""
     prior_std: Callable[[PreparedSignals, int], Array] = lambda _signals, _place: np.full(1, np.inf)

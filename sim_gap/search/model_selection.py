@@ -16,8 +16,6 @@ from sim_gap.search.term_equations import TermChoice, TermEquations
 from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
 
 MOMENTS, BODY = "link.mass_moment", "link.payload"
-SURE_FRICTION = ("friction.coulomb", "friction.viscous")
-"""Effects that every joint has."""
 
 
 def one_body(store: ColumnStore, choice: TermChoice, offered: Sequence[Term]) -> list[Term] | None:
@@ -75,15 +73,9 @@ def search_again(
 
 def first_search(store: ColumnStore, library: Sequence[str]) -> tuple[list[Term], list[Term]]:
     """The terms that are offered to the search about the estimate, and those that a search about the nominal model
-    selects: one that begins with nothing, and one with the friction that every arm has. Of an arm that swings free,
-    dry and viscous friction explain the torque together, and neither does alone.
-    """
-    equations = TermEquations(store, candidates(store.data, library))
-    friction = [term for term in equations.terms if term.effect in SURE_FRICTION]
-    starts = [TermChoice(equations), TermChoice(equations, friction)]
-    for start in starts:
-        start.run()
-    choice = min(starts, key=lambda start: start.score)
+    selects."""
+    choice = TermChoice(TermEquations(store, candidates(store.data, library)))
+    choice.run()
     return likely_shapes(choice), choice.current
 
 

@@ -103,7 +103,8 @@ class TermEquations:
                 tuple(other for key in keys for other in forms.get(key, ()))
                 for keys in (term.beneath, term.alternatives(self.layout))
             )
-            price = 0.0 if term.effect in usual else self.price(term)
+            likely = term.form.plausibility
+            price = 0.0 if term.effect in usual or likely.every_joint else self.price(term)
             numbers = tuple(self.index([term]).tolist())
             out[term] = Effect(term, numbers, needs, price=price, excludes=excluded, simpler=simpler)
         return out
@@ -130,7 +131,7 @@ class TermEquations:
 
 
 class TermChoice(EffectChoice[Term]):
-    """A choice among the terms of some equations."""
+    """A choice among the terms of some equations; it begins with what every joint has."""
 
     def __init__(
         self,
@@ -140,7 +141,8 @@ class TermChoice(EffectChoice[Term]):
         least: float = 0.0,
     ) -> None:
         self.equations, self.usual = equations, usual
-        super().__init__(equations.linear, equations.effects(usual), current, least)
+        every = [term for term in equations.terms if term.form.plausibility.every_joint and term not in current]
+        super().__init__(equations.linear, equations.effects(usual), [*current, *every], least)
 
     def values(self, terms: Sequence[Term] | None = None) -> dict[Term, Array]:
         """Coefficients of a fit of some terms, of those chosen if none are given."""
