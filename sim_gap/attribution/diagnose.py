@@ -11,6 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
@@ -29,14 +31,14 @@ from sim_gap.attribution.friction_compensation import find_compensations, held_i
 from sim_gap.attribution.position_answer import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_quiet, is_within
-from sim_gap.checks.check import check_recordings, unchecked_note
+from sim_gap.checks.check import check_recordings, times_in_motion, unchecked_note
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joints import match_joints
 from sim_gap.checks.position_command import check_position_only, is_position_only
 from sim_gap.effects.registry import library_without
 from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model
 from sim_gap.residuals.disregarded_rows import without_disturbances
-from sim_gap.residuals.preprocess import prepare, require_length
+from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, SHORTEST_S, prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
@@ -213,7 +215,7 @@ def _checked(
     names = () if matched[0].names == default_names(matched[0].n) else matched[0].names
     sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n, hinges)
     alone = all(is_position_only(recording) for recording in matched)
-    require_length(matched, labels, together=alone)
+    require_length(matched, labels, 0.0 if alone else SHORTEST_PIECE_S)
     if alone:
         checked, found = check_position_only(sim.arm, matched, labels[: len(matched)], stated)
     else:
@@ -222,11 +224,15 @@ def _checked(
 
 
 def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording]]:
-    """Each recording without its end, and the ends."""
+    """Each recording without its end, and the ends: what is fitted and what judges both hold motion, if the arm comes
+    to rest before its end as one does that swings free."""
     first, last = [], []
     for recording in recordings:
         span = recording.t[-1] - recording.t[0]
         cut = recording.t[-1] - max(OWN_HELDOUT * span, min(OWN_HELDOUT_S, 0.5 * span))
+        moved = times_in_motion(recording)
+        if len(moved):
+            cut = min(cut, max(float(np.quantile(moved, 1.0 - OWN_HELDOUT)), recording.t[0] + SHORTEST_S))
         first.append(slice_rows(recording, recording.t < cut))
         last.append(slice_rows(recording, recording.t >= cut))
     return first, last

@@ -54,7 +54,7 @@ Bounds = Callable[[Ratings, Shape], tuple[Array | float, Array | float]]
 """Least and largest coefficients of an effect that can exist."""
 
 Channel = Literal["any", "sensor", "motor", "command"]
-"""The channel without which an effect cannot show."""
+"""A channel without which an effect cannot show."""
 Side = Literal["link", "motor", "drive", "distortion", "reading", "command"]
 """Where in the chain from link to command an effect acts: on the torque of the links, between link and motor, on the
 motor's report of all that, in the sensor before its gain, on the sensor's reading, between command and motor."""
@@ -68,7 +68,7 @@ class Signature:
 
     columns: Callable[[PreparedSignals, ChannelLayout, int, Shape], Columns]
     """Columns at the work rate, by row."""
-    channel: Channel = "any"
+    channel: Channel | tuple[Channel, ...] = "any"
     whole_arm: bool = False
     """Whether it belongs to the arm as a whole instead of to one joint or link."""
     recordings: Callable[[Shape], tuple[int, ...]] = lambda _shape: ()
@@ -92,7 +92,8 @@ class Signature:
     def places(self, layout: ChannelLayout) -> range:
         """Joints or links at which it may be; empty if these channels cannot show it."""
         channels = {"sensor": layout.sensor, "motor": layout.motor, "command": layout.commanded}
-        if self.channel != "any" and channels[self.channel] is None:
+        needed = self.channel if isinstance(self.channel, tuple) else (self.channel,)
+        if any(each != "any" and channels[each] is None for each in needed):
             return range(0)
         return range(1 if self.whole_arm else layout.n)
 

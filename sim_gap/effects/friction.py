@@ -1,5 +1,7 @@
 """Friction between motor and torque sensor: it shows on the motor side, and without a motor channel, in `tau`.
 
+What rubs behind the sensor, on the link side, shows in `tau` against the model.
+
 F(v) = (Fc + Fb·exp(−(v/vs)²) + μ·|τ|)·(1 ± ratio) + d·|v|, opposing v; τ is the transmitted torque.
 """
 
@@ -20,7 +22,7 @@ from sim_gap.effects.effect import (
     as_fitted_and_shape,
     between,
 )
-from sim_gap.residuals.layout import ChannelLayout
+from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
 
 COULOMB = ("friction.coulomb",)
@@ -61,6 +63,15 @@ def _below_dry(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
 def _stribeck(s: PreparedSignals, joint: int, shape: Shape) -> Array:
     """Breakaway in excess of Coulomb friction, decaying as exp(−(v/vs)²)."""
     return np.asarray(s.direction[:, joint] * np.exp(-((s.v[:, joint] / shape[0]) ** 2)))
+
+
+def _bearing(s: PreparedSignals, layout: ChannelLayout, joint: int, _shape: Shape) -> Columns:
+    """Dry and viscous friction on the link side of a torque sensor."""
+    return {(layout.against_model, joint): np.column_stack([s.direction[:, joint], s.v[:, joint]])}
+
+
+def _bearing_bounds(ratings: Ratings, _shape: Shape) -> tuple[float, Array]:
+    return 0.0, np.array([ratings.torque, ratings.torque / max(ratings.speed, SLOWEST)])
 
 
 def _velocities(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
@@ -105,6 +116,11 @@ EFFECTS = (
         Plausibility(bounds=_below_dry),
         needs=COULOMB,
         parameters_of=_ratio,
+    ),
+    InverseEffect(  # with a sensor alone, or a motor alone, it is not to be told from the friction before the sensor
+        "friction.bearing",
+        Signature(_bearing, ("sensor", "motor")),
+        Plausibility(prior_penalty=0, background_std=0.02, background_nm=True, bounds=_bearing_bounds),
     ),
     InverseEffect(
         "friction.load",
