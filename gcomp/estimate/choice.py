@@ -84,7 +84,7 @@ class LinearTerms:
 
     @cached_property
     def _still(self) -> Array:
-        return np.nan_to_num(self.away)
+        return np.asarray(np.nan_to_num(self.away))
 
     def _fit(self, free: frozenset[int]) -> tuple[Index, Array]:
         """Free parameters (p,) and their changes without each fold, then from all, (F + 1, p)."""
@@ -124,13 +124,13 @@ class LinearTerms:
         while True:
             rest = np.flatnonzero(~held)
             if not len(rest):
-                return values
+                return np.asarray(values)
             fixed = np.flatnonzero(held)
             beside = sides[:, rest] - (grams[:, rest[:, None], fixed] @ values[:, fixed, None])[..., 0]
             values[:, rest] = _solved(grams[:, rest[:, None], rest], beside)
             beyond = ~held & ((values[-1] < low) | (values[-1] > high))
             if not beyond.any():
-                return np.clip(values, low, high)
+                return np.asarray(np.clip(values, low, high))
             values[:, beyond] = np.clip(values[-1], low, high)[beyond]
             held |= beyond
 
@@ -236,14 +236,14 @@ class LinearTerms:
             own = gram[np.ix_(index, index)] * scale * scale[:, None] + RIDGE * np.eye(len(index))
             half = np.linalg.solve(np.linalg.cholesky(own), scale[:, None] * gram[index])
             left = side - gram[:, index] @ change
-            gram = gram - half.T @ half
+            gram = np.asarray(gram - half.T @ half)
         else:
             left = side
         out = np.zeros(len(candidates))
         widths = np.array([len(each) for each in candidates])
         for width in np.unique(widths):
             same = np.flatnonzero(widths == width)
-            own = np.array([candidates[k] for k in same], np.intp)
+            own = np.array([candidates[k] for k in same.tolist()], np.intp)
             blocks = gram[own[:, :, None], own[:, None, :]] + floor[own][:, :, None] * np.eye(width)
             aim = left[own]
             if self.low is not None and self.high is not None:

@@ -38,7 +38,7 @@ from sim_gap.checks.position_command import check_position_only, is_position_onl
 from sim_gap.effects.registry import library_without
 from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model
 from sim_gap.residuals.disregarded_rows import without_disturbances
-from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, SHORTEST_S, prepare, require_length
+from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
@@ -232,7 +232,7 @@ def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recor
         cut = recording.t[-1] - max(OWN_HELDOUT * span, min(OWN_HELDOUT_S, 0.5 * span))
         moved = times_in_motion(recording)
         if len(moved):
-            cut = min(cut, max(float(np.quantile(moved, 1.0 - OWN_HELDOUT)), recording.t[0] + SHORTEST_S))
+            cut = min(cut, max(float(np.quantile(moved, 1.0 - OWN_HELDOUT)), recording.t[0] + SHORTEST_PIECE_S))
         first.append(slice_rows(recording, recording.t < cut))
         last.append(slice_rows(recording, recording.t >= cut))
     return first, last

@@ -58,7 +58,7 @@ class EffectEstimate:
 
     def at_bounds(self) -> list[Term]:
         """Terms of which a coefficient is the largest or least that can exist: its size is not determined."""
-        at = {int(k) for k in self.linear.at_bounds(self.coefficients)}
+        at = {k for k in self.linear.at_bounds(self.coefficients).tolist() if self.coefficients[k]}
         return [term for term in self.terms if at & {*self.equations.at[term].tolist()}]
 
     @cached_property

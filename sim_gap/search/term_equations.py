@@ -41,10 +41,10 @@ class TermEquations:
         """Index of the column that a nonlinear term has beside its own; its coefficient is one."""
         self.size = int(ends[-1]) + len(held)
         self.ratings = Rated(data, store.values)
-        self.linear = self._linear(data)
+        self.linear = self._linear(data, 1 if like else FEWEST)
         store.release()
 
-    def _linear(self, data: ResidualSet) -> LinearTerms:
+    def _linear(self, data: ResidualSet, fewest: int) -> LinearTerms:
         folds = int(data.folds.max()) + 1
         shape = (len(self.rows), folds)
         acting, squares, products = list[NDArray[np.intp]](), list[Array](), list[Array]()
@@ -56,7 +56,7 @@ class TermEquations:
             touching = [term for term in self.terms if row in self.store.columns(term)]
             index, x, y = self.index(touching), self.store.wide(touching, row, self.fixed), data.values[row]
             seen = int(valid[row].sum())
-            each = measurements / seen if seen > FEWEST else 0.0
+            each = measurements / seen if seen >= fewest else 0.0
             gram, side = np.zeros((folds, len(index), len(index))), np.zeros((folds, len(index)))
             for fold in range(folds):
                 pick = valid[row] & (data.folds == fold)
@@ -73,8 +73,8 @@ class TermEquations:
             likely = term.form.plausibility
             spread[at], expected[at] = likely.prior_std(data.signals[0], term.place), likely.prior_mean
             low[at], high[at] = likely.bounds(self.ratings.of(term), term.shape)
-        for at in self.fixed.values():
-            spread[at], expected[at], low[at], high[at] = np.inf, 1.0, 1.0, 1.0
+        beside = list(self.fixed.values())
+        spread[beside], expected[beside], low[beside], high[beside] = np.inf, 1.0, 1.0, 1.0
         for term, values in self.store.pins.items():
             if term in self.at:
                 low[self.at[term]] = high[self.at[term]] = values
@@ -160,9 +160,8 @@ class Rated:
         self.joint = of_motor * np.stack([arm.frictionloss, arm.damping, arm.armature])
         """Friction, damping and armature of the nominal model, (3, n): a sensor on the link reads none of them."""
         self.speed = np.sqrt(np.mean([np.mean(s.v**2, axis=0) for s in data.signals], axis=0))
-        largest = lambda x: np.quantile(np.abs(x), LARGEST, axis=0)  # noqa: E731
-        parts = [largest(s.model) + max_of([largest(x) for x in s.reading.values()]) for s in data.signals]
-        self.torque = max_of(parts)
+        parts = [largest(s.model) + np.max([largest(x) for x in s.reading.values()], axis=0) for s in data.signals]
+        self.torque = np.asarray(np.max(parts, axis=0))
         self.tip_mass, self.mass = float(arm.inertial[-1, 0]), float(arm.inertial[:, 0].sum())
 
     def of(self, term: Term) -> Ratings:
@@ -175,5 +174,5 @@ class Rated:
         return Ratings(friction, damping, armature, speed, torque, self.tip_mass, self.mass, dry, own)
 
 
-def max_of(parts: Sequence[Array]) -> Array:
-    return np.asarray(np.max(parts, axis=0))
+def largest(torque: Array) -> Array:
+    return np.asarray(np.quantile(np.abs(torque), LARGEST, axis=0))
