@@ -3,7 +3,7 @@
 All is linear about one point, so that a choice takes no further evaluation of the problem.
 """
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Generic, TypeVar
@@ -73,14 +73,19 @@ class LinearTerms:
     _fits: dict[frozenset[int], tuple[Index, Array]] = field(default_factory=dict)
 
     @cached_property
-    def _places(self) -> list[Index]:
-        """Place of each parameter among those that act on a channel, −1 for the others, (K,) each."""
-        out = []
-        for index in self.acting:
-            place = np.full(len(self.theta), -1, np.intp)
-            place[index] = np.arange(len(index))
-            out.append(place)
+    def _places(self) -> Index:
+        """Place of each parameter among those that act on a channel, −1 for the others, (C, K)."""
+        out = np.full((len(self.acting), len(self.theta)), -1, np.intp)
+        for c, index in enumerate(self.acting):
+            out[c, index] = np.arange(len(index))
         return out
+
+    def _inside(self, index: Index) -> Iterator[tuple[int, Index, Index]]:
+        """Each channel on which some of these parameters act, which of them do, and their places there."""
+        places = self._places[:, index]
+        there = places >= 0
+        for c in np.flatnonzero(there.any(1) & self.counts.any(1)).tolist():
+            yield c, np.flatnonzero(there[c]), places[c, there[c]]
 
     @cached_property
     def _still(self) -> Array:
@@ -96,12 +101,8 @@ class LinearTerms:
         still = self._still.copy()
         still[index] = 0.0
         moved = np.flatnonzero(still)
-        for c, place in enumerate(self._places):
-            inside = np.flatnonzero(place[index] >= 0)
-            at = place[index[inside]]
-            if not len(at) or not self.counts[c].any():
-                continue
-            own = -self.products[c][:, at]
+        for c, inside, at in self._inside(index):
+            own, place = -self.products[c][:, at], self._places[c]
             if len(moved) and len(beside := moved[place[moved] >= 0]):
                 own -= self.squares[c][:, at[:, None], place[beside]] @ still[beside]
             gram[:, inside[:, None], inside] += self.squares[c][:, at[:, None], at] / self.variance[c]
@@ -151,9 +152,8 @@ class LinearTerms:
         """Weighted squares that remain after a change of the parameters, (C, F), or of one fold (C,)."""
         out = self.totals.copy()
         moved = np.flatnonzero(change)
-        for c, place in enumerate(self._places):
-            own = moved[place[moved] >= 0]
-            at, values = place[own], change[own]
+        for c, own, at in self._inside(moved):
+            values = change[moved[own]]
             bent = (self.squares[c][:, at[:, None], at] @ values) @ values
             out[c] += 2.0 * self.products[c][:, at] @ values + bent
         out = np.maximum(out, 0.0)
@@ -181,9 +181,8 @@ class LinearTerms:
         index = np.concatenate([index, beside])
         values = np.hstack([values[:-1], np.broadcast_to(still[beside], (len(values) - 1, len(beside)))])
         out = self.totals.copy()
-        for c, place in enumerate(self._places):
-            inside = np.flatnonzero(place[index] >= 0)
-            at, own = place[index[inside]], values[:, inside]
+        for c, inside, at in self._inside(index):
+            own = values[:, inside]
             bent = (self.squares[c][:, at[:, None], at] @ own[..., None])[..., 0]
             out[c] += np.sum(own * (2.0 * self.products[c][:, at] + bent), axis=1)
         return np.maximum(out, 0.0)

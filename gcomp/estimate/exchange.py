@@ -10,16 +10,13 @@ import numpy as np
 
 from gcomp.estimate.choice import Effect, LinearTerms, Name, price_of
 
-SHORTLIST = 10
-"""Candidates that are tried in a step, of those that promise most and of those that promise most beyond their price."""
-EXCHANGED = 4
-"""Candidates that are tried in place of one that is there."""
+SHORTLIST, EXCHANGED, PAIRED = 12, 4, 4
+"""Candidates that are tried in a step, in place of an effect that is there, and together with another one where none
+pays alone: those that promise most beyond their price."""
 MOST_EFFECTS = 60
 """Largest number of effects of a choice."""
 AS_GOOD = 1e-3
 """Fall of the cost that is none."""
-PAIRED = 5
-"""Candidates that are tried together with another one, where none pays alone."""
 ROUNDS = 4
 """Times that steps and exchanges follow one another."""
 
@@ -60,24 +57,17 @@ class EffectChoice(Generic[Name]):
         """These effects less one and those that need it."""
         return [n for n in names if n != name and name not in self.effects[n].needs]
 
-    def shortlist(self, names: Sequence[Name], offered: Sequence[Name], most: int = SHORTLIST) -> list[Name]:
-        """Those that promise most beside `names`, by themselves and beyond their price; of the forms of one effect at
-        most two."""
+    def shortlist(self, names: Sequence[Name], offered: Sequence[Name], most: int) -> list[Name]:
+        """Those that promise most beside `names` beyond their price; of the forms of one effect at most two."""
         falls = self.terms.promises(self.free(names), [self.effects[n].parameters for n in offered])
         net = falls - [price_of(self.effects[n]) for n in offered]
-        out = dict[Name, None]()
-        for order in (np.argsort(-falls), np.argsort(-net)):
-            count = 0
-            taken: list[Name] = []
-            for k in order.tolist():
-                name = offered[k]
-                if sum(other in self.effects[name].excludes for other in taken) < 2:
-                    taken.append(name)
-                    count += 1
-                if count == most:
-                    break
-            out.update(dict.fromkeys(taken))
-        return list(out)
+        taken = list[Name]()
+        for k in np.argsort(-net).tolist():
+            if len(taken) == most:
+                break
+            if sum(other in self.effects[offered[k]].excludes for other in taken) < 2:
+                taken.append(offered[k])
+        return taken
 
     def _rest(self, names: Iterable[Name]) -> list[Name]:
         there = {*names}
@@ -104,7 +94,7 @@ class EffectChoice(Generic[Name]):
     def forward(self) -> bool:
         """Add the effect that helps most, if any pays."""
         offered = self._rest(self.current)
-        names = self.shortlist(self.current, offered) if offered else []
+        names = self.shortlist(self.current, offered, SHORTLIST) if offered else []
         return self.step((self.with_needs(name, self.current) for name in names), self.score - self.least)
 
     def backward(self) -> bool:

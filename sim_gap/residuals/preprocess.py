@@ -258,7 +258,7 @@ class Found:
 
 
 def require_length(recordings: Sequence[Recording], labels: Sequence[str], shortest: float = 0.0) -> None:
-    """Raise BadInput if all recordings together are too short for a diagnosis, or one is shorter than `shortest` [s]."""
+    """Raise BadInput if all recordings together are too short, or one is shorter than `shortest` [s]."""
     spans = [float(recording.t[-1] - recording.t[0]) if len(recording.t) else 0.0 for recording in recordings]
     for recording, label, span in zip(recordings, labels, spans, strict=False):
         if len(recording.t) < 4 or sum(spans) < SHORTEST_S or span < shortest:
