@@ -26,7 +26,7 @@ from sim_gap.effects.effect import (
 )
 from sim_gap.residuals.preprocess import PreparedSignals
 
-ROTOR = 0.3
+ROTOR = 1.0
 """Usual size of a reflected rotor inertia, as a share of the stretched arm's inertia about its base: geared drives are
 matched to their load within a factor of some."""
 LONGEST = 0.2
