@@ -16,6 +16,7 @@ from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.column_order import find_changed_order
 from sim_gap.checks.finding import RecordingFinding
+from sim_gap.checks.held_out import is_certain
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.jumps import find_jumps, find_seam, unwrap
 from sim_gap.checks.mapping import SURE, find_mapping
@@ -139,6 +140,8 @@ def check_recording(
             continue
         for look in (_gravity, _unsigned, _mapping, _source):
             findings = look(view)
+            if look in (_gravity, _mapping):
+                findings = _tested(view, findings, label)
             found += findings
             certain = [finding for finding in findings if finding.corrected]
             if len(certain) < len(findings):  # what looks on would see the same fault again
@@ -158,6 +161,20 @@ def check_recording(
     for finding in find_seam(recording, stated):
         raise BadInput(f"{label}: {finding.sentence()}")
     return recording, [*found, *velocity]
+
+
+def _tested(view: "_ChannelView", findings: list[RecordingFinding], label: str) -> list[RecordingFinding]:
+    """The findings; none of those that would be corrected unless the recording is predicted better then than as it is
+    with effects of the arm."""
+    recording = view.recording
+    if not findings or not all(finding.corrected for finding in findings):
+        return findings
+    for finding in findings:
+        recording = _corrected(recording, finding, label, view.arm)
+    s = _prepared(recording, view.arm, label, view.stated)
+    if view.motion.channel not in s.channels:
+        return findings
+    return findings if is_certain(view.mounted, view.motion, motion_of(s, view.motion.channel), view.rate) else []
 
 
 def _prepared(recording: Recording, arm: RigidArm, label: str, stated: Corrections) -> PreparedSignals:
