@@ -43,7 +43,6 @@ class CatalogueEntry:
 
     @property
     def family(self) -> str:
-        """The part of the id before the dot."""
         return self.id.partition(".")[0]
 
     @property

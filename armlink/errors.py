@@ -21,6 +21,12 @@ class Refused(ArmlinkError):
     exit_status = 1
 
 
+class Declined(ArmlinkError):
+    """A person answered a question with no."""
+
+    exit_status = 130
+
+
 class BusFault(ArmlinkError):
     """The bus or a device on it failed; the joints were left safe."""
 
@@ -40,7 +46,6 @@ class HostLate(Stall):
         self.late, self.limit, self.then = late, limit, then
 
     def __reduce__(self) -> tuple[type["HostLate"], tuple[float, float, str]]:
-        """Passes from process to process."""
         return type(self), (self.late, self.limit, self.then)
 
 

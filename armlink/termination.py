@@ -45,7 +45,6 @@ class Presses:
     """Within this context signals do not raise: presses of Ctrl-C are counted, and the other ones wait for the end."""
 
     def __init__(self) -> None:
-        """Nothing was pressed."""
         self.dropped = False
         """Whether Ctrl-C was pressed twice within TWICE_SECONDS."""
         self._pressed_at = float("-inf")
@@ -64,7 +63,6 @@ class Presses:
             signal.signal(number, handler)
 
     def press(self) -> None:
-        """Ctrl-C was pressed."""
         now = time.monotonic()
         self.dropped = self.dropped or now - self._pressed_at <= TWICE_SECONDS
         self._pressed_at = now

@@ -231,7 +231,6 @@ class SimulatedArm:
         self.plant.attach_mass(mass, self.truth.attachment if point is None else point)
 
     def detach_mass(self) -> None:
-        """Remove the attached mass."""
         self.plant.detach_mass()
 
     def turn_by_hand(self, joint: int | str, angle: float) -> None:
@@ -260,7 +259,6 @@ class SimulatedArm:
 
     @property
     def effects(self) -> tuple[EffectSetting, ...]:
-        """Current imperfections."""
         return self._entries
 
     @property
@@ -299,7 +297,6 @@ class SimulatedArm:
         self.outbox.append(frame)
 
     def _address(self) -> None:
-        """Take the nodes' buses."""
         self._place_of = {node.tag | node.node_id: node.place for node in self.nodes}
         self._sdo = {node.tag | 0x600 + node.node_id: node for node in self.nodes}
 

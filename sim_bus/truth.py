@@ -31,7 +31,6 @@ class Truth:
     """Attachment point of a reference mass in the last link's bar frame [m] (3,)."""
 
     def __post_init__(self) -> None:
-        """Freeze the arrays."""
         for name in self.__dataclass_fields__:
             array = np.array(getattr(self, name), float)
             array.flags.writeable = False

@@ -62,6 +62,12 @@ def realdata() -> Path:
 
 
 @pytest.fixture(autouse=True)
+def _no_store_of_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command's `--store` holds for the rest of its process."""
+    monkeypatch.setenv("ARMLINK_STORE", "")
+
+
+@pytest.fixture(autouse=True)
 def _vcan(request: pytest.FixtureRequest) -> None:
     if request.node.get_closest_marker("vcan") and not Path("/sys/class/net/vcan0").exists():
         why = os.environ.get("ARMLINK_NO_VCAN", "run it with scripts/with-vcan .venv/bin/pytest -m vcan")

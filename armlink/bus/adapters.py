@@ -30,11 +30,9 @@ class PythonCanBus:
         self.channel_info = name or str(bus.channel_info)
 
     def __enter__(self) -> Self:
-        """The bus itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Close the bus."""
         self.shutdown()
 
     @property
@@ -43,11 +41,9 @@ class PythonCanBus:
         return str(self.bus.protocol).startswith("CanProtocol.CAN_FD")
 
     def open_port(self, as_node: bool = False) -> Port:
-        """See CanBus."""
         return MessagePort(self.bus, self.channel_info, self.fd, as_node)
 
     def open_listening_port(self) -> Port:
-        """See CanBus."""
         return self.open_port()
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
@@ -66,11 +62,9 @@ class SocketCanBus(PythonCanBus):
     """Linux's SocketCAN."""
 
     def open_port(self, as_node: bool = False) -> Port:
-        """See CanBus."""
         return SocketPort(self.bus.socket, self.channel_info, self.fd, as_node)
 
     def open_listening_port(self) -> Port:
-        """See CanBus."""
         return StampedSocketPort(self.bus.socket, self.channel_info, self.fd)
 
 
@@ -101,7 +95,6 @@ class MulticastBus(PythonCanBus):
         return port
 
     def shutdown(self) -> None:
-        """Close the bus and its ports."""
         for port in self._ports:
             port.close()
         super().shutdown()

@@ -71,11 +71,9 @@ class ArmHold:
                 held.close()
 
     def __enter__(self) -> Self:
-        """The hold itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Release it."""
         self.release()
 
 

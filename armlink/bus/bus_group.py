@@ -31,15 +31,12 @@ class BusGroup:
         self.channel_info = " and ".join(member.channel_info for member in self.members)
 
     def member(self, name: str) -> MessageBus:
-        """The bus of this name in the arm file."""
         return self.members[self.tags[name] >> BUS_SHIFT]
 
     def open_port(self, as_node: bool = False) -> "GroupPort":
-        """See CanBus."""
         return GroupPort([member.open_port(as_node) for member in self.members])
 
     def open_listening_port(self) -> "GroupPort":
-        """See CanBus."""
         ports = [member.open_listening_port() for member in self.members]
         return StampedGroup(ports) if all(isinstance(port, StampedPort) for port in ports) else GroupPort(ports)
 
@@ -57,7 +54,6 @@ class BusGroup:
             wait = min(_SLICE, max(0.0, end - time.monotonic()))
 
     def shutdown(self) -> None:
-        """Close every bus."""
         for member in self.members:
             member.shutdown()
 
@@ -66,7 +62,6 @@ class GroupPort:
     """The ports of several buses as one."""
 
     def __init__(self, members: Sequence[Port]) -> None:
-        """In the order of the buses."""
         self.members = tuple(members)
         self._numbers = [port.fileno() for port in self.members if isinstance(port, Selectable)]
 
@@ -77,7 +72,6 @@ class GroupPort:
 
     @property
     def dropped(self) -> int:
-        """Frames lost on all buses."""
         return sum(port.dropped for port in self.members)
 
     def send(self, can_id: int, data: bytes) -> None:

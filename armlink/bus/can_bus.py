@@ -17,9 +17,7 @@ class CanBus(Protocol):
     """An open bus."""
 
     @property
-    def channel_info(self) -> str:
-        """Its name for messages."""
-        ...
+    def channel_info(self) -> str: ...
 
     @property
     def clock(self) -> Clock | None:
@@ -38,18 +36,14 @@ class CanBus(Protocol):
         """A port for a listener: a StampedPort if the interface timestamps frames."""
         ...
 
-    def shutdown(self) -> None:
-        """Close the bus and its ports."""
-        ...
+    def shutdown(self) -> None: ...
 
 
 class MessageSource(Protocol):
     """A bus that gives access to all messages, extended, remote and error frames too, with their timestamps."""
 
     @property
-    def channel_info(self) -> str:
-        """Its name for messages."""
-        ...
+    def channel_info(self) -> str: ...
 
     @property
     def clock(self) -> Clock | None:
@@ -60,9 +54,7 @@ class MessageSource(Protocol):
         """The next message, or None after `timeout` seconds (None: wait without limit)."""
         ...
 
-    def shutdown(self) -> None:
-        """Close the bus."""
-        ...
+    def shutdown(self) -> None: ...
 
 
 class MessageBus(CanBus, MessageSource, Protocol):
@@ -74,9 +66,7 @@ class TimedBus(Protocol):
     """A bus whose frames have their own timestamps, such as a log."""
 
     @property
-    def ended(self) -> bool:
-        """Whether no more frames will come."""
-        ...
+    def ended(self) -> bool: ...
 
     def stamp(self) -> float:
         """Time of the newest frame since the first [s]."""

@@ -99,11 +99,9 @@ class FrameLog:
         self._flushed = 0
 
     def __enter__(self) -> Self:
-        """The log itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Complete the file."""
         self._writer.stop()
 
     def write(self, message: can.Message, stamp: int) -> None:
@@ -129,7 +127,6 @@ class LogBus(InProcessBus):
 
     @property
     def ended(self) -> bool:
-        """Whether every frame has been taken."""
         return self._next is None
 
     def now(self) -> float:
@@ -313,5 +310,4 @@ class _WholeLines:
         raise NotImplementedError
 
     def close(self) -> None:
-        """Close the file."""
         self._stream.close()

@@ -38,7 +38,6 @@ class InProcessBus(ABC):
         return InProcessPort(self)
 
     def open_listening_port(self) -> Port:
-        """A port without timestamps."""
         return InProcessPort(self)
 
     @abstractmethod
@@ -58,7 +57,6 @@ class InProcessPort:
 
     @property
     def errors(self) -> int:
-        """Error frames received."""
         return self._bus.errors
 
     @property
@@ -67,6 +65,5 @@ class InProcessPort:
         return self._bus.dropped
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send the frames in this order."""
         for can_id, data in frames:
             self.send(can_id, data)

@@ -35,9 +35,7 @@ class Port(Protocol):
     """Frames with their flags; error frames are counted."""
 
     @property
-    def errors(self) -> int:
-        """Error frames received."""
-        ...
+    def errors(self) -> int: ...
 
     @property
     def dropped(self) -> int:
@@ -63,9 +61,7 @@ class Port(Protocol):
 class Selectable(Protocol):
     """A port that `select` can wait for."""
 
-    def fileno(self) -> int:
-        """File descriptor of its socket."""
-        ...
+    def fileno(self) -> int: ...
 
 
 @runtime_checkable

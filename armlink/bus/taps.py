@@ -47,7 +47,6 @@ class TappedBus(InProcessBus):
         raise BusFault(f"bus {self.channel_info}: listen-only")
 
     def shutdown(self) -> None:
-        """Close the source."""
         self._source.shutdown()
 
 
@@ -60,7 +59,6 @@ class TappedPort:
 
     @property
     def errors(self) -> int:
-        """Error frames received."""
         return self._port.errors
 
     @property

@@ -177,29 +177,35 @@ def _answer(arm: str, serial: str, bus: str, results: "list[Result]") -> dict[st
 
 
 def _table(title: str, names: tuple[str, ...], results: "list[Result]") -> "Table":
-    """Groups of checks as rows, joints as columns; a time where one was measured."""
+    """A row for each group of checks: what came of it, with names where joints differ; times where any were taken."""
     from rich.box import SIMPLE
     from rich.table import Table
 
     groups: dict[str, dict[str, list[Result]]] = {}
     for each in results:
         groups.setdefault(each.check.partition(":")[0], {}).setdefault(each.joint, []).append(each)
-    table = Table(box=SIMPLE, title=title)
-    table.add_column("check", no_wrap=True)
-    for name in names:
-        table.add_column(name, justify="right")
+    table = Table("check", "every joint" if len(names) > 1 else names[0], box=SIMPLE, title=title)
     for group, joints in groups.items():
-        table.add_row(group, *(_cell(joints.get(name, [])) for name in names))
+        table.add_row(group, _outcomes({name: _outcome(joints.get(name, [])) for name in names}))
     return table
 
 
-def _cell(results: "list[Result]") -> "Text":
+def _outcomes(found: dict[str, str]) -> "Text":
     from rich.text import Text
 
+    told = [*dict.fromkeys(found.values())]
+    if all(each.endswith(" ms") for each in told):
+        times = sorted(float(each.removesuffix(" ms")) for each in told)
+        return Text(f"{times[0]:g} ms" if len(times) == 1 else f"{times[0]:g} to {times[-1]:g} ms", "green")
+    rows = [(each, ", ".join(name for name in found if found[name] == each)) for each in told]
+    text = rows[0][0] if len(rows) == 1 else "; ".join(f"{each}: {who}" for each, who in rows)
+    return Text(text, "red" if "FAILED" in told else "green" if told != ["–"] else "")
+
+
+def _outcome(results: "list[Result]") -> str:
     outcomes = {each.outcome for each in results}
     if "failed" in outcomes:
-        return Text("FAILED", style="red")
-    times = [each.seconds for each in results if each.seconds is not None]
-    if times:
-        return Text(f"{max(times) * 1e3:.0f} ms", style="green")
-    return Text("ok", style="green") if "passed" in outcomes else Text("–")
+        return "FAILED"
+    if times := [each.seconds for each in results if each.seconds is not None]:
+        return f"{max(times) * 1e3:.0f} ms"
+    return "ok" if "passed" in outcomes else "–"

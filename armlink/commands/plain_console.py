@@ -23,6 +23,7 @@ from rich.text import Text
 
 from armlink.commands.fitted_table import fitted
 from armlink.content.printable_text import printable_text
+from armlink.errors import Declined
 
 PIPE_WIDTH = 10_000
 """Columns of a pipe or file: no line is broken there, unless the environment says COLUMNS."""
@@ -86,7 +87,6 @@ class PlainConsole(Console):
 
 class _PlainStatus(Status):
     def update(self, status: RenderableType | None = None, **options: Any) -> None:
-        """Replace the text."""
         super().update(None if status is None else _plain(status), **options)
 
 
@@ -114,17 +114,15 @@ def command_line(*words: str, **options: object) -> str:
 
 
 def suggest(command: str) -> None:
-    """Name the next command."""
     PlainConsole().print(f"next: {command}", style="bold")
 
 
 def confirm(question: str, *, abort: bool = True, default: bool = False) -> bool:
-    """The answer to a question of yes or no; raises typer.Abort where it is no and `abort`."""
+    """The answer to a question of yes or no; raises Declined where it is no and `abort`."""
     with _question():
         agreed = typer.confirm(printable_text(question), default=default, err=True)
     if abort and not agreed:
-        PlainConsole().print("no: nothing was done")
-        raise typer.Abort
+        raise Declined("the answer was no: nothing was done")
     return agreed
 
 

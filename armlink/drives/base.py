@@ -57,11 +57,9 @@ class BasicDrives:
         return reading
 
     def traits(self, joint: int) -> Traits:
-        """See Drives."""
         return self._traits[joint]
 
     def power(self, joint: int) -> Power:
-        """See Drives."""
         return self.powers[joint]
 
     def state_request(self, joint: int) -> list[Frame]:
@@ -73,7 +71,6 @@ class BasicDrives:
         return self.powers[joint] in (Power.OFF, Power.READY, Power.FAULT)
 
     def ready(self, joint: int) -> bool:
-        """See Drives."""
         return self.powers[joint] is Power.ON
 
     def alarm(self) -> BusFault | None:
@@ -102,20 +99,17 @@ class BasicDrives:
         return False
 
     def own_stop(self, joint: int) -> str:
-        """See Drives."""
         if self.powers[joint] is not Power.STOPPED:
             return ""
         return f"{self.where(joint)} stopped itself: it did not hear its host"
 
     def stuck(self, joint: int, target: Power, seconds: float) -> str:
-        """See Drives."""
         if self.faults[joint]:
             return f"{self.where(joint)}: {self.faults[joint]}"
         found = self.powers[joint].value
         return f"{self.where(joint)}: power stays {found}, expected {target.value} within {seconds:g} s"
 
     def forget(self, restarts: bool = False) -> None:
-        """See Drives."""
         self.faults = [""] * self.m
 
     def missing(self, ask: Ask) -> list[int]:
@@ -123,7 +117,6 @@ class BasicDrives:
         return [each.joint for each in self.identify(ask) if not each.present]
 
     def commands(self) -> Mapping[int, str]:
-        """See Drives."""
         raise NotImplementedError
 
     def intrusion(self, can_id: int, data: bytes) -> str:
@@ -131,7 +124,6 @@ class BasicDrives:
         return self.commands().get(can_id, "")
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
-        """See Drives."""
         raise NotImplementedError
 
     def cycle_bits(self) -> float:
@@ -148,7 +140,6 @@ class BasicDrives:
         return {can_id: joint for can_id, joint in self.routes().items() if joint >= 0}
 
     def routes(self) -> Mapping[int, int]:
-        """See Drives."""
         raise NotImplementedError
 
     def details(self, joint: int, sends: bool) -> Mapping[str, Any]:

@@ -23,7 +23,6 @@ class DriveEvent(NamedTuple):
 
     @property
     def text(self) -> str:
-        """In words."""
         return f"emergency {self.code}, {self.meaning}" if self.code else self.meaning
 
 
@@ -31,7 +30,6 @@ class Board:
     """Buffers of n joints; NaN where nothing has come since the last sample. Values as `Reading` has them."""
 
     def __init__(self, n: int) -> None:
-        """Nothing has come."""
         self.n = n
         self.position = [math.nan] * n
         self.sensor = [math.nan] * n

@@ -129,9 +129,7 @@ class Drives(Protocol):
         """Decode a frame of a drive; None if it tells nothing, or is not as it should be (any bytes may come)."""
         ...
 
-    def power(self, joint: int) -> Power:
-        """Newest power state of a drive."""
-        ...
+    def power(self, joint: int) -> Power: ...
 
     def state_request(self, joint: int) -> list[Frame]:
         """Frames by which a drive tells its state although it is not commanded, and that are no command; empty where

@@ -32,9 +32,7 @@ class FoundDrives(Protocol):
     """The drives of an open bus."""
 
     @property
-    def found(self) -> list[FoundDrive]:
-        """In the order of their ids."""
-        ...
+    def found(self) -> list[FoundDrive]: ...
 
     def positions(self) -> dict[int, float]:
         """Position reading of every drive by its id [rad]; raises BusFault."""

@@ -55,7 +55,6 @@ class MitDrives(BasicDrives):
     """The drives of one bus; their settings have `id` (of commands), `reply` (of replies) and `kd`."""
 
     def __init__(self, joints: Sequence[LinkJoint], traits: Traits, known: Sequence[MitKnown]) -> None:
-        """Nothing is sent."""
         super().__init__(joints, traits)
         self._settings = [joint.settings for joint in joints]
         self._known = known
@@ -67,11 +66,9 @@ class MitDrives(BasicDrives):
         return {reply: joint if replies.count(reply) == 1 else BROADCAST for joint, reply in enumerate(replies)}
 
     def commands(self) -> Mapping[int, str]:
-        """See Drives."""
         return {drive: f"MIT command to {self.names[joint]}" for drive, joint in self._joint_of.items()}
 
     def sent(self, joint: int) -> Order | None:
-        """See Drives."""
         return self._known[joint].sent
 
     def _command(self, joint: int, order: Order) -> Frame:
@@ -100,7 +97,6 @@ class MitDrives(BasicDrives):
         return self._settings[joint].id, data
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives."""
         joint = self._joint_of.get(can_id)
         if joint is None or len(data) != 8:
             return None

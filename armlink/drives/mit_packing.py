@@ -153,7 +153,6 @@ def _nearest(steps: float, most: float) -> int:
 
 @lru_cache(maxsize=256)
 def grid_of(ranges: Ranges, bits: tuple[int, int, int, int, int] = MIT_BITS) -> Grid:
-    """The grid of ranges, made once."""
     return Grid(ranges, bits)
 
 

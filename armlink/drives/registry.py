@@ -12,7 +12,6 @@ GROUP = "armlink.drives"
 
 
 def family_names() -> list[str]:
-    """Names of the installed families."""
     return sorted({point.name for point in contributed(GROUP)})
 
 

@@ -54,7 +54,6 @@ class Source:
     """Where a reading stands: frame id, bytes that it begins with, place and code of the number."""
 
     def __init__(self, found: dict[str, Any]) -> None:
-        """From the policy."""
         self.id, self.prefix = int(found["frame"]), bytes.fromhex(found.get("prefix", ""))
         self.at, self.number = int(found["at"]), _number(found["code"])
 
@@ -93,7 +92,6 @@ class Field:
         self._room, self._at = self.slack, -math.inf
 
     def see(self, value: float, now: float) -> None:
-        """A reading came from the wire."""
         self._readings = [*self._readings[-1:], (value, now)]
 
     def refusal(self, data: bytes, now: float, power: bool = True) -> str:
@@ -137,7 +135,6 @@ class Allowance:
     """How often a frame may come: `per_second`, by default any number, and after a pause `burst` of them at once."""
 
     def __init__(self, found: dict[str, Any]) -> None:
-        """From the policy."""
         self._rate, self._burst = _bound(found, "per_second", math.inf), _bound(found, "burst", 1.0)
         self._room, self._at = self._burst, -math.inf
 
@@ -190,7 +187,6 @@ class Frame:
         return True
 
     def all_fields(self) -> Collection[Field]:
-        """Every field."""
         return self.fields
 
 
@@ -200,7 +196,6 @@ class Requests:
     UPLOAD, SEGMENTS, ABORT, DOWNLOAD = 0x40, (0x60, 0x70), 0x80, 0x23
 
     def __init__(self, found: dict[str, Any]) -> None:
-        """From the policy."""
         self.after: frozenset[tuple[int, bytes]] = frozenset()
         self.allowance = Allowance({"name": "request"})
         self.writes: dict[bytes, Field] = {}
@@ -213,7 +208,6 @@ class Requests:
         return True
 
     def pick(self, data: bytes) -> Iterable[Field] | None:
-        """As Frame.pick."""
         if len(data) != 8:
             return None
         command = data[0]
@@ -229,7 +223,6 @@ class Requests:
         return data[:1] not in (bytes([each]) for each in (self.UPLOAD, self.ABORT, *self.SEGMENTS))
 
     def all_fields(self) -> Collection[Field]:
-        """Every field."""
         return self.writes.values()
 
 
@@ -267,7 +260,6 @@ class Policy:
         self._drives = frozenset(self._sources) | frozenset(self._awaited) | frozenset(self.restarts)
 
     def hear(self, can_id: int, data: bytes, now: float) -> None:
-        """A frame came from the wire."""
         for source, field in self._sources.get(can_id, ()):
             value = source.value(data)
             if value is not None:

@@ -24,7 +24,6 @@ class BusLoad:
 
     @property
     def what(self) -> str:
-        """In words."""
         joints, load = ("1 joint", "loads") if self.joints == 1 else (f"{self.joints} joints", "load")
         return f"{joints} at {self.rate:g} Hz {load} the bus by up to {self.share:.0%} of {self.bus.bitrate} bit/s"
 
@@ -54,7 +53,6 @@ def overload(arm: ArmFile, spec: str | None = None) -> str:
 
 
 def _buses(link: LinkSection, spec: str | None) -> Iterator[tuple[Bus, list[LinkJoint]]]:
-    """Each bus with its joints."""
     if spec is not None:
         yield resolve_bus(spec, link.bus), list(link.joints)
         return

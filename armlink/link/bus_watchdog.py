@@ -25,7 +25,6 @@ class BusWatch:
     """Counts the readings of the cyclic loop, and frames that are no process data."""
 
     def __init__(self, joints: int) -> None:
-        """Nothing was heard."""
         self._crowd = CROWD_PER_JOINT * joints + CROWD
         self._doubled: set[int] = set()
         self._double_cycles = [0] * joints

@@ -316,7 +316,6 @@ class Commander:
         return f"no complete set of readings within {ENABLE_SECONDS} s of cycles: frames are lost"
 
     def restarted(self) -> bool:
-        """Whether some drive has restarted."""
         return any(drives.has_restarted(drive) for drives, drive in self._drives)
 
     @property

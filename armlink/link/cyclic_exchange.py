@@ -125,7 +125,6 @@ class Loop:
                 self._others[can_id | tag] = take
 
     def reset_counters(self) -> None:
-        """Restart the counters."""
         self.stats, self.bits, self._first, self._counted = Stats(), 0, None, 0
         self.board.came, self.board.errors = [0] * self.n, 0
         self._dropped = self._port.dropped
@@ -136,7 +135,6 @@ class Loop:
         return self._port.dropped - self._dropped
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame and count it."""
         self._port.send(can_id, data)
         self.count(1, len(data))
 

@@ -68,9 +68,7 @@ class Ended(Parked, Protocol):
         """Whether some drive lets go when its host falls silent."""
         ...
 
-    def stop(self) -> None:
-        """Stop every joint."""
-        ...
+    def stop(self) -> None: ...
 
     def let_go(self) -> None:
         """Stop every joint and hold none."""

@@ -22,7 +22,6 @@ class ReadingBounds:
 
     @classmethod
     def none(cls, n: int) -> "ReadingBounds":
-        """No bounds."""
         return cls(np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf))
 
     def check(self, names: tuple[str, ...], position: Array, target: Array) -> None:
@@ -49,5 +48,4 @@ class Crossed(Refused):
         """The Sample that showed it."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Passes from process to process."""
         return type(self), (self.name, self.joint, self.bound, self.position, self.target), {"sample": self.sample}

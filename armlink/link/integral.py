@@ -31,7 +31,6 @@ class Integral:
     """Feed-forward torque of one joint."""
 
     def __init__(self) -> None:
-        """Starts from nothing."""
         self.torque = 0.0
         """[N·m]."""
         self._active = False

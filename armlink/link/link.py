@@ -105,11 +105,9 @@ class Link(Calibrations):
         return cls(arm, open_link_bus(bus, arm.require_link()), overloaded=overload(arm, bus))
 
     def __enter__(self) -> Self:
-        """The link itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """See `close`."""
         self.close(cause_of(error))
 
     def close(self, cause: EndCause = EndCause.DONE, tell: Tell | None = None) -> None:
@@ -150,7 +148,6 @@ class Link(Calibrations):
 
     @property
     def last(self) -> Command | None:
-        """The newest command."""
         return self._last
 
     @property

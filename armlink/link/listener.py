@@ -70,11 +70,9 @@ class Listener(Calibrations):
         self._now = 0.0
 
     def __enter__(self) -> Self:
-        """The listener itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Close the bus."""
         self.bus.shutdown()
 
     @property

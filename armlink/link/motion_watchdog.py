@@ -24,10 +24,8 @@ from armlink.link.bus_watchdog import SLOW_CYCLES
 
 LAGS = (1, 2, 4, 8, 16, 32)
 """Mean speeds are taken over so many cycles: the short ones are quick, the long ones exact."""
-ROWS = LAGS[-1] + 1
-"""Cycles whose readings are kept."""
-PRESENT = 4
-"""The first so many lags tell of the present: a mean over up to eight cycles."""
+PRESENT = LAGS[:4]
+"""These tell of the present: a mean over up to eight cycles."""
 REACTION_CYCLES = 3
 """A joint that this reading does not stop is stopped by the next: the reading is a cycle old, the next comes a cycle
 later, and an order acts within a third."""
@@ -48,16 +46,14 @@ IDLE_SHARE = 0.25
 class _Joint:
     """The newest readings of one joint, and what they prove."""
 
-    __slots__ = ("age", "apart", "at", "before", "cycles", "earliest", "fastest", "latest", "most", "newest", "peak",
+    __slots__ = ("age", "apart", "at", "before", "earliest", "latest", "most", "newest", "peak",
                  "positions", "steady", "step", "time", "told", "way", "width")  # fmt: skip
 
-    def __init__(self, step: float, most: float, fastest: int) -> None:
-        """Resolution of its positions [rad], its speed limit [rad/s], and of how many cycles the speeds are kept."""
-        self.step, self.most = step, most
-        self.cycles = self.at = 0
-        self.positions, self.earliest, self.latest = [math.nan] * ROWS, [math.nan] * ROWS, [math.nan] * ROWS
-        self.fastest = [math.inf] * fastest
-        """Greatest speeds that the positions allowed, in the newest cycles [rad/s]."""
+    def __init__(self, step: float, most: float, rows: int) -> None:
+        """Resolution of its positions [rad], its speed limit [rad/s], and of how many cycles the readings are kept."""
+        self.step, self.most, self.at = step, most, 0
+        self.positions, self.earliest, self.latest = [math.nan] * rows, [math.nan] * rows, [math.nan] * rows
+        """Rings whose newest row is `at`, so that row `at − lag` is the one of so many cycles ago."""
         self.newest = -math.inf
         self.steady = 0.0
         """Speed that all means over the newest positions prove [rad/s]."""
@@ -100,8 +96,9 @@ class MotionWatch:
         """(n,)."""
         self.unexplained = [0.0] * self.n
         """Way by the positions less that by the velocities, of late (n,) [rad]."""
-        kept = math.ceil(self._delay / self._period)
-        self._joints = [_Joint(*each, kept) for each in zip(self._step, self._most, strict=True)]
+        self._newest = range(math.ceil(self._delay / self._period))
+        rows = LAGS[-1] + len(self._newest)
+        self._joints = [_Joint(*each, rows) for each in zip(self._step, self._most, strict=True)]
 
     def update(
         self,
@@ -128,17 +125,15 @@ class MotionWatch:
             own.newest = until
         else:
             here = math.nan
-        own.cycles += 1
-        row = own.at = own.cycles % ROWS
+        row = own.at = (own.at + 1) % len(own.positions)
         own.positions[row], own.earliest[row], own.latest[row] = here, since, until
-        least, steady, greatest = _means(own, here, since, until)
+        least, steady = _present(own, here, until)
         proven, own.steady = min(steady, own.steady), steady
-        present = max(speed, least)
+        present = speed if speed > least else least
         self._compare(own, here, since, until, told, present, age)
         ahead = max(least, self._extrapolated(own, here, since, until)) if present > IDLE_SHARE * own.most else least
-        own.fastest[own.cycles % len(own.fastest)] = greatest
         told_before, own.told = own.told, speed if age <= self._delay else 0.0
-        unseen = told_before > own.most and (1 - SHARE) * told_before > max(own.fastest)
+        unseen = told_before > own.most and (1 - SHARE) * told_before > max(_fastest(own, ago) for ago in self._newest)
         explained = WAY + 2 * own.step + SHARE * own.way + (max(self._delay, own.age) + own.width) * own.peak
         return proven, ahead, unseen or abs(own.apart) > explained
 
@@ -147,7 +142,7 @@ class MotionWatch:
         middle, lead, found = (since + until) / 2, REACTION_CYCLES * self._period, 0.0
         exact = own.step / 2 + own.peak * own.width / 2
         for near, far in pairwise(LAGS):
-            at, before = (own.at - near) % ROWS, (own.at - far) % ROWS
+            at, before = own.at - near, own.at - far
             then, earlier = ((own.earliest[each] + own.latest[each]) / 2 for each in (at, before))
             interval, interval_before = middle - then, then - earlier
             if not (interval > 0.0 and interval_before > 0.0):
@@ -182,23 +177,33 @@ class MotionWatch:
             own.before, own.time = here, middle
 
 
-def _means(own: _Joint, here: float, since: float, until: float) -> tuple[float, float, float]:
-    """Least present speed, by any of the means and by all of them, and greatest speed of late that the positions allow
-    [rad/s]."""
-    least = greatest = 0.0
-    steady = math.inf
-    for place, lag in enumerate(LAGS):
-        row = (own.at - lag) % ROWS
-        way = abs(here - own.positions[row])
+def _present(own: _Joint, here: float, until: float) -> tuple[float, float]:
+    """Least present speed, by any of the means and by all of them [rad/s]."""
+    at, positions, earliest, step = own.at, own.positions, own.earliest, own.step
+    least, steady = 0.0, math.inf
+    for lag in PRESENT:
+        longest = until - earliest[at - lag]
+        if longest > 0.0:
+            mean = (abs(here - positions[at - lag]) - step) / longest
+            if mean < 0.0:
+                mean = 0.0
+            if mean > least:  # not NaN
+                least = mean
+            if mean < steady:
+                steady = mean
+    return least, steady if steady < math.inf else 0.0
+
+
+def _fastest(own: _Joint, ago: int) -> float:
+    """Greatest speed that the positions up to so many cycles ago allow [rad/s]."""
+    row, greatest = own.at - ago, 0.0
+    here, since = own.positions[row], own.earliest[row]
+    for lag in LAGS:
+        way = abs(here - own.positions[row - lag])
         if way != way:
-            if not place:
-                greatest = math.inf
+            if lag == LAGS[0]:
+                return math.inf
             continue
-        if place < PRESENT:
-            longest = until - own.earliest[row]
-            if longest > 0.0:
-                mean = max((way - own.step) / longest, 0.0)
-                least, steady = max(least, mean), min(steady, mean)
-        shortest = since - own.latest[row]
+        shortest = since - own.latest[row - lag]
         greatest = max(greatest, (way + own.step) / shortest if shortest > 0.0 else math.inf)
-    return least, steady if steady < math.inf else 0.0, greatest
+    return greatest

@@ -46,9 +46,7 @@ class Parked(Protocol):
     commander: Commander
 
     @property
-    def enabled(self) -> bool:
-        """Whether the joints are enabled."""
-        ...
+    def enabled(self) -> bool: ...
 
     @property
     def latest_position(self) -> Array:
@@ -59,9 +57,7 @@ class Parked(Protocol):
         """One cycle that holds every joint that can be held, or leads it towards `goal` (n,) [rad]."""
         ...
 
-    def disable(self) -> None:
-        """Take the power from every joint."""
-        ...
+    def disable(self) -> None: ...
 
 
 def falling(link: Parked) -> list[str]:

@@ -65,16 +65,13 @@ class Setpoints:
         return cls(np.full(n, Mode.POSITION, np.int8), np.zeros(n), position, guard)
 
     def __len__(self) -> int:
-        """Rows."""
         return len(self.position)
 
     def __getitem__(self, rows: slice) -> "Setpoints":
-        """Some of the rows."""
         torque = self.torque if self.torque.ndim == 1 else self.torque[rows]
         return Setpoints(self.mode, torque, self.position[rows], self.guard)
 
     def command(self, row: int) -> Command:
-        """The command of one row."""
         torque = self.torque if self.torque.ndim == 1 else self.torque[row]
         return Command(self.mode, torque, self.position[row], guard=self.guard)
 

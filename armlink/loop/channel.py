@@ -36,7 +36,6 @@ class Channel:
         """Samples that were dropped since nobody read them."""
 
     def fileno(self) -> int:
-        """For select."""
         return self._socket.fileno()
 
     def put(self, message: Any, sample: bool = False) -> None:
@@ -113,5 +112,4 @@ class Channel:
         return messages
 
     def close(self) -> None:
-        """Close this end."""
         self._socket.close()

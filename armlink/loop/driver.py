@@ -48,13 +48,9 @@ class ArmDriver(Protocol):
         """Counters since the first cycle."""
         ...
 
-    def __enter__(self) -> Self:
-        """The driver itself."""
-        ...
+    def __enter__(self) -> Self: ...
 
-    def __exit__(self, *error: Any) -> None:
-        """Stop the joints and close the bus."""
-        ...
+    def __exit__(self, *error: Any) -> None: ...
 
     def scan(self) -> list[DriveIdentity]:
         """Identity and state of each joint's controller."""
@@ -80,9 +76,7 @@ class ArmDriver(Protocol):
         """Stow the arm in the pose `link.park` of its file and take the power there; raises BadInput, Refused."""
         ...
 
-    def stop(self) -> None:
-        """Quick stop of every joint."""
-        ...
+    def stop(self) -> None: ...
 
     def cycle(self, command: Command) -> Sample:
         """The sample of a cycle in which this command was in force; raises Refused, Crossed, BusFault."""

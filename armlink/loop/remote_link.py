@@ -70,7 +70,6 @@ class RemoteLink:
             raise
 
     def __enter__(self) -> Self:
-        """The link itself."""
         return self
 
     def __exit__(self, kind: object, error: object, tb: object) -> None:
@@ -79,7 +78,6 @@ class RemoteLink:
 
     @property
     def pid(self) -> int:
-        """Process id of the loop."""
         return self._process.pid
 
     @property
@@ -114,16 +112,13 @@ class RemoteLink:
         return found
 
     def start(self) -> None:
-        """As Link.start."""
         self._call("start")
         self._step = self._call("position_step")
 
     def enable(self) -> Sample:
-        """As Link.enable."""
         return self._enabled("enable")
 
     def recover(self) -> Sample:
-        """As Link.recover."""
         return self._enabled("recover")
 
     def _enabled(self, how: str) -> Sample:
@@ -135,40 +130,32 @@ class RemoteLink:
         return sample
 
     def park(self) -> None:
-        """As Link.park."""
         self.inside(park, lambda text: None)
 
     def disable(self) -> None:
-        """As Link.disable."""
         self._call("disable")
 
     def stop(self) -> None:
-        """Quick stop of every joint."""
         self._call("stop")
 
     def read_calibration(self, joint: int) -> Calibration:
-        """As Link.read_calibration."""
         found: Calibration = self._call("read_calibration", joint)
         return found
 
     @property
     def uncalibrated(self) -> tuple[str, ...]:
-        """As Link.uncalibrated."""
         found: tuple[str, ...] = self._call("uncalibrated")
         return found
 
     def read_temperatures(self) -> Array:
-        """As Link.read_temperatures."""
         found: Array = self._call("read_temperatures")
         return found
 
     def drive_serial(self, joint: int) -> DriveSerial:
-        """As Link.drive_serial."""
         found: DriveSerial = self._call("drive_serial", joint)
         return found
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
-        """As Link.write_calibration."""
         found: Calibration = self._call("write_calibration", joint, calibration, store)
         return found
 

@@ -89,7 +89,6 @@ class CycleStats:
         self._waiting = set(self._readings)
 
     def report(self) -> CycleReport:
-        """Statistics up to now."""
         periods, latencies = np.array(self._periods) * 1e3, np.array(self._latencies) * 1e3
         at = np.percentile(latencies, (50, 99, 99.9, 100)).tolist() if latencies.size else [math.nan] * 4
         elapsed = self._sync - self._first
@@ -109,7 +108,6 @@ class CycleStats:
         )
 
     def as_json(self) -> dict[str, object]:
-        """The report by field name."""
         return asdict(self.report())
 
 

@@ -37,11 +37,9 @@ class FoxgloveStream:
         """Where it listens."""
 
     def __enter__(self) -> Self:
-        """The stream itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
-        """End the server."""
         with contextlib.suppress(Exception):
             self._server.stop()
 

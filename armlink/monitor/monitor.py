@@ -80,7 +80,6 @@ class Monitor:
 
     @property
     def frames(self) -> int:
-        """Frames received and sent."""
         return self._loop.stats.frames
 
     @property

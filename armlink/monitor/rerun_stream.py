@@ -35,7 +35,6 @@ class RerunStream:
         self._names = names
 
     def __enter__(self) -> Self:
-        """The stream itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:

@@ -103,7 +103,6 @@ def _plain_cells(line: str) -> list[str]:
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell holds a number."""
     try:
         float(cell)
     except ValueError:

@@ -65,7 +65,6 @@ class RecordingWriter:
         self._flushed = 0
 
     def __enter__(self) -> Self:
-        """The writer itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:

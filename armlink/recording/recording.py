@@ -61,7 +61,6 @@ class Recording:
 
     @property
     def n(self) -> int:
-        """Number of joints."""
         return int(self.position.shape[1])
 
     def channels(self) -> dict[str, Array]:

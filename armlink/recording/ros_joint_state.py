@@ -40,11 +40,6 @@ class JointState(NamedTuple):
     effort: tuple[float, ...]
 
 
-def decode_joint_state(data: bytes) -> JointState:
-    """Decode one message; raises ValueError if the bytes are malformed."""
-    return _decoded(data)[0]
-
-
 def _decoded(data: bytes) -> tuple[JointState, str]:
     """A message, and the frame in its header."""
     from rosbags.serde import SerdeError

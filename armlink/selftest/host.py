@@ -72,35 +72,28 @@ class EchoDrives(BasicDrives):
     """Drives of no real family, which answer each command at once, standing still: what is measured is the host."""
 
     def routes(self) -> dict[int, int]:
-        """See Drives."""
         return {base + joint: joint for joint in range(self.m) for base in (_ANSWER, STOPPED)}
 
     def commands(self) -> dict[int, str]:
-        """See Drives."""
         return {1 + joint: "command" for joint in range(self.m)}
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        """See Drives."""
         self.powers = [Power.ON] * self.m
         return [Setup(0.0, 0.0, 1e-6, frozenset((Mode.POSITION, Mode.TORQUE)))] * self.m
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        """See Drives."""
         return [(1 + joint, _VALUES.pack(order.position, order.torque)) for joint, order in enumerate(orders) if order]
 
     def sent(self, joint: int) -> Order | None:
-        """See Drives."""
         return None
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
-        """See Drives."""
         if can_id >= STOPPED:
             return self.note(Reading(can_id - STOPPED, power=Power.STOPPED))
         position, torque = _VALUES.unpack(data)
         return Reading(can_id - _ANSWER, position, 0.0, torque)
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives."""
         return None
 
 
@@ -115,11 +108,9 @@ class EchoPort:
         self._waiting: deque[Frame] = deque()
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Take one frame."""
         self._waiting.append((can_id - 1 + _ANSWER, data))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Take the frames of a cycle."""
         for can_id, data in frames:
             self.send(can_id, data)
 

@@ -62,7 +62,6 @@ class Tracks:
         self._rows.append((sample.t, [(*readings, *_told(order)) for *readings, order in columns]))
 
     def of(self, joint: int) -> ScaleTrack:
-        """The track of one joint."""
         t = np.array([t for t, _ in self._rows])
         table = np.array([row[joint] for _, row in self._rows]).reshape(-1, 8)
         return ScaleTrack(t, *table.T)

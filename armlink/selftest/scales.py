@@ -99,7 +99,6 @@ class ScaleFinding:
 
     @property
     def text(self) -> str:
-        """In a sentence."""
         what, why = " or ".join(self.quantities), "; ".join(self.evidence)
         if math.isnan(self.factor):
             return f"the reading of {what} is unsteady: {why}"
@@ -179,7 +178,6 @@ def integrated(track: ScaleTrack) -> Evidence | None:
 
 
 def _median(values: Array, weights: Array) -> float:
-    """Weighted median."""
     order = np.argsort(values)
     share = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(share, 0.5 * share[-1])])

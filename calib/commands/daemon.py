@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from calib.commands.options import StoreUrl
+from calib.commands.options import Store
 
 
 class Policies(StrEnum):
@@ -51,7 +51,7 @@ def daemon(
     state: Annotated[
         Path | None, typer.Option(help="Directory of journal and recordings; default the user's state directory.")
     ] = None,
-    store: StoreUrl = None,
+    store: Store = None,
     work: Annotated[
         bool, typer.Option("--work", help="Move the arm among random poses: for trying it on a simulated arm.")
     ] = False,

@@ -1,12 +1,11 @@
 """Floats the arm: gravity is compensated, and it stays where a hand leaves it."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import StoreUrl, WithoutAsking
+from calib.commands.options import JsonFile, Store, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -21,11 +20,9 @@ def hold_afloat(
     record: Annotated[
         str | None, typer.Option(help="Id of a gravity record; default: the current one, else the model's inertials.")
     ] = None,
-    store: StoreUrl = None,
+    store: Store = None,
     yes: WithoutAsking = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write a summary here; - is standard output.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Feed the gravity torque forward until Ctrl-C; then every joint holds where it is.
 

@@ -1,5 +1,6 @@
 """Arguments and options that several commands share."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,8 +33,21 @@ Replaced = Annotated[
         help="Joint whose sensor was exchanged since the last record; may be repeated.", rich_help_panel=APPLY
     ),
 ]
-Store = Annotated[str | None, typer.Option(help="Record store: file or database URL; default: state folder.")]
-StoreUrl = Annotated[str | None, typer.Option(help="Record store: file or database URL.")]
+
+
+def _use_store(store: str | None) -> str | None:
+    """The store of whatever the command opens: the link and the process on the bus take calibrations from it, too."""
+    if store is not None:
+        os.environ["ARMLINK_STORE"] = store
+    return store
+
+
+Store = Annotated[
+    str | None,
+    typer.Option(
+        envvar="ARMLINK_STORE", callback=_use_store, help="Record store: file or database URL; default: state folder."
+    ),
+]
 KeepGoing = Annotated[
     int,
     typer.Option(

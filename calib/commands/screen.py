@@ -46,11 +46,9 @@ class SweepScreen:
         self._task = self._progress.add_task("" if above else title, total=1, left="", text="connecting")
 
     def update(self, done: int, total: int, seconds_left: float, text: str) -> None:
-        """As run_sweep's progress."""
         self._update(done, total, f"{int(seconds_left) // 60}:{int(seconds_left) % 60:02d} left", text)
 
     def count(self, done: int, total: int) -> None:
-        """As run_verify's progress."""
         self._update(done, total, "", "poses")
 
     def _update(self, done: int, total: int, left: str, text: str) -> None:
@@ -93,7 +91,7 @@ class SweepScreen:
 
 
 def confirm(question: str) -> None:
-    """Ask a person at the terminal; without a terminal nobody is asked. Raises typer.Abort where the answer is no."""
+    """Ask a person at the terminal; without a terminal nobody is asked. Raises Declined where the answer is no."""
     if sys.stdin is not None and sys.stdin.isatty():
         ask_to_confirm(question)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import KeepGoing, WithoutAsking
+from calib.commands.options import JsonFile, KeepGoing, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
@@ -51,9 +51,7 @@ def sweep(
     keep_going: KeepGoing = 0,
     yes: WithoutAsking = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.", rich_help_panel="Plan")] = 0,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write plan or outcome here; - is standard output.")
-    ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Sweep every joint, tip to base, and write each reading to disk before the next.
 
@@ -170,7 +168,6 @@ def _run(
     seed: int,
     check_stops: bool,
 ) -> "tuple[Preflight, SweepData]":
-    """Enable the arm, check it and sweep it."""
     from calib.creep.choice import sweep_motion
     from calib.creep.run import run_creep
     from calib.sweep.preflight import find_stops, listen

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from armlink.commands.options import Arm, OtherBus
-from calib.commands.options import JsonFile, KeepGoing, StoreUrl, WithoutAsking
+from calib.commands.options import JsonFile, KeepGoing, Store, WithoutAsking
 
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
@@ -20,7 +20,7 @@ def verify(
     record: Annotated[
         list[str] | None, typer.Option(help="Id of a gravity or calibration record; default: the current ones.")
     ] = None,
-    store: StoreUrl = None,
+    store: Store = None,
     poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the poses.")] = 0,
     keep_going: KeepGoing = 0,

@@ -9,7 +9,7 @@ from calib.commissioning.arm_text import assumed_lines
 from calib.commissioning.bus_checks import bus_findings, turn_findings
 from calib.commissioning.finding import ORDER, SetupFinding
 from calib.commissioning.model_checks import model_findings
-from calib.commissioning.model_judgement import model_errors
+from calib.commissioning.model_judgement import arm_errors
 from calib.commissioning.motion_checks import motion_findings
 from gcomp.errors import GcompError
 
@@ -38,7 +38,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
         return
     impossible = list[SetupFinding]()
     try:
-        impossible += model_errors(arm_file)
+        impossible += arm_errors(arm_file)
         yield from impossible
         if not impossible:
             yield from model_findings(arm_file)

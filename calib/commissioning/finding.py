@@ -17,9 +17,7 @@ class SetupFinding:
     remedy: str
 
     def to_json(self) -> dict[str, Any]:
-        """As machines get it."""
         return {"level": self.level, "what": self.what, "where": self.where, "remedy": self.remedy}
 
     def __str__(self) -> str:
-        """One line for people."""
         return f"{self.where}: {self.what}: {self.remedy}"

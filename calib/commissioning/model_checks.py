@@ -8,9 +8,8 @@ from armlink.arm_file import ArmFile
 from armlink.model_file import NOT_FOUND, UNFETCHED, read_model
 from calib.arm.kinematics import gcomp_arm, model_arm
 from calib.commissioning.finding import SetupFinding
-from calib.commissioning.model_judgement import NO_MASS
+from calib.commissioning.model_judgement import NO_MASS, largest_levers
 from calib.plan.sweep_plan import DEAD_LEVER
-from gcomp.gravity.torque import gravity_levers
 
 SMALL_LEVER = 0.2
 """Γ/g below which the torque gain becomes imprecise; a choice."""
@@ -21,10 +20,6 @@ EARTH_GRAVITY = (9.7, 9.9)
 def model_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     """Findings about kinematics and model; raises BadInput where the model cannot be used at all."""
     where = str(arm_file.path)
-    if arm_file.model_path is None and not any(row.a or row.alpha or row.d for row in arm_file.kinematics.joints):
-        remedy = "give a, alpha and d of every joint, or make the arm file of its URDF or MJCF: armlink new --help"
-        yield SetupFinding("error", "its geometry is not known: nothing can be swept or identified", where, remedy)
-        return
     if arm_file.model_path is None:
         yield SetupFinding(
             "hint",
@@ -84,12 +79,7 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     if not EARTH_GRAVITY[0] < size < EARTH_GRAVITY[1]:
         remedy = "give kinematics.gravity in m/s² in the base frame, such as [0, 0, -9.81]"
         yield SetupFinding("warning", f"gravity is {size:.3g} m/s², not 9.81", f"{where}: kinematics.gravity", remedy)
-        if size < 1e-6:
-            return
-    low = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
-    high = np.where(np.isfinite(arm.upper), arm.upper, np.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (500, arm.n))
-    lever = gravity_levers(arm, poses).max(axis=0) / size
+    lever = largest_levers(arm)
     for joint, name in enumerate(arm.names):
         if lever[joint] < DEAD_LEVER:
             axis = "its axis is vertical" if joint == 0 else "its axis is vertical in every pose"

@@ -7,14 +7,16 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.values import try_limits
-from calib.arm.kinematics import DriveLimits, model_arm
+from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.commissioning.finding import SetupFinding
 from calib.creep.choice import sweep_motion
 from calib.creep.plan import refuse_unbearable_creeps
 from calib.plan.rough_gravity import HAND, guess_of_file, reach
-from calib.plan.sweep_plan import refuse_unbearable_mass
+from calib.plan.sweep_plan import DEAD_LEVER, refuse_unbearable_mass
+from gcomp.arm.arm import Arm
 from gcomp.arm.load import ModelArm
-from gcomp.gravity.torque import gravity_torque
+from gcomp.arrays import Array
+from gcomp.gravity.torque import gravity_levers, gravity_torque
 
 NO_MASS = 1e-9
 """Mass of all moving links that stands for none [kg]: the reader gives massless bodies a negligible one."""
@@ -27,7 +29,7 @@ POSES = 500
 
 def refuse_impossible_model(arm_file: ArmFile) -> None:
     """Raise BadInput in the words of doctor where a model's masses or the torque limits cannot be those of an arm."""
-    for found in model_errors(arm_file):
+    for found in arm_errors(arm_file):
         raise BadInput(str(found))
 
 
@@ -40,6 +42,23 @@ def refuse_impossible_sweep(arm_file: ArmFile, reference_mass: float) -> None:
         refuse_unbearable_creeps(arm_file, reference_mass)
     else:
         refuse_unbearable_mass(arm_file, reference_mass, guess_of_file(arm_file))
+
+
+def arm_errors(arm_file: ArmFile) -> list[SetupFinding]:
+    """Errors of the model, of an arm without geometry, or of one that stands so that gravity loads no joint."""
+    found, where = list(model_errors(arm_file)), str(arm_file.path)
+    if found:
+        return found
+    if arm_file.model_path is None and not any(row.a or row.alpha or row.d for row in arm_file.kinematics.joints):
+        remedy = "give a, alpha and d of every joint, or make the arm file of its URDF or MJCF: armlink new --help"
+        return [SetupFinding("error", "its geometry is not known: nothing can be swept or identified", where, remedy)]
+    if (largest_levers(gcomp_arm(arm_file)) < DEAD_LEVER).all():
+        what, remedy = (
+            "gravity loads no joint in any pose: nothing to calibrate by",
+            "incline the base, then say how here",
+        )
+        return [SetupFinding("error", what, f"{where}: kinematics.gravity", remedy)]
+    return []
 
 
 def model_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:
@@ -61,12 +80,22 @@ def model_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:
         yield from _strength_errors(arm_file, model)
 
 
-def gravity_need(model: ModelArm) -> np.ndarray:
+def largest_levers(arm: Arm) -> Array:
+    """Γ/g (n,) of each joint at its largest in the range of the joints; NaN where there is no gravity."""
+    with np.errstate(invalid="ignore"):
+        levers: Array = gravity_levers(arm, _poses(arm)).max(axis=0) / np.linalg.norm(arm.gravity)
+    return levers
+
+
+def gravity_need(model: ModelArm) -> Array:
     """Largest torque against gravity (n,) [N·m] in the range of the joints."""
-    low, high = np.nan_to_num([model.arm.lower, model.arm.upper], neginf=-np.pi, posinf=np.pi)
-    poses = np.random.default_rng(0).uniform(low, high, (POSES, model.arm.n))
-    need: np.ndarray = np.abs(gravity_torque(model.arm, model.beta, poses)).max(axis=0)
+    need: Array = np.abs(gravity_torque(model.arm, model.beta, _poses(model.arm))).max(axis=0)
     return need
+
+
+def _poses(arm: Arm) -> Array:
+    low, high = np.nan_to_num([arm.lower, arm.upper], neginf=-np.pi, posinf=np.pi)
+    return np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
 
 
 def _mass_error(arm_file: ArmFile, model: ModelArm) -> SetupFinding | None:

@@ -21,7 +21,7 @@ from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_ha
 from calib.commissioning.finding import SetupFinding
 from calib.commissioning.model_checks import file_findings
 from calib.commissioning.model_joints import model_joints
-from calib.commissioning.model_judgement import refuse_impossible_model
+from calib.commissioning.model_judgement import model_errors
 
 RATING_FACTOR = 2.5
 """A drive whose rated torque differs from the model's effort limit by more is doubted; a choice."""
@@ -100,7 +100,8 @@ def new_arm(
         draft.notes.append(f"tip assumed: the model has {len(chains)} arms; the others end in {others} (--tip)")
     draft.name = name or draft.name
     made = NewArm(out, draft)
-    refuse_impossible_model(made.parsed())
+    for found in model_errors(made.parsed()):
+        raise BadInput(str(found))
     _narrow_until_clear(made)
     made.findings += file_findings(made.parsed())
     return made

@@ -74,7 +74,6 @@ class Doubt:
 
     @classmethod
     def of(cls, section: SweepSection) -> Self:
-        """As an arm file states it."""
         return cls(zero=section.creep.zero_std, point=section.known_point)
 
 

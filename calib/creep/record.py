@@ -153,7 +153,6 @@ def gravity_fit(fit: CreepFit) -> GravityFit:
 
 
 def gravity_record(fit: CreepFit, arm_file: ArmFile, calibration: CalibrationRecord | None) -> GravityRecord:
-    """The same as a record."""
     return gravity_fit(fit).record(arm_file, calibration)
 
 

@@ -39,7 +39,6 @@ class Immediate:
         done(outcome)
 
     def drain(self, seconds: float, /) -> bool:
-        """Nothing ever waits."""
         return True
 
 

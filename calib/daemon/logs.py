@@ -21,7 +21,6 @@ class JsonFormatter(logging.Formatter):
     """time, level, logger, message, the fields given as `extra`, and the exception if there is one."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line of JSON."""
         line = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -91,7 +90,6 @@ class LineLimit(logging.Filter):
         self._buckets: dict[str, tuple[float, float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a line is written."""
         left, since, missing = self._buckets.get(record.name, (self._burst, record.created, 0))
         left = min(self._burst, left + max(record.created - since, 0.0) * self._per_second)
         if left < 1.0:

@@ -252,7 +252,6 @@ class _CurrentProcess:
         self._process = process
 
     def sweep(self, poses: int, seed: int, /) -> LoopAnswer | None:
-        """Ask for a tour of poses."""
         return self._process().sweep(poses, seed)
 
 

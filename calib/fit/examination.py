@@ -109,7 +109,6 @@ def _setting(kinematics: Arm, rows: SweepReadings, rated: Array, parameters: Par
 
 
 def _sized(effects: list[UnmodelledEffect], refined: Refined) -> Iterator[tuple[UnmodelledEffect, Array]]:
-    """Each effect with its coefficients."""
     place = 0
     for effect in effects:
         yield effect, refined.coefficients[place : place + len(effect.extras)]

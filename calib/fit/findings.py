@@ -51,7 +51,6 @@ class FitFinding:
 def effect_finding(
     names: tuple[str, ...], effect: UnmodelledEffect, coefficient: Array, refined: Refined, rated: Array
 ) -> FitFinding:
-    """One effect in words."""
     name, gain = names[effect.joint], float(refined.fit.complete.gain[effect.joint]) or 1.0
     value = float(coefficient[0])
     if effect.id == "transmission.spring":

@@ -94,7 +94,8 @@ def _scored(effects: RandomEffects, theta: Array) -> tuple[Array, Array, Array]:
     of_each = level[family]
     square = of_each[:, None] * effects.square * of_each
     square[np.diag_indices_from(square)] += 1.0
-    inverse = linalg.cho_solve(linalg.cho_factor(square, lower=True, check_finite=False), np.eye(len(square)))
+    below = np.tril(linalg.lapack.dpotri(linalg.cholesky(square, lower=True, check_finite=False), lower=True)[0])
+    inverse = below + np.tril(below, -1).T
     shown = np.eye(len(square)) - inverse
     value = inverse @ (of_each * effects.right)  # in levels
     member = (family == np.arange(count)[:, None]).astype(float)

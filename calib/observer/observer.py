@@ -68,7 +68,6 @@ class Observer:
 
     @property
     def rows(self) -> int:
-        """Rests used."""
         return self._tracking.rows
 
     @property

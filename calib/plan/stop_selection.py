@@ -38,11 +38,9 @@ class Candidates:
 
     @property
     def count(self) -> int:
-        """Number of combinations, C."""
         return len(self.stops)
 
     def kept(self, which: Mask) -> "Candidates":
-        """These combinations alone."""
         return Candidates(self.joint, self.stops[which], self.poses[which], self.lever[which])
 
 

@@ -35,7 +35,7 @@ tests/calib/drawn_arms.py."""
 DEAD_LEVER = 0.005
 """Γ/g below which a joint is swept at one combination, for its offset alone (docs/theory.md, section 4.4)."""
 MORE_POSES = 2
-"""Stop combinations per joint that may be added to reach the gains' precision; a choice: each takes minutes."""
+"""Stop combinations per joint that may be added, where they suffice for the gains' precision; each takes minutes."""
 FINEST = 3.0
 """Largest factor of precision by averaging longer: nine times the samples; a choice."""
 HOLDING_RESERVE = 1.1
@@ -61,8 +61,8 @@ def plan_sweep(
     `reference_mass` [kg] is what hangs on the arm during this pass, 0 for nothing; `resolution` (n,) [rad] that of the
     position readings, if known. Without `guess` nothing is known of the masses and no bias torque is set. With the
     scout's guess, combinations that cannot be held within max_torque are left out, the others get their bias torques,
-    and up to `MORE_POSES` more a joint are swept if the gains would not come out as exactly as asked. Raises BadInput
-    if a joint's range is too short to sweep or no combination can be held.
+    and up to `MORE_POSES` more a joint are swept if that makes the gains as precise as asked. Raises BadInput if a
+    joint's range is too short to sweep or no combination can be held.
     """
     planned = PlannedArm.of(arm_file, guess)
     section, goal = planned.section, planned.section.gain_std
@@ -72,7 +72,7 @@ def plan_sweep(
     masses = [given] if given else reference_masses(planned.kinematics, planned.limits, options, guess)
     poses = section.loaded_poses if reference_mass else section.poses
     scout = scout_poses(planned.kinematics, section, planned.limits, seed, planned.geometry)
-    for more in range(MORE_POSES + 1):
+    for more in (*range(MORE_POSES + 1), 0):  # none more where those do not suffice
         sweeps = _choose(planned, options, poses + more, moments, masses[-1])
         mass, gain_std = _lightest(planned, sweeps, scout, masses, resolution)
         if gain_std is None or gain_std <= FINEST * goal:
@@ -81,7 +81,7 @@ def plan_sweep(
     if gain_std is not None and gain_std > ENOUGH * FINEST * goal:
         notes.append(
             f"gains will be known to ± {200 * gain_std / finer:.2g} % only, not ± {200 * goal:.2g} %, even with long"
-            " averages: use a heavier reference mass, or measure where it hangs (sweep.reference_point)"
+            " averages: use a heavier reference mass or more sweep.poses, or measure its place (sweep.reference_point)"
         )
     return SweepPlan(
         sweeps=sweeps,
@@ -159,7 +159,6 @@ def _lightest(
 
 
 def _sweep(planned: PlannedArm, name: str, options: Candidates, pick: int) -> Sweep:
-    """The sweep at one of the combinations."""
     section, limits = planned.section, planned.limits
     joint, stops = options.joint, options.stops[pick]
     steps = np.linspace(*sweep_range(section, limits, joint), section.steps)

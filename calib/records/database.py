@@ -42,7 +42,9 @@ class _Replaced(Exception):
 
 
 def default_url() -> str:
-    """URL of the store in the user's state directory (XDG_STATE_HOME, else ~/.local/state)."""
+    """URL of the store: ARMLINK_STORE, else in the user's state directory (XDG_STATE_HOME, else ~/.local/state)."""
+    if named := os.environ.get("ARMLINK_STORE"):
+        return named
     state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
     return f"sqlite:///{state / 'armlink' / 'records.db'}"
 

@@ -139,7 +139,6 @@ class _StepPass(SweepPass):
         self.refuge = mover.position.copy()
 
     def save(self, reading: StaticReading) -> None:
-        """Put a reading on disk and report."""
         self.writer.append(reading)
         self.readings.append(reading)
         made = len(self.readings) - self._at_start

@@ -53,7 +53,6 @@ class Arm:
 
     @property
     def n(self) -> int:
-        """Number of joints."""
         return len(self.names)
 
     @property

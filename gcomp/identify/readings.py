@@ -65,7 +65,6 @@ class StaticReadings:
         return ~np.isnan(self.torque)
 
     def __len__(self) -> int:
-        """Number of readings, K."""
         return len(self.position)
 
     def rows(self, which: Mask | slice) -> "StaticReadings":

@@ -63,7 +63,6 @@ class Injector:
         self._begin()
 
     def clear(self) -> None:
-        """End all faults."""
         self._planned.clear()
         for joint in range(self.arm.n):
             device = self.arm.device(joint)

@@ -48,7 +48,6 @@ class Fault:
 
     @property
     def kind(self) -> FaultKind:
-        """Its kind."""
         return ALL_KINDS[self.id]
 
     @property

@@ -32,7 +32,6 @@ class SimulatedClock:
         self._arm, self._bus, self._lock = bus.arm, bus, lock
 
     def now(self) -> float:
-        """Simulated seconds since power-on."""
         return self._arm.time
 
     def sleep_until(self, instant: float) -> None:
@@ -90,7 +89,6 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
             self._faults().inject(parse_fault(fault, self.arm.names) if isinstance(fault, str) else fault)
 
     def clear_faults(self) -> None:
-        """End all faults."""
         with self._lock:
             self._faults().clear()
 

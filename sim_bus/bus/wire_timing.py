@@ -38,7 +38,6 @@ class TimedWire:
     """A wire of `bitrate` [bit/s] in front of `line`, with on_frame(), advance() and `outbox` of the arm."""
 
     def __init__(self, line: TimedArm, bitrate: int, transmit_queue: int = TRANSMIT_QUEUE) -> None:
-        """An idle bus."""
         self.line, self.bitrate, self.transmit_queue = line, bitrate, transmit_queue
         self.outbox: deque[Frame] = deque()
         self.time = self._free = 0.0
@@ -84,7 +83,6 @@ class TimedWire:
         self.time = end
 
     def _send_next(self) -> None:
-        """Send the frame that wins arbitration."""
         if self._host and (not self._nodes or self._host[0][0] <= self._nodes[0][0]):
             can_id, data = self._host.popleft()
             self._occupy(can_id, data)
@@ -102,7 +100,6 @@ class TimedWire:
         self._on_wire += time
 
     def _collect(self) -> None:
-        """Collect the nodes' frames."""
         sent = self.line.outbox
         while sent:
             can_id, data = sent.popleft()

@@ -21,7 +21,6 @@ class CubeMarsDrive(SimulatedDrive):
     """One AK drive, with the CAN timeout that its arm file states."""
 
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None], settings: CubeMarsSettings) -> None:
-        """Out of motor mode."""
         super().__init__(motor, send)
         self.address, self.reply = settings.id, settings.reply
         self.can_timeout = settings.can_timeout
@@ -36,7 +35,6 @@ class CubeMarsDrive(SimulatedDrive):
 
     @property
     def patience(self) -> float:
-        """See SimulatedDrive."""
         return self.can_timeout / LOOP_RATE
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -85,7 +83,6 @@ class CubeMarsDrive(SimulatedDrive):
         self.motor.free()
 
     def reboot(self) -> None:
-        """See SimulatedDrive."""
         self.motor_mode, self.command, self.error = False, NO_COMMAND, 0
         self.motor.free()
 
@@ -99,7 +96,6 @@ class CubeMarsFront(AddressedFront[CubeMarsDrive]):
     """All CubeMars drives on one bus: which of them a frame is for."""
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
         if not can_id & (EXTENDED | REMOTE) and (drive := self._addressed.get(can_id)) is not None:
             drive.on_frame(can_id, data)
 

@@ -71,7 +71,6 @@ class DamiaoDrive(SimulatedDrive):
 
     @property
     def patience(self) -> float:
-        """See SimulatedDrive."""
         return self.registers[DamiaoRegister.TIMEOUT] * TIMEOUT_UNIT
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -156,12 +155,10 @@ class DamiaoDrive(SimulatedDrive):
         self._stop(DamiaoStatus.LOST_COMMUNICATION)
 
     def reboot(self) -> None:
-        """See SimulatedDrive."""
         self.registers = dict(self._stored)
         self._stop(DamiaoStatus.DISABLED)
 
     def inject(self, fault: str, value: float) -> None:
-        """See SimulatedDrive."""
         super().inject(fault, value)
         if fault == "drive.mode":
             self.registers[DamiaoRegister.CONTROL_MODE] = int(value)
@@ -184,7 +181,6 @@ class DamiaoFront:
         }
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
         if can_id & (EXTENDED | REMOTE):
             return
         if can_id == REGISTERS_ID:

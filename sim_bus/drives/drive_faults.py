@@ -62,23 +62,19 @@ class FalseReadings:
     """Falsehoods of one joint's frames."""
 
     def __init__(self) -> None:
-        """The truth."""
         self._faults: dict[str, float] = {}
         self._first: dict[str, float] = {}
         """Value that each falsehood began with."""
 
     def begin(self, fault: str, value: float) -> None:
-        """A falsehood begins."""
         self._faults[fault] = value
 
     def end(self) -> None:
-        """All falsehoods end."""
         self._faults.clear()
         self._first.clear()
 
     @property
     def any(self) -> bool:
-        """Whether anything is false."""
         return bool(self._faults)
 
     def repeated(self, quantities: tuple[str, ...]) -> bool:

@@ -83,7 +83,6 @@ class MoteusDrive(SimulatedDrive):
 
     @property
     def watches(self) -> bool:
-        """See SimulatedDrive."""
         return super().watches and self.mode is MoteusMode.POSITION
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -221,12 +220,10 @@ class MoteusDrive(SimulatedDrive):
             self._damp()
 
     def reboot(self) -> None:
-        """See SimulatedDrive."""
         self.mode, self.fault_code, self.command = MoteusMode.STOPPED, 0, dict(COMMANDS)
         self.motor.free()
 
     def inject(self, fault: str, value: float) -> None:
-        """See SimulatedDrive."""
         super().inject(fault, value)
         if fault == "drive.mode":
             self.mode = MoteusMode.BRAKE
@@ -250,7 +247,6 @@ class MoteusFront(AddressedFront[MoteusDrive]):
     """All moteus controllers on one bus: which of them a frame is for."""
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
         if can_id & REMOTE:
             return
         number = can_id & 0x1FFFFFFF
@@ -261,5 +257,4 @@ class MoteusFront(AddressedFront[MoteusDrive]):
             drive_at.on_frame(number, data)
 
     def joint_of(self, can_id: int) -> int | None:
-        """See Front."""
         return self.joint_at(can_id >> 8 & 0x7F) if can_id & 0x1FFFFFFF < 0x10000 else None

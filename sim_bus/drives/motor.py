@@ -106,7 +106,6 @@ class Motor:
         return stiffness / square, damping / square, integral / square
 
     def free(self) -> None:
-        """Take the power away."""
         if self.powered:
             self.powered = False
             self._loops.release(self.joint)

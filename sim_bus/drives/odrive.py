@@ -63,16 +63,13 @@ class ODriveAxis(SimulatedDrive):
 
     @property
     def patience(self) -> float:
-        """See SimulatedDrive."""
         return self._watchdog
 
     @property
     def due(self) -> float:
-        """See SimulatedDrive."""
         return min(super().due, *self._next.values())
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """A message to this axis."""
         command = can_id & 0x1F
         if can_id & REMOTE:
             self._send_message(command)
@@ -193,13 +190,11 @@ class ODriveAxis(SimulatedDrive):
         self._disarm(AxisError.WATCHDOG)
 
     def reboot(self) -> None:
-        """See SimulatedDrive."""
         self.state, self.errors, self.reason = AxisState.IDLE, 0, 0
         self.control_mode = frames.POSITION_CONTROL
         self.motor.free()
 
     def inject(self, fault: str, value: float) -> None:
-        """See SimulatedDrive."""
         super().inject(fault, value)
         if fault == "drive.mode":
             self.control_mode = int(value)
@@ -213,7 +208,6 @@ class ODriveFront(AddressedFront[ODriveAxis]):
     """All ODrive axes on one bus: which of them a frame is for."""
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
         if can_id & EXTENDED:
             return
         drive = self._addressed.get((can_id & 0x7FF) >> 5)
@@ -221,5 +215,4 @@ class ODriveFront(AddressedFront[ODriveAxis]):
             drive.on_frame(can_id & (0x7FF | REMOTE), data)
 
     def joint_of(self, can_id: int) -> int | None:
-        """See Front."""
         return self.joint_at(can_id >> 5) if can_id < 0x800 else None

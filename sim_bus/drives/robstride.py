@@ -80,16 +80,13 @@ class RobStrideDrive(SimulatedDrive):
 
     @property
     def patience(self) -> float:
-        """See SimulatedDrive."""
         return self.parameters[RobStrideParameter.TIMEOUT] * TIMEOUT_UNIT
 
     @property
     def due(self) -> float:
-        """See SimulatedDrive."""
         return min(super().due, self._reports_at)
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """A frame whose target is this drive."""
         kind = kind_of(can_id)
         if len(data) != 8:
             return
@@ -182,13 +179,11 @@ class RobStrideDrive(SimulatedDrive):
         self._stop()
 
     def reboot(self) -> None:
-        """See SimulatedDrive."""
         self.parameters = dict(self._stored)
         self.fault_bits, self._reports_at, self._host = 0, math.inf, HOST
         self._stop()
 
     def inject(self, fault: str, value: float) -> None:
-        """See SimulatedDrive."""
         super().inject(fault, value)
         if fault == "drive.mode":
             self.parameters[RobStrideParameter.RUN_MODE] = int(value)
@@ -203,7 +198,6 @@ class RobStrideFront(AddressedFront[RobStrideDrive]):
     """All RobStride drives on one bus: which of them a frame is for."""
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
         if not can_id & EXTENDED or can_id & REMOTE:
             return
         drive = self._addressed.get(can_id & 0xFF)
@@ -211,5 +205,4 @@ class RobStrideFront(AddressedFront[RobStrideDrive]):
             drive.on_frame(can_id & 0x1FFFFFFF, data)
 
     def joint_of(self, can_id: int) -> int | None:
-        """See Front."""
         return self.joint_at(can_id >> 8 & 0xFF) if can_id & EXTENDED else None

@@ -44,11 +44,9 @@ class SimulatedDrive:
             self.receive(can_id, data)
 
     def receive(self, can_id: int, data: bytes) -> None:
-        """Process a frame."""
         raise NotImplementedError
 
     def answer(self, can_id: int, data: bytes) -> None:
-        """Send a frame, but from an unplugged drive."""
         if not self.unplugged:
             self._send(can_id | CLASSICAL * ("drive.classic" in self.faults), data)
 
@@ -84,7 +82,6 @@ class SimulatedDrive:
 
     @property
     def watches(self) -> bool:
-        """Whether the watchdog runs."""
         return self.motor.powered and "watchdog.off" not in self.faults
 
     def pass_time(self, now: float) -> None:
@@ -104,7 +101,6 @@ class SimulatedDrive:
     # ---- faults
 
     def trip(self) -> None:
-        """The watchdog acts."""
         raise NotImplementedError
 
     def reboot(self) -> None:
@@ -157,13 +153,9 @@ class Front(Protocol):
     """The drives of one family on one bus."""
 
     @property
-    def drives(self) -> Sequence[SimulatedDrive]:
-        """In arm order."""
-        ...
+    def drives(self) -> Sequence[SimulatedDrive]: ...
 
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the bus."""
-        ...
+    def on_frame(self, can_id: int, data: bytes) -> None: ...
 
     def joint_of(self, can_id: int) -> int | None:
         """Joint whose drive sends frames of this identifier, or None."""

@@ -96,7 +96,6 @@ class Imperfections:
     """Loss of the torque constant when warm [1], time constant [s] and rise of temperature [K] of warming up (n, 3)."""
 
     def __post_init__(self) -> None:
-        """Start with a perfect arm."""
         n = len(self.names)
         square, pair = (n, n), (n, 2)
         shapes: dict[str, tuple[int, ...]] = {"ripple": (n, 3), "spring": pair, "tilt": (2,)}

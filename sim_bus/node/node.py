@@ -79,7 +79,6 @@ class Node:
             self._values[key] = bytes(data)
 
     def raw(self, index: int, sub: int = 0) -> bytes:
-        """Current bytes of an object."""
         if (index, sub) in self._signals:
             return bytes(self._signals[index, sub][self.place].tobytes())
         if index == 0x2100:
@@ -89,7 +88,6 @@ class Node:
         return self._values[index, sub]
 
     def value(self, index: int, sub: int = 0) -> int:
-        """Current value of an integer object."""
         entry = variable(index, sub)
         assert entry is not None
         return int(np.frombuffer(self.raw(index, sub), DTYPES[entry.data_type])[0])
@@ -201,11 +199,9 @@ class Node:
     # ---- services
 
     def boot_up(self) -> None:
-        """Say that it has booted."""
         self.send(0x700 + self.node_id, b"\0")
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a frame on its bus."""
         self._put((self.tag | can_id, data))
 
     def on_sdo(self, data: bytes) -> None:

@@ -38,7 +38,6 @@ def _entry(name: str, index: int, sub: int, kind: int, pdo_mappable: bool = Fals
 
 
 def variable(index: int, sub: int) -> ODVariable | None:
-    """The EDS's entry, or None."""
     item = data_sheet().get(index)
     if item is None or isinstance(item, ODVariable):
         return item if sub == 0 else None
@@ -52,7 +51,6 @@ class ObjectArrays:
     """`values[index, sub]` is an (n,) array of the object's type; the arrays are never replaced."""
 
     def __init__(self, n: int) -> None:
-        """Start with the EDS's defaults."""
         entries = [
             entry
             for item in data_sheet().values()

@@ -81,7 +81,6 @@ class PdoGroup:
         return rows
 
     def pack(self) -> bytes:
-        """Pack the current data of all members."""
         for field, signal in self.fields:
             field[:] = signal if self.whole else signal[self.rows]
         return bytes(self.buffer)

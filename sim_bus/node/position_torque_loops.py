@@ -43,7 +43,6 @@ class Loops:
     """Targets and integrators; arrays (n,)."""
 
     def __init__(self, arm: ArmFile, plant: Plant, sensors: JointSensors, signals: ObjectArrays) -> None:
-        """Start with all joints unpowered."""
         section, self.n = sim_section(arm).servo, plant.n
         self._plant, self._sensors = plant, sensors
         self.rated = arm.require_link().rated_torques

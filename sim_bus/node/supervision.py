@@ -67,7 +67,6 @@ class Supervision:
             self.due = min(self.due, time + self._rpdo[joint][number])
 
     def sync(self, time: float) -> None:
-        """A SYNC arrived."""
         if any(self._sync):
             for node in self._nodes:
                 period = self._sync[node.place]

@@ -34,7 +34,6 @@ class SensorRecord:
 
     @property
     def content(self) -> bytes:
-        """Bytes covered by the CRC."""
         return struct.pack("<ffII", self.gain, self.offset, self.record_id, self.date)
 
 
@@ -42,7 +41,6 @@ class TorqueRecord:
     """The active record, the staged one, and the one in non-volatile memory."""
 
     def __init__(self) -> None:
-        """Records of a new controller."""
         self._kept = SensorRecord()
         self.reset()
 
@@ -53,7 +51,6 @@ class TorqueRecord:
         self._crc = zlib.crc32(self.active.content)
 
     def store(self) -> None:
-        """Store the active record."""
         self._kept = self.active
 
     def forget(self) -> None:

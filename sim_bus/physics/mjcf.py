@@ -117,6 +117,7 @@ def _set_options(spec: Any, arm: ArmFile, section: SimSection) -> None:
 
 def _set_joint(joint: Any, section: SimSection) -> None:
     joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+    joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # torque ends where the arm file's drives end
     joint.solref_limit = [max(section.stops.time_constant, 2 * section.step), 1.0]
     joint.solimp_limit = STOP_IMPEDANCE
     _set_friction(joint, section)

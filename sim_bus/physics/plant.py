@@ -149,7 +149,6 @@ class Plant:
         mujoco.mj_forward(self.model, self.data)
 
     def detach_mass(self) -> None:
-        """Remove the attached mass."""
         self.attach_mass(0.0, np.zeros(3))
 
     def gravity_torque(self, q: Array) -> Array:
@@ -185,7 +184,6 @@ class Plant:
 
     @property
     def motor_torque(self) -> Array:
-        """Torque of each motor."""
         return self._motor_torques.copy()
 
     @property

@@ -1,12 +1,14 @@
 """False readings of every family's drives: is the arm stopped before it is fast, or past a stop?
 
-`false_readings.py [--draws 100] [--seed 1] [--family six-damiao …]`; a draw is a pose, a job and one falsehood about
-one joint: its position, velocity or torque frozen, forged or doubled (by a second node that sends in its name), or
-scaled by 0.2 to 5. The job is a motion under position control, or torque control of that joint with a push besides
-gravity. All is in lock-step; speeds and angles are the true ones of the simulated plant, from the end of the set-up to
-the cycle in which the host notices; speeds, until a joint strikes a stop, which throws the others. As many sound draws
-are moved, and none of them may be refused. Exit status 0 where no joint turned 1.5 times as fast as max_velocity, none
-was 0.1 rad past a stop, and no sound arm was refused.
+`false_readings.py [--draws 100] [--seed 1] [--family six-damiao …] [--units]`; a draw is a pose, a job and one
+falsehood about one joint: its position, velocity or torque frozen, forged or doubled (by a second node that sends in
+its name), or scaled by 0.2 to 5. The job is a motion under position control, or torque control of that joint with a
+push besides gravity. All is in lock-step; speeds and angles are the true ones of the simulated plant, from the end of
+the set-up to the cycle in which the host notices; speeds, until a joint strikes a stop, which throws the others. As
+many sound draws are moved, and none of them may be refused. With `--units` a position that is coded by another scale
+is that of a stock drive whose `position_unit` is false in the arm file: its velocity is coded alike, no reading
+contradicts another, and the arm file's warning and `armlink check --scales` are what there is. Exit status 0 where no
+joint turned 1.5 times as fast as max_velocity, none was 0.1 rad past a stop, and no sound arm was refused.
 """
 
 import argparse
@@ -57,6 +59,8 @@ class Draw:
     """Torque control, else position control."""
     begins: float
     """Time in the job [s]."""
+    unit: bool = False
+    """A position that is coded by another scale has its velocity coded alike."""
 
     @property
     def words(self) -> str:
@@ -79,7 +83,7 @@ class Outcome:
         return self.fastest <= FASTEST and self.past <= PAST_A_STOP
 
 
-def drawn(name: str, seed: int, sound: bool = False) -> Draw:
+def drawn(name: str, seed: int, sound: bool = False, unit: bool = False) -> Draw:
     """The draw of a seed."""
     random = np.random.default_rng([seed, 606])
     n = len(load_arm(name).joint_names)
@@ -96,7 +100,7 @@ def drawn(name: str, seed: int, sound: bool = False) -> Draw:
         begins = -0.3 * begins  # so that it is false when torque control begins
     value = factor if how == "scaled" else forged if how == "forged" else 0.0
     fault = "" if sound else f"{how}.{quantity}"
-    return Draw(name, seed, joint, fault, value, coded and not sound, torque and not sound, begins)
+    return Draw(name, seed, joint, fault, value, coded and not sound, torque and not sound, begins, unit)
 
 
 def arms_of(draw: Draw) -> tuple[ArmFile, ArmFile]:
@@ -112,6 +116,8 @@ def arms_of(draw: Draw) -> tuple[ArmFile, ArmFile]:
         row["rated_torque"] /= draw.value
     elif "drive" in row:
         row["drive"][f"{quantity}_unit"] = unit
+        if quantity == "position" and not draw.unit:
+            row["drive"]["velocity_unit"] = unit * draw.value
     return true, parse_arm(content, path)
 
 
@@ -214,11 +220,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--family", nargs="*", default=list(ALL))
     parser.add_argument("--verbose", action="store_true")
+    parser.add_argument("--units", action="store_true")
     asked = parser.parse_args()
     failed = 0
     for name in asked.family:
         seeds = range(1000 * asked.seed, 1000 * asked.seed + asked.draws)
-        false = [(draw, run(draw)) for draw in (drawn(name, seed) for seed in seeds)]
+        false = [(draw, run(draw)) for draw in (drawn(name, seed, unit=asked.units) for seed in seeds)]
         sound = [(draw, run(draw)) for draw in (drawn(name, seed, sound=True) for seed in seeds)]
         wrong = [each for each in false if not each[1].held] + [each for each in sound if each[1].says]
         failed += len(wrong)

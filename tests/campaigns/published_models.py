@@ -2,8 +2,8 @@
 
 `published_models.py FOLDER… [--out table.md] [--only NAME…] [--seconds 300] [--seed 1]`: every URDF and MJCF below the
 folders that has an arm in it. Each must either be refused by `new` or `doctor` in one line, before anything moves, or
-reach its report with exit status 0 and with errors inside their intervals. Writes a table in Markdown; exit status 1
-where a model did neither.
+reach its report with exit status 0 and with errors inside their intervals. Writes a table in Markdown, in place of the
+one that ends the page `--out`; exit status 1 where a model did neither.
 """
 
 import argparse
@@ -156,7 +156,8 @@ def main() -> int:
     held, told = (sum(getattr(each, of) for each in outcomes) for of in ("inside", "intervals"))
     print(f"{sum(each.good for each in outcomes)} of {len(outcomes)} models good; {held} of {told} intervals hold")
     if given.out is not None:
-        given.out.write_text(table + "\n", encoding="utf-8")
+        page = given.out.read_text(encoding="utf-8") if given.out.exists() else ""
+        given.out.write_text(page.partition("| model |")[0] + table + "\n", encoding="utf-8")
     return int(not all(each.good for each in outcomes))
 
 

@@ -12,7 +12,7 @@ import pytest
 import typer
 
 from armlink import cli
-from armlink.errors import BadInput, BusFault, Refused
+from armlink.errors import BadInput, BusFault, Declined, Refused
 
 
 @pytest.fixture
@@ -45,6 +45,7 @@ def raising(error):
         (BadInput("two\nlines"), 2, "two lines"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (typer.Abort(), 130, "interrupted"),
+        (Declined("the answer was no: nothing was done"), 130, "the answer was no: nothing was done"),
         (FileNotFoundError(2, "No such file or directory", "gone.csv"), 2, "gone.csv: No such file or directory"),
         (PermissionError(13, "Permission denied", "/out"), 2, "/out: Permission denied"),
         (OSError(28, "No space left on device"), 2, "work: No space left on device"),

@@ -64,6 +64,21 @@ def test_an_arm_from_a_model_file_takes_its_inertials_and_stops_from_there(tmp_p
     np.testing.assert_allclose(arm.plant.upper, [1.0, 2.0])
 
 
+def test_torque_ends_where_the_drives_of_the_arm_file_end_not_the_effort_of_the_model(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(URDF.replace('effort="50"', 'effort="3"'))
+    controllers = [
+        {"name": name, "node": node, "rated_torque": 20.0, "max_torque": 30.0}
+        for name, node in (("shoulder", 3), ("elbow", 4))
+    ]
+    kinematics = {"gravity": [0.0, 0.0, -9.81], "model": "arm.urdf"}
+    content = {"name": "two", "kinematics": kinematics, "link": {"joints": controllers}, "sim": {}}
+    described = parse_arm(content, tmp_path / "arm.yaml")
+    plant = SimulatedArm(described, Truth.of(described)).plant
+    plant.set_servo(np.zeros(2), np.zeros(2), np.full(2, 30.0))
+    plant.step(np.array([25.0, 20.0]), np.array([25.0, 20.0]), 0.004)
+    np.testing.assert_allclose(plant.data.qfrc_actuator, [25.0, 20.0], atol=1e-9)
+
+
 @pytest.mark.parametrize("angle", ["radian", "degree"])
 def test_stops_of_the_arm_file_come_before_those_of_a_model_file(tmp_path: Path, angle: str) -> None:
     (tmp_path / "arm.xml").write_text(

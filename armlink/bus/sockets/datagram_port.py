@@ -143,7 +143,6 @@ class DatagramPort(ABC):
         """Decode the first `count` datagrams, one frame each, with flags in identifiers."""
 
     def fileno(self) -> int:
-        """File descriptor of the receiving socket."""
         return self._number
 
     def send(self, can_id: int, data: bytes) -> None:

@@ -46,7 +46,6 @@ class MulticastPort(DatagramPort):
         super().__init__(name, receiving, sending, DatagramBatch(256), DatagramBatch(LONGEST, names=True), as_node)
 
     def close(self) -> None:
-        """Close the sending socket."""
         self._sending.close()
 
     def _encode(self, frames: Sequence[Frame]) -> None:

@@ -1,5 +1,6 @@
 """CiA 402 drives on one bus: what they are, their set-up by SDO, states and calibration; cycles are in `cyclic`."""
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -21,13 +22,14 @@ from armlink.drives.canopen.host_frames import HostFrames
 from armlink.drives.canopen.pdo import RPDO1, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
 from armlink.drives.canopen.profile import Profile, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
-from armlink.drives.canopen.units import assumed_units, read_units
+from armlink.drives.canopen.units import assumed_units, read_units, unit_doubt
 from armlink.drives.family import Ask
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
 from armlink.errors import ArmlinkError, BusFault
 from armlink.torque_calibration import Calibration
 
+log = logging.getLogger("armlink")
 SDO_RESPONSE_ID = 0x580
 _POWERS = {
     DriveState.ENABLED: Power.ON,
@@ -77,7 +79,6 @@ class CanopenDrives:
     # ---- what they are
 
     def traits(self, joint: int) -> Traits:
-        """See Drives."""
         settings, profile = self.rows[joint].settings, self.wires[joint].profile
         if settings.torque == "record" and settings.calibration is None:
             return self._traits
@@ -94,7 +95,6 @@ class CanopenDrives:
         )
 
     def routes(self) -> Mapping[int, int]:
-        """See Drives."""
         services = (
             TPDO1.cob_base,
             TPDO2.cob_base,
@@ -106,7 +106,6 @@ class CanopenDrives:
         return {base + node: joint for joint, node in enumerate(self.nodes) for base in services}
 
     def commands(self) -> Mapping[int, str]:
-        """See Drives."""
         return self._host_frames.by_id
 
     def intrusion(self, can_id: int, data: bytes) -> str:
@@ -120,7 +119,6 @@ class CanopenDrives:
         return self.m * (each + slow) + longest_frame_bits(0)
 
     def cycle_ids(self) -> frozenset[int]:
-        """See Drives."""
         return frozenset((objects.SYNC_ID,))
 
     def services(self, ask: Ask) -> tuple[NodeServices, ...]:
@@ -131,11 +129,9 @@ class CanopenDrives:
         return self._services
 
     def missing(self, ask: Ask) -> list[int]:
-        """See Drives."""
         return [joint for joint, services in enumerate(self.services(ask)) if not services.present()]
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
-        """See Drives."""
         found = []
         for joint, services in enumerate(self.services(ask)):
             address = self.rows[joint].settings.address
@@ -149,7 +145,6 @@ class CanopenDrives:
         return found
 
     def positions(self, ask: Ask) -> list[float]:
-        """See TellsPosition."""
         found = []
         for services, row in zip(self.services(ask), self.rows, strict=True):
             try:
@@ -197,6 +192,8 @@ class CanopenDrives:
     def _set_up(self, joint: int, services: NodeServices, limits: Limits, profile: Profile) -> tuple[Wire, Setup]:
         row, known = self.rows[joint], self.known
         unit = read_units(services, row)
+        if doubt := unit_doubt(services, row):
+            log.warning(doubt)
         check_fits(row, limits, unit)
         supported = self.offered(services, joint)
         device.configure(services, row, unit, limits, self.protection, supported, profile)
@@ -244,11 +241,9 @@ class CanopenDrives:
         return self.cycle.frames(orders, now)
 
     def sent(self, joint: int) -> Order | None:
-        """See Drives."""
         return self.cycle.sent(joint)
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives."""
         joint = self._joint_of.get(can_id - RPDO1.cob_base)
         order = None if joint is None else self.cycle.decoded(joint, data)
         if joint is None or order is None:
@@ -258,7 +253,6 @@ class CanopenDrives:
     # ---- frames to readings
 
     def fill(self, board: Board, places: Sequence[int]) -> dict[int, Callable[[bytes], None]]:
-        """See FillsBoard."""
         return self._readings.fill(board, places)
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
@@ -303,7 +297,6 @@ class CanopenDrives:
     # ---- states
 
     def power(self, joint: int) -> Power:
-        """See Drives."""
         return _POWERS.get(state_of(self.known.statuses[joint]), Power.UNKNOWN)
 
     def state_request(self, joint: int) -> list[Frame]:
@@ -311,21 +304,17 @@ class CanopenDrives:
         return []
 
     def lets_go(self, joint: int) -> bool:
-        """See Drives."""
         return self.power(joint) in (Power.OFF, Power.READY, Power.FAULT)
 
     def ready(self, joint: int) -> bool:
-        """See Drives."""
         displayed = self.wires[joint].entries.get(TPDO3.name, ())
         told = len(displayed) < 2 or self.known.displays[joint] == self.cycle.modes[joint]
         return self.power(joint) is Power.ON and told
 
     def alarm(self) -> BusFault | None:
-        """See Drives."""
         return faults.alarm(self.known)
 
     def fault(self, modes: Sequence[int], now: float) -> BusFault | None:
-        """See Drives."""
         known, own = self.known, self.cycle.own_modes(modes)
         if self._sound == (own, known.displays, known.statuses):
             return None
@@ -335,19 +324,15 @@ class CanopenDrives:
         return fault
 
     def has_restarted(self, joint: int) -> bool:
-        """See Drives."""
         return joint in self.known.restarted
 
     def own_stop(self, joint: int) -> str:
-        """See Drives."""
         return faults.stopped_itself(self.known, joint)
 
     def stuck(self, joint: int, target: Power, seconds: float) -> str:
-        """See Drives."""
         return faults.stuck(self.known, joint, TARGETS[target], self.cycle.modes[joint], seconds)
 
     def forget(self, restarts: bool = False) -> None:
-        """See Drives."""
         if restarts:
             self.known.restarted.clear()
         self.cycle.forget_walk()
@@ -355,21 +340,17 @@ class CanopenDrives:
         self.known.node_states.clear()
 
     def temperature(self, joint: int, ask: Ask) -> float:
-        """See Drives."""
         return device.read_temperature(self.services(ask)[joint])
 
     def serial_number(self, joint: int, ask: Ask) -> str:
-        """See TellsSerialNumber."""
         return device.serial_number(self.services(ask)[joint])
 
     # ---- calibration in the controller
 
     def read_calibration(self, joint: int, ask: Ask) -> Calibration:
-        """See KeepsCalibration."""
         return torque_sensor_record.read_record(self.services(ask)[joint])
 
     def write_calibration(self, joint: int, ask: Ask, calibration: Calibration, store: bool = False) -> Calibration:
-        """See KeepsCalibration."""
         return torque_sensor_record.write_record(self.services(ask)[joint], calibration, store)
 
 

@@ -26,7 +26,6 @@ TRAITS = Traits(
 
 
 def build(arm: ArmFile, joints: Sequence[LinkJoint]) -> Drives:
-    """Drives of these joints."""
     from armlink.drives.canopen.drives import CanopenDrives  # imports the canopen package, which takes its time
 
     return CanopenDrives(arm, joints, TRAITS)

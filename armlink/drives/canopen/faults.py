@@ -28,7 +28,6 @@ class JointStates:
     """Newest states, emergencies and faults of m joints."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        """Nothing is known yet."""
         m = len(names)
         self.names = names
         self.statuses = [NO_STATUS] * m

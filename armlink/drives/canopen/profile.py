@@ -59,7 +59,6 @@ class Profile:
     """Whether 6060h and 6061h can be mapped, so that the mode can change while cycling."""
 
     def has(self, entry: Entry) -> bool:
-        """Whether the device has an object."""
         return entry not in self.absent
 
     position_mode: int = int(Mode.POSITION)

@@ -46,7 +46,6 @@ class PumpedNetwork(canopen.Network):  # type: ignore[misc]
         """Newest request to each node: the kind of response that it brings, and its index and sub-index."""
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send one frame."""
         if can_id & 0x780 == 0x600 and data[0] >> 5 in RESPONSE_TO:
             self._asked[can_id & 0x7F] = (RESPONSE_TO[data[0] >> 5], bytes(data[1:4]))
         self._send(can_id, bytes(data))

@@ -25,12 +25,10 @@ class TorqueObject(Section):
 
     @property
     def index(self) -> int:
-        """Index of the object."""
         return int(self.object.partition(".")[0], 16)
 
     @property
     def sub(self) -> int:
-        """Sub-index of the object."""
         return int(self.object.partition(".")[2] or "0", 16)
 
 
@@ -55,5 +53,4 @@ class CanopenSettings(DriveSettings):
 
     @property
     def address(self) -> str:
-        """Its id on the bus."""
         return f"node {self.node}"

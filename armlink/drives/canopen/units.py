@@ -108,6 +108,19 @@ def _stock_units(services: NodeServices, joint: LinkJoint, settings: CanopenSett
     return Units(rated * 1e-3, position, velocity, position)
 
 
+def unit_doubt(services: NodeServices, joint: LinkJoint) -> str:
+    """How the arm file's position_unit contradicts the device's own objects; empty where it does not."""
+    given = getattr(joint.settings, "position_unit", None)
+    own = _position_unit(services) if given else None
+    if not given or not own or math.isclose(given, own, rel_tol=RATED_TORQUE_TOLERANCE):
+        return ""
+    return (
+        f"{joint.name} ({joint.settings.address}): drive.position_unit is {given / own:.3g} times what 6092h, 60A8h or "
+        f"608Fh of the device tell; if it is wrong, the joint turns {own / given:.3g} times as fast and as far as it "
+        "reads: before anything else, armlink check ARM --scales"
+    )
+
+
 def _position_unit(services: NodeServices) -> float | None:
     """Radians at the output of one count of 6064h: by 6092h, else by 60A8h, else by 608Fh and 6091h."""
     feed, shaft = _optional(services, objects.FEED), _optional(services, objects.FEED_SHAFT) or 1

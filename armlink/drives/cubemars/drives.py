@@ -143,7 +143,6 @@ class CubeMarsDrives(MitDrives):
     # ---- cycle
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        """See Drives."""
         return [
             frame
             for joint, order in enumerate(orders)
@@ -175,7 +174,6 @@ class CubeMarsDrives(MitDrives):
         return [(drive, special(Special.DISABLE))]
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
-        """See Drives."""
         joint = self._replies.get((can_id, data[0])) if data else None
         if joint is None:
             return None
@@ -235,17 +233,14 @@ class CubeMarsDrives(MitDrives):
         return [(self._settings[joint].id, pack_command(NO_COMMAND, known.ranges))]
 
     def lets_go(self, joint: int) -> bool:
-        """See Drives."""
         return not self._known[joint].on
 
     def own_stop(self, joint: int) -> str:
-        """See Drives."""
         if not self._known[joint].stopped:
             return ""
         return f"{self.where(joint)}: without a command for its deadline: its CAN timeout has let it go"
 
     def forget(self, restarts: bool = False) -> None:
-        """See Drives."""
         super().forget(restarts)
         for known in self._known:
             known.stopped, known.lacking = False, math.inf

@@ -61,5 +61,4 @@ class CubeMarsSettings(DriveSettings):
 
     @property
     def address(self) -> str:
-        """Its id on the bus."""
         return f"id {self.id:02X}h"

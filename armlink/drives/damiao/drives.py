@@ -56,7 +56,6 @@ class DamiaoDrives(MitDrives):
     """The drives of one bus; see `Drives`."""
 
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
-        """Nothing is sent."""
         self._known: list[_DamiaoState] = [_DamiaoState() for _ in joints]
         super().__init__(joints, TRAITS, self._known)
         for known, settings in zip(self._known, self._settings, strict=True):
@@ -67,7 +66,6 @@ class DamiaoDrives(MitDrives):
         """Joint, READ or WRITE and register of the newest register request of another host."""
 
     def commands(self) -> Mapping[int, str]:
-        """See Drives."""
         others = {
             drive + offset: f"{mode} command to {self.names[joint]}"
             for drive, joint in self._joint_of.items()
@@ -76,13 +74,11 @@ class DamiaoDrives(MitDrives):
         return {frames.REGISTERS_ID: "register request", **super().commands(), **others}
 
     def poll(self, first: bool) -> list[Frame]:
-        """Requests for the state alone."""
         return [(frames.REGISTERS_ID, frames.refresh_request(settings.id)) for settings in self._settings]
 
     # ---- set-up
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
-        """See Drives."""
         found = []
         for joint, settings in enumerate(self._settings):
             values = read_registers(ask, settings.id, IDENTITY)
@@ -112,7 +108,6 @@ class DamiaoDrives(MitDrives):
         return [read_position(ask, self.names[joint], each) for joint, each in enumerate(self._settings)]
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        """See Drives."""
         found = []
         for joint, (known, settings, limit) in enumerate(zip(self._known, self._settings, limits, strict=True)):
             ranges, result = prepare(ask, self.names[joint], settings, limit)
@@ -125,7 +120,6 @@ class DamiaoDrives(MitDrives):
     # ---- cycle
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        """See Drives."""
         return [self._frame(joint, order) for joint, order in enumerate(orders) if order is not None]
 
     def _frame(self, joint: int, order: Order) -> Frame:
@@ -150,7 +144,6 @@ class DamiaoDrives(MitDrives):
         return frames.REGISTERS_ID, frames.refresh_request(drive)
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
-        """See Drives."""
         joint = self._replies.get((can_id, data[0] & 0xF)) if len(data) == 8 else None
         if joint is None:
             return None
@@ -192,7 +185,6 @@ class DamiaoDrives(MitDrives):
         return POWERS.get(known.state, Power.FAULT)
 
     def state_request(self, joint: int) -> list[Frame]:
-        """See Drives."""
         return [(frames.REGISTERS_ID, frames.refresh_request(self._settings[joint].id))]
 
     def lets_go(self, joint: int) -> bool:
@@ -200,7 +192,6 @@ class DamiaoDrives(MitDrives):
         return self._known[joint].state != ENABLED
 
     def own_stop(self, joint: int) -> str:
-        """See Drives."""
         if self._known[joint].state != DamiaoStatus.LOST_COMMUNICATION:
             return ""
         return f"{self.where(joint)}: lost communication (state Dh): its TIMEOUT ran out, the torque is off"

@@ -35,7 +35,6 @@ class DamiaoSettings(DriveSettings):
 
     @property
     def address(self) -> str:
-        """Its id on the bus."""
         return f"id {self.id:02X}h"
 
 

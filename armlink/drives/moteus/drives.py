@@ -42,7 +42,6 @@ class MoteusSettings(DriveSettings):
 
     @property
     def address(self) -> str:
-        """Its id on the bus."""
         return f"controller {self.id}"
 
 
@@ -109,7 +108,6 @@ class MoteusDrives(BasicDrives):
             raise BadInput(f"{arm.path}: {joints[0].name}: moteus controllers need CAN FD: set fd: true at their bus")
 
     def routes(self) -> Mapping[int, int]:
-        """See Drives."""
         return self._joint_of
 
     def commands(self) -> Mapping[int, str]:
@@ -126,7 +124,6 @@ class MoteusDrives(BasicDrives):
         return self.m * (2 * NOMINAL_BITS + (8 * payload + 2 * FAST_BITS) * 1.25 / FASTER)
 
     def poll(self, first: bool) -> list[Frame]:
-        """Queries alone."""
         return [
             (_flagged(frames.identifier(settings.source, settings.id, True)), frames.pack({}, QUERY))
             for settings in self._settings
@@ -135,7 +132,6 @@ class MoteusDrives(BasicDrives):
     # ---- set-up
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
-        """See Drives."""
         asked = (
             MoteusRegister.MODEL,
             MoteusRegister.FIRMWARE,
@@ -216,7 +212,6 @@ class MoteusDrives(BasicDrives):
     # ---- cycle
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        """See Drives."""
         found = []
         for joint, order in enumerate(orders):
             if order is None:
@@ -265,7 +260,6 @@ class MoteusDrives(BasicDrives):
         }
 
     def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
-        """See TellsCurrent."""
         constant = self._settings[joint].torque_constant
         values = (
             None if constant is None else self._ask(ask, joint, {}, (MoteusRegister.TORQUE, MoteusRegister.Q_CURRENT))
@@ -275,11 +269,9 @@ class MoteusDrives(BasicDrives):
         return values.get(MoteusRegister.TORQUE, math.nan), constant * values.get(MoteusRegister.Q_CURRENT, math.nan)
 
     def sent(self, joint: int) -> Order | None:
-        """See Drives."""
         return self._known[joint].sent
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
-        """See Drives."""
         joint = self._joint_of.get(can_id)
         if joint is None:
             return None
@@ -313,7 +305,6 @@ class MoteusDrives(BasicDrives):
         return [self.poll(first=False)[joint]]
 
     def own_stop(self, joint: int) -> str:
-        """See Drives."""
         if self._known[joint].mode != frames.MoteusMode.TIMEOUT:
             return ""
         return f"{self.where(joint)}: its watchdog ran out: it damps until it is stopped (mode 11)"
@@ -321,7 +312,6 @@ class MoteusDrives(BasicDrives):
     # ---- listening
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives."""
         for joint, settings in enumerate(self._settings):
             if can_id & 0xFF == settings.id and can_id & 0x1FFFFFFF < 0x10000 and _flagged(can_id & 0xFFFF) == can_id:
                 order = _order_of(data)

@@ -48,7 +48,6 @@ class ODriveSettings(DriveSettings):
 
     @property
     def address(self) -> str:
-        """Its id on the bus."""
         return f"node {self.node}"
 
 
@@ -100,18 +99,15 @@ class ODriveDrives(BasicDrives):
     """The axes of one bus; see `Drives`."""
 
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
-        """Nothing is sent."""
         super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
         self._known = [_ODriveState() for _ in joints]
         self._joint_of = {settings.node: joint for joint, settings in enumerate(self._settings)}
 
     def routes(self) -> Mapping[int, int]:
-        """See Drives."""
         return {identifier(node, message): joint for node, joint in self._joint_of.items() for message in FROM_DRIVE}
 
     def commands(self) -> Mapping[int, str]:
-        """See Drives."""
         return {
             identifier(node, message): f"{message.name.lower().replace('_', ' ')} to {self.names[joint]}"
             for node, joint in self._joint_of.items()
@@ -123,7 +119,6 @@ class ODriveDrives(BasicDrives):
         return 3 * self.m * longest_frame_bits(8)
 
     def reading_ids(self) -> Mapping[int, int]:
-        """See Drives."""
         return {identifier(node, Message.ESTIMATES): joint for node, joint in self._joint_of.items()}
 
     # ---- set-up
@@ -198,7 +193,6 @@ class ODriveDrives(BasicDrives):
     # ---- cycle
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        """See Drives."""
         return [
             frame
             for joint, order in enumerate(orders)
@@ -273,7 +267,6 @@ class ODriveDrives(BasicDrives):
         return identifier(self._settings[joint].node, message), pack(message, *values)
 
     def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
-        """See TellsCurrent."""
         constant = self._settings[joint].torque_constant
         if constant is None:
             return None
@@ -282,11 +275,9 @@ class ODriveDrives(BasicDrives):
         return None if torques is None or currents is None else (torques[1], constant * currents[1])
 
     def sent(self, joint: int) -> Order | None:
-        """See Drives."""
         return self._known[joint].sent
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
-        """See Drives."""
         joint = self._joint_of.get(can_id >> 5)
         message = can_id & 0x1F
         values = unpack(message, data)
@@ -317,7 +308,6 @@ class ODriveDrives(BasicDrives):
         return beat is not None and beat.state != AxisState.CLOSED_LOOP
 
     def own_stop(self, joint: int) -> str:
-        """See Drives."""
         beat = self._known[joint].heartbeat
         if beat is None or beat.state == AxisState.CLOSED_LOOP or not beat.error & AxisError.WATCHDOG:
             return ""
@@ -332,7 +322,6 @@ class ODriveDrives(BasicDrives):
     # ---- listening
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives."""
         joint = self._joint_of.get(can_id >> 5)
         if joint is None:
             return None

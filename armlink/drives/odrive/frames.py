@@ -135,7 +135,6 @@ def heartbeat(data: bytes) -> Heartbeat | None:
 
 
 def error_names(bits: int) -> str:
-    """Errors in words, comma-separated."""
     return (
         ", ".join(str(error.name).lower().replace("_", " ") for error in AxisError if bits & error)
         or f"unknown ({bits:#x})"

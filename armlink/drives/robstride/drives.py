@@ -43,7 +43,6 @@ class RobStrideDrives(BasicDrives):
     """The drives of one bus; see `Drives`."""
 
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
-        """Nothing is sent."""
         super().__init__(joints, TRAITS)
         self._settings = [joint.settings for joint in joints]
         self._known = [_RobStrideState(RANGES[settings.model]) for settings in self._settings]
@@ -77,7 +76,6 @@ class RobStrideDrives(BasicDrives):
     # ---- set-up
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
-        """See Drives."""
         found = []
         for joint, settings in enumerate(self._settings):
             serial = identify(ask, settings)
@@ -95,12 +93,10 @@ class RobStrideDrives(BasicDrives):
         return found
 
     def positions(self, ask: Ask) -> list[float]:
-        """See TellsPosition."""
         found = [read_parameter(ask, settings, RobStrideParameter.POSITION) for settings in self._settings]
         return [math.nan if position is None else position for position in found]
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        """See Drives."""
         found = []
         for joint, (known, settings, limit) in enumerate(zip(self._known, self._settings, limits, strict=True)):
             result = prepare(ask, self.names[joint], settings, limit, known.ranges)
@@ -111,7 +107,6 @@ class RobStrideDrives(BasicDrives):
     # ---- cycle
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        """See Drives."""
         found = [self._frame(joint, order) for joint, order in enumerate(orders) if order is not None]
         return [(can_id | EXTENDED, data) for can_id, data in found]
 
@@ -153,11 +148,9 @@ class RobStrideDrives(BasicDrives):
         return frame
 
     def sent(self, joint: int) -> Order | None:
-        """See Drives."""
         return self._known[joint].sent
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
-        """See Drives."""
         if not can_id & EXTENDED:
             return None
         if intruder := self.intrusion(can_id, data):
@@ -210,7 +203,6 @@ class RobStrideDrives(BasicDrives):
         return f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off"
 
     def forget(self, restarts: bool = False) -> None:
-        """See Drives."""
         super().forget(restarts)
         self._intruder = ""
         for known in self._known:
@@ -219,7 +211,6 @@ class RobStrideDrives(BasicDrives):
     # ---- listening
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives."""
         joint = self._joint_of.get(can_id & 0xFF)
         if joint is None or not can_id & EXTENDED or len(data) != 8:
             return None

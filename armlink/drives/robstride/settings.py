@@ -32,5 +32,4 @@ class RobStrideSettings(DriveSettings):
 
     @property
     def address(self) -> str:
-        """Its id on the bus."""
         return f"motor {self.id}"

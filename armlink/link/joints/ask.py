@@ -28,7 +28,6 @@ class LinkAsk:
     def __call__(
         self, frame: Frame, answer: Callable[[int, bytes], T | None], timeout: float = ANSWER, tries: int = TRIES
     ) -> T | None:
-        """See Ask."""
         found: list[T] = []
 
         def look(can_id: int, data: bytes) -> None:
@@ -48,5 +47,4 @@ class LinkAsk:
         return None
 
     def send(self, can_id: int, data: bytes) -> None:
-        """See Ask."""
         self._loop.send(can_id | self._tag, data)

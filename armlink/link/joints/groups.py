@@ -49,7 +49,6 @@ class Mounting:
 
     @classmethod
     def of(cls, arm: ArmFile) -> "Mounting":
-        """From the arm file."""
         settings = [joint.settings for joint in arm.require_link().joints]
         direction, zero, gear = (
             np.array([float(getattr(each, key)) for each in settings]) for key in ("direction", "zero", "gear")
@@ -86,7 +85,6 @@ def by_joint(groups: Sequence[Group]) -> tuple[tuple[Group, int], ...]:
 
 
 def traits_of(groups: Sequence[Group]) -> list[Traits]:
-    """Traits of every joint, in joint order."""
     return [group.drives.traits(number) for group, number in by_joint(groups)]
 
 

@@ -79,7 +79,6 @@ class LoopProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process id of the loop."""
         return self._process.pid
 
     def fileno(self) -> int:

@@ -73,7 +73,6 @@ class ArmState:
             self._report("late", None, warning, {"late_ms": stats.lateness.in_ms()})
 
     def up(self) -> None:
-        """The joints answer."""
         self._told_late = False
         back = self.connected is False
         self.connected, self.fault, self._heard_at = True, "", self._monotonic()

@@ -395,7 +395,6 @@ class Journal:
     def add_event(
         self, time: datetime, t: float, kind: str, joint: str | None, text: str, evidence: dict[str, Any]
     ) -> int:
-        """Append an event and return its id."""
         number, self._next_event = self._next_event, self._next_event + 1
         statement = "INSERT INTO events(id, time, t, kind, joint, text, evidence) VALUES (?, ?, ?, ?, ?, ?, ?)"
         with self.transaction():
@@ -460,7 +459,6 @@ class Journal:
         return sum(row.state == "pending" for row in self.proposals())
 
     def proposal(self, number: int) -> ProposalRow | None:
-        """The proposal of that id."""
         return self._rows.get(number)
 
     def proposal_numbered(self, number: int) -> ProposalRow | None:

@@ -47,7 +47,6 @@ class ProposalRow:
         return DriftFinding.from_json(self.values)
 
     def answer(self) -> Proposal:
-        """As the API shows it."""
         finding = self.finding
         gain_std, offset_std = finding.std
         return Proposal(

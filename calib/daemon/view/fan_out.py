@@ -22,7 +22,6 @@ class Client:
         self._more.set()
 
     async def get(self) -> Item:
-        """The next item."""
         while not self._items:
             self._more.clear()
             await self._more.wait()

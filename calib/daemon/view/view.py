@@ -70,26 +70,18 @@ class Decisions(Protocol):
 class Subscription(Protocol):
     """One client's stream: bounded; a client that is too slow loses the oldest items and never delays the daemon."""
 
-    async def get(self) -> JointsItem | EventItem:
-        """The next item."""
-        ...
+    async def get(self) -> JointsItem | EventItem: ...
 
-    def close(self) -> None:
-        """No more items."""
-        ...
+    def close(self) -> None: ...
 
 
 class DaemonView(Protocol):
     """Everything that the web layer can reach. Nothing here commands torque or motion."""
 
     @property
-    def decisions(self) -> Decisions:
-        """Approval and rejection of proposals."""
-        ...
+    def decisions(self) -> Decisions: ...
 
-    def status(self) -> Status:
-        """State, bus and records."""
-        ...
+    def status(self) -> Status: ...
 
     def joints(self) -> tuple[JointNow, ...]:
         """Every joint as of the newest snapshot, base to tip."""
@@ -129,9 +121,7 @@ class DaemonView(Protocol):
         """Likewise in pieces that fit in memory; what it raises it raises at the first."""
         ...
 
-    def proposals(self, limit: int = 200) -> tuple[Proposal, ...]:
-        """Newest first."""
-        ...
+    def proposals(self, limit: int = 200) -> tuple[Proposal, ...]: ...
 
     def subscribe(self) -> Subscription:
         """A new client of the stream, which begins with the present joints."""

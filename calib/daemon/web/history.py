@@ -85,7 +85,6 @@ class Histories:
 
 
 def _as_json(pages: Iterator[tuple[HistoryPoint, ...]]) -> Iterator[bytes]:
-    """All points as one JSON list."""
     separator = b"["
     for page in pages:
         if page:

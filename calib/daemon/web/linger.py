@@ -67,7 +67,6 @@ class _Drain(asyncio.Protocol):
         self._end = self._loop.call_later(LINGER_SECONDS, self._transport.abort)
 
     def data_received(self, data: bytes) -> None:
-        """Discard it."""
         self._bytes_left -= len(data)
         if self._bytes_left < 0:
             self._transport.abort()

@@ -61,7 +61,6 @@ UNKNOWN = Peer("unknown", "unknown", tcp=True)
 
 
 def peer_of(scope: Scope) -> Peer:
-    """The peer of a request."""
     found = scope.get(PEER, UNKNOWN)
     return found if isinstance(found, Peer) else UNKNOWN
 
@@ -113,7 +112,6 @@ class BoundedProtocol(H11Protocol):
             self.loop.call_later(FIRST_SECONDS, self.admission.admit)
 
     def begin(self) -> None:
-        """It is this connection's turn."""
         self.transport.resume_reading()
 
     def give_way(self) -> None:
@@ -140,7 +138,6 @@ class BoundedProtocol(H11Protocol):
             self.cut()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the deadlines."""
         self._stop_the_clock()
         self._stop_waiting()
         self.admission.leave(self)
@@ -154,7 +151,6 @@ class BoundedProtocol(H11Protocol):
         self.admission.stuck(self)
 
     def resume_writing(self) -> None:
-        """As uvicorn's."""
         self._stop_waiting()
         self.admission.moves(self)
         super().resume_writing()

@@ -37,7 +37,6 @@ class Streams:
 
     @property
     def clients(self) -> int:
-        """Number of clients connected."""
         return len(self._tasks)
 
     def make_room(self, owner: str) -> bool:

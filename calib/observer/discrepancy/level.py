@@ -40,7 +40,6 @@ class DiscrepancyLevel:
 
     @classmethod
     def none(cls, n: int) -> "DiscrepancyLevel":
-        """A model without error."""
         zero = np.zeros(n)
         return cls(np.zeros((len(PARTS), n)), zero, zero, zero + SPREAD_UNKNOWN)
 

@@ -40,7 +40,6 @@ class ChangeHypothesis:
 
     @property
     def name(self) -> tuple[str, int | None]:
-        """Kind of change."""
         return self.cause, self.joint
 
 

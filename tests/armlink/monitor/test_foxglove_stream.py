@@ -11,7 +11,7 @@ from websockets.asyncio.client import connect
 from armlink.errors import BadInput
 from armlink.link.types import Sample
 from armlink.monitor.foxglove_stream import FoxgloveStream
-from armlink.recording.ros_joint_state import decode_joint_state
+from armlink.recording.ros_joint_state import JointStateDecoder
 
 NAMES = ("shoulder", "elbow")
 
@@ -54,12 +54,12 @@ def test_a_client_gets_the_readings_as_joint_states():
         found = asyncio.run(first_messages(stream))
     channel, data = found["/joint_states"]
     assert (channel["encoding"], channel["schemaName"]) == ("cdr", "sensor_msgs/msg/JointState")
-    state = decode_joint_state(data)
+    state = JointStateDecoder()(data)
     assert state.names == NAMES
     np.testing.assert_array_equal(state.position, [1.0, -1.0])
     np.testing.assert_array_equal(state.velocity, [0.1, np.nan])
     np.testing.assert_array_equal(state.effort, [0.5, 2.0])
-    np.testing.assert_array_equal(decode_joint_state(found["/motor_states"][1]).effort, [0.4, 1.9])
+    np.testing.assert_array_equal(JointStateDecoder()(found["/motor_states"][1]).effort, [0.4, 1.9])
 
 
 def test_a_port_that_is_taken_is_one_line():

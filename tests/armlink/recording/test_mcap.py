@@ -14,7 +14,6 @@ from armlink.recording.ros_joint_state import (
     SCHEMA,
     SCHEMA_NAME,
     JointStateDecoder,
-    decode_joint_state,
     joint_state_encoder,
 )
 
@@ -88,7 +87,7 @@ def test_the_codec_agrees_with_the_ros_library(lists, names):
     rng = np.random.default_rng(3)
     values = [rng.normal(size=len(names)).tolist() if there else [] for there in lists]
     ours = joint_state_encoder(names, lists)(5_000_000_007, [x for each in values for x in each])
-    decoded = decode_joint_state(ours)
+    decoded = JointStateDecoder()(ours)
     assert decoded == (5_000_000_007, names, *map(tuple, values))
     stream = JointStateDecoder()
     assert stream(ours) == stream(ours) == decoded
@@ -115,7 +114,7 @@ def test_a_stream_decodes_as_single_messages_do():
     rng = np.random.default_rng(2)
     stream = JointStateDecoder()
     for choice in rng.integers(0, len(some), 200):
-        assert stream(some[choice]) == decode_joint_state(some[choice])
+        assert stream(some[choice]) == JointStateDecoder()(some[choice])
 
 
 @pytest.mark.parametrize(("rows", "cuts"), [(3, None), (300, 40)])

@@ -10,6 +10,7 @@ import yaml
 
 from armlink.arm_file import bundled_arms, parse_arm
 from armlink.cli import run
+from armlink.commands.check import _outcomes
 from armlink.drives.canopen.check.power_test import PowerTest
 from armlink.link.link import Link
 from armlink.selftest.self_test import SelfTest
@@ -220,3 +221,15 @@ def test_a_drive_that_lost_a_turn_fails_without_power(tmp_path, capsys, drive, p
     assert "set zero: 6.2832 (a whole turn more)" in failed["found"]
     with_power = ("enables and holds", "quick stop", "silence")
     assert {each["outcome"] for each in checks if each["check"] in with_power} == {"not run"}
+
+
+@pytest.mark.parametrize(
+    ("found", "shown"),
+    [
+        ({"a": "ok", "b": "ok"}, "ok"),
+        ({"a": "8 ms", "b": "12 ms", "c": "8 ms"}, "8 to 12 ms"),
+        ({"a": "ok", "b": "FAILED", "c": "ok", "d": "–"}, "ok: a, c; FAILED: b; –: d"),
+    ],
+)
+def test_the_table_names_joints_where_they_differ(found, shown):
+    assert _outcomes(found).plain == shown

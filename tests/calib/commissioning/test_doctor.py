@@ -90,7 +90,7 @@ def test_a_sound_arm_has_no_error(tmp_path):
         (("likn",), {}, "error", ["did you mean link?"]),
         (("sweep",), {"hodl": "servo"}, "error", ["sweep.hodl", "did you mean hold?"]),
         (("link", "joints", 0, "rated_torque"), "40 Nm", "error", ["link.joints.0.rated_torque", "without 'Nm'"]),
-        (("kinematics", "gravity"), [0, 0, -9.81], "warning", ["shoulder", "vertical", "Γ/g 0.00"]),
+        (("kinematics", "gravity"), [0, 0, -9.81], "error", ["kinematics.gravity", "gravity loads no joint"]),
         (("kinematics", "gravity"), [0, -1.6, 0], "warning", ["kinematics.gravity", "1.6"]),
         (("kinematics", "joints", 0, "upper"), -1.95, "error", ["shoulder", "nothing to sweep"]),
         (("serial",), "FILL-IN", "warning", ["serial is FILL-IN", "serial: …"]),
@@ -122,7 +122,7 @@ def test_a_drive_that_does_not_answer_and_one_that_nobody_knows(tmp_path):
 def test_findings_come_in_the_order_of_their_levels(tmp_path):
     arm = written(
         tmp_path,
-        (("kinematics", "gravity"), [0, 0, -9.81]),
+        (("kinematics", "gravity"), [0, -1.6, 0]),
         (("link", "bus", "bitrate"), 125000),
         (("link", "joints", 0, "max_torque_rate"), 9000.0),
     )

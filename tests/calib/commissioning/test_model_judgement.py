@@ -76,7 +76,8 @@ def drafted(model: Path, ratings: Mapping[str, float] | None = None) -> NewArm:
     joints, gravity = model_joints(model)
     chain = find_chains(joints, model)[0]
     made = NewArm(model.with_suffix(".yaml"), draft_of_model(model, chain, gravity, {}, ratings))
-    refuse_impossible_model(made.parsed())
+    for found in model_errors(made.parsed()):
+        raise BadInput(str(found))
     return made
 
 
@@ -100,6 +101,19 @@ def test_a_model_without_masses_has_nothing_to_calibrate(seed: int, tmp_path: Pa
     model = DrawnModel(seed, massless=True).write(tmp_path)
     with pytest.raises(BadInput, match="the model states no masses"):
         new_arm(model, tmp_path / "arm.yaml")
+
+
+@pytest.mark.parametrize("seed", [3, 7])
+def test_an_arm_whose_axes_are_all_vertical_has_nothing_to_calibrate_by(seed: int, tmp_path: Path) -> None:
+    """Its file is written all the same: its base can be inclined."""
+    model = DrawnModel(seed, effort=2.0).write(tmp_path)
+    model.write_text(model.read_text().replace('axis xyz="0 1 0"', 'axis xyz="0 0 1"'))
+    flat = drafted(model, {f"joint_{i}": 500.0 for i in range(9)}).parsed()
+    with pytest.raises(BadInput, match=r"kinematics.gravity: gravity loads no joint in any pose"):
+        refuse_impossible_model(flat)
+    assert flat.kinematics is not None
+    inclined = flat.kinematics.model_copy(update={"gravity": (6.9, 0.0, -6.9)})
+    refuse_impossible_model(flat.model_copy(update={"kinematics": inclined}))
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -12,6 +12,7 @@ import sqlalchemy as sa
 from fake_controllers import Controllers
 from made_records import ARM, activate_by_hand, arm_file, calibration, gravity
 
+from armlink.cli import run
 from armlink.errors import BadInput, Refused
 from calib.install.journaled_write import install
 from calib.install.plausibility import Admitted
@@ -137,6 +138,14 @@ def test_a_calibration_of_no_working_arm_is_not_in_force_in_the_host(
     activate_by_hand(store, changed(record, ("joints", 0, "offset"), 51.0))
     with pytest.raises(Refused, match="shoulder: offset is 51 N·m, not -50 to 50"):
         calibrations_in_force(fake_controllers.ARM)
+
+
+def test_the_store_that_a_command_names_holds_for_what_the_host_keeps(tmp_path: Path) -> None:
+    """`--store`: the link that the command opens takes its calibrations from there, too."""
+    store = RecordStore(other := str(tmp_path / "other.db"))
+    store.put(fake_controllers.record(), fake_controllers.ARM, by="ann", reason="sweep")
+    assert run(["history", "sarcos", "--store", other]) == 0
+    assert calibrations_in_force(fake_controllers.ARM)[0] is not None
 
 
 def test_mass_moments_are_bounded_by_what_the_drives_can_carry() -> None:

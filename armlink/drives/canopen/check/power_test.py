@@ -199,7 +199,6 @@ class PowerTest:
             )
 
     def _again(self) -> None:
-        """Everything back to enabled."""
         drives = self.drives
         self.loop.withheld, drives.cycle.beating = frozenset(), True
         for joint, state in drives.known.node_states.items():

@@ -14,7 +14,7 @@ from armlink.cli import run
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
 from armlink.drives.canopen.profile import profile_of
-from armlink.drives.canopen.units import read_units
+from armlink.drives.canopen.units import read_units, unit_doubt
 from armlink.drives.orders import Mode
 from armlink.link.link import Link
 from armlink.link.park import straight
@@ -176,6 +176,13 @@ def test_units_are_those_that_the_device_or_the_arm_file_tells(written, device, 
     found = read_units(services(**device, x6076=10_000), joint)
     assert (found.position, found.velocity) == pytest.approx((position, velocity))
     assert found.torque == pytest.approx(10.0 / 1000)
+
+
+@pytest.mark.parametrize(("file", "said"), [(TURN / 4096 / 3, "0.333 times"), (TURN / 4096, ""), (None, "")])
+def test_a_position_unit_that_contradicts_the_device_is_said(written, file, said):
+    joint = load_arm(written("cia402", **({} if file is None else {"position_unit": file}))).link.joints[0]
+    doubt = unit_doubt(services(x608F_1=4096, x608F_2=1, x6076=10_000), joint)
+    assert (said in doubt and "3 times as fast and as far" in doubt) if said else doubt == ""
 
 
 def test_a_rated_torque_in_micro_newton_metres_is_known_as_such(written):

@@ -12,7 +12,7 @@ from served_page import Served
 from small_arm import small_arm
 
 from armlink.recording.files import load_recording
-from armlink.recording.ros_joint_state import decode_joint_state
+from armlink.recording.ros_joint_state import JointStateDecoder
 from calib.daemon.web.window import PIECE, csv_lines, mcap_pieces
 
 
@@ -43,7 +43,7 @@ def test_the_models_torque_goes_along(server: Served, view: MadeUpView, tmp_path
     np.testing.assert_allclose([float(line.split(",")[-1]) for line in lines[1:]], model[:, -1], rtol=1e-5, atol=1e-6)
     (tmp_path / "window.mcap").write_bytes(client.get("/api/window.mcap").content)
     with (tmp_path / "window.mcap").open("rb") as stream:
-        found = [decode_joint_state(m.data).effort for _, _, m in make_reader(stream).iter_messages("/model_torques")]
+        found = [JointStateDecoder()(m.data).effort for _, _, m in make_reader(stream).iter_messages("/model_torques")]
     np.testing.assert_allclose(found, model, rtol=1e-12)
 
 
