@@ -7,7 +7,7 @@ the likelihood of parts of the recording that are held out, as effects are chose
 import numpy as np
 
 from gcomp.arrays import Array
-from gcomp.estimate.choice import PRICE, SIGNIFICANT, LinearTerms
+from gcomp.estimate.choice import PRICE, SIGNIFICANT, HeldOutEvidence, LinearTerms
 from sim_gap.checks.rigid_fit import FLOOR, ChannelMotion
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.search.term_equations import CORRELATED, MOST_MEASUREMENTS
@@ -21,13 +21,22 @@ CERTAIN = 5.0 * PRICE
 paid then, and the choice among the hundred changes that are looked at."""
 
 
-def is_certain(arm: RigidArm, before: ChannelMotion, after: ChannelMotion, rows_per_s: float) -> bool:
-    """Whether the corrected motion is predicted so much better that nothing else can be the reason."""
+def shown_by(arm: RigidArm, before: ChannelMotion, after: ChannelMotion, rows_per_s: float) -> HeldOutEvidence:
+    """How much better a corrected motion is predicted than it was before."""
     scale = np.maximum(before.reading.std(0), after.reading.std(0))
     costs = [_costs(arm, motion, scale, rows_per_s) for motion in (before, after)]
     falls = costs[0] - costs[1]
-    error = float(falls.std(ddof=1) * np.sqrt(len(falls)))
-    return bool(falls.sum() > max(CERTAIN, SIGNIFICANT * error))
+    return HeldOutEvidence(float(falls.sum()), float(falls.std(ddof=1) * np.sqrt(len(falls))))
+
+
+def is_certain(shown: HeldOutEvidence) -> bool:
+    """Whether nothing but the fault that is corrected can be the reason."""
+    return shown.fall > max(CERTAIN, SIGNIFICANT * shown.error)
+
+
+def is_refuted(shown: HeldOutEvidence) -> bool:
+    """Whether the recording is predicted worse with the correction."""
+    return shown.fall < -SIGNIFICANT * shown.error
 
 
 def _costs(arm: RigidArm, motion: ChannelMotion, scale: Array, rows_per_s: float) -> Array:
