@@ -169,7 +169,7 @@ def _tested(
     """The findings; none of those that would be corrected unless the recording is predicted better then than as it is
     with effects of the arm.
 
-    Masses and springs of the usual size explain most of a missing `gravity`, too, but not that all joints lack it alike:
+    Masses and springs of usual size explain most of a missing `gravity`, too, but not that all joints lack it alike:
     that is given up only where the recording is predicted worse. A base on its side is no rival of it.
     """
     recording = view.recording
