@@ -44,8 +44,15 @@ class EffectChoice(Generic[Name]):
         return sum(price_of(self.effects[name]) for name in names)
 
     def judge(self, names: Sequence[Name]) -> float:
-        """Negative logarithm of the held-out likelihood plus the price of the effects; less is better."""
-        return float(self.terms.cost(self.free(names)).sum()) + self.price(names)
+        """Negative logarithm of the held-out likelihood plus the price of the effects; less is better.
+
+        Infinite if an effect with a price ends at a bound: what is not that effect would have it impossible.
+        """
+        free = self.free(names)
+        at = {*self.terms.at_bounds(self.terms.fit(free)).tolist()} & free
+        if at and any(at & {*self.effects[n].parameters} and price_of(self.effects[n]) > 0.0 for n in names):
+            return float("inf")
+        return float(self.terms.cost(free).sum()) + self.price(names)
 
     def with_needs(self, name: Name, names: Sequence[Name]) -> list[Name]:
         """These effects, one more and what it needs; what it excludes gives way."""

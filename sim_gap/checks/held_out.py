@@ -8,6 +8,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, SIGNIFICANT, HeldOutEvidence, LinearTerms
+from gcomp.estimate.problem import Index
 from sim_gap.checks.rigid_fit import FLOOR, ChannelMotion
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.search.term_equations import CORRELATED, MOST_MEASUREMENTS
@@ -46,8 +47,9 @@ def _costs(arm: RigidArm, motion: ChannelMotion, scale: Array, rows_per_s: float
     fold = np.arange(len(model)) * FOLDS // len(model)
     # measurements are independent after the time in which residuals of real arms are correlated
     each = min(1.0, 24.0 / CORRELATED / rows_per_s, MOST_MEASUREMENTS / len(model))
-    acting, squares, products, totals = [], [], [], np.zeros((n, FOLDS))
-    spread, low, high = [], [], []
+    acting, squares, products = list[Index](), list[Array](), list[Array]()
+    totals = np.zeros((n, FOLDS))
+    spread, low, high = list[float](), list[float](), list[float]()
     for j in range(n):
         q = motion.q[:, j]
         columns = [model[:, j] / size[j], np.ones_like(q), np.sin(q), np.cos(q), q - q.mean()]
