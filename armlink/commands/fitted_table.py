@@ -1,4 +1,5 @@
-"""Tables on narrow terminals: cells wrap between words, and where that is too wide each row becomes a list.
+"""Tables on narrow terminals: headings wrap between words; else the table is cut between columns, its first in each
+part; else cells wrap, too; and where that is too wide each row becomes a list.
 
 Names of joints and effects are never cut: rich alone cuts a word that is wider than its column.
 """
@@ -9,14 +10,16 @@ from dataclasses import replace
 from rich.console import Console, ConsoleOptions, Group, RenderableType
 from rich.measure import Measurement
 from rich.padding import Padding
-from rich.table import Table
+from rich.table import Column, Table
 
 UNBOUNDED = 100_000
 """Columns of a terminal on which everything fits."""
+MOST_PARTS = 3
+"""A table in more parts is worse to read than one with wrapped cells."""
 
 
 def fitted(table: Table, console: Console, options: ConsoleOptions) -> RenderableType:
-    """The table as it is where it fits, with wrapped cells where whole words fit, else a list of headings and values.
+    """The table as it is where it fits, else narrower as above.
 
     A title that is wider than the table becomes a line above it.
     """
@@ -29,17 +32,44 @@ def fitted(table: Table, console: Console, options: ConsoleOptions) -> Renderabl
         table = copy.copy(table)
         table.title = None
         return Group(title, fitted(table, console, options))
-    fitting = _in_width(table, console, options)
-    return _listed(table, console, options) if fitting is None else fitting
+    whole = _in_width(table, console, options, whole_cells=True)
+    if whole is not None:
+        return whole
+    if parts := _parts(table, console, options):
+        return Group(*parts)
+    wrapped = _in_width(table, console, options)
+    return _listed(table, console, options) if wrapped is None else wrapped
 
 
-def _in_width(table: Table, console: Console, options: ConsoleOptions) -> Table | None:
-    """The table in this width, its cells wrapped between words if need be; None where a word would be cut."""
+def _parts(table: Table, console: Console, options: ConsoleOptions) -> list[Table]:
+    """The table cut between columns, whole cells in each part; empty where the first column does not tell the rows
+    apart, or it takes too many parts."""
+    parts, rest = list[Table](), table.columns[1:]
+    if len({str(cell) for cell in table.columns[0].cells}) < table.row_count:
+        return []
+    while rest:
+        for count in range(len(rest), 0, -1):
+            part = copy.copy(table)
+            part.columns = [replace(each, _index=at) for at, each in enumerate((table.columns[0], *rest[:count]))]
+            part.title = None if parts else table.title
+            fitting = _in_width(part, console, options, whole_cells=True)
+            if fitting is not None:
+                break
+        if fitting is None or len(parts) == MOST_PARTS:
+            return []
+        parts.append(fitting)
+        rest = rest[count:]
+    return parts
+
+
+def _in_width(table: Table, console: Console, options: ConsoleOptions, *, whole_cells: bool = False) -> Table | None:
+    """The table in this width, wrapped between words if need be, headings alone with `whole_cells`; None where a word
+    would be cut."""
     wide = options.update(width=UNBOUNDED)
     width = Measurement.get(console, wide, table).maximum
     if width <= options.max_width:
         return table
-    columns = [_width_of_column(console, wide, table, number) for number in range(len(table.columns))]
+    columns = [_width_of_column(console, wide, each, whole_cells) for each in table.columns]
     lacking = sum(each.maximum - each.minimum for each in columns)
     room = options.max_width - width + lacking
     if room < 0:
@@ -52,12 +82,12 @@ def _in_width(table: Table, console: Console, options: ConsoleOptions) -> Table 
     return shown
 
 
-def _width_of_column(console: Console, wide: ConsoleOptions, table: Table, number: int) -> Measurement:
-    """The longest word and the longest line of a column, its heading included."""
-    column = table.columns[number]
-    cells = [Measurement.get(console, wide, cell) for cell in (column.header, *column.cells)]
-    widest = max(cell.maximum for cell in cells)
-    return Measurement(widest if column.no_wrap else max(cell.minimum for cell in cells), widest)
+def _width_of_column(console: Console, wide: ConsoleOptions, column: Column, whole_cells: bool) -> Measurement:
+    """The narrowest width of a column, and that of its longest line, its heading included."""
+    heading, *cells = (Measurement.get(console, wide, cell) for cell in (column.header, *column.cells))
+    widest = max(each.maximum for each in (heading, *cells))
+    least = max([heading.minimum, *(each.maximum if whole_cells else each.minimum for each in cells)])
+    return Measurement(widest if column.no_wrap else least, widest)
 
 
 def _listed(table: Table, console: Console, options: ConsoleOptions) -> Group:

@@ -59,7 +59,7 @@ def calibrate(
     if all_creep(data):
         if apply:
             raise BadInput("--apply: the host keeps the calibration of these drives: the record is in force without it")
-        calibrate_creep(data, arm_file, store, json_file)
+        calibrate_creep(data, arm_file, store, json_file, report)
         suggest(command_line("identify", *map(str, directories), arm=arm, store=store))
         return
     drives = drives_of(data)
@@ -70,7 +70,7 @@ def calibrate(
     record = fit.record(arm_file).model_copy(update={"parent": parent, "drives": drives})
     felt = felt_mass(gcomp_arm(arm_file), fit.rows.readings)
     if felt is not None and felt.contradicts:
-        records.add(record)
+        records.add(record.model_copy(update={"note": f"not made current: {felt}"}))
         write_json(json_file, _answer(fit, record, False))
         raise Refused(f"{felt} Record {record.id} is kept, and not made current")
     out = results(json_file)

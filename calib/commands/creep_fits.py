@@ -17,7 +17,9 @@ from calib.records.store import RecordStore
 from calib.sweep.dataset import SweepData
 
 
-def calibrate_creep(data: list[SweepData], arm_file: ArmFile, store: str | None, json_file: Path | None) -> None:
+def calibrate_creep(
+    data: list[SweepData], arm_file: ArmFile, store: str | None, json_file: Path | None, report: Path | None
+) -> None:
     """Fit, show and keep a calibration record; it is in force when the arm is opened next: the host keeps it."""
     fit = _fit(data, arm_file)
     records = RecordStore(store)
@@ -26,6 +28,10 @@ def calibrate_creep(data: list[SweepData], arm_file: ArmFile, store: str | None,
     records.put(record, arm_file, by="armlink calibrate", reason="creep sweeps")
     out = results(json_file)
     _show(fit, data, out)
+    if report is not None:
+        from calib.report.calibration import write_creep_report
+
+        write_creep_report(fit, record, [each.reason for one in data for each in contacts(one)], report)
     out.print(f"record {record.id} is current: it corrects readings and commands when the arm is opened next")
     write_json(json_file, {"schema": "armlink.creep/1", "record": record.id, **_answer(fit, data)})
 

@@ -25,7 +25,6 @@ class Chain:
 
     @property
     def tip(self) -> str:
-        """Body that the chain ends in."""
         return self.joints[-1].body
 
 

@@ -30,9 +30,7 @@ RATING_FACTOR = 2.5
 class Questions(Protocol):
     """Questions to a person at a terminal."""
 
-    def which(self, chains: Sequence[Chain]) -> Chain:
-        """Which of several arms in a model is meant."""
-        ...
+    def which(self, chains: Sequence[Chain]) -> Chain: ...
 
     def stops(self, joint: str) -> tuple[float, float] | None:
         """Stops [rad] of a joint for which the model has none; None where they are not known."""

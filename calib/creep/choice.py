@@ -31,7 +31,6 @@ def sweep_motion(arm_file: ArmFile) -> Motion:
 
 
 def is_creep(data: SweepData) -> bool:
-    """Whether a data set was swept by creeping."""
     return data.plan is not None and any(sweep.speed is not None for sweep in data.plan.sweeps)
 
 

@@ -195,7 +195,6 @@ class CreepCalibration:
         return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
 
     def record(self, arm_file: ArmFile) -> CalibrationRecord:
-        """The calibration record, with friction."""
         return calibration_record(self.fit, arm_file)
 
     @staticmethod

@@ -56,7 +56,6 @@ class LineQueue:
         atexit.register(self.drain, DRAIN_SECONDS)
 
     def write(self, text: str) -> None:
-        """Returns at once."""
         try:
             self._lines.put_nowait(text)
         except queue.Full:

@@ -78,7 +78,6 @@ class DaemonSection(Section):
 
 
 def daemon_section(arm: ArmFile) -> DaemonSection:
-    """The arm file's section, or the defaults."""
     return arm.daemon if isinstance(arm.daemon, DaemonSection) else DaemonSection()
 
 
@@ -92,5 +91,4 @@ class Configuration:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Joints, base to tip."""
         return self.arm.joint_names

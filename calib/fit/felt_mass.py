@@ -31,7 +31,6 @@ class FeltMass:
         return not LEAST <= self.felt / self.stated <= MOST
 
     def __str__(self) -> str:
-        """The contradiction in one line."""
         return (
             f"the loaded pass feels {self.felt:.1f} kg where {self.stated:g} kg were stated (--reference-mass): was the"
             " mass attached, and is the number right?"

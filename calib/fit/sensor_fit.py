@@ -196,7 +196,6 @@ def _quantiles(freedom: Parameters) -> Parameters:
 
 
 def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
-    """The global fit, then refined and examined."""
     kinematics, section = gcomp_arm(arm_file), sweep_section(arm_file)
     unknown = {"gain", "offset", "position_gain", "beta"}
     priors = dict(extra)

@@ -141,7 +141,6 @@ class _Float:
                     return
 
     def hold(self) -> None:
-        """Position control at the present positions."""
         here = Command.hold(self.position)
         for _ in range(round(HOLD_SECONDS / self._link.period)):
             self._link.cycle(here)

@@ -58,7 +58,6 @@ class DriftFinding:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Self:
-        """The finding that `as_json` wrote."""
         return cls(**{**values, "covariance": np.array(values["covariance"])})
 
 

@@ -81,7 +81,6 @@ class Investigation:
         return rows
 
     def save(self) -> dict[str, Any]:
-        """Rows and results as JSON values."""
         first, said = self.first, self.reported
         return {
             "held": self.held,

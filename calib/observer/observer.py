@@ -169,7 +169,6 @@ class Observer:
         return True
 
     def _angle(self, position: Array) -> Array:
-        """True angles of position readings."""
         return np.asarray(self._position_gain * position + self._position_offset)
 
     def _test(self, t: float) -> list[Event]:

@@ -11,12 +11,14 @@ from markupsafe import Markup
 from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
+from calib.creep.fit import QUANTILE, CreepFit
+from calib.creep.record import HEADINGS, determined_values, missing
 from calib.fit.heldout import heldout_scores
 from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, Parameter
-from calib.report.figures import before_after_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
-from calib.report.page import ReportSection, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.figures import before_after_figure, creep_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
+from calib.report.page import ReportSection, bullets, html_of, paragraph, paragraphs, render, verdict_line
 from calib.report.tables import ReportTable, interval_table
 from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
@@ -50,7 +52,7 @@ def write_report(done: Calibrated, path: Path) -> None:
 
 def sections(done: Calibrated) -> list[ReportSection]:
     """The results, for a part of another report."""
-    return [_sensors(done), _comparison(done), *_sweeps(done), _left_out(done)]
+    return [_comparison(done), _sensors(done), *_sweeps(done), _left_out(done)]
 
 
 def _identity(done: Calibrated) -> ReportSection:
@@ -242,3 +244,19 @@ def _left_out(done: Calibrated) -> ReportSection:
 
 def _number(value: float | None, form: str) -> str:
     return "–" if value is None or not np.isfinite(value) else format(value, form)
+
+
+def creep_sections(fit: CreepFit) -> list[ReportSection]:
+    """Creep sweeps, for a part of another report."""
+    text = "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
+    return [ReportSection("Creep sweeps", paragraph(text) + paragraphs(fit.findings), [creep_figure(fit)])]
+
+
+def write_creep_report(fit: CreepFit, record: CalibrationRecord, contacts: Sequence[str], path: Path) -> None:
+    """Write one self-contained HTML file; raises OSError."""
+    columns = {title: (determined_values(fit, key), QUANTILE * fit.std(key)) for key, title in HEADINGS.items()}
+    values = interval_table(fit.names, columns, "Estimates ± half of the 95 % interval.")
+    unknown = (f"{joint} {parameter}: {reason}" for (joint, parameter), reason in missing(fit).items())
+    drives = ReportSection("Drives", bullets([*unknown, *contacts]), (), [values])
+    title = f"Calibration {record.id}: {record.arm} {record.serial}"
+    render(path, title, [drives, *creep_sections(fit)], f"{record.created:%Y-%m-%d %H:%M} UTC, {record.software}")

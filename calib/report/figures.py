@@ -31,7 +31,6 @@ def sweeps_of(fit: SensorFit, joint: int) -> list[str]:
 
 
 def sweep_rows(fit: SensorFit, joint: int, sweep: str) -> Indices:
-    """Rows of one sweep, in order of position."""
     at = np.flatnonzero((fit.rows.swept == joint) & (fit.rows.readings.series == fit.rows.sweeps.index(sweep)))
     return at[np.argsort(fit.rows.readings.position[at, joint])]
 

@@ -129,7 +129,6 @@ def drives_of(data: Sequence["SweepData"]) -> tuple[str, ...]:
 
 
 def encode(line: Line) -> bytes:
-    """A line of a data set as in the file."""
     return _LINE.dump_json(line) + b"\n"
 
 
@@ -151,7 +150,6 @@ class SweepData:
 
     @property
     def complete(self) -> bool:
-        """Whether it has every reading of the plan."""
         return self.plan is not None and len(self.readings) >= self.plan.readings
 
     @property

@@ -100,7 +100,6 @@ def _final_plan(
 
 
 def sparkline(values: Sequence[float]) -> str:
-    """A curve of one character a value."""
     low, high = min(values), max(values)
     steps = (len(BARS) - 1) / max(high - low, 1e-12)
     return "".join(BARS[round((value - low) * steps)] for value in values)

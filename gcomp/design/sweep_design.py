@@ -167,7 +167,6 @@ class _Judge:
         return select([each[None] for each in information], prior, counts, criterion=criterion, unit=self.unit)
 
     def design(self, sweeps: Sequence[JointSweep]) -> Design:
-        """The sweeps with their predicted precision."""
         readings = readings_of(self.arm, sweeps, self.sigma, self.loads)
         return Design(tuple(sweeps), predict_covariance(self.arm, readings, self.guess, unknown=self.unknown))
 

@@ -24,7 +24,6 @@ class Signed(NamedTuple):
     sign: float
 
     def rows(self, first: int, last: int) -> "Signed":
-        """Rows first to last − 1 alone."""
         return Signed(self.array[first:last], self.sign)
 
 

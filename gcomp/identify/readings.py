@@ -68,7 +68,6 @@ class StaticReadings:
         return len(self.position)
 
     def rows(self, which: Mask | slice) -> "StaticReadings":
-        """These readings alone."""
         return StaticReadings(*(column[which] for column in self._columns()))
 
     def blocks(self, size: int = 2048) -> Iterator["StaticReadings"]:

@@ -32,8 +32,8 @@ from calib.plan.types import SweepPlan
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
 from calib.report import calibration
-from calib.report.figures import creep_figure, verify_figure
-from calib.report.page import ReportSection, paragraph, paragraphs
+from calib.report.figures import verify_figure
+from calib.report.page import ReportSection, paragraph
 from calib.sweep.dataset import SweepData
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
@@ -246,15 +246,17 @@ class Demo:
         names: tuple[Any, ...] = ("gain", "offset", "position_offset" if self.bench.creeping else "position_gain")
         account.note(sensors={name: {"true": true[name], **_estimate(fit, name)} for name in names}, drift=None)
         account.note(not_identifiable={f"{joint}.{name}": why for (joint, name), why in fit.reasons.items()})
-        text = "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
+        swept = "was swept without and with"
         if isinstance(fit, CreepCalibration):
-            parts = [ReportSection("Creep sweeps", paragraph(text) + paragraphs(fit.findings), [creep_figure(fit.fit)])]
+            swept, parts = (
+                "crept through its range without, with and again without",
+                calibration.creep_sections(fit.fit),
+            )
             friction = {name: _estimate(fit.fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
             friction["coulomb"]["true"] = true["coulomb"]
             account.note(friction=friction, disturbed=fit.findings, sag=None)
             names += ("coulomb", "load", "viscous")
         else:
-            text = "Each joint was swept without and with a reference mass; the true values were hidden from the fit."
             parts = calibration.sections(calibration.Calibrated(self.bench.arm, passes, fit, record, None))
         columns: dict[str, tuple[Array, Array]] = {}
         for name in names:
@@ -262,7 +264,9 @@ class Demo:
             if name in true:
                 columns["true " + name.replace("_", " ")] = true[name], 0 * true[name]
         table = account.table("torque gain, offset [N·m] and the like: estimated ± 95 %, and true", fit.names, columns)
-        account.sections += [ReportSection("Sensor calibration and the truth", paragraph(text), (), [table]), *parts]
+        text = f"Each joint {swept} a reference mass; the true values were hidden from the fit."
+        truths = ReportSection("Sensor calibration and the truth", paragraph(text), (), [table])
+        account.sections += [parts[0], truths, *parts[1:]]
         error = np.abs(fit.value("gain") / truth.gain - 1)
         unseen = ", ".join(name for name, each in zip(fit.names, error, strict=True) if np.isnan(each))
         known = f"Torque gains found to {np.nanmax(error, initial=0.0):.2%} at worst"

@@ -70,6 +70,8 @@ def test_every_command_of_the_page_and_the_same_in_python(
         status = cli.run(shlex.split(here(line))[1:])
         said = capsys.readouterr()
         assert status == 0, f"{line}: {said.err}"
+    report = Path("calibration.html").read_text()
+    assert all(each in report for each in ("Creep sweeps", "upper", "fore", "Coulomb friction [N·m]"))
     copied = armlink.load_arm("copy.yaml")
     assert copied.serial == "DOCS"
     assert copied.require_link().bus.channel.endswith("my-openarm.yaml")

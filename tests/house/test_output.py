@@ -36,7 +36,7 @@ COMMANDS = {
     "gap plan": ["gap", "plan", "arm.yaml", "--out", "motion.csv"],
     "gap diagnose": ["gap", "diagnose", "--sim", "wrong.xml", "--train", "wrong.csv"],
 }
-WITHOUT_NAMES = {"doctor", "convert", "replay", "drives", "history"}
+WITHOUT_NAMES = {"doctor", "convert", "replay", "drives", "history", "check"}
 NEXT = {"new", "doctor", "scan", "check", "sweep --plan", "history", "gap plan", "gap diagnose"}
 
 
@@ -96,7 +96,7 @@ def test_json_on_standard_output_is_alone_there(run, name):
 
 
 @pytest.mark.sample(3)
-@pytest.mark.parametrize("name", ["scan", "gap diagnose", "monitor", "check", "sweep --plan", "torque"])
+@pytest.mark.parametrize("name", ["scan", "gap diagnose", "monitor", "sweep --plan", "torque"])
 def test_names_come_whole_on_a_narrow_terminal(run, monkeypatch, name):
     monkeypatch.setenv("COLUMNS", "30")
     said = run(name)

@@ -122,7 +122,6 @@ class LoopProcess:
         self._process.kill()
 
     def ask(self, call: Call) -> LoopAnswer:
-        """Send a call and wait for its answer."""
         answer: Future[LoopAnswer] = Future()
         self._waiting[call.id] = answer
         if not self._send(call):

@@ -38,7 +38,6 @@ class ObserverFeed:
         self._left: Samples | None = None
 
     def measures_against(self, calibration: CalibrationRecord, gravity: GravityRecord) -> bool:
-        """Whether these are its records."""
         return (calibration.id, gravity.id) == (self.calibration.id, self.gravity.id)
 
     def install(self, record: CalibrationRecord, finding: DriftFinding) -> None:

@@ -452,7 +452,6 @@ class Journal:
         self._write(statement, proposal, _iso(time), state, by, note, proposal, proposal=proposal)
 
     def proposals(self, limit: int = 200) -> list[ProposalRow]:
-        """Those on disk, newest first."""
         return list(self._rows.values())[:limit]
 
     def pending(self) -> int:
@@ -462,7 +461,6 @@ class Journal:
         return self._rows.get(number)
 
     def proposal_numbered(self, number: int) -> ProposalRow | None:
-        """The newest proposal of that number."""
         return next((row for row in self._rows.values() if row.number == number), None)
 
     # ---- belief and history
@@ -483,7 +481,6 @@ class Journal:
             return None
 
     def add_history(self, time: datetime, t: float, record: str | None, estimate: dict[str, Any]) -> None:
-        """Append the estimates of all joints."""
         statement = "INSERT INTO history(time, t, record, estimate) VALUES (?, ?, ?, ?)"
         self._write(statement, _iso(time), t, record, json.dumps(estimate))
 

@@ -41,9 +41,7 @@ class Connection(Protocol):
 
     def cut(self) -> None: ...
 
-    def unsent(self) -> int:
-        """Bytes that its client has not taken."""
-        ...
+    def unsent(self) -> int: ...
 
 
 class Admission:

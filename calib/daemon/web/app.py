@@ -64,7 +64,6 @@ def make_app(view: DaemonView, access: Access | None = None) -> tuple[App, Strea
 
 
 def open_app(view: DaemonView, streams: Streams, files: dict[str, PageFile]) -> FastAPI:
-    """The application without the guard."""
     app = Described(
         title="armlink daemon",
         description=PURPOSE,

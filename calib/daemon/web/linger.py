@@ -27,7 +27,6 @@ class LingeringTransport:
         return getattr(self._plain, name)
 
     def is_closing(self) -> bool:
-        """Whether nothing more can be sent."""
         return self._lingers or self._plain.is_closing()
 
     def write(self, data: bytes) -> None:
@@ -72,6 +71,5 @@ class _Drain(asyncio.Protocol):
             self._transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Pass on to the connection's own protocol."""
         self._end.cancel()
         self._owner.connection_lost(exc)

@@ -160,7 +160,6 @@ class BoundedProtocol(H11Protocol):
         self.transport.abort()
 
     def unsent(self) -> int:
-        """Bytes that the client has not taken."""
         return int(self.transport.get_write_buffer_size())
 
     def _stop_waiting(self) -> None:

@@ -70,7 +70,6 @@ OptionalDecision = Annotated[Decision | None, Body()]
 
 
 def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes]) -> APIRouter:
-    """Every route of the API on this view."""
     router = APIRouter(responses=REFUSALS)
     histories = streams.histories
     _add_now(router, view, histories)

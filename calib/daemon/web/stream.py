@@ -135,7 +135,6 @@ class StreamResponse(StreamingResponse):
         self._streams, self._after = streams, after
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve until the client leaves."""
         await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
         await self._streams.run(scope, receive, send, self._after)
 

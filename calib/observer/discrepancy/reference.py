@@ -56,7 +56,6 @@ class Reference:
 
     @property
     def is_first(self) -> bool:
-        """Whether the first epoch is still open."""
         return self._epoch == 0
 
     @property

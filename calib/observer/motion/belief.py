@@ -75,7 +75,6 @@ class MotorBelief:
         self._first = (self.mean, self.covariance, self.sigma)
 
     def rows(self, passages: Sequence[Passage]) -> CreepRows:
-        """Passages as rows of the creep model."""
         joint = np.array([each.joint for each in passages], dtype=np.int64)
         warm = np.array([each.temperature for each in passages]) - self.reference_temperature[joint]
         return CreepRows(

@@ -180,7 +180,6 @@ class Tracking:
         return limits(CauseTest(belief, anywhere, config), config, wait)
 
     def save(self) -> dict[str, Any]:
-        """All parts as JSON values."""
         saved = save_rows([row for row, _ in self._since])
         since = [[*row[:4], known, *row[4:]] for row, (_, known) in zip(saved, self._since, strict=True)]
         own: dict[str, Any] = {"sigma": self.sigma.tolist(), "rows": self.rows, "since": since}

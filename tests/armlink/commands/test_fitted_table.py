@@ -60,6 +60,18 @@ def test_a_wide_terminal_has_the_table_and_a_narrow_one_a_list():
     assert "  j2s6s200_joint_1" in [line.rstrip() for line in shown(table, 20)]
 
 
+def test_a_table_whose_rows_have_names_is_cut_between_columns_before_its_cells_wrap():
+    table = Table("joint", "gain", "true gain", "offset [N·m]", title="Sensors")
+    for number in (1, 2):
+        table.add_row(f"panda_joint{number}", f"0.98 ± 0.0{number}", "0.99", f"1.93 ± 0.0{number}")
+    lines = [" ".join(line.split()) for line in shown(table, 46)]
+    assert [line for line in lines if "panda_joint1" in line] == [
+        "│ panda_joint1 │ 0.98 ± 0.01 │ 0.99 │",
+        "│ panda_joint1 │ 1.93 ± 0.01 │",
+    ]
+    assert sum("Sensors" in line for line in lines) == 1
+
+
 def test_a_long_title_is_a_line_above_and_not_folded_into_the_table():
     table = Table("joint", title="Model against sensor at 24 poses [N·m]")
     table.add_row("j1")

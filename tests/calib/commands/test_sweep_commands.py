@@ -168,6 +168,24 @@ def test_recalibrate_writes_what_drifted_to_the_controllers(
     )
 
 
+def test_history_says_why_a_record_was_not_made_current(
+    arm_path: Path, swept: Path, loaded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Four times the mass that hung there is stated."""
+    other = tmp_path / "other"
+    shutil.copytree(loaded, other)
+    manifest = json.loads((other / "manifest.json").read_text())
+    manifest["reference_mass"] *= 4.0
+    (other / "manifest.json").write_text(json.dumps(manifest))
+    store = ["--store", str(tmp_path / "records.db")]
+    assert run(["calibrate", str(swept), str(other), *store]) == 1
+    assert "is kept, and not made current" in capsys.readouterr().err
+    assert run(["history", str(arm_path), *store, "--json", "-"]) == 0
+    (record,) = json.loads(capsys.readouterr().out)["records"]
+    assert record["note"].startswith("not made current: ")
+    assert not record["current"]
+
+
 def test_sweep_needs_a_directory(arm_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["sweep", str(arm_path)]) == 2
     assert "--out DIR" in capsys.readouterr().err
