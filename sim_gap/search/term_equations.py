@@ -1,6 +1,7 @@
 """Normal equations of all candidate terms on one set of residuals, and their choice by held-out likelihood."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,6 +144,19 @@ class TermChoice(EffectChoice[Term]):
         self.equations, self.usual = equations, usual
         every = [term for term in equations.terms if term.form.plausibility.every_joint and term not in current]
         super().__init__(equations.linear, equations.effects(usual), [*current, *every], least)
+
+    def judge(self, names: Sequence[Term]) -> float:
+        """As of any choice; infinite for a body that is farther from the tip than its own mass allows."""
+        change: Array | None = None
+        for term in names:
+            if term.form.signature.body:
+                change = self.terms.fit(self.free(names)) if change is None else change
+                c = change[self.equations.at[term]]
+                rated = replace(self.equations.ratings.of(term), own=c)
+                low, high = term.form.plausibility.bounds(rated, term.shape)
+                if np.any(c < low) or np.any(c > high):
+                    return float("inf")
+        return super().judge(names)
 
     def values(self, terms: Sequence[Term] | None = None) -> dict[Term, Array]:
         """Coefficients of a fit of some terms, of those chosen if none are given."""
