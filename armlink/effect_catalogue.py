@@ -63,6 +63,11 @@ _ENTRIES = (
         (Parameter("angles", "rad", ("angle_1", "angle_2")),),
         whole_arm=True,
     ),
+    CatalogueEntry(
+        "friction.bearing",
+        "friction on the link side of the torque sensor, as of bearings and seals",
+        (Parameter("torque", "N·m"), Parameter("damping", "N·m·s/rad")),
+    ),
     CatalogueEntry("friction.coulomb", "Coulomb friction, independent of speed", (Parameter("torque", "N·m"),)),
     CatalogueEntry("friction.viscous", "viscous friction, proportional to speed", (Parameter("damping", "N·m·s/rad"),)),
     CatalogueEntry(

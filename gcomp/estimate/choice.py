@@ -3,8 +3,10 @@
 All is linear about one point, so that a choice takes no further evaluation of the problem.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -18,17 +20,28 @@ brings log m of rows that are fitted (risk inflation criterion, Foster and Georg
 one less of rows that are held out. A six-joint arm has m = 150: log 150 − 1 = 4.0."""
 SIGNIFICANT = 2.0
 """Standard errors over the blocks by which an effect has to pay: 98 % of a normal distribution, one-sided."""
+RIDGE = 1e-10
+"""Addition to normal equations of columns of unit length, for columns that are nearly alike."""
+REWEIGHINGS = 3
+"""Fits after which the scale of a channel and the fit that follows from it agree."""
+Name = TypeVar("Name", bound=Hashable)
 
 
 @dataclass(frozen=True)
-class Effect:
+class Effect(Generic[Name]):
     """Parameters that come together, and what they need beside them."""
 
-    name: str
+    name: Name
     parameters: tuple[int, ...]
-    needs: tuple[str, ...] = ()
+    needs: tuple[Name, ...] = ()
     least: float = 0.0
     """Fall of the cost that it has to bring, if that is more than the price."""
+    price: float | None = None
+    """Price, if it is not that of all its parameters: some may show nothing, and a rare effect costs more."""
+    excludes: frozenset[Name] = frozenset()
+    """Effects that give way to it: its own other forms, and those whose columns it contains."""
+    simpler: tuple[Name, ...] = ()
+    """Simpler effects that together could take its place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,37 +62,102 @@ class LinearTerms:
     """(C,)."""
     floor: Array
     away: Array
-    """Nominal value less that of the point, (K,); NaN where there is none."""
+    """Change of a parameter that is not free: its nominal value less that of the point, (K,); NaN where there is
+    none."""
     prior: Array
     """Inverse variance of each parameter before any measurement, (K,)."""
+    expected: Array | None = None
+    """Expected change of a parameter that is free, (K,); as `away` if it is not given."""
+    low: Array | None = None
+    """Least change of each parameter, (K,); no bound if it is not given."""
+    high: Array | None = None
     _found: dict[frozenset[int], tuple[Array, Array]] = field(default_factory=dict)
+    _fits: dict[frozenset[int], tuple[Index, Array]] = field(default_factory=dict)
+
+    @cached_property
+    def _places(self) -> Index:
+        """Place of each parameter among those that act on a channel, −1 for the others, (C, K)."""
+        out = np.full((len(self.acting), len(self.theta)), -1, np.intp)
+        for c, index in enumerate(self.acting):
+            out[c, index] = np.arange(len(index))
+        return out
+
+    def _inside(self, index: Index) -> Iterator[tuple[int, Index, Index]]:
+        """Each channel on which some of these parameters act, which of them do, and their places there."""
+        places = self._places[:, index]
+        there = places >= 0
+        for c in np.flatnonzero(there.any(1) & self.counts.any(1)).tolist():
+            yield c, np.flatnonzero(there[c]), places[c, there[c]]
+
+    @cached_property
+    def _still(self) -> Array:
+        return np.asarray(np.nan_to_num(self.away))
+
+    def _fit(self, free: frozenset[int]) -> tuple[Index, Array]:
+        """Free parameters (p,) and their changes without each fold, then from all, (F + 1, p)."""
+        if free in self._fits:
+            return self._fits[free]
+        index = np.array(sorted(free), np.intp)
+        folds, size = self.totals.shape[1], len(index)
+        gram, side = np.zeros((folds, size, size)), np.zeros((folds, size))
+        still = self._still.copy()
+        still[index] = 0.0
+        moved = np.flatnonzero(still)
+        for c, inside, at in self._inside(index):
+            own, place = -self.products[c][:, at], self._places[c]
+            if len(moved) and len(beside := moved[place[moved] >= 0]):
+                own -= self.squares[c][:, at[:, None], place[beside]] @ still[beside]
+            gram[:, inside[:, None], inside] += self.squares[c][:, at[:, None], at] / self.variance[c]
+            side[:, inside] += own / self.variance[c]
+        whole, right = gram.sum(0), side.sum(0)
+        grams, sides = np.concatenate([whole - gram, whole[None]]), np.concatenate([right - side, right[None]])
+        grams[:, np.arange(size), np.arange(size)] += self.prior[index]
+        sides += self.prior[index] * np.nan_to_num(self.away if self.expected is None else self.expected)[index]
+        self._fits[free] = index, self._bounded(index, grams, sides)
+        return self._fits[free]
+
+    def _bounded(self, index: Index, grams: Array, sides: Array) -> Array:
+        """Solutions of normal equations (F + 1, p, p) within the bounds: what the whole would have beyond is held there
+        in all of them, and the others are fitted beside it."""
+        if self.low is None or self.high is None:
+            return _solved(grams, sides)
+        low, high = self.low[index], self.high[index]
+        held = low == high
+        values = np.broadcast_to(np.where(held, low, 0.0), sides.shape).copy()
+        while True:
+            rest = np.flatnonzero(~held)
+            if not len(rest):
+                return np.asarray(values)
+            fixed = np.flatnonzero(held)
+            beside = sides[:, rest] - (grams[:, rest[:, None], fixed] @ values[:, fixed, None])[..., 0]
+            values[:, rest] = _solved(grams[:, rest[:, None], rest], beside)
+            beyond = ~held & ((values[-1] < low) | (values[-1] > high))
+            if not beyond.any():
+                return np.asarray(np.clip(values, low, high))
+            values[:, beyond] = np.clip(values[-1], low, high)[beyond]
+            held |= beyond
 
     def fit(self, free: Iterable[int], fold: int = -1) -> Array:
         """Change of all parameters (K,) with some free and the others at their nominal values, without one fold."""
-        free = sorted(set(free))
-        size = len(self.theta)
-        change = np.nan_to_num(self.away)
-        change[free] = 0.0
-        normal, right = np.diag(self.prior), np.zeros(size)
-        for c, index in enumerate(self.acting):
-            square, product = self.squares[c].sum(0), self.products[c].sum(0)
-            if fold >= 0:
-                square, product = square - self.squares[c][fold], product - self.products[c][fold]
-            normal[np.ix_(index, index)] += square / self.variance[c]
-            right[index] -= (product + square @ change[index]) / self.variance[c]
-        right += self.prior * np.nan_to_num(self.away) * (self.prior > 0.0)
-        if free:
-            own = normal[np.ix_(free, free)]
-            own[np.diag_indices(len(free))] *= 1.0 + 1e-9
-            change[free] = np.linalg.lstsq(own, right[free], rcond=1e-12)[0]
+        index, values = self._fit(frozenset(free))
+        change = self._still.copy()
+        change[index] = values[fold]
         return change
+
+    def at_bounds(self, change: Array) -> Index:
+        """Parameters whose change (K,) is a bound that leaves room on the other side."""
+        if self.low is None or self.high is None:
+            return np.zeros(0, np.intp)
+        return np.flatnonzero((self.low < self.high) & ((change <= self.low) | (change >= self.high)))
 
     def left(self, change: Array, fold: int | None = None) -> Array:
         """Weighted squares that remain after a change of the parameters, (C, F), or of one fold (C,)."""
         out = self.totals.copy()
-        for c, index in enumerate(self.acting):
-            own = change[index]
-            out[c] += 2.0 * self.products[c] @ own + np.einsum("a,fab,b->f", own, self.squares[c], own)
+        moved = np.flatnonzero(change)
+        for c, own, at in self._inside(moved):
+            values = change[moved[own]]
+            bent = (self.squares[c][:, at[:, None], at] @ values) @ values
+            out[c] += 2.0 * self.products[c][:, at] @ values + bent
         out = np.maximum(out, 0.0)
         return out if fold is None else np.asarray(out[:, fold])
 
@@ -88,23 +166,118 @@ class LinearTerms:
         key = frozenset(free)
         if key not in self._found:
             folds = self.totals.shape[1]
-            if folds > 1:
-                out = np.stack([self.left(self.fit(key, f), f) for f in range(folds)], axis=1)
-            else:
-                out = self.left(self.fit(key))
-            mean = out.sum(1) / np.maximum(self.counts.sum(1), 1e-300) + self.floor**2
+            out = self._held_out(key) if folds > 1 else self.left(self.fit(key))
+            total = self.counts.sum(1)
+            mean = np.where(total > 0.0, out.sum(1) / np.maximum(total, 1e-300) + self.floor**2, 1.0)
             share = out / np.maximum(out.sum(1, keepdims=True), 1e-300)
-            each = 0.5 * self.counts * np.log(mean)[:, None] + 0.5 * (
-                share * self.counts.sum(1, keepdims=True) - self.counts
-            )
-            self._found[key] = each, np.asarray(0.5 * self.counts.sum(1) * np.log(mean))
+            each = 0.5 * self.counts * np.log(mean)[:, None] + 0.5 * (share * total[:, None] - self.counts)
+            self._found[key] = each, np.asarray(0.5 * total * np.log(mean))
         return self._found[key][0]
+
+    def _held_out(self, free: frozenset[int]) -> Array:
+        """Weighted squares of each fold as it is predicted from the others, (C, F)."""
+        index, values = self._fit(free)
+        still = self._still.copy()
+        still[index] = 0.0
+        beside = np.flatnonzero(still)
+        index = np.concatenate([index, beside])
+        values = np.hstack([values[:-1], np.broadcast_to(still[beside], (len(values) - 1, len(beside)))])
+        out = self.totals.copy()
+        for c, inside, at in self._inside(index):
+            own = values[:, inside]
+            bent = (self.squares[c][:, at[:, None], at] @ own[..., None])[..., 0]
+            out[c] += np.sum(own * (2.0 * self.products[c][:, at] + bent), axis=1)
+        return np.maximum(out, 0.0)
 
     def cost(self, free: Iterable[int]) -> Array:
         """The same of each channel, (C,)."""
         key = frozenset(free)
         self.costs(key)
         return self._found[key][1]
+
+    def mean_squares(self, change: Array) -> Array:
+        """Mean square that remains in each channel after a change of the parameters, (C,)."""
+        return np.asarray(self.left(change).sum(1) / np.maximum(self.counts.sum(1), 1e-300))
+
+    def reweighed(self, free: Iterable[int]) -> "LinearTerms":
+        """The same with the scale of each channel that these parameters leave."""
+        free = frozenset(free)
+        squares = self.totals.sum(1) / np.maximum(self.counts.sum(1), 1e-300)
+        for _ in range(REWEIGHINGS):
+            terms = replace(self, variance=squares + self.floor**2, _found={}, _fits={})
+            squares = terms.mean_squares(terms.fit(free))
+        return terms
+
+    @cached_property
+    def _matrix(self) -> tuple[Array, Array]:
+        """Normal equations of all parameters and all channels, (K, K) and (K,)."""
+        size = len(self.theta)
+        gram, side = np.diag(self.prior), np.zeros(size)
+        for c, index in enumerate(self.acting):
+            if len(index) and self.counts[c].any():
+                gram[index[:, None], index] += self.squares[c].sum(0) / self.variance[c]
+                side[index] -= self.products[c].sum(0) / self.variance[c]
+        return gram, side + self.prior * np.nan_to_num(self.away if self.expected is None else self.expected)
+
+    def curvature(self, own: Index, free: Iterable[int]) -> Array:
+        """Second derivatives of the cost in some parameters, all other free ones adapting, (p, p)."""
+        rest = np.setdiff1d(np.array(sorted(free), np.intp), own)
+        gram = self._matrix[0]
+        onto = gram[np.ix_(rest, own)]
+        return np.asarray(gram[np.ix_(own, own)] - onto.T @ np.linalg.lstsq(gram[np.ix_(rest, rest)], onto, 1e-12)[0])
+
+    def promises(self, free: Iterable[int], candidates: Sequence[tuple[int, ...]]) -> Array:
+        """About how far the cost falls by each group of parameters in addition to free ones, these adapting, (M,)."""
+        gram, side = self._matrix
+        index = np.array(sorted(free), np.intp)
+        floor = 1e-6 * np.diag(gram) + 1e-300
+        if len(index):
+            change = self.fit(index.tolist())[index]
+            scale = 1.0 / np.sqrt(np.maximum(np.diag(gram)[index], 1e-300))
+            own = gram[np.ix_(index, index)] * scale * scale[:, None] + RIDGE * np.eye(len(index))
+            half = np.linalg.solve(np.linalg.cholesky(own), scale[:, None] * gram[index])
+            left = side - gram[:, index] @ change
+            gram = np.asarray(gram - half.T @ half)
+        else:
+            left = side
+        out = np.zeros(len(candidates))
+        widths = np.array([len(each) for each in candidates])
+        for width in np.unique(widths):
+            same = np.flatnonzero(widths == width)
+            own = np.array([candidates[k] for k in same.tolist()], np.intp)
+            blocks = gram[own[:, :, None], own[:, None, :]] + floor[own][:, :, None] * np.eye(width)
+            aim = left[own]
+            if self.low is not None and self.high is not None:
+                low, high = self.low[own], self.high[own]
+                held = low == high
+                fixed = np.where(held, low, 0.0)
+                beside = np.where(held, fixed, aim - (blocks @ fixed[..., None])[..., 0])
+                free_blocks = np.where(held[:, :, None] | held[:, None, :], np.eye(width), blocks)
+                values = np.clip(np.linalg.solve(free_blocks, beside[..., None])[..., 0], low, high)
+            else:
+                values = np.linalg.solve(blocks, aim[..., None])[..., 0]
+            out[same] = np.sum(values * (aim - 0.5 * (blocks @ values[..., None])[..., 0]), axis=1)
+        return out
+
+    def freedom(self, parameters: Sequence[int]) -> float:
+        """Effective number of parameters: those whose plausible size would show in the data; at least 1."""
+        own = np.array(parameters, np.intp)
+        gram = np.zeros((len(own), len(own)))
+        for c, place in enumerate(self._places):
+            if np.all(place[own] >= 0):
+                gram += self.squares[c].sum(0)[np.ix_(place[own], place[own])] / self.floor[c] ** 2
+        spread = 1.0 / np.sqrt(np.maximum(self.prior[own], 1e-300))
+        values = np.maximum(np.linalg.eigvalsh(gram * spread * spread[:, None]), 0.0)
+        return max(float(np.sum(values / (1.0 + values))), 1.0)
+
+
+def _solved(grams: Array, sides: Array) -> Array:
+    """Solutions of normal equations (…, p, p) and (…, p)."""
+    if not sides.shape[-1]:
+        return sides.copy()
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(grams, axis1=-2, axis2=-1), 1e-300))
+    scaled = grams * scale[..., None, :] * scale[..., None] + RIDGE * np.eye(sides.shape[-1])
+    return np.asarray(scale * np.linalg.solve(scaled, (scale * sides)[..., None])[..., 0])
 
 
 def terms_of(problem: EstimationProblem, about: Linearised, folds: Index) -> LinearTerms:
@@ -150,42 +323,42 @@ def evidence(terms: LinearTerms, less: Iterable[int], more: Iterable[int]) -> He
     return HeldOutEvidence(fall, float(each.std(ddof=1) * np.sqrt(len(each))) if len(each) > 1 else 0.0)
 
 
-def price_of(effect: Effect) -> float:
-    return max(PRICE * len(effect.parameters), effect.least)
+def price_of(effect: Effect[Name]) -> float:
+    return max(PRICE * len(effect.parameters), effect.least) if effect.price is None else effect.price
 
 
 def choose(
     terms: LinearTerms,
-    effects: Sequence[Effect],
-    chosen: Iterable[str],
-    kept: Iterable[str] = (),
+    effects: Sequence[Effect[Name]],
+    chosen: Iterable[Name],
+    kept: Iterable[Name] = (),
     most: int = 1000,
-    progress: Callable[[str], None] = lambda text: None,
-) -> list[str]:
+    progress: Callable[[Name], None] = lambda name: None,
+) -> list[Name]:
     """Effects in the order in which they pay most beside those there, from the ones `chosen` on; then those that do
     not pay any more are taken out, but for those `kept`."""
     by_name = {effect.name: effect for effect in effects}
     current = [name for name in chosen if name in by_name]
 
-    def free(names: Iterable[str]) -> frozenset[int]:
+    def free(names: Iterable[Name]) -> frozenset[int]:
         return frozenset(k for name in names for k in by_name[name].parameters)
 
-    def pays(less: Sequence[str], more: Sequence[str], effect: Effect) -> float:
+    def pays(less: Sequence[Name], more: Sequence[Name], effect: Effect[Name]) -> float:
         """Gain beyond the price; not positive for one that is not sure over the folds."""
         shown = evidence(terms, free(less), free(more))
         sure = shown.fall > SIGNIFICANT * shown.error or shown.error == 0.0
         return shown.fall - price_of(effect) if sure else -np.inf
 
-    dead = set[str]()
     for _ in range(most):
-        best, gain = "", 0.0
+        best: Name | None = None
+        gain = 0.0
         for effect in effects:
-            if effect.name in current or effect.name in dead or not set(effect.needs) <= set(current):
+            if effect.name in current or not set(effect.needs) <= set(current):
                 continue
             worth = pays(current, [*current, effect.name], effect)
             if worth > gain:
                 best, gain = effect.name, worth
-        if not best:
+        if best is None:
             break
         progress(best)
         current.append(best)
@@ -193,11 +366,11 @@ def choose(
     while True:
         needed = {need for name in current for need in by_name[name].needs}
         losses = [
-            (pays([n for n in current if n != name], current, by_name[name]), name)
-            for name in current
+            (pays([n for n in current if n != name], current, by_name[name]), k)
+            for k, name in enumerate(current)
             if name not in fixed and name not in needed
         ]
-        worst = min(losses, default=(1.0, ""))
+        worst = min(losses, default=(1.0, -1))
         if worst[0] > 0.0:
             return current
-        current.remove(worst[1])
+        current.pop(worst[1])

@@ -11,7 +11,8 @@ from sim_bus.effects.forms import EFFECTS
 from sim_bus.effects.state import Imperfections
 
 NOT_SIMULATED = {
-    "torque.nonlinearity": "the simulated sensor is linear apart from hysteresis, dead band and saturation"
+    "friction.bearing": "all friction of the simulated arm is between motor and torque sensor",
+    "torque.nonlinearity": "the simulated sensor is linear apart from hysteresis, dead band and saturation",
 }
 """Catalogue ids without a forward form, and why."""
 _EFFECTS = {each.id: each for each in sorted(EFFECTS, key=lambda each: each.id)}

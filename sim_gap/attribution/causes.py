@@ -16,8 +16,8 @@ from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import ChannelLayout, Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import EffectEstimate, Value
-from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.term import Term
+from sim_gap.search.term_equations import TermEquations
 
 STEADY = 2.0
 """Least mean decrease of a row's sum of squares over the blocks, in standard errors."""
@@ -38,8 +38,8 @@ def steadiness(estimate: EffectEstimate, heldout: ResidualSet, terms: Sequence[T
         touching = [term for term in estimate.terms if row in store.columns(term)]
         if not valid.any() or not any(row in store.columns(term) for term in terms):
             continue
-        columns = store.wide(touching, row, estimate.normal.fixed)[valid]
-        index = estimate.normal.index(touching)
+        columns = store.wide(touching, row, estimate.equations.fixed)[valid]
+        index = estimate.equations.index(touching)
         left, more = (heldout.values[row][valid] - columns @ c[index] for c in (with_them, without))
         falls = np.bincount(heldout.blocks[valid], more**2 - left**2)
         falls = falls[np.unique(heldout.blocks[valid])]
@@ -72,17 +72,17 @@ FLOOR_KNOWN = 1.05
 class _Scorer:
     def __init__(self, estimate: EffectEstimate, heldout: ResidualSet) -> None:
         self.estimate, self.heldout = estimate, heldout
-        self.normal = NormalEquations(estimate.on(heldout), estimate.terms, estimate.normal)
-        self.joint = np.array([row[1] for row in self.normal.rows])
-        self.counts = self.normal.count.sum(0) > 0
+        self.equations = TermEquations(estimate.on(heldout), estimate.terms, estimate.equations)
+        self.joint = np.array([row[1] for row in self.equations.rows])
+        self.counts = self.equations.seen
 
     def squares(self, terms: list[Term]) -> Array:
         """Held-out mean square per row after fitting these terms to the training set, (R,)."""
-        return self.normal.mean_square(np.arange(self.normal.size), self.estimate.subset(terms))
+        return self.equations.mean_square(self.estimate.subset(terms))
 
     def signs(self, terms: tuple[Term, ...], evidence: float, outside: float) -> Signs:
         """The evidence for and against a cause, on the row that increases most without its terms."""
-        data, rows = self.heldout, self.normal.rows
+        data, rows = self.heldout, self.equations.rows
         final = self.squares(list(self.estimate.terms))
         without = self.squares([term for term in self.estimate.terms if term not in terms])
         raw = np.maximum(self.squares([]), final)
@@ -97,7 +97,7 @@ class _Scorer:
     @cached_property
     def noise(self) -> Array:
         """Mean square of the noise in each row: of its floor, but at most of the residual of all terms, (R,)."""
-        floor = np.array([self.heldout.floor[row] for row in self.normal.rows])
+        floor = np.array([self.heldout.floor[row] for row in self.equations.rows])
         return np.asarray(np.minimum(floor**2, self.squares(list(self.estimate.terms))))
 
     def rms(self, terms: list[Term]) -> Array:

@@ -11,6 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording, default_names, slice_rows
@@ -29,7 +31,7 @@ from sim_gap.attribution.friction_compensation import find_compensations, held_i
 from sim_gap.attribution.position_answer import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_quiet, is_within
-from sim_gap.checks.check import check_recordings, unchecked_note
+from sim_gap.checks.check import check_recordings, times_in_motion, unchecked_note
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joints import match_joints
 from sim_gap.checks.position_command import check_position_only, is_position_only
@@ -37,12 +39,12 @@ from sim_gap.effects.registry import library_without
 from sim_gap.model.known_gains import KnownGains
 from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains
 from sim_gap.residuals.disregarded_rows import without_disturbances
-from sim_gap.residuals.preprocess import prepare, require_length
+from sim_gap.residuals.preprocess import SHORTEST_PIECE_S, prepare, require_length
 from sim_gap.residuals.residual_set import ResidualSet, residual_sets
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.model_selection import select_model
-from sim_gap.search.stepwise_search import StepwiseSearch
+from sim_gap.search.term_equations import TermChoice
 
 OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
@@ -156,7 +158,7 @@ def _placed(estimate: EffectEstimate, heldout: ResidualSet) -> ResidualSet:
     return without_disturbances(judge, estimate.predict(judge))
 
 
-def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch, EffectEstimate]:
+def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[TermChoice, EffectEstimate]:
     """The search of the library and the fit (`_searched`); again without what disturbed the arm, if anything did."""
     search, estimate = _searched(fit, library)
     data = estimate.store.data
@@ -164,10 +166,10 @@ def _fitted(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch, E
     return (search, estimate) if undisturbed is data else _searched(undisturbed, library)
 
 
-def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch, EffectEstimate]:
+def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[TermChoice, EffectEstimate]:
     """The search of the library and the fit; again if a body is mounted in different ways, kept if that is better."""
     search = select_model(ColumnStore(fit), library)
-    estimate = EffectEstimate(search.normal.store, search.active)
+    estimate = EffectEstimate(search.equations.store, search.current)
     for _ in range(MOUNTED):
         signals = estimate.store.data.signals
         angles = mounts(estimate)
@@ -175,9 +177,9 @@ def _searched(fit: ResidualSet, library: Sequence[str]) -> tuple[StepwiseSearch,
             break
         turned = tuple(replace(s, mount=angle) for s, angle in zip(signals, angles, strict=True))
         again = select_model(ColumnStore(ResidualSet(turned, fit.layout)), library)
-        if again.score > search.score - CLEARLY:
+        if again.score > search.score - CLEARLY * search.equations.measurements:
             break
-        search, estimate = again, EffectEstimate(again.normal.store, again.active)
+        search, estimate = again, EffectEstimate(again.equations.store, again.current)
     return search, estimate
 
 
@@ -218,7 +220,7 @@ def checked_recordings(
     names = () if matched[0].names == default_names(matched[0].n) else matched[0].names
     sim = load_model(source if isinstance(source, str | Path) else compiled_model, names, matched[0].n, hinges)
     alone = all(is_position_only(recording) for recording in matched)
-    require_length(matched, labels, together=alone)
+    require_length(matched, labels, 0.0 if alone else SHORTEST_PIECE_S)
     if alone:
         checked, found = check_position_only(sim.arm, matched, labels[: len(matched)], stated)
     else:
@@ -227,11 +229,15 @@ def checked_recordings(
 
 
 def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording]]:
-    """Each recording without its end, and the ends."""
+    """Each recording without its end, and the ends: what is fitted and what judges both hold motion, if the arm comes
+    to rest before its end as one does that swings free."""
     first, last = [], []
     for recording in recordings:
         span = recording.t[-1] - recording.t[0]
         cut = recording.t[-1] - max(OWN_HELDOUT * span, min(OWN_HELDOUT_S, 0.5 * span))
+        moved = times_in_motion(recording)
+        if len(moved):
+            cut = min(cut, max(float(np.quantile(moved, 1.0 - OWN_HELDOUT)), recording.t[0] + SHORTEST_PIECE_S))
         first.append(slice_rows(recording, recording.t < cut))
         last.append(slice_rows(recording, recording.t >= cut))
     return first, last

@@ -111,11 +111,13 @@ def _law(command: Array, velocity: Array, position: Array) -> tuple[float, float
             continue
         scale = np.maximum(x.std(axis=0), 1e-12)
         x = x / scale
-        without, whole = (_rest(part, y) for part in (x[:, LAGS:], x))
-        share = 1.0 - float(whole @ whole) / max(float(without @ without), 1e-300)
-        inverse = np.linalg.pinv(x.T @ x, hermitian=True)
-        values = inverse @ (x.T @ y) / scale
-        spread = inverse / np.outer(scale, scale) * float(whole @ whole) / len(y)
+        gram, side, power = x.T @ x, x.T @ y, float(y @ y)
+        inverse = np.linalg.pinv(gram, hermitian=True)
+        without = power - float(side[LAGS:] @ np.linalg.pinv(gram[LAGS:, LAGS:], hermitian=True) @ side[LAGS:])
+        whole = power - float(side @ inverse @ side)
+        share = 1.0 - whole / max(without, 1e-300)
+        values = inverse @ side / scale
+        spread = inverse / np.outer(scale, scale) * whole / len(y)
         torque, error = float(values[:LAGS].sum()), float(np.sqrt(max(spread[:LAGS, :LAGS].sum(), 0.0)))
         sure = torque > max(SURE * error, SLIGHT * float(np.nanstd(command)))
         if share > max(FOLLOWS, best[0] if best else 0.0) and sure:
@@ -129,10 +131,6 @@ def _dry(velocity: Array, speed: float) -> Array:
 
 def _bent(x: Array) -> Array:
     return np.asarray(np.diff(x, 2))
-
-
-def _rest(x: Array, y: Array) -> Array:
-    return np.asarray(y - x @ np.linalg.lstsq(x, y, 1e-10)[0])
 
 
 @dataclass(frozen=True)

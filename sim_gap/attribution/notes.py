@@ -35,7 +35,13 @@ def notes(
 ) -> tuple[str, ...]:
     """All notes; `fit` is the training set, `judge` the held-out set with the remaining residual `left`."""
     usual = (*_noisy(fit), *_spiked((fit, judge)), *_stuck(stuck, fit), *_impacts(fit), *_disturbed((fit, judge)))
-    known = (*usual, *_common_factor(estimate, fit), *_bound(estimate, fit, judge), *_alike(found))
+    known = (
+        *usual,
+        *_at_bounds(estimate, fit),
+        *_common_factor(estimate, fit),
+        *_bound(estimate, fit, judge),
+        *_alike(found),
+    )
     return (*known, *_remaining(judge, left), *_at_rest(fit))
 
 
@@ -92,6 +98,15 @@ def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
         for one in s.disturbances
     )
     return tuple(dict.fromkeys(lines))
+
+
+def _at_bounds(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[str, ...]:
+    names = fit.signals[0].arm.names
+    return tuple(
+        f"{term.effect} of {'the arm' if term.form.signature.whole_arm else names[term.place]} is the largest or least "
+        "that can exist there: these recordings do not determine its size"
+        for term in (estimate.at_bounds() if estimate is not None else ())
+    )
 
 
 def _common_factor(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[str, ...]:

@@ -4,19 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sim_gap.search.gauss_newton import converge
-from sim_gap.search.normal_equations import NormalEquations
-from sim_gap.search.stepwise_search import StepwiseSearch, shortlist
 from sim_gap.search.term import Term
+from sim_gap.search.term_equations import TermChoice, TermEquations
 from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants
 
 AS_GOOD = 0.036
-"""A rival is as good if its score (½ log of the mean square) is worse by no more than this: the price of three
-coefficients, for the background of every arm can favour either by that much."""
+"""A rival is as good if its score, per independent measurement, is worse by no more than this: the price of three
+coefficients of a long recording, for the background of every arm can favour either by that much."""
+BARE = AS_GOOD / 3.0
+"""A cause that brings no more than the price of a coefficient has as a rival any effect that brings some of it."""
 ALIKE = 1e-6
 """Difference of two scores, apart from their prices, up to which two effects fit exactly alike: then the dearer one is
 a rival of the cheaper one, too."""
-BARE = 0.012
-"""A cause that brings no more than the price of a coefficient has as a rival any effect that brings some of it."""
 NEAR = 0.3
 """A rival within this is fitted about itself, if the columns of either depend on the other."""
 TRIED = 4
@@ -60,72 +59,67 @@ class Weighed:
 
 
 class Rivals:
-    def __init__(self, search: StepwiseSearch) -> None:
-        self.search = search
+    def __init__(self, choice: TermChoice) -> None:
+        self.choice = choice
 
     def weigh(self, effect: str, terms: Sequence[Term]) -> Weighed:
         """Score lost without a cause at its best-founded place, if best replaced, and its equally good rivals."""
-        search = self.search
-        present = [term for term in search.active if term in terms and term.effect == effect]
+        choice = self.choice
+        present = [term for term in choice.current if term in terms and term.effect == effect]
         outcomes = [self._replaced(term) for term in sorted(present, key=lambda term: (term.place, term.shape))]
-        evidence, rivals = max(outcomes, key=lambda outcome: outcome[0], default=(0.0, []))
-        if effect == MASSES and masses_may_be_constants(search.normal.layout, search.active):
+        lost, rivals = max(outcomes, key=lambda outcome: outcome[0], default=(0.0, []))
+        if effect == MASSES and masses_may_be_constants(choice.equations.layout, choice.current):
             rivals = [CONSTANT, *rivals]
         confounded = tuple(dict.fromkeys(rivals))
         if not confounded:
-            return Weighed(max(evidence, 0.0), (), None)
+            return Weighed(max(lost, 0.0), (), None)
         motion = SEPARATING_MOTION.get(frozenset({effect, confounded[0]}), GENERAL_MOTION)
-        return Weighed(max(evidence, 0.0), confounded, f"record {motion}")
+        return Weighed(max(lost, 0.0), confounded, f"record {motion}")
+
+    def _worse(self, terms: Sequence[Term]) -> float:
+        """By how much other terms score worse than those chosen, per independent measurement."""
+        return (self.choice.judge(terms) - self.choice.score) / self.choice.equations.measurements
 
     def _replaced(self, term: Term) -> tuple[float, list[str]]:
         """Score lost without a term, if best replaced, and the effects that are as good in its place."""
-        search = self.search
-        rest = search.without(term, search.active)
-        lost = search.judge(rest) - search.score
+        choice = self.choice
+        rest = choice.without(term, choice.current)
+        lost = self._worse(rest)
         enough = max(0.5 * lost, min(lost, BARE))
         weakest, rivals = lost, []
         for other in self._tried(term, rest):
-            trial = search.with_beneath(other, rest)
-            worse = search.judge(trial) - search.score
+            trial = choice.with_needs(other, rest)
+            worse = self._worse(trial)
             if AS_GOOD <= worse < NEAR and _bends(term) and _bends(other):
-                worse = min(worse, self._refitted(other, rest))
+                worse = min(worse, self._refitted(trial, rest))
             weakest = min(weakest, worse)
-            good = worse < AS_GOOD or abs(worse - self._dearer(trial)) < ALIKE
+            dearer = (choice.price(trial) - choice.price(choice.current)) / choice.equations.measurements
+            good = worse < AS_GOOD or abs(worse - dearer) < ALIKE
             if good and worse < enough and other.effect != term.effect:
                 rivals.append(other.effect)
         return weakest, rivals
 
     def _tried(self, term: Term, rest: list[Term]) -> list[Term]:
         """The likeliest terms in place of one beside the rest, and those that are known to be alike."""
-        search = self.search
         others = [
             other
-            for other in search.normal.terms
+            for other in self.choice.effects
             if other.key != term.key
             and other not in rest
             and term.key not in other.beneath
             and not (term.effect == other.effect == "transmission.coupling")
         ]
-        likely = [other for _, other in shortlist(search.weighted.screen(rest, others))[:TRIED]]
         here = [other for other in others if other.place == term.place]
         known = [other for other in here if frozenset({term.effect, other.effect}) in SEPARATING_MOTION]
-        return list(dict.fromkeys([*likely, *known]))
+        return list(dict.fromkeys([*(self.choice.shortlist(rest, others, TRIED) if others else ()), *known]))
 
-    def _dearer(self, trial: Sequence[Term]) -> float:
-        """By how much the price of these terms exceeds that of the search's."""
-        search = self.search
-        return search.normal.price * (sum(map(search.cost, trial)) - sum(map(search.cost, search.active)))
-
-    def _refitted(self, other: Term, rest: list[Term]) -> float:
-        """How much worse another term scores in place of one, with all columns about that fit."""
-        terms = self.search.with_beneath(other, rest)
-        store = self.search.normal.store
-        nominal, start = store.nominal or store, store.values
-        about, kept = converge(nominal, terms, {term: c for term, c in start.items() if term in rest})
-        if other.key not in {term.key for term in kept}:
-            return float("inf")
-        again = StepwiseSearch(NormalEquations(about, kept), kept, usual=self.search.usual)
-        return again.score - self.search.score
+    def _refitted(self, trial: Sequence[Term], rest: Sequence[Term]) -> float:
+        """How much worse terms score in place of those chosen, with all columns about their own fit."""
+        store = self.choice.equations.store
+        start = {term: c for term, c in store.values.items() if term in rest}
+        about, kept = converge(store.nominal or store, trial, start)
+        again = TermChoice(TermEquations(about, kept), kept, self.choice.usual)
+        return (again.score - self.choice.score) / self.choice.equations.measurements
 
 
 def _bends(term: Term) -> bool:

@@ -110,7 +110,8 @@ def verdict(
     comparison is `unsettled`; `ambiguous` if the first cause has a rival, or one that carries the rest is a hint only.
     """
     data, left = sets[0]
-    quiet = all(rms <= data.margin[row] for row, rms in row_rms(data, left).items())
+    near = 1.0 if found else NEAR  # what an explanation may leave is no gap of the model that it was written into
+    quiet = all(rms <= near * data.margin[row] for row, rms in row_rms(data, left).items())
     if not found:
         return "no_gap" if quiet and not unsettled else "unexplained"
     if not (quiet or is_closed(data, left)) or not all(is_closed(*each) for each in sets[1:]):

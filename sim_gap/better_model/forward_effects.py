@@ -42,7 +42,14 @@ JOINTS: tuple[str, ...] = ()
 EFFECTS: tuple[JointEffect, ...] = ()
 LAWS = ("law.position", "law.velocity", "law.load", "law.time", "law.temperature")
 """Torques that follow one quantity of their joint; what causes them is not known."""
-PASSIVE = ("friction.stribeck", "friction.load", "friction.asymmetric", "transmission.ripple", *LAWS)
+PASSIVE = (
+    "friction.bearing",
+    "friction.stribeck",
+    "friction.load",
+    "friction.asymmetric",
+    "transmission.ripple",
+    *LAWS,
+)
 """Effects that act on the joints themselves."""
 CREEPING = 0.01
 """Speed below which the direction of a motion is not defined [rad/s]."""
@@ -117,9 +124,11 @@ class Effects:
         level = level + self.values("friction.load", "coefficient") * xp.abs(carried)
         heading = xp.where(xp.abs(speed) < RESTING, xp.sign(driven), xp.sign(speed))
         level = level * (1.0 + self.values("friction.asymmetric", "ratio") * heading)
+        level = level + self.values("friction.bearing", "torque")
         angle = self.values("transmission.ripple", "cycles") * position
         ripple = xp.sin(angle + self.values("transmission.ripple", "phase"))
         lost = self.values("transmission.ripple", "amplitude") * ripple + self.values("torque.offset", "lost")
+        lost = lost + self.values("friction.bearing", "damping") * speed
         return xp.maximum(level, 0.0), lost + self._lawful(position, speed, carried, time, xp)
 
     def _lawful(self, position: Array, speed: Array, carried: Array, time: float, xp: Any) -> Any:

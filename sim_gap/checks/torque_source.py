@@ -135,7 +135,7 @@ def find_source(
 
     One joint that has all that friction is asked about: it may be in another unit.
     """
-    if motion.channel != "tau" or stated.effort:
+    if motion.channel != "tau" or stated.effort or "tau_motor" in s.reading:  # then it is the bearings' friction
         return []
     moving = np.isfinite(fit.friction)
     friction, spread = np.maximum(fit.friction[moving], 0.0), fit.spread[moving]
@@ -148,9 +148,7 @@ def find_source(
     evidence = (
         f"contains friction ({share:.0%} of its torque), which a link-side sensor does not feel: it is a motor's effort"
     )
-    return [
-        RecordingFinding("effort_source", "tau", "all", evidence, "--effort-is motor", "tau_motor" not in s.reading)
-    ]
+    return [RecordingFinding("effort_source", "tau", "all", evidence, "--effort-is motor", True)]
 
 
 def _odd_joint(j: int, fit: RigidFit, s: PreparedSignals, stated: Corrections) -> list[RecordingFinding]:

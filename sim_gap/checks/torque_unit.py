@@ -37,8 +37,9 @@ it, where that torque is more than all that is read, and share of the reading th
 ALONE = 0.15
 """Share of the model's torque in a reading (standard deviations) below which it is friction alone; on real and
 simulated arms such a joint reads at most 0.65 of what those nearer the base do, the first joint left aside."""
-OUTGROWN = 1.2
-"""From this multiple of those on it is in another unit: coupled joints of a light arm read up to 1.1 of them."""
+OUTGROWN = 5.0
+"""From this multiple of those on it is in another unit: milliamperes are some tens or hundreds of newton metres, and
+the last joint of a leg, which rubs most, reads three times what the others do."""
 SLIM = 0.03
 """Least share of the largest model torque (standard deviations) that a joint's must have for its coefficient to tell a
 unit: at a slim wrist a tool, a hose or a spring may be more."""

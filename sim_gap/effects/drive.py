@@ -16,16 +16,19 @@ from sim_gap.effects.effect import (
     Beneath,
     InverseEffect,
     Plausibility,
+    Ratings,
     SearchHints,
     Shape,
     Signature,
-    added_or_taken_off,
     as_shape,
     between,
     delay_effect,
 )
 from sim_gap.residuals.preprocess import PreparedSignals
 
+ROTOR = 1.0
+"""Usual size of a reflected rotor inertia, as a share of the stretched arm's inertia about its base: geared drives are
+matched to their load within a factor of some."""
 LONGEST = 0.2
 """Longest time that counts as a lag or delay [s]."""
 
@@ -35,9 +38,9 @@ def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
     return 1.0 / (1.0 + coefficients)
 
 
-def _above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+def _above_nominal(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
     """The rotor may have less inertia than the model's armature."""
-    return added_or_taken_off(float(coefficients[0]), float(beneath["nominal"][2]), beneath)
+    return -ratings.armature, np.inf
 
 
 def _missing(lost: Callable[[Array, float, float], Array]) -> Signature:
@@ -74,21 +77,25 @@ EFFECTS = (
         "actuator.gain",
         Signature.at_motor(lambda s, j, _: s.motor_model[:, j], "motor", "drive"),
         Plausibility(
-            background_std=0.002, prior_std=lambda _signals, _place: np.full(1, 0.5), allows=between(-0.5, 1.0)
+            background_std=0.002, prior_std=lambda _signals, _place: np.full(1, 0.5), bounds=between(-0.5, 1.0)
         ),
         parameters_of=_gain,
     ),
     InverseEffect(
         "actuator.rotor_inertia",
         Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
-        Plausibility(prior_penalty=0, allows=_above_nominal),
+        Plausibility(
+            every_joint=True,
+            prior_std=lambda signals, _place: np.full(1, ROTOR * signals.arm.stretched_inertia),
+            bounds=_above_nominal,
+        ),
     ),
     delay_effect("actuator.lag", _missing(_lag), 0.01, LONGEST),
     delay_effect("actuator.delay", _missing(_delay), 0.01, LONGEST),
     InverseEffect(
         "actuator.saturation",
         _missing(_clipped),
-        Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE),
+        Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), bounds=NEAR_ONE),
         SearchHints(shapes_for=_levels),
         parameters_of=as_shape,
     ),

@@ -23,17 +23,38 @@ Key = tuple[str, int]
 Column = Callable[[PreparedSignals, int, Shape], Array]
 """The columns of an effect at one place, (K,) or (K, p), from signals, place and shape."""
 Beneath = Mapping[str, Array]
-"""Coefficients of the effects that one needs, by id. `nominal`: friction loss [N·m], damping [N·m·s/rad], armature
-[kg·m²] of the joint in the model, and its usual speed (RMS) [rad/s]. `needed`: 1 if another effect builds on this one.
-"""
-NONE_LEFT = 1.02
-"""Largest share of what the model has that can be taken off: all of it, within the error of a fit."""
-LEAST_OFF = 0.05
-"""Smallest share of what the model has that is taken off: less is how sound arms differ, and splits their friction."""
+"""Coefficients of the effects that one needs, by id. `nominal`: friction loss [N·m] of the joint in the model."""
 
+
+@dataclass(frozen=True)
+class Ratings:
+    """What a joint's drive, its model and an estimate say of how large an effect can be there."""
+
+    friction: float
+    """Friction loss of the joint in the model, as far as a motor reads it [N·m]."""
+    damping: float
+    """[N·m·s/rad]."""
+    armature: float
+    """[kg·m²]."""
+    speed: float
+    """Usual speed (RMS) [rad/s]."""
+    torque: float
+    """Largest torque that the drive was seen to make, and that the model's links ask of it, together [N·m]."""
+    tip_mass: float
+    """Mass of the model's last link [kg]."""
+    mass: float
+    """Mass of all its links [kg]."""
+    dry: float
+    """Dry friction of the joint as estimated, `torque` without an estimate [N·m]."""
+    own: Array | None = None
+    """Coefficients of the effect itself as estimated."""
+
+
+Bounds = Callable[[Ratings, Shape], tuple[Array | float, Array | float]]
+"""Least and largest coefficients of an effect that can exist."""
 
 Channel = Literal["any", "sensor", "motor", "command"]
-"""The channel without which an effect cannot show."""
+"""A channel without which an effect cannot show."""
 Side = Literal["link", "motor", "drive", "distortion", "reading", "command"]
 """Where in the chain from link to command an effect acts: on the torque of the links, between link and motor, on the
 motor's report of all that, in the sensor before its gain, on the sensor's reading, between command and motor."""
@@ -47,7 +68,7 @@ class Signature:
 
     columns: Callable[[PreparedSignals, ChannelLayout, int, Shape], Columns]
     """Columns at the work rate, by row."""
-    channel: Channel = "any"
+    channel: Channel | tuple[Channel, ...] = "any"
     whole_arm: bool = False
     """Whether it belongs to the arm as a whole instead of to one joint or link."""
     recordings: Callable[[Shape], tuple[int, ...]] = lambda _shape: ()
@@ -71,7 +92,8 @@ class Signature:
     def places(self, layout: ChannelLayout) -> range:
         """Joints or links at which it may be; empty if these channels cannot show it."""
         channels = {"sensor": layout.sensor, "motor": layout.motor, "command": layout.commanded}
-        if self.channel != "any" and channels[self.channel] is None:
+        needed = self.channel if isinstance(self.channel, tuple) else (self.channel,)
+        if any(each != "any" and channels[each] is None for each in needed):
             return range(0)
         return range(1 if self.whole_arm else layout.n)
 
@@ -104,38 +126,26 @@ def _2d(columns: Array) -> Array:
     return columns[:, None] if columns.ndim == 1 else columns
 
 
-def always(_coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
-    return True
+def unbounded(_ratings: Ratings, _shape: Shape) -> tuple[float, float]:
+    return -np.inf, np.inf
 
 
-def not_negative(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
-    """The first coefficient is not below zero: friction opposes motion, masses are positive."""
-    return bool(coefficients[0] >= 0.0)
+def not_negative(_ratings: Ratings, _shape: Shape) -> tuple[float, float]:
+    return 0.0, np.inf
 
 
-def added_or_taken_off(coefficient: float, has: float, beneath: Beneath, noise: float = 0.0) -> bool:
-    """Whether an arm can differ by this from a model that `has` so much of it; below zero by `noise` is none.
-
-    Where another effect builds on it, the model's own is what that one needs, and no difference is too small.
-    """
-    least = 0.0 if beneath["needed"][0] else LEAST_OFF * has
-    return coefficient >= -noise or least <= -coefficient <= NONE_LEFT * has + noise
-
-
-def positive(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
-    return bool(coefficients[0] > 0.0)
-
-
-def between(low: float, high: float) -> Callable[[Array, Shape, Beneath], bool]:
-    return lambda coefficients, _shape, _beneath: bool(low < coefficients[0] < high)
+def between(low: float, high: float) -> Bounds:
+    return lambda _ratings, _shape: (low, high)
 
 
 @dataclass(frozen=True)
 class Plausibility:
     """Priors of an effect, and the values that can exist."""
 
+    every_joint: bool = False
+    """Whether every joint has it, as all gears rub: then only its size is in question, and it costs nothing."""
     prior_penalty: int = 3
-    """Number of extra coefficients that the effect is charged for: 0 if every arm has it, more if few have."""
+    """Number of extra coefficients that the effect is charged for: 0 if many arms have it, more if few have."""
     prior_mean: float = 0.0
     """Prior mean of the coefficients: 1 if the shape alone determines the effect."""
     prior_std: Callable[[PreparedSignals, int], Array] = lambda _signals, _place: np.full(1, np.inf)
@@ -144,8 +154,8 @@ class Plausibility:
     """Standard deviation of each coefficient over sound arms; confidence intervals include it."""
     background_nm: bool = False
     """Whether it is a torque, and so smaller on arms of little strength."""
-    allows: Callable[[Array, Shape, Beneath], bool] = always
-    """Whether such an effect can exist with these coefficients."""
+    bounds: Bounds = unbounded
+    """Least and largest coefficients that can exist."""
 
 
 @dataclass(frozen=True)
@@ -228,8 +238,8 @@ NEAR_ONE = between(0.6, 1.6)
 def delay_effect(effect_id: str, signature: Signature, start: float, longest: float) -> InverseEffect:
     """An effect whose shape is a time: the search starts at `start` and goes up to `longest` [s]."""
 
-    def allows(coefficients: Array, shape: Shape, _beneath: Beneath) -> bool:
-        return bool(SHORTEST_DELAY < coefficients[0] * shape[0] < longest)
+    def bounds(_ratings: Ratings, shape: Shape) -> tuple[float, float]:
+        return SHORTEST_DELAY / shape[0], longest / shape[0]
 
     def relinearise(coefficients: Array, shape: Shape) -> Shape:
         return (float(np.clip(coefficients[0] * shape[0], SHORTEST_DELAY, longest)),)
@@ -237,7 +247,7 @@ def delay_effect(effect_id: str, signature: Signature, start: float, longest: fl
     return InverseEffect(
         effect_id,
         signature,
-        Plausibility(allows=allows),
+        Plausibility(bounds=bounds),
         SearchHints(shapes=((start,),), linearised_at=0, relinearise=relinearise),
         parameters_of=as_share_of_shape,
     )

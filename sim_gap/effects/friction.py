@@ -1,5 +1,7 @@
 """Friction between motor and torque sensor: it shows on the motor side, and without a motor channel, in `tau`.
 
+What rubs behind the sensor, on the link side, shows in `tau` against the model.
+
 F(v) = (Fc + Fb·exp(−(v/vs)²) + μ·|τ|)·(1 ± ratio) + d·|v|, opposing v; τ is the transmitted torque.
 """
 
@@ -13,18 +15,17 @@ from sim_gap.effects.effect import (
     InverseEffect,
     Key,
     Plausibility,
+    Ratings,
     SearchHints,
     Shape,
     Signature,
-    added_or_taken_off,
     as_fitted_and_shape,
+    between,
 )
-from sim_gap.residuals.layout import ChannelLayout
+from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
 
 COULOMB = ("friction.coulomb",)
-NOISE = 0.01
-"""Coulomb friction below zero that is noise [N·m]."""
 SLOWEST = 0.05
 """Usual speed of a joint from which dry friction in the model may be taken for viscous [rad/s]."""
 VELOCITIES = (0.03, 0.06, 0.12, 0.25, 0.5)
@@ -41,33 +42,36 @@ def dry(beneath: Beneath) -> float:
     return float(beneath["friction.coulomb"][0] + beneath["nominal"][0])
 
 
-def _dry_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+def _dry_above_nominal(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
     """The arm may have less friction than the model, of both kinds: one alone stands for both at the usual speed."""
-    loss, damping, _, speed = beneath["nominal"]
-    return added_or_taken_off(float(coefficients[0]), float(loss + damping * speed), beneath, NOISE)
+    return -ratings.friction - ratings.damping * ratings.speed, ratings.torque
 
 
-def _viscous_above_nominal(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
-    loss, damping, _, speed = beneath["nominal"]
-    return added_or_taken_off(float(coefficients[0]), float(damping + loss / max(speed, SLOWEST)), beneath)
+def _viscous_above_nominal(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
+    speed = max(ratings.speed, SLOWEST)
+    return -ratings.damping - ratings.friction / speed, ratings.torque / speed
 
 
-def _below_self_locking(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
-    return bool(0.0 <= coefficients[0] < SELF_LOCKING)
+def _up_to_rated(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
+    return 0.0, ratings.torque
 
 
-def _above_minus_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
-    """Real gears can have less friction at low speed than Coulomb's: breakaway is then negative."""
-    return bool(coefficients[0] > -dry(beneath))
-
-
-def _below_dry(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
-    return bool(abs(coefficients[0]) < dry(beneath))
+def _below_dry(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
+    return -ratings.dry, ratings.dry
 
 
 def _stribeck(s: PreparedSignals, joint: int, shape: Shape) -> Array:
     """Breakaway in excess of Coulomb friction, decaying as exp(−(v/vs)²)."""
     return np.asarray(s.direction[:, joint] * np.exp(-((s.v[:, joint] / shape[0]) ** 2)))
+
+
+def _bearing(s: PreparedSignals, layout: ChannelLayout, joint: int, _shape: Shape) -> Columns:
+    """Dry and viscous friction on the link side of a torque sensor."""
+    return {(layout.against_model, joint): np.column_stack([s.direction[:, joint], s.v[:, joint]])}
+
+
+def _bearing_bounds(ratings: Ratings, _shape: Shape) -> tuple[float, Array]:
+    return 0.0, np.array([ratings.torque, ratings.torque / max(ratings.speed, SLOWEST)])
 
 
 def _velocities(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]:
@@ -91,17 +95,17 @@ EFFECTS = (
     InverseEffect(
         "friction.coulomb",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.03, background_nm=True, allows=_dry_above_nominal),
+        Plausibility(every_joint=True, background_std=0.03, background_nm=True, bounds=_dry_above_nominal),
     ),
     InverseEffect(
         "friction.viscous",
         Signature.at_motor(lambda s, joint, _: s.v[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.02, background_nm=True, allows=_viscous_above_nominal),
+        Plausibility(every_joint=True, background_std=0.02, background_nm=True, bounds=_viscous_above_nominal),
     ),
     InverseEffect(
         "friction.stribeck",
         Signature.at_motor(_stribeck),
-        Plausibility(allows=_above_minus_dry),
+        Plausibility(bounds=_up_to_rated),
         SearchHints(shapes_for=_velocities, alternatives=_viscous_or_load),
         needs=COULOMB,
         parameters_of=as_fitted_and_shape,
@@ -109,13 +113,18 @@ EFFECTS = (
     InverseEffect(
         "friction.asymmetric",
         Signature.at_motor(lambda s, joint, _: np.abs(s.direction[:, joint])),
-        Plausibility(allows=_below_dry),
+        Plausibility(bounds=_below_dry),
         needs=COULOMB,
         parameters_of=_ratio,
+    ),
+    InverseEffect(  # with a sensor alone, or a motor alone, it is not to be told from the friction before the sensor
+        "friction.bearing",
+        Signature(_bearing, ("sensor", "motor")),
+        Plausibility(prior_penalty=0, background_std=0.02, background_nm=True, bounds=_bearing_bounds),
     ),
     InverseEffect(
         "friction.load",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint] * np.abs(s.model[:, joint])),
-        Plausibility(allows=_below_self_locking),
+        Plausibility(bounds=between(0.0, SELF_LOCKING)),
     ),
 )

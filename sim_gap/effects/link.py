@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.effects.effect import Beneath, InverseEffect, Key, Plausibility, SearchHints, Shape, Signature
+from sim_gap.effects.effect import Beneath, InverseEffect, Key, Plausibility, Ratings, SearchHints, Shape, Signature
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 
@@ -166,11 +166,11 @@ def _all_mass_moments(layout: ChannelLayout, _place: int, _shape: Shape) -> tupl
     return tuple(("link.mass_moment", link) for link in range(layout.n))
 
 
-def _near_the_tip(coefficients: Array, _shape: Shape, beneath: Beneath) -> bool:
+def _near_the_tip(ratings: Ratings, _shape: Shape) -> tuple[Array, Array]:
     """A body at the last link; if the arm lacks it, it is no heavier than what the model has there."""
-    mass = float(coefficients[0])
-    most = TAKEN * float(beneath["tip"][0])
-    return mass > -most and mass != 0.0 and float(np.linalg.norm(coefficients[1:])) < FARTHEST * abs(mass)
+    mass = ratings.mass if ratings.own is None else abs(float(ratings.own[0]))
+    high = np.array([ratings.mass, *3 * [FARTHEST * mass]])
+    return np.array([-TAKEN * ratings.tip_mass, *-high[1:]]), high
 
 
 def _mass_and_centre(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
@@ -198,7 +198,7 @@ EFFECTS = (
         "link.payload",
         Signature(_payload, whole_arm=True, recordings=recording_numbers, body=True, slopes=_payload_slopes),
         Plausibility(
-            prior_penalty=0, prior_std=lambda _signals, _place: np.array([20.0, 4.0, 4.0, 4.0]), allows=_near_the_tip
+            prior_penalty=0, prior_std=lambda _signals, _place: np.array([20.0, 4.0, 4.0, 4.0]), bounds=_near_the_tip
         ),
         SearchHints(
             shapes_for=_recordings, discrete=frozenset({0}), covers=_tip_mass_moment, alternatives=_all_mass_moments

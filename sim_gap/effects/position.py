@@ -84,10 +84,6 @@ def _amplitude_and_phase(coefficients: Array, _shape: Shape, _beneath: Beneath) 
     return np.array([np.hypot(*coefficients), np.arctan2(coefficients[1], coefficients[0])])
 
 
-def _within_a_few_degrees(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
-    return bool(np.hypot(*coefficients) < WORST_ECCENTRICITY)
-
-
 def _small(_signals: PreparedSignals, _place: int) -> Array:
     return np.full(1, 0.2)
 
@@ -103,14 +99,17 @@ EFFECTS = (
     InverseEffect(
         "position.gain",
         position_effect(reading_moves(lambda q: (q, np.ones_like(q), 0 * q)), shaped=True),
-        Plausibility(prior_std=_small, allows=between(-WORST_GAIN, WORST_GAIN)),
+        Plausibility(prior_std=_small, bounds=between(-WORST_GAIN, WORST_GAIN)),
         FROM_ZERO,
         parameters_of=as_gain,
     ),
     InverseEffect(
         "position.eccentricity",
         position_effect(reading_moves(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
-        Plausibility(prior_std=lambda _signals, _place: np.full(2, 0.1), allows=_within_a_few_degrees),
+        Plausibility(
+            prior_std=lambda _signals, _place: np.full(2, 0.1),
+            bounds=between(-WORST_ECCENTRICITY, WORST_ECCENTRICITY),
+        ),
         SearchHints(shapes_for=_far_enough),
         parameters_of=_amplitude_and_phase,
     ),

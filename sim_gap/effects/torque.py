@@ -91,7 +91,7 @@ def _delayed(signals: PreparedSignals, joint: int, shape: Shape) -> Array:
     return np.asarray(np.interp(signals.t - shape[0], signals.t, torque) - torque)
 
 
-CUT_OFF = Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), allows=NEAR_ONE)
+CUT_OFF = Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), bounds=NEAR_ONE)
 """Of a level, beyond which all is cut off."""
 EFFECTS = (
     InverseEffect(  # without a sensor, an offset of the motor's torque
@@ -103,21 +103,21 @@ EFFECTS = (
     InverseEffect(
         "torque.gain",
         Signature.at_sensor(lambda s, joint, _shape: s.sensed[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.002, allows=between(-0.5, 1.0)),
+        Plausibility(prior_penalty=0, background_std=0.002, bounds=between(-0.5, 1.0)),
         parameters_of=as_gain,
     ),
     InverseEffect("torque.drift", Signature.at_sensor(lambda s, _joint, _shape: s.t), needs=("torque.offset",)),
     InverseEffect(
         "torque.crosstalk",
         Signature.at_sensor(lambda s, _joint, shape: s.model[:, int(shape[0]) - 1], side="distortion"),
-        Plausibility(allows=between(-0.5, 0.5)),
+        Plausibility(bounds=between(-0.5, 0.5)),
         SearchHints(shapes_for=_other_joints, discrete=frozenset({0})),
         parameters_of=as_fitted_and_shape,
     ),
     InverseEffect(  # the width is the deviation after a long way
         "torque.hysteresis",
         _distorted(_stays_behind),
-        Plausibility(allows=NEAR_ONE),
+        Plausibility(bounds=NEAR_ONE),
         SearchHints(
             shapes_for=_shares(0.01, 0.03, 0.06, 0.12, 0.25), discrete=frozenset({1}), forms=_abrupt_and_gradual
         ),

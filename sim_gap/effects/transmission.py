@@ -15,11 +15,12 @@ from sim_gap.effects.effect import (
     InverseEffect,
     Key,
     Plausibility,
+    Ratings,
     SearchHints,
     Shape,
     Signature,
     between,
-    positive,
+    not_negative,
 )
 from sim_gap.effects.position import position_effect
 from sim_gap.model.rigid_body import CREEP
@@ -62,6 +63,10 @@ def _spring(s: PreparedSignals, joint: int, _shape: Shape) -> Array:
     return np.column_stack([q, np.ones_like(q)])
 
 
+def _stiff(_ratings: Ratings, _shape: Shape) -> tuple[Array, float]:
+    return np.array([0.0, -np.inf]), np.inf
+
+
 def _stiffness_and_rest(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
     stiffness = float(coefficients[0])
     return np.array([stiffness, -coefficients[1] / (stiffness if abs(stiffness) > 1e-9 else np.inf)])
@@ -94,10 +99,6 @@ def _outer_joint(place: int, shape: Shape) -> tuple[int, Shape]:
 def _own_rotors(_layout: ChannelLayout, place: int, shape: Shape) -> tuple[Key, ...]:
     own = ("friction.coulomb", "friction.viscous", "actuator.rotor_inertia")
     return tuple((effect, joint) for joint in (place, int(shape[0]) - 1) for effect in own)
-
-
-def _all_positive(coefficients: Array, _shape: Shape, _beneath: Beneath) -> bool:
-    return bool(np.all(coefficients >= 0.0))
 
 
 def _coupled(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
@@ -141,18 +142,18 @@ EFFECTS = (
     InverseEffect(
         "transmission.spring",
         Signature.at_link(_spring),
-        Plausibility(allows=positive),
+        Plausibility(bounds=_stiff),
         parameters_of=_stiffness_and_rest,
     ),
     InverseEffect(
         "transmission.coupling",
         Signature(_coupling, side="motor"),
-        Plausibility(allows=_all_positive),
+        Plausibility(bounds=not_negative),
         SearchHints(shapes_for=_neighbours, discrete=frozenset({0}), alternatives=_own_rotors, canonical=_outer_joint),
         parameters_of=_coupled,
     ),
     InverseEffect(
-        "transmission.elasticity", position_effect(_bend), Plausibility(allows=positive), parameters_of=_stiffness
+        "transmission.elasticity", position_effect(_bend), Plausibility(bounds=not_negative), parameters_of=_stiffness
     ),
-    InverseEffect("transmission.backlash", position_effect(_play), Plausibility(allows=between(0.0, 0.3))),
+    InverseEffect("transmission.backlash", position_effect(_play), Plausibility(bounds=between(0.0, 0.3))),
 )

@@ -90,12 +90,23 @@ class RigidArm:
     @property
     def stretched_torque(self) -> float:
         """Torque that the links' weight would have at the base, all stretched out and lying [N·m]."""
+        moments = self.inertial[:, 0] * self._reach + np.linalg.norm(self.inertial[:, 1:4], axis=1)
+        return float(np.linalg.norm(self.gravity) * moments.sum())
+
+    @property
+    def stretched_inertia(self) -> float:
+        """Inertia of the links about the base, all stretched out [kg·m²]."""
+        mass = np.maximum(self.inertial[:, 0], 1e-9)
+        return float(mass @ (self._reach + np.linalg.norm(self.inertial[:, 1:4], axis=1) / mass) ** 2)
+
+    @property
+    def _reach(self) -> Array:
+        """Distance of each joint from the base with all links stretched out [m], (n,)."""
         reach = np.zeros(self.n)
         for j, before in enumerate(self.parent):
             if before >= 0:
                 reach[j] = reach[before] + np.linalg.norm(self.offset[j])
-        moments = self.inertial[:, 0] * reach + np.linalg.norm(self.inertial[:, 1:4], axis=1)
-        return float(np.linalg.norm(self.gravity) * moments.sum())
+        return reach
 
     def with_inertial(self, inertial: Array) -> "RigidArm":
         return replace(self, inertial=inertial)

@@ -149,7 +149,7 @@ class About:
     fit: LoopFit
     layout: Layout
     terms: LinearTerms
-    effects: dict[str, Effect]
+    effects: dict[str, Effect[str]]
 
     def parameters(self, names: Sequence[str]) -> frozenset[int]:
         return frozenset(k for name in names for k in self.effects[name].parameters)

@@ -46,7 +46,8 @@ TRIM_S = 0.3
 """Length cut off at both ends after filtering [s]."""
 COLUMNS = 8
 """Number of columns that are filtered at a time."""
-SHORTEST_S = 3.0
+SHORTEST_S, SHORTEST_PIECE_S = 3.0, 1.0
+"""Least length of all recordings together, and of one of them with torques, whose ends are lost to a filter [s]."""
 MOST_SAMPLES_PER_ROW = 100.0
 """Most even samples for each recorded row."""
 ABSENT = -1
@@ -256,14 +257,14 @@ class Found:
     """Share of `link` that springs across the joints have [N·m], (K, n)."""
 
 
-def require_length(recordings: Sequence[Recording], labels: Sequence[str], *, together: bool) -> None:
-    """Raise BadInput if a recording, or all `together`, is too short for a diagnosis."""
+def require_length(recordings: Sequence[Recording], labels: Sequence[str], shortest: float = 0.0) -> None:
+    """Raise BadInput if all recordings together are too short, or one is shorter than `shortest` [s]."""
     spans = [float(recording.t[-1] - recording.t[0]) if len(recording.t) else 0.0 for recording in recordings]
     for recording, label, span in zip(recordings, labels, spans, strict=False):
-        if len(recording.t) < 4 or (sum(spans) if together else span) < SHORTEST_S:
+        if len(recording.t) < 4 or sum(spans) < SHORTEST_S or span < shortest:
             raise BadInput(
                 f"{label}: {len(recording.t)} rows over {span:.3g} s: too short for a diagnosis; "
-                f"record at least {SHORTEST_S:.0f} s" + (", in one recording or in several" if together else "")
+                f"record at least {SHORTEST_S:.0f} s, in one recording or in several"
             )
 
 

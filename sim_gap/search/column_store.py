@@ -117,7 +117,7 @@ class ColumnStore:
         return self._offsets[term]
 
     def wide(self, terms: Sequence[Term], row: Row, nonlinear: Collection[Term]) -> Array:
-        """Columns of terms in one row, then those beside the nonlinear ones, ordered as `NormalEquations.index`."""
+        """Columns of terms in one row, then those beside the nonlinear ones, ordered as `TermEquations.index`."""
         total = sum(self.data.lengths)
         parts = [self.columns(term).get(row) for term in terms]
         own = [

@@ -12,9 +12,8 @@ from gcomp.arrays import Array
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.normal_equations import CORRELATED, NormalEquations
-from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
+from sim_gap.search.term_equations import TermEquations
 from sim_gap.search.torque_constants import shares_a_factor
 
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
@@ -40,42 +39,46 @@ class Value:
 class EffectEstimate:
     """Terms fitted to a training set."""
 
-    def __init__(self, store: ColumnStore, terms: list[Term]) -> None:
-        """Terms of a search on this store, which holds the columns about what they are fitted to be."""
+    def __init__(self, store: ColumnStore, terms: Sequence[Term]) -> None:
+        """Terms of a choice on this store, which holds the columns about what they are fitted to be."""
         self.store = store
-        self.normal = NormalEquations(store, terms)
-        self.terms = tuple(self.normal.terms)
-        self.search = StepwiseSearch(self.normal, list(self.terms))
-        self.index, self.coefficients = self.search.weighted.fit(self.terms)
+        self.equations = TermEquations(store, terms)
+        self.terms = tuple(self.equations.terms)
+        every = self.equations.index(self.terms).tolist()
+        self.linear = self.equations.linear.reweighed(every)
+        self.coefficients = self.linear.fit(every)
         self._elsewhere: ColumnStore | None = None
 
     def of(self, term: Term) -> Array:
-        return self.coefficients[self.normal.at[term]]
+        return self.coefficients[self.equations.at[term]]
 
-    def subset(self, terms: list[Term]) -> Array:
+    def subset(self, terms: Sequence[Term]) -> Array:
         """Coefficients (P,) of a fit of these terms alone with the final weights; zero for the others."""
-        out = np.zeros(self.normal.size)
-        index, values = self.search.weighted.fit(terms)
-        out[index] = values
-        return out
+        return self.linear.fit(self.equations.index(terms).tolist())
+
+    def at_bounds(self) -> list[Term]:
+        """Terms of which a coefficient is the largest or least that can exist: its size is not determined."""
+        at = {k for k in self.linear.at_bounds(self.coefficients).tolist() if self.coefficients[k]}
+        return [term for term in self.terms if at & {*self.equations.at[term].tolist()}]
 
     @cached_property
     def _jacobian(self) -> list[tuple[float, Array, Array, NDArray[np.intp]]]:
         """Per row: weight, columns with shape derivatives (k, P + S), residual (k,), block (k,)."""
-        data, out = self.store.data, []
-        weights = self.normal.weights(self.normal.mean_square(self.index, self.coefficients))
+        data, size, out = self.store.data, self.equations.size, []
+        counts = self.linear.counts.sum(1)
         shaped = [(term, term.free) for term in self._shaped]
-        for weight, row in zip(weights, self.normal.rows, strict=True):
+        for r, row in enumerate(self.equations.rows):
             valid = data.valid[row]
-            x = np.zeros((len(valid), self.normal.size + len(shaped)))
+            weight = float(counts[r] / max(valid.sum(), 1) / self.linear.variance[r])
+            x = np.zeros((len(valid), size + len(shaped)))
             touching = [term for term in self.terms if row in self.store.columns(term)]
-            x[:, self.normal.index(touching)] = self.store.wide(touching, row, self.normal.fixed)
+            x[:, self.equations.index(touching)] = self.store.wide(touching, row, self.equations.fixed)
             for k, (term, i) in enumerate(shaped):
                 if row in self.store.columns(term):
                     assert i is not None
-                    x[:, self.normal.size + k] = self._shape_slope(term, i, row)
-            residual = data.values[row] - x[:, : self.normal.size] @ self.coefficients
-            out.append((float(weight), x[valid], residual[valid], data.blocks[valid]))
+                    x[:, size + k] = self._shape_slope(term, i, row)
+            residual = data.values[row] - x[:, :size] @ self.coefficients
+            out.append((weight, x[valid], residual[valid], data.blocks[valid]))
         return out
 
     @cached_property
@@ -100,18 +103,18 @@ class EffectEstimate:
         for weight, x, residual, block in self._jacobian:
             bread += weight * x.T @ x
             np.add.at(scores, block, weight * x * residual[:, None])
-        bread[np.arange(self.normal.size), np.arange(self.normal.size)] += self.normal.free
+        own = np.arange(self.equations.size)
+        bread[own, own] += self.linear.prior
         scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
         inverse = np.linalg.pinv(bread * scale * scale[:, None], hermitian=True, rcond=1e-10) * scale * scale[:, None]
         blocks = max(len(scores), 2)
-        seen = sum(len(residual) for _, _, residual, _ in self._jacobian) / max(len(self._jacobian), 1)
-        systematic = SYSTEMATIC**2 * seen / CORRELATED * inverse
+        systematic = SYSTEMATIC**2 * float(self.linear.counts.sum()) / max(len(self._jacobian), 1) * inverse
         statistical = inverse @ (scores.T @ scores) @ inverse * blocks / (blocks - 1)
         background = np.zeros(size)
         for term in self.terms:
             usual = term.form.plausibility
             std = self.store.data.background(usual.background_std) if usual.background_nm else usual.background_std
-            background[self.normal.at[term]] = std
+            background[self.equations.at[term]] = std
         return np.asarray(statistical + systematic + self._undetected(inverse) + np.diag(background**2))
 
     def _undetected(self, inverse: Array) -> Array:
@@ -125,7 +128,7 @@ class EffectEstimate:
         if not size:
             return np.zeros_like(inverse)
         pull, own, seen = np.zeros((len(inverse), size)), np.eye(size), np.zeros(size)
-        for (weight, x, residual, _), row in zip(self._jacobian, self.normal.rows, strict=True):
+        for (weight, x, residual, _), row in zip(self._jacobian, self.equations.rows, strict=True):
             z, valid = np.zeros((len(residual), size)), self.store.data.valid[row]
             for link in np.flatnonzero(np.any(errors.reshape(-1, 3, size), axis=(1, 2))).tolist():
                 if row in (columns := self.store.columns(Term("link.mass_moment", link))):
@@ -151,13 +154,13 @@ class EffectEstimate:
         share = min(max(NOMINAL, WORSE * wrong), WORST)
         open_links = np.repeat([link not in found for link in range(arm.n)], 3)
         errors = [np.diag(share * np.repeat(usual, 3))[:, open_links]]
-        if shares_a_factor(self.normal.layout, self.terms):
+        if shares_a_factor(self.equations.layout, self.terms):
             errors.append(NOMINAL * arm.inertial[:, 1:4].reshape(-1, 1))
         return np.hstack(errors)
 
     def may_be_nothing(self, term: Term) -> bool:
         """Whether the 95 % interval of every coefficient of a term contains zero."""
-        at = self.normal.at[term]
+        at = self.equations.at[term]
         return bool(np.all(np.abs(self.of(term)) <= self._quantile * np.sqrt(np.diag(self.covariance)[at])))
 
     @property
@@ -204,16 +207,16 @@ class EffectEstimate:
         effect = term.form
         beneath = {other.effect: other for other in self.terms if other.key in term.beneath}
         shaped, free = self._shaped, term.free
-        chosen = [*self.normal.at[term], *(i for other in beneath.values() for i in self.normal.at[other])]
+        chosen = [*self.equations.at[term], *(i for other in beneath.values() for i in self.equations.at[other])]
         if term in shaped:
-            chosen.append(self.normal.size + shaped.index(term))
-        own = len(self.normal.at[term])
+            chosen.append(self.equations.size + shaped.index(term))
+        own = len(self.equations.at[term])
 
         def evaluate(z: Array) -> Array:
             shape = term.shape if free is None else term.reshaped(free, float(z[-1])).shape
-            under, at = {"nominal": self.normal.known_joint[term.place]}, own
+            under, at = {"nominal": self.equations.ratings.joint[:, term.place]}, own
             for name, other in beneath.items():
-                width = len(self.normal.at[other])
+                width = len(self.equations.at[other])
                 under[name], at = z[at : at + width], at + width
             return np.asarray(effect.parameters_of(z[:own], shape, under), float)
 

@@ -8,14 +8,13 @@ coefficients are fitted to that.
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from sim_gap.effects.link import pseudo_inertia
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.search.estimate_signals import inertial_change
-from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
+from sim_gap.search.term_equations import TermEquations
 
 BARRIER_WEIGHTS = (1e-1, 1e-2, 1e-3, 1e-4)
 """Weights of −log det in turn, in units of the squares that the constraint costs at the start."""
@@ -27,26 +26,27 @@ LEAST_EIGENVALUE = 1e-6
 """Least eigenvalue of a pseudo-inertia, as a share of its trace."""
 
 Matrix = Callable[[Array], Array]
-Places = NDArray[np.intp]
 
 
-def pins(search: StepwiseSearch, arm: RigidArm) -> dict[Term, Array]:
+def pins(equations: TermEquations, arm: RigidArm) -> dict[Term, Array]:
     """Coefficients of the terms that a fit would give to links that cannot exist, at the closest that can."""
-    index, coefficients = search.weighted.fit(search.active)
-    values = {term: coefficients[np.isin(index, search.normal.at[term])] for term in search.active}
+    every = equations.index(equations.terms).tolist()
+    linear = equations.linear.reweighed(every)
+    change = linear.fit(every)
+    values = {term: change[at] for term, at in equations.at.items()}
     out: dict[Term, Array] = {}
     for link in range(arm.n):
-        own = [term for term in search.active if _shapes(term, link, arm.n)]
+        own = [term for term in values if _shapes(term, link, arm.n)]
         if not own:
             continue
         start = np.concatenate([values[term] for term in own])
         matrix = _matrix(arm, link, own, values)
         if _positive(matrix(start)) or not _positive(matrix(0.0 * start)):
             continue
-        at = search.normal.index(own)[: len(start)]
-        best = _closest(start, _alone(search, index, at), matrix)
+        at = np.concatenate([equations.at[term] for term in own])
+        best = _closest(start, linear.curvature(at, every), matrix)
         for term in own:
-            width = len(search.normal.at[term])
+            width = len(equations.at[term])
             out[term], best = best[:width], best[width:]
     return out
 
@@ -82,15 +82,6 @@ def _change(term: Term, c: Array, inertial: Array) -> Array:
 
 def _positive(matrix: Array) -> bool:
     return bool(np.linalg.eigvalsh(matrix).min() > LEAST_EIGENVALUE * max(float(np.trace(matrix)), 0.0))
-
-
-def _alone(search: StepwiseSearch, index: Places, at: Places) -> Array:
-    """Curvature of the weighted squares in the coefficients `at`, all others of the fit adapting, (p, p)."""
-    weighted = search.weighted
-    rest = np.setdiff1d(index, at).astype(int)
-    whole = weighted.gram + np.diag(search.normal.prior)
-    onto = whole[np.ix_(rest, at)]
-    return np.asarray(whole[np.ix_(at, at)] - onto.T @ np.linalg.lstsq(whole[np.ix_(rest, rest)], onto, rcond=1e-12)[0])
 
 
 def _closest(wanted: Array, curvature: Array, matrix: Matrix) -> Array:

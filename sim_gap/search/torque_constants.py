@@ -9,10 +9,11 @@ one factor, the masses are named, and the answer says that they may be the const
 
 from collections.abc import Sequence
 
+from gcomp.estimate.choice import PRICE
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import ChannelLayout
-from sim_gap.search.stepwise_search import StepwiseSearch
 from sim_gap.search.term import Term
+from sim_gap.search.term_equations import TermChoice
 
 CONSTANT = "actuator.gain"
 CONSTANTS = frozenset({CONSTANT})
@@ -22,31 +23,29 @@ OFF = 0.05
 """A torque constant is off from this share on."""
 
 
-def drives_are_off(search: StepwiseSearch) -> bool:
+def drives_are_off(choice: TermChoice) -> bool:
     """Whether drives of an arm without torque sensors have another torque constant than they take it for.
 
     Several have, or one has while links seem to be wrong.
     """
-    if search.normal.layout.sensor is not None:
+    if choice.equations.layout.sensor is not None:
         return False
-    off, links = _count_off(search), any(term.effect in LINKS for term in search.active)
+    off, links = _count_off(choice), any(term.effect in LINKS for term in choice.current)
     return off > 1 or (off == 1 and links)
 
 
-def most_are_off(search: StepwiseSearch) -> bool:
+def most_are_off(choice: TermChoice) -> bool:
     """Whether most drives have another constant: those of an arm come from one maker, and are in doubt together."""
-    return 2 * _count_off(search) > search.normal.layout.n
+    return 2 * _count_off(choice) > choice.equations.layout.n
 
 
-def _count_off(search: StepwiseSearch) -> int:
-    index, values = search.weighted.fit(search.active)
-    found = [term for term in search.active if term.effect == CONSTANT]
-    return sum(abs(float(values[index == search.normal.at[term][0]][0])) > OFF for term in found)
+def _count_off(choice: TermChoice) -> int:
+    return sum(abs(float(c[0])) > OFF for term, c in choice.values().items() if term.effect == CONSTANT)
 
 
-def price_of_all(search: StepwiseSearch) -> float:
+def price_of_all() -> float:
     """Price of the constants of all drives together: that of one effect that few arms have."""
-    return search.normal.price * (1 + effects()[CONSTANT].plausibility.prior_penalty)
+    return PRICE * (1 + effects()[CONSTANT].plausibility.prior_penalty)
 
 
 def shares_a_factor(layout: ChannelLayout, terms: Sequence[Term]) -> bool:
@@ -61,7 +60,7 @@ def masses_may_be_constants(layout: ChannelLayout, terms: Sequence[Term]) -> boo
     return layout.sensor is None and not constants and 2 * len(links) > layout.n
 
 
-def every_constant(search: StepwiseSearch, offered: Sequence[Term]) -> list[Term]:
+def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
     """Where to search from again: every drive's constant free, the links as in the model, all else as found."""
     drives = [term for term in offered if term.effect == CONSTANT]
-    return [*drives, *(term for term in search.active if term.effect not in (CONSTANT, *LINKS))]
+    return [*drives, *(term for term in choice.current if term.effect not in (CONSTANT, *LINKS))]

@@ -4,6 +4,9 @@ from sim_gap.blind.effects import link, motor_side, sensors
 from sim_gap.blind.effects.drawn_effect import Draw
 
 DRAWS: dict[str, Draw] = {**link.DRAWS, **sensors.DRAWS, **motor_side.DRAWS}
-NOT_DRAWN = {"torque.nonlinearity": "no diagnosis names it, so a case of it could not be scored"}
+NOT_DRAWN = {
+    "friction.bearing": "all friction of the simulated arm is between motor and torque sensor",
+    "torque.nonlinearity": "no diagnosis names it, so a case of it could not be scored",
+}
 """Catalogue ids without a blind form, and why."""
 EFFECTS = tuple(sorted(DRAWS))

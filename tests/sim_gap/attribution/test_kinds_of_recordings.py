@@ -113,6 +113,58 @@ def test_a_pendulum_that_swings_free_shows_its_friction(seed: int) -> None:
     assert (answer.heldout_after < 0.1 * answer.heldout_before).all()
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_one_swing_that_ends_at_rest_is_judged_where_it_moves(seed: int) -> None:
+    random = np.random.default_rng([seed, 8])
+    mass, length = random.uniform(0.5, 3.0), random.uniform(0.1, 0.3)
+    coulomb, viscous = random.uniform(0.04, 0.06) * mass * 9.81 * length, random.uniform(0.005, 0.01) * mass
+    loss = f'frictionloss="{coulomb}" damping="{viscous}" solreffriction="0.002 1" solimpfriction="0.999 0.9999 0.001"'
+    real = mujoco.MjModel.from_xml_string(PENDULUM.format(friction=loss, mass=mass, length=length))
+    nominal = PENDULUM.format(friction="", mass=mass, length=length)
+    answer = diagnose(model(nominal), [swing(real, 1.9, random, 0.002 * mass * 9.81 * length)])
+    assert answer.verdict in ("explained", "ambiguous")  # two seconds of it may not tell the kinds of friction apart
+    assert values(answer, "friction.coulomb", "torque") == pytest.approx([coulomb], rel=0.15)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_friction_behind_the_sensor_is_told_from_that_before_it(seed: int) -> None:
+    """Bearings and seals rub on the link side of the sensor: both channels hold that, the motor's the gear's, too."""
+    random = np.random.default_rng([seed, 9])
+    gear, bearing = random.uniform(1.0, 3.0, N), random.uniform(0.3, 0.8, N)
+    recordings = []
+    for number in range(2):
+        t, q, v, a = motion(N, 30.0, 100.0, 10 * seed + number)
+        made = record_along((t, q, v, a), model(), Wrong(coulomb=gear, viscous=0.5), number)
+        rubs = bearing * np.tanh(v / 0.01) + 0.2 * v
+        recordings.append(replace(made, torque=made.torque + rubs, motor_torque=made.motor_torque + rubs))
+    answer = diagnose(model(), recordings[:1], recordings[1:])
+    assert answer.verdict == "explained"
+    assert values(answer, "friction.coulomb", "torque") == pytest.approx(gear, rel=0.1)
+    assert values(answer, "friction.bearing", "torque") == pytest.approx(bearing, rel=0.15)
+    assert values(answer, "friction.bearing", "damping") == pytest.approx(np.full(N, 0.2), abs=0.1)
+
+
+def test_recordings_of_some_seconds_are_diagnosed_together() -> None:
+    wrong = Wrong(coulomb=0.8, viscous=0.4)
+    parts = [record(model(), wrong, seed=k, seconds=2.5, rate=100.0, channels=("tau_motor",)) for k in range(5)]
+    answer = diagnose(model(), parts[:4], parts[4:])
+    assert values(answer, "friction.coulomb", "torque") == pytest.approx(np.full(N, 0.8), rel=0.25)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_column_of_a_short_piece_of_a_sound_arm_is_corrected(seed: int) -> None:
+    """Three seconds of two joints in motion, with friction and a payload, may look like a turned zero."""
+    random = np.random.default_rng([seed, 10])
+    t, q, v, a = motion(N, 3.3, 100.0, seed)
+    still = random.permutation(N)[: N - 2]
+    for each in (v, a):
+        each[:, still] = 0.0
+    q[:, still] = q[0, still]
+    wrong = Wrong(coulomb=random.uniform(0.0, 2.0), viscous=random.uniform(0.0, 1.0), payload=random.uniform(0.0, 0.5))
+    piece = record_along((t, q, v, a), model(), wrong, seed, channels=("tau_motor",))
+    assert not [each for each in check_recording(load_model(model()).arm, piece, "r", AS_IT_IS)[1] if each.corrected]
+
+
 def swing(real: mujoco.MjModel, start: float, random: np.random.Generator, noise: float) -> Recording:
     data = mujoco.MjData(real)
     data.qpos[0] = start

@@ -44,7 +44,7 @@ def steady(falls: np.ndarray) -> float:
         terms=(OFFSET,),
         on=lambda data: store,
         subset=lambda terms: np.ones(1) if terms else np.zeros(1),
-        normal=SimpleNamespace(fixed={}, index=lambda terms: np.array([0])),
+        equations=SimpleNamespace(fixed={}, index=lambda terms: np.array([0])),
     )
     heldout = SimpleNamespace(rows=(row,), valid={row: np.full(len(y), True)}, values={row: y}, blocks=blocks)
     return steadiness(estimate, heldout, [OFFSET])

@@ -1,4 +1,4 @@
-"""Which effects are named as confounded with a cause, on searches whose scores are made by hand."""
+"""Which effects are named as confounded with a cause, on choices whose scores are made by hand."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -13,29 +13,31 @@ LAG, DELAY = Term("actuator.lag", 0, (0.01,)), Term("actuator.delay", 0, (0.01,)
 CLIPS = [Term("actuator.saturation", joint, (5.0,)) for joint in range(6)]
 
 
-def lag_search(
-    scores: dict[frozenset[Term], float], active: list[Term], *others: Term, dearer: float = 0.0, price: float = 0.012
+def lag_choice(
+    scores: dict[frozenset[Term], float], current: list[Term], *others: Term, dearer: float = 0.0, price: float = 0.012
 ) -> Any:
-    """A search that found the active terms, at a score of 0; that of others is as given, else infinite.
+    """A choice of the current terms, at a score of 0 per measurement; that of others is as given, else infinite.
 
-    Effects but the active ones are `dearer` by so many coefficients.
+    Effects but the current ones are `dearer` by so many coefficients.
     """
     return SimpleNamespace(
-        active=active,
+        current=current,
         score=0.0,
-        normal=SimpleNamespace(terms=[*active, *CLIPS, DELAY, *others], price=price),
-        weighted=SimpleNamespace(screen=lambda _rest, offered: [(1.0, other) for other in offered]),
-        cost=lambda term: 1.0 + dearer * (term not in active),
+        usual=frozenset(),
+        effects=dict.fromkeys([*current, *CLIPS, DELAY, *others]),
+        equations=SimpleNamespace(measurements=1.0, layout=None, store=SimpleNamespace(nominal=None, values={})),
+        shortlist=lambda _rest, offered, most: offered[:most],
+        price=lambda terms: price * sum(1.0 + dearer * (term not in current) for term in terms),
         judge=lambda terms: scores.get(frozenset(terms), float("inf")),
         without=lambda term, terms: [other for other in terms if other != term],
-        with_beneath=lambda term, terms: [*terms, term],
+        with_needs=lambda term, terms: [*terms, term],
     )
 
 
 def rivals(scores: dict[Term | None, float]) -> tuple[str, ...]:
     """Rivals of a lag, given the scores with another in its place (None: nothing)."""
     sets = {frozenset({term} if term else ()): score for term, score in scores.items()}
-    return Rivals(lag_search(sets, [LAG])).weigh("actuator.lag", [LAG]).confounded_with
+    return Rivals(lag_choice(sets, [LAG])).weigh("actuator.lag", [LAG]).confounded_with
 
 
 def test_what_does_nearly_as_well_is_a_rival_and_what_brings_little_is_not():
@@ -46,10 +48,10 @@ def test_what_does_nearly_as_well_is_a_rival_and_what_brings_little_is_not():
 @pytest.mark.parametrize("price", [0.012, 0.04])
 def test_what_fits_exactly_alike_is_a_rival_though_it_costs_more(price):
     """An asymmetric friction costs three coefficients more than the offset that reads as it does."""
-    search = lag_search({frozenset(): 0.4, frozenset({DELAY}): 3.0 * price}, [LAG], dearer=3.0, price=price)
-    assert Rivals(search).weigh("actuator.lag", [LAG]).confounded_with == ("actuator.delay",)
-    search = lag_search({frozenset(): 0.4, frozenset({DELAY}): 3.5 * price}, [LAG], dearer=3.0, price=price)
-    assert Rivals(search).weigh("actuator.lag", [LAG]).confounded_with == ()
+    choice = lag_choice({frozenset(): 0.4, frozenset({DELAY}): 3.0 * price}, [LAG], dearer=3.0, price=price)
+    assert Rivals(choice).weigh("actuator.lag", [LAG]).confounded_with == ("actuator.delay",)
+    choice = lag_choice({frozenset(): 0.4, frozenset({DELAY}): 3.5 * price}, [LAG], dearer=3.0, price=price)
+    assert Rivals(choice).weigh("actuator.lag", [LAG]).confounded_with == ()
 
 
 def test_an_effect_known_to_be_alike_is_tried_even_where_others_promise_more():
@@ -67,7 +69,7 @@ def test_the_rivals_are_those_of_the_best_founded_place_in_whatever_order(turned
     """Joint 1 has much evidence of a lag, and of a delay as well; the little at joint 2 has no rival."""
     weak = Term("actuator.lag", 1, (0.01,))
     scores = {frozenset({weak}): 0.4, frozenset({weak, DELAY}): 0.03, frozenset({LAG}): 0.02}
-    weighed = Rivals(lag_search(scores, in_order([LAG, weak], turned))).weigh("actuator.lag", [LAG, weak])
+    weighed = Rivals(lag_choice(scores, in_order([LAG, weak], turned))).weigh("actuator.lag", [LAG, weak])
     assert weighed.evidence == 0.03
     assert weighed.confounded_with == ("actuator.delay",)
 
@@ -77,7 +79,7 @@ def test_the_rivals_of_a_weak_place_are_none_of_the_best_founded_one_in_whatever
     """Joint 1 has much evidence of a lag alone; the little at joint 2 may be a delay."""
     weak, late = Term("actuator.lag", 1, (0.01,)), Term("actuator.delay", 1, (0.01,))
     scores = {frozenset({weak}): 0.4, frozenset({LAG}): 0.03, frozenset({LAG, late}): 0.01}
-    weighed = Rivals(lag_search(scores, in_order([LAG, weak], turned), late)).weigh("actuator.lag", [LAG, weak])
+    weighed = Rivals(lag_choice(scores, in_order([LAG, weak], turned), late)).weigh("actuator.lag", [LAG, weak])
     assert weighed.evidence == 0.4
     assert weighed.confounded_with == ()
 
@@ -86,15 +88,8 @@ def in_order(terms: list[Term], turned: bool) -> list[Term]:
     return terms[::-1] if turned else terms
 
 
-@pytest.mark.parametrize(("kept", "worse"), [([DELAY], 0.2), ([], float("inf"))])
-def test_a_rival_that_a_fit_about_itself_drops_is_none(monkeypatch, kept, worse):
-    monkeypatch.setattr(module, "converge", lambda nominal, terms, start: (None, kept))
-    monkeypatch.setattr(module, "NormalEquations", lambda about, terms: None)
-    monkeypatch.setattr(module, "StepwiseSearch", lambda normal, terms, usual: SimpleNamespace(score=1.2))
-    search = SimpleNamespace(
-        score=1.0,
-        usual=None,
-        normal=SimpleNamespace(store=SimpleNamespace(nominal=None, values={})),
-        with_beneath=lambda term, terms: [*terms, term],
-    )
-    assert Rivals(search)._refitted(DELAY, []) == pytest.approx(worse)
+def test_a_rival_whose_columns_bend_is_judged_about_its_own_fit(monkeypatch):
+    monkeypatch.setattr(module, "converge", lambda nominal, terms, start: (None, [DELAY]))
+    monkeypatch.setattr(module, "TermEquations", lambda about, terms: None)
+    monkeypatch.setattr(module, "TermChoice", lambda equations, terms, usual: SimpleNamespace(score=0.2))
+    assert Rivals(lag_choice({}, [LAG]))._refitted([DELAY], []) == pytest.approx(0.2)

@@ -1,10 +1,12 @@
-"""Single figures of effects: inertia of a point mass, which bodies can be, lag of a drive."""
+"""Single figures of effects: inertia of a point mass, what can exist, lag of a drive."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sim_gap.effects.drive import _lag
-from sim_gap.effects.effect import added_or_taken_off
+from sim_gap.effects.effect import Ratings
 from sim_gap.effects.link import point_mass, pseudo_inertia
 from sim_gap.effects.registry import effects
 
@@ -18,22 +20,38 @@ def test_a_point_mass_has_its_inertia_by_the_parallel_axes(mass: float) -> None:
     assert np.linalg.matrix_rank(pseudo_inertia(inertial), tol=1e-9) == 1
 
 
-def test_no_more_can_be_missing_than_the_last_link_has() -> None:
-    can = effects()["link.payload"].plausibility.allows
-    tip = {"tip": np.array([1.5])}
-    assert can(np.array([-1.4, 0.0, 0.0, 0.0]), (), tip)
-    assert not can(np.array([-1.5, 0.0, 0.0, 0.0]), (), tip)
-    assert can(np.array([5.0, 0.0, 0.0, 1.0]), (), tip)
-    assert not can(np.array([5.0, 0.0, 0.0, 4.0]), (), tip)
+RATINGS = Ratings(
+    friction=0.4, damping=0.2, armature=0.1, speed=0.5, torque=30.0, tip_mass=1.5, mass=12.0, dry=1.0, own=None
+)
 
 
-def test_little_is_taken_off_only_where_another_effect_builds_on_it() -> None:
-    can = lambda coefficient, needed: added_or_taken_off(coefficient, 2.0, {"needed": np.array([needed])})  # noqa: E731
-    assert not can(-0.06, 0.0)
-    assert can(-0.06, 1.0)
-    assert can(-0.12, 0.0)
-    assert not can(-2.1, 1.0)
-    assert can(0.01, 0.0)
+def bounds(effect: str, ratings: Ratings = RATINGS) -> tuple[np.ndarray, np.ndarray]:
+    low, high = effects()[effect].plausibility.bounds(ratings, ())
+    return np.atleast_1d(low), np.atleast_1d(high)
+
+
+def test_no_more_can_be_missing_than_the_last_link_has_and_no_body_hangs_far_off() -> None:
+    low, high = bounds("link.payload")
+    assert -1.5 < low[0] < -1.4
+    assert high[0] == 12.0
+    _, near = bounds("link.payload", replace(RATINGS, own=np.array([5.0, 0.0, 0.0, 4.0])))
+    assert 1.0 < near[3] < 4.0
+
+
+def test_friction_and_rotor_may_be_less_than_the_model_has_but_not_less_than_none() -> None:
+    assert bounds("friction.coulomb")[0] == pytest.approx(-0.5)  # both kinds at the usual speed
+    assert bounds("friction.viscous")[0] == pytest.approx(-1.0)
+    assert bounds("actuator.rotor_inertia")[0] == pytest.approx(-0.1)
+
+
+@pytest.mark.parametrize("effect", ["friction.coulomb", "friction.stribeck"])
+def test_no_joint_rubs_by_more_than_its_drive_was_seen_to_make(effect: str) -> None:
+    assert bounds(effect)[1] == 30.0
+
+
+@pytest.mark.parametrize("effect", ["friction.stribeck", "friction.load", "transmission.elasticity"])
+def test_what_adds_to_friction_or_gives_way_is_not_negative(effect: str) -> None:
+    assert bounds(effect)[0] == 0.0
 
 
 @pytest.mark.parametrize("time", [0.005, 0.05])

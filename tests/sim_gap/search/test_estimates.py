@@ -18,7 +18,6 @@ from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.estimate_signals import signals_about
 from sim_gap.search.feasibility import _closest, _shapes
 from sim_gap.search.model_selection import golden_section, relinearised_in_place, select_model
-from sim_gap.search.normal_equations import NormalEquations
 from sim_gap.search.term import Term
 
 PAYLOAD, SPRING = Term("link.payload", 0), Term("transmission.spring", 1)
@@ -78,16 +77,6 @@ def test_columns_of_what_an_estimate_holds_are_its_own(data: ResidualSet) -> Non
     assert own._source(PAYLOAD) is None
     assert own._source(Term("link.mass_moment", 0)) is nominal
     assert own._source(Term("law.velocity", 0)) is None
-
-
-def test_the_size_of_a_term_is_the_rms_of_its_torque(data: ResidualSet) -> None:
-    terms = [Term("torque.offset", 0), Term("torque.offset", 1)]
-    normal = NormalEquations(ColumnStore(data), terms)
-    index = normal.index(terms)
-    values = np.where(np.isin(index, normal.at[terms[0]]), 2.0, 3.0)
-    sizes = dict(zip(normal.rows, normal.size_of(terms[0], index, values), strict=True))
-    assert sizes["tau", 0] == pytest.approx(2.0)
-    assert sizes["tau", 1] == 0.0
 
 
 def test_between_motor_and_sensor_less_of_a_gap_is_worth_a_parameter(data: ResidualSet) -> None:
@@ -170,9 +159,7 @@ class Bent:
 
 def test_a_step_moves_positions_and_linearises_other_effects_where_they_are() -> None:
     turned, bent = Bent("position.offset", True), Bent("torque.hysteresis", False)
-    normal = SimpleNamespace(size=2, at={turned: np.array([0]), bent: np.array([1])})
-    weighted = SimpleNamespace(fit=lambda terms: (np.array([0, 1]), np.array([0.3, 0.7])))
-    terms, values = gauss_newton._step(SimpleNamespace(active=[turned, bent], normal=normal, weighted=weighted))
+    terms, values = gauss_newton.relinearised_at({turned: np.array([0.3]), bent: np.array([0.7])})
     assert [term.times for term in terms] == [0, 1]
     assert values == {terms[0]: [0.3], terms[1]: [1.0]}  # a secant's size is in its shape
 
@@ -180,21 +167,19 @@ def test_a_step_moves_positions_and_linearises_other_effects_where_they_are() ->
 def test_nonlinear_effects_are_offered_at_the_size_that_they_have_in_place_of_a_chosen_one(monkeypatch) -> None:
     bent, chosen = Bent("torque.hysteresis", False), Bent("friction.coulomb", False)
 
-    def search(normal: object, terms: list[Bent]) -> SimpleNamespace:
+    def choice(terms: list[Bent], current: list[Bent]) -> SimpleNamespace:
         return SimpleNamespace(
-            active=terms,
-            without=lambda term, active: [other for other in active if other != term],
-            weighted=SimpleNamespace(
-                screen=lambda rest, others: [(1.0, other) for other in others],
-                fit=lambda terms: (np.array([0]), np.array([0.5])),
-            ),
-            with_beneath=lambda term, rest: [*rest, term],
+            current=current,
+            effects=dict.fromkeys(terms),
+            without=lambda term, names: [other for other in names if other != term],
+            shortlist=lambda rest, offered, most: offered[:most],
+            with_needs=lambda term, rest: [*rest, term],
             judge=lambda terms: 0.0,
-            normal=SimpleNamespace(at={Bent("torque.hysteresis", False, k): np.array([0]) for k in range(3)}),
+            values=lambda terms: dict.fromkeys(terms, np.array([0.5])),
         )
 
-    monkeypatch.setattr(model_selection, "NormalEquations", lambda store, terms: None)
-    monkeypatch.setattr(model_selection, "StepwiseSearch", search)
+    monkeypatch.setattr(model_selection, "TermEquations", lambda store, terms: terms)
+    monkeypatch.setattr(model_selection, "TermChoice", choice)
     assert [term.times for term in relinearised_in_place(None, [chosen], [bent])] == [2]
     assert relinearised_in_place(None, [], [bent]) == [bent]
 
@@ -208,29 +193,11 @@ def test_golden_sections_end_at_the_minimum() -> None:
 def test_one_body_in_place_of_several_errors_of_links_is_kept_if_it_scores_better(monkeypatch, score, kept) -> None:
     def found(name: str, score: float) -> SimpleNamespace:
         store = SimpleNamespace(beside=lambda near: SimpleNamespace(keep=lambda terms: None))
-        return SimpleNamespace(name=name, score=score, active=[], normal=SimpleNamespace(store=store))
+        return SimpleNamespace(name=name, score=score, current=[], equations=SimpleNamespace(store=store))
 
     results = iter([found("first", 2.0), found("several", score)])
     monkeypatch.setattr(model_selection, "first_search", lambda store, library: ([], []))
-    monkeypatch.setattr(model_selection, "search_again", lambda store, active, offered: next(results))
-    monkeypatch.setattr(model_selection, "one_body", lambda store, search, offered: [PAYLOAD])
-    monkeypatch.setattr(model_selection, "drives_are_off", lambda search: False)
+    monkeypatch.setattr(model_selection, "search_again", lambda store, chosen, offered: next(results))
+    monkeypatch.setattr(model_selection, "one_body", lambda store, choice, offered: [PAYLOAD])
+    monkeypatch.setattr(model_selection, "drives_are_off", lambda choice: False)
     assert select_model(SimpleNamespace(keep=lambda terms: None), []).name == kept
-
-
-def test_what_needs_a_term_that_cannot_exist_is_not_offered_again(monkeypatch) -> None:
-    """Asymmetric friction needs Coulomb friction: alone it could not be judged."""
-    asymmetric, viscous = Term("friction.asymmetric", 1), Term("friction.viscous", 1)
-    given: list[list[Term]] = []
-
-    def about(_store, _chosen, offered, *_):
-        given.append(offered)
-        search = SimpleNamespace(active=[viscous] if given[1:] else [], added={})
-        search.normal = SimpleNamespace(store=SimpleNamespace(values={}))
-        search.run = lambda: setattr(search, "active", [viscous])
-        return search
-
-    monkeypatch.setattr(model_selection, "refit_about_itself", about)
-    monkeypatch.setattr(model_selection, "refine", lambda _store, terms: terms)
-    model_selection.search_again(None, [COULOMB], [COULOMB, asymmetric, viscous])
-    assert given == [[COULOMB, asymmetric, viscous], [viscous]]

@@ -1,0 +1,192 @@
+"""Normal equations of all candidate terms on one set of residuals, and their choice by held-out likelihood."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcomp.arrays import Array
+from gcomp.estimate.choice import PRICE, Effect, LinearTerms
+from gcomp.estimate.exchange import EffectChoice
+from sim_gap.effects.effect import Key, Ratings
+from sim_gap.residuals.residual_set import ResidualSet
+from sim_gap.search.column_store import ColumnStore
+from sim_gap.search.term import Term
+
+CORRELATED = 8.0
+"""Samples per independent measurement: residuals of real arms are correlated over a third of a second or more."""
+MOST_MEASUREMENTS = 333.0
+"""Independent measurements that a row counts for at most: with the price of a parameter, this is a fall of its RMS by
+1 %, which what no model has can mimic however long the recording is."""
+FEWEST = 25
+"""Samples from which a row is looked at."""
+LARGEST = 0.999
+"""Quantile of the absolute torques that is taken for the largest."""
+
+
+class TermEquations:
+    """Terms as parameters of the residual rows, linear about the estimate of a store of columns."""
+
+    def __init__(self, store: ColumnStore, terms: Sequence[Term], like: "TermEquations | None" = None) -> None:
+        """`like` has the same coefficients, on other data."""
+        data = store.data
+        self.store = store
+        self.terms = [term for term in terms if store.columns(term)]
+        self.rows, self.layout = data.rows, data.layout
+        widths = [next(iter(store.columns(term).values())).shape[1] for term in self.terms]
+        ends = np.cumsum([0, *widths])
+        self.at = {term: np.arange(ends[i], ends[i + 1]) for i, term in enumerate(self.terms)}
+        held = [term for term in self.terms if (term in like.fixed if like else store.offset(term))]
+        self.fixed: dict[Term, int] = {term: int(ends[-1]) + k for k, term in enumerate(held)}
+        """Index of the column that a nonlinear term has beside its own; its coefficient is one."""
+        self.size = int(ends[-1]) + len(held)
+        self.ratings = Rated(data, store.values)
+        self.linear = self._linear(data, 1 if like else FEWEST)
+        store.release()
+
+    def _linear(self, data: ResidualSet, fewest: int) -> LinearTerms:
+        folds = int(data.folds.max()) + 1
+        shape = (len(self.rows), folds)
+        acting, squares, products = list[NDArray[np.intp]](), list[Array](), list[Array]()
+        totals, counts, power = np.zeros(shape), np.zeros(shape), np.zeros(self.size)
+        valid = {row: data.valid[row] for row in self.rows}
+        longest = max(max(int(mask.sum()) for mask in valid.values()), 1)
+        measurements = min(longest / CORRELATED, MOST_MEASUREMENTS)
+        for r, row in enumerate(self.rows):
+            touching = [term for term in self.terms if row in self.store.columns(term)]
+            index, x, y = self.index(touching), self.store.wide(touching, row, self.fixed), data.values[row]
+            seen = int(valid[row].sum())
+            each = measurements / seen if seen >= fewest else 0.0
+            gram, side = np.zeros((folds, len(index), len(index))), np.zeros((folds, len(index)))
+            for fold in range(folds):
+                pick = valid[row] & (data.folds == fold)
+                part, target = x[pick], y[pick]
+                gram[fold], side[fold] = each * part.T @ part, -each * part.T @ target
+                totals[r, fold], counts[r, fold] = each * float(target @ target), each * pick.sum()
+            acting.append(index)
+            squares.append(gram)
+            products.append(side)
+            power[index] += np.diagonal(gram.sum(0)) / measurements
+        floor = np.array([data.relevance_floor[row] for row in self.rows])
+        spread, expected, low, high = (np.zeros(self.size) for _ in range(4))
+        for term, at in self.at.items():
+            likely = term.form.plausibility
+            spread[at], expected[at] = likely.prior_std(data.signals[0], term.place), likely.prior_mean
+            low[at], high[at] = likely.bounds(self.ratings.of(term), term.shape)
+        beside = list(self.fixed.values())
+        spread[beside], expected[beside], low[beside], high[beside] = np.inf, 1.0, 1.0, 1.0
+        for term, values in self.store.pins.items():
+            if term in self.at:
+                low[self.at[term]] = high[self.at[term]] = values
+        prior = 1.0 / spread**2 + 1e-9 * power + (power == 0.0)
+        raw = totals.sum(1) / np.maximum(counts.sum(1), 1e-300)
+        return LinearTerms(
+            np.zeros(self.size), tuple(acting), tuple(squares), tuple(products), totals, counts, raw + floor**2, floor,
+            np.zeros(self.size), prior, expected, low, high,
+        )  # fmt: skip
+
+    def index(self, terms: Sequence[Term]) -> NDArray[np.intp]:
+        """Indices of the terms' coefficients, then of the columns beside them (`fixed`)."""
+        beside = [np.array([self.fixed[term]]) for term in terms if term in self.fixed]
+        return np.concatenate([*(self.at[term] for term in terms), *beside, np.zeros(0, np.intp)]).astype(np.intp)
+
+    def effects(self, usual: Collection[str] = ()) -> dict[Term, Effect[Term]]:
+        """Every term as an effect of the choice; those that are `usual` on this arm are not charged for."""
+        forms: dict[Key, set[Term]] = {}
+        for term in self.terms:
+            forms.setdefault(term.key, set()).add(term)
+        out = {}
+        for term in self.terms:
+            gone = {term.key, *term.covers(self.layout)}
+            excluded = frozenset(other for key in gone for other in forms.get(key, ()) if other != term)
+            needs, simpler = (
+                tuple(other for key in keys for other in forms.get(key, ()))
+                for keys in (term.beneath, term.alternatives(self.layout))
+            )
+            likely = term.form.plausibility
+            price = 0.0 if term.effect in usual or likely.every_joint else self.price(term)
+            numbers = tuple(self.index([term]).tolist())
+            out[term] = Effect(term, numbers, needs, price=price, excludes=excluded, simpler=simpler)
+        return out
+
+    def price(self, term: Term) -> float:
+        """Price of a term: of its effective coefficients, its shape, and of being rare."""
+        form = term.form
+        shape = len(term.shape) * (form.hints.linearised_at is None)
+        return PRICE * (self.linear.freedom(self.at[term].tolist()) + shape + form.plausibility.prior_penalty)
+
+    def mean_square(self, change: Array) -> Array:
+        """Mean square of the residual per row after subtracting the terms with these coefficients (P,), (R,)."""
+        return self.linear.mean_squares(change)
+
+    @property
+    def measurements(self) -> float:
+        """Independent measurements of the row with most."""
+        return float(self.linear.counts.sum(1).max(initial=0.0))
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Rows that are looked at, (R,)."""
+        return np.asarray(self.linear.counts.sum(1) > 0.0)
+
+
+class TermChoice(EffectChoice[Term]):
+    """A choice among the terms of some equations; it begins with what every joint has."""
+
+    def __init__(
+        self,
+        equations: TermEquations,
+        current: Sequence[Term] = (),
+        usual: frozenset[str] = frozenset(),
+        least: float = 0.0,
+    ) -> None:
+        self.equations, self.usual = equations, usual
+        every = [term for term in equations.terms if term.form.plausibility.every_joint and term not in current]
+        super().__init__(equations.linear, equations.effects(usual), [*current, *every], least)
+
+    def judge(self, names: Sequence[Term]) -> float:
+        """As of any choice; infinite for a body that is farther from the tip than its own mass allows."""
+        change: Array | None = None
+        for term in names:
+            if term.form.signature.body:
+                change = self.terms.fit(self.free(names)) if change is None else change
+                c = change[self.equations.at[term]]
+                rated = replace(self.equations.ratings.of(term), own=c)
+                low, high = term.form.plausibility.bounds(rated, term.shape)
+                if np.any(c < low) or np.any(c > high):
+                    return float("inf")
+        return super().judge(names)
+
+    def values(self, terms: Sequence[Term] | None = None) -> dict[Term, Array]:
+        """Coefficients of a fit of some terms, of those chosen if none are given."""
+        terms = self.current if terms is None else terms
+        change = self.terms.fit(self.free(terms))
+        return {term: change[self.equations.at[term]] for term in terms}
+
+
+class Rated:
+    """Ratings of every joint of an arm, from the nominal model, the recordings and an estimate."""
+
+    def __init__(self, data: ResidualSet, values: Mapping[Term, Array]) -> None:
+        arm, of_motor = data.signals[0].arm, float(data.layout.motor is not None)
+        self.values = {term.key: c for term, c in values.items()}
+        self.joint = of_motor * np.stack([arm.frictionloss, arm.damping, arm.armature])
+        """Friction, damping and armature of the nominal model, (3, n): a sensor on the link reads none of them."""
+        self.speed = np.sqrt(np.mean([np.mean(s.v**2, axis=0) for s in data.signals], axis=0))
+        parts = [largest(s.model) + np.max([largest(x) for x in s.reading.values()], axis=0) for s in data.signals]
+        self.torque = np.asarray(np.max(parts, axis=0))
+        self.tip_mass, self.mass = float(arm.inertial[-1, 0]), float(arm.inertial[:, 0].sum())
+
+    def of(self, term: Term) -> Ratings:
+        friction, damping, armature = self.joint[:, term.place].tolist()
+        torque = float(self.torque[term.place])
+        found = self.values.get(("friction.coulomb", term.place))
+        dry = torque if found is None else max(friction + float(found[0]), 0.0)
+        speed = float(self.speed[term.place])
+        own = self.values.get(term.key)
+        return Ratings(friction, damping, armature, speed, torque, self.tip_mass, self.mass, dry, own)
+
+
+def largest(torque: Array) -> Array:
+    return np.asarray(np.quantile(np.abs(torque), LARGEST, axis=0))
