@@ -180,8 +180,8 @@ def _tested(
     s = _prepared(recording, view.arm, label, view.stated)
     if view.motion.channel not in s.channels:
         return findings
-    arm = view.arm if gravity else view.mounted
-    shown = shown_by(arm, view.motion, motion_of(s, view.motion.channel), view.rate)
+    arms = [view.arm] if gravity else [view.arm, view.mounted]
+    shown = shown_by(arms, view.motion, motion_of(s, view.motion.channel), view.rate)
     return findings if (not is_refuted(shown) if gravity else is_certain(shown)) else []
 
 

@@ -4,6 +4,8 @@ A wrong sign, order, zero or clock has to explain more than masses, friction, sp
 the likelihood of parts of the recording that are held out, as effects are chosen.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from gcomp.arrays import Array
@@ -22,11 +24,14 @@ CERTAIN = 5.0 * PRICE
 paid then, and the choice among the hundred changes that are looked at."""
 
 
-def shown_by(arm: RigidArm, before: ChannelMotion, after: ChannelMotion, rows_per_s: float) -> HeldOutEvidence:
-    """How much better a corrected motion is predicted than it was before."""
+def shown_by(
+    arms: Iterable[RigidArm], before: ChannelMotion, after: ChannelMotion, rows_per_s: float
+) -> HeldOutEvidence:
+    """How much better a corrected motion is predicted than it was before, each by the likelier of the arms: how a base
+    is mounted may have been read off the recording with its fault."""
     scale = np.maximum(before.reading.std(0), after.reading.std(0))
-    costs = [_costs(arm, motion, scale, rows_per_s) for motion in (before, after)]
-    falls = costs[0] - costs[1]
+    costs = [[_costs(arm, motion, scale, rows_per_s) for arm in arms] for motion in (before, after)]
+    falls = min(costs[0], key=np.sum) - min(costs[1], key=np.sum)
     return HeldOutEvidence(float(falls.sum()), float(falls.std(ddof=1) * np.sqrt(len(falls))))
 
 
@@ -41,7 +46,8 @@ def is_refuted(shown: HeldOutEvidence) -> bool:
 
 
 def _costs(arm: RigidArm, motion: ChannelMotion, scale: Array, rows_per_s: float) -> Array:
-    """Negative logarithm of the likelihood of each held-out part, over all joints, (F,)."""
+    """Negative logarithm of the likelihood of each held-out part, over all joints, (F,), and of such effects: a reading
+    turned round is one of a gain of minus one, which no sensor has."""
     model, n = arm.carried(motion.q, motion.v, motion.a), arm.n
     size = np.maximum(model.std(0), 1e-9)
     fold = np.arange(len(model)) * FOLDS // len(model)
@@ -72,4 +78,6 @@ def _costs(arm: RigidArm, motion: ChannelMotion, scale: Array, rows_per_s: float
         1.0 / np.array(spread) ** 2, none, np.array(low), np.array(high),
     )  # fmt: skip
     every = range(len(spread))
-    return np.asarray(terms.reweighed(every).costs(every).sum(0))
+    terms = terms.reweighed(every)
+    usual = 0.5 * float(terms.prior @ terms.fit(every) ** 2)
+    return np.asarray(terms.costs(every).sum(0) + usual / FOLDS)

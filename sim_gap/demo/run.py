@@ -266,7 +266,7 @@ class Demo:
         table = account.table("torque gain, offset [N·m] and the like: estimated ± 95 %, and true", fit.names, columns)
         text = f"Each joint {swept} a reference mass; the true values were hidden from the fit."
         truths = ReportSection("Sensor calibration and the truth", paragraph(text), (), [table])
-        account.sections += [parts[0], truths, *parts[1:]]
+        account.sections += [*parts[:1], truths, *parts[1:]]
         error = np.abs(fit.value("gain") / truth.gain - 1)
         unseen = ", ".join(name for name, each in zip(fit.names, error, strict=True) if np.isnan(each))
         known = f"Torque gains found to {np.nanmax(error, initial=0.0):.2%} at worst"
