@@ -92,7 +92,11 @@ def _from_model(arm: ArmFile, section: SimSection) -> Any:
     for joint in spec.joints:
         if joint.name not in names:
             spec.delete(joint)
+    drives = {} if arm.link is None else {drive.name: drive for drive in arm.link.joints}
     for joint in spec.joints:
+        drive = drives.get(joint.name)
+        if drive is not None and np.sum(joint.damping) * drive.max_velocity > drive.max_torque:
+            joint.damping = 0.0 * joint.damping  # a placeholder: the drive could not move the joint
         if joint.name in arm.kinematics.stops:
             joint.range = np.array(arm.kinematics.stops[joint.name]) / (DEGREE if joint.compiler.degree else 1.0)
         if joint.type != mujoco.mjtJoint.mjJNT_HINGE or joint.range[0] >= joint.range[1]:

@@ -79,6 +79,22 @@ def test_torque_ends_where_the_drives_of_the_arm_file_end_not_the_effort_of_the_
     np.testing.assert_allclose(plant.data.qfrc_actuator, [25.0, 20.0], atol=1e-9)
 
 
+@pytest.mark.parametrize(("damping", "taken"), [(2.0, 2.0), (40.0, 0.0)])
+def test_damping_that_no_drive_of_the_arm_could_move_is_a_placeholder(
+    tmp_path: Path, damping: float, taken: float
+) -> None:
+    (tmp_path / "arm.urdf").write_text(URDF.replace("</joint>", f'<dynamics damping="{damping}"/></joint>'))
+    controllers = [
+        {"name": name, "node": node, "rated_torque": 20.0, "max_torque": 30.0, "max_velocity": 1.0}
+        for name, node in (("shoulder", 3), ("elbow", 4))
+    ]
+    kinematics = {"gravity": [0.0, 0.0, -9.81], "model": "arm.urdf"}
+    content = {"name": "two", "kinematics": kinematics, "link": {"joints": controllers}, "sim": {}}
+    described = parse_arm(content, tmp_path / "arm.yaml")
+    plant = SimulatedArm(described, Truth.of(described)).plant
+    np.testing.assert_allclose(plant.model.dof_damping, [taken, taken])
+
+
 @pytest.mark.parametrize("angle", ["radian", "degree"])
 def test_stops_of_the_arm_file_come_before_those_of_a_model_file(tmp_path: Path, angle: str) -> None:
     (tmp_path / "arm.xml").write_text(
