@@ -28,7 +28,7 @@ Beneath = Mapping[str, Array]
 
 @dataclass(frozen=True)
 class Ratings:
-    """What a joint's drive, its model and an estimate say of how large an effect can be there."""
+    """How large effects can be at a joint, by its drive, its model and an estimate."""
 
     friction: float
     """Friction loss of the joint in the model, as far as a motor reads it [N·m]."""
