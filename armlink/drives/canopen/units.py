@@ -117,7 +117,7 @@ def unit_doubt(services: NodeServices, joint: LinkJoint) -> str:
     return (
         f"{joint.name} ({joint.settings.address}): drive.position_unit is {given / own:.3g} times what 6092h, 60A8h or "
         f"608Fh of the device tell; if it is wrong, the joint turns {own / given:.3g} times as fast and as far as it "
-        "reads: before anything else, armlink check ARM --scales"
+        "reads: before anything else, armlink check ARM --scales hand"
     )
 
 
