@@ -5,7 +5,7 @@ free; with one, its torque is compared in stretches of time.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,10 @@ from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnose import checked_recordings
+from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.position_command import is_position_only
 from sim_gap.model.known_gains import KnownGains
-from sim_gap.model.load import SimModel, with_gains
+from sim_gap.model.load import SimModel
 from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.parameters import PARAMETERS
 from sim_gap.position_gap.plant import MovedModel, nominal_point
@@ -67,6 +68,8 @@ class ModelComparison:
     """Windows."""
     models: tuple[ModelGap, ...]
     """The best first."""
+    checks: tuple[tuple[str, RecordingFinding], ...] = ()
+    """Model, and what its check of the recordings found and corrected."""
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -74,6 +77,7 @@ class ModelComparison:
             "unit": self.unit,
             "joints": list(self.names),
             "windows": self.count,
+            "checks": [{"model": model, **found.to_json()} for model, found in self.checks],
             "models": [
                 {
                     "model": each.model,
@@ -109,16 +113,15 @@ def compare_models(
     free: list[Array] = []
     counts: Array | None = None
     names: tuple[str, ...] = ()
-    unit = ""
+    unit, findings = "", list[tuple[str, RecordingFinding]]()
     for model in models:
-        sim, checked, _ = checked_recordings(model, recordings, labels, stated, base, tip)
+        sim, checked, found = checked_recordings(model, recordings, labels, stated, base, tip, known_gains)
+        findings += [(str(model), each) for each in found]
         if names and sim.arm.names != names:
             raise BadInput(f"--sim {model}: its joints are {', '.join(sim.arm.names)}, not {', '.join(names)}")
         names = sim.arm.names
         if all(is_position_only(recording) for recording in checked):
-            own, weight, moved = _moved(
-                model, sim if known_gains is None else with_gains(sim, known_gains), checked, labels
-            )
+            own, weight, moved = _moved(model, sim, checked, labels)
             free.append(moved)
             unit = "rad"
         else:
@@ -128,7 +131,8 @@ def compare_models(
             counts = weight
         squares.append(own)
     assert counts is not None
-    return _ranked([str(model) for model in models], np.stack(squares), counts, free, unit, names)
+    ranked = _ranked([str(model) for model in models], np.stack(squares), counts, free, unit, names)
+    return replace(ranked, checks=tuple(findings))
 
 
 def _moved(

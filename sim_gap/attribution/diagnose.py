@@ -95,7 +95,7 @@ def diagnose(
     if not train:
         raise BadInput("no training recording: give at least one (--train FILE)")
     labels = list(labels) or [f"recording {i + 1}" for i in range(len(train) + len(heldout))]
-    sim, recordings, findings = checked_recordings(model, [*train, *heldout], labels, stated, base, tip)
+    sim, recordings, findings = checked_recordings(model, [*train, *heldout], labels, stated, base, tip, known_gains)
     train, heldout = recordings[: len(train)], recordings[len(train) :]
     heldout_is = "the recordings given" if heldout else f"the last {OWN_HELDOUT:.0%} of each training recording"
     numbers = list(range(1, len(train) + len(heldout) + 1))
@@ -105,7 +105,7 @@ def diagnose(
         train, heldout, labels, numbers, named, starts = *_split(train), labels * 2, numbers * 2, named * 2, starts * 2
     if all(is_position_only(recording) for recording in [*train, *heldout]):
         return diagnose_positions(
-            sim if known_gains is None else with_gains(sim, known_gains),
+            sim,
             train,
             heldout,
             labels,
@@ -115,8 +115,6 @@ def diagnose(
             gains=gains,
             progress=progress,
         )
-    if known_gains is not None:
-        raise BadInput("--gains: the recordings have a torque channel, which is compared with the model's torque")
     ready = [
         prepare(recording, sim.arm, label, number, names, start)
         for recording, label, number, names, start in zip(
@@ -207,8 +205,10 @@ def checked_recordings(
     stated: Corrections,
     base: str | None,
     tip: str | None,
+    known_gains: KnownGains | None = None,
 ) -> tuple[SimModel, list[Recording], tuple[RecordingFinding, ...]]:
-    """The model, the recordings with joints, units and clocks as they should be, and what was found in them."""
+    """The model with the gains that are known, the recordings with joints, units and clocks as they should be, and what
+    was found in them. Raises BadInput, for gains where the recordings have a torque channel too."""
     compiled_model = load_compiled(source)
     own_base, own_tip = ends_of(source)
     hinges = hinges_between(compiled_model, base or own_base, tip or own_tip)
@@ -223,6 +223,9 @@ def checked_recordings(
     require_length(matched, labels, 0.0 if alone else SHORTEST_PIECE_S)
     if alone:
         checked, found = check_position_only(sim.arm, matched, labels[: len(matched)], stated)
+        sim = sim if known_gains is None else with_gains(sim, known_gains)
+    elif known_gains is not None:
+        raise BadInput("--gains: the recordings have a torque channel, which is compared with the model's torque")
     else:
         checked, found = check_recordings(sim.arm, matched, labels[: len(matched)], stated)
     return sim, checked, (*findings, *found)

@@ -83,6 +83,8 @@ def compare(
             *cells,
         )
     out.print(table)
+    for model, finding in found.checks:
+        out.print(f"{model}: {finding.sentence()}", style="yellow")
     if found.unit == "rad":
         out.print("in brackets: running free")
     write_json(json, found.to_json())

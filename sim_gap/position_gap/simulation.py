@@ -16,7 +16,7 @@ from sim_gap.position_gap.windows import Windows
 
 WORLDS = 32
 """Simulations that are stepped together where laws are evaluated at each step: with more their states leave the
-processor's cache, with fewer the laws cost as much as the steps (benchmarks/positions_peer.py times them)."""
+processor's cache, with fewer the laws cost as much as the steps."""
 
 SAME_RAD = 1e-9
 """Difference of two commands that rounding makes [rad]."""

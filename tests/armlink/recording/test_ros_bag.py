@@ -317,7 +317,7 @@ def ros1_bag(path, rows, compression=None):
 
 @pytest.mark.parametrize("compression", [None, *Ros1Writer.CompressionFormat])
 def test_a_bag_of_ros_1(tmp_path, compression):
-    rows = np.random.default_rng().uniform(-1.0, 1.0, (30, 2))
+    rows = np.random.default_rng(1128).uniform(-1.0, 1.0, (30, 2))
     ros1_bag(tmp_path / "run.bag", rows, compression)
     loaded = load_recording(tmp_path / "run.bag")
     assert loaded.names == ("b", "a")
@@ -345,7 +345,7 @@ def refuse_above(most):
 def test_a_damaged_bag_of_ros_1_is_one_error(tmp_path):
     ros1_bag(tmp_path / "run.bag", np.zeros((50, 2)))
     whole = (tmp_path / "run.bag").read_bytes()
-    random = np.random.default_rng()
+    random = np.random.default_rng(1128)
     for cut in random.integers(1, len(whole), 12).tolist():
         (tmp_path / "cut.bag").write_bytes(whole[:cut])
         with pytest.raises(BadInput, match=r"cut\.bag"):
@@ -353,7 +353,7 @@ def test_a_damaged_bag_of_ros_1_is_one_error(tmp_path):
 
 
 def lerobot_with(path, state, action, described):
-    values = np.random.default_rng().uniform(-1.0, 1.0, (2, 40, 2))
+    values = np.random.default_rng(1128).uniform(-1.0, 1.0, (2, 40, 2))
     (path / "meta").mkdir(parents=True)
     (path / "data").mkdir()
     (path / "meta" / "info.json").write_text(json.dumps({"features": {state: described, action: described}}))

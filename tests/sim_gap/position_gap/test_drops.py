@@ -44,7 +44,7 @@ POSITION = '<position name="servo" joint="servo" kp="30" kv="2"/>'
 
 
 def test_drops_show_friction_and_rotor(tmp_path: Path) -> None:
-    random = np.random.default_rng()
+    random = np.random.default_rng(1128)
     friction, armature = random.uniform(0.2, 0.35), random.uniform(0.015, 0.025)
     real = servo(friction, armature, POSITION)
     sim = tmp_path / "sim.xml"
@@ -59,7 +59,7 @@ def test_drops_show_friction_and_rotor(tmp_path: Path) -> None:
 
 def test_known_gains_are_the_models(tmp_path: Path) -> None:
     """Of a model with a motor; what is written has a position actuator."""
-    random = np.random.default_rng()
+    random = np.random.default_rng(1128)
     t, kp = np.arange(0.0, 12.0, 0.02), float(random.uniform(20.0, 40.0))
     text = servo(0.1, 0.01, POSITION.replace('kp="30"', f'kp="{kp}"'))
     model = mujoco.MjModel.from_xml_string(text)
@@ -81,7 +81,7 @@ def test_known_gains_are_the_models(tmp_path: Path) -> None:
 
 def test_a_short_roll_out_alone_is_no_proof_of_a_wrong_sign() -> None:
     """A square wave of a second, half a period behind, among others that follow."""
-    random = np.random.default_rng()
+    random = np.random.default_rng(1128)
     text = servo(0.1, 0.01, POSITION)
     arm = load_model(mujoco.MjModel.from_xml_string(text)).arm
     recordings = []
