@@ -32,7 +32,6 @@ INSIDE = 0.95
 """Probability of an interval."""
 RESAMPLED = 2000
 """Samples of a bootstrap over windows (Efron and Tibshirani 1993: a thousand and more for the ends of an interval)."""
-
 ALIKE = 0.01
 """Relative difference of two gaps that is none to a user."""
 
@@ -109,11 +108,8 @@ def compare_models(
 ) -> ModelComparison:
     """The gap that each model leaves of the same recordings. Raises BadInput where one cannot be used."""
     labels = list(labels) or [f"recording {i + 1}" for i in range(len(recordings))]
-    squares: list[Array] = []
-    free: list[Array] = []
-    counts: Array | None = None
+    squares, weights, free, findings = list[Array](), list[Array](), list[Array](), list[tuple[str, RecordingFinding]]()
     names: tuple[str, ...] = ()
-    unit, findings = "", list[tuple[str, RecordingFinding]]()
     for model in models:
         sim, checked, found = checked_recordings(model, recordings, labels, stated, base, tip, known_gains)
         findings += [(str(model), each) for each in found]
@@ -123,16 +119,12 @@ def compare_models(
         if all(is_position_only(recording) for recording in checked):
             own, weight, moved = _moved(model, sim, checked, labels)
             free.append(moved)
-            unit = "rad"
         else:
             own, weight = _torques(sim, checked, labels)
-            unit = "N·m"
-        if counts is None:
-            counts = weight
         squares.append(own)
-    assert counts is not None
-    ranked = _ranked([str(model) for model in models], np.stack(squares), counts, free, unit, names)
-    return replace(ranked, checks=tuple(findings))
+        weights.append(weight)
+    unit, called = "rad" if free else "N·m", [str(model) for model in models]
+    return replace(_ranked(called, np.stack(squares), weights[0], free, unit, names), checks=tuple(findings))
 
 
 def _moved(

@@ -66,10 +66,9 @@ def compare(
         )
     out = results(json)
     scale, unit = (1e3, "mrad") if found.unit == "rad" else (1.0, found.unit)
-    table = Table(
-        "model", "all joints", "95 % interval", *found.names, title=f"gap in {found.count} windows, RMS in {unit}"
-    )
-    short = {Path(name).name for name in sim}
+    title = f"gap in {found.count} windows, RMS in {unit}"
+    table = Table("model", "all joints", "95 % interval", *found.names, title=title)
+    alone = len({Path(name).name for name in sim}) == len(sim)
     for each in found.models:
         value, low, high = (scale * x for x in each.overall)
         cells = (
@@ -77,7 +76,7 @@ def compare(
             for j, x in enumerate(each.windows)
         )
         table.add_row(
-            Path(each.model).name if len(short) == len(sim) else each.model,
+            Path(each.model).name if alone else each.model,
             f"{value:.3g}",
             f"{low:.3g} to {high:.3g}",
             *cells,
@@ -88,6 +87,6 @@ def compare(
     if found.unit == "rad":
         out.print("in brackets: running free")
     write_json(json, found.to_json())
-    alike = [each.model for each in found.models[1:] if each.alike]
-    told = f"; these recordings do not tell it from {', '.join(alike)}" if alike else ""
+    alike = ", ".join(each.model for each in found.models[1:] if each.alike)
+    told = f"; these recordings do not tell it from {alike}" if alike else ""
     out.print(f"{found.models[0].model} leaves the least{told}", style="bold")
