@@ -31,18 +31,24 @@ def parse_yaml(content: bytes | str, path: Path) -> Any:
     """The content of a YAML file; raises BadInput, in one line, where it is none or its aliases make it too large."""
     try:
         text = content.decode("utf-8") if isinstance(content, bytes) else content
-        _require_few_nodes(text, path)
-        return yaml.safe_load(text)
+        loader = yaml.SafeLoader(text)
+        try:
+            root = loader.get_single_node()
+            if root is None:
+                return None
+            if "&" in text:  # an anchor, so aliases may be there
+                _require_few_nodes(root, path)
+            return loader.construct_document(root)
+        finally:
+            loader.dispose()
     except RecursionError:
         raise BadInput(f"{path}: not YAML that can be used: nested too deeply") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date or number that does not exist, for example
         raise BadInput(f"{path}: not YAML: {' '.join(str(error).split())}") from None
 
 
-def _require_few_nodes(text: str, path: Path) -> None:
+def _require_few_nodes(root: yaml.Node, path: Path) -> None:
     """Raise BadInput where aliases stand for more values than MOST_NODES, or for what they are in themselves."""
-    if "&" not in text:  # no anchor, so no alias
-        return
     counts: dict[int, int] = {}
     kept = []  # the nodes, so that no id is given twice
 
@@ -64,6 +70,4 @@ def _require_few_nodes(text: str, path: Path) -> None:
             raise BadInput(f"{path}: its aliases stand for more than {MOST_NODES} values")
         return total
 
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    if root is not None:
-        count(root)
+    count(root)

@@ -4,7 +4,7 @@ import re
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "sim_gap"))  # importlib mode leaves this folder out
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "sim_gap")]  # importlib leaves them out
 PAGE = (Path(__file__).parent.parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
 
 

@@ -158,14 +158,21 @@ def test_the_table_has_every_extra_of_the_project():
     assert REQUIREMENT.match('psycopg[binary]>=3.2; extra == "postgresql"')["extra"] == "postgresql"
 
 
-@pytest.mark.slow
-def test_the_demo_needs_the_extra_that_draws_its_report_alone(tmp_path):
-    words = ["demo", str(ROOT / "examples" / "planar3.yaml"), "--out", "demo"]
-    source = f"from armlink import cli\nsys.exit(cli.run({words!r}))"
+DEMO = "from armlink import cli\nsys.exit(cli.run({words!r}))"
+
+
+def test_without_the_extra_that_draws_its_report_the_demo_does_not_begin(tmp_path):
+    source = DEMO.format(words=["demo", str(ROOT / "examples" / "planar3.yaml"), "--out", "demo"])
     lacking = run_without(["reports"], source, tmp_path)
     assert lacking.returncode == 2
     assert lacking.stderr.strip().endswith("is not installed: pip install 'armlink[reports]'")
     assert not (tmp_path / "demo").exists()
+
+
+@pytest.mark.long
+def test_the_demo_needs_no_other_extra(tmp_path):
+    """The demo of a small arm in test_first_hour has no other either."""
+    source = DEMO.format(words=["demo", str(ROOT / "examples" / "planar3.yaml"), "--out", "demo"])
     done = run_without(EXTRAS.keys() - {"reports"}, source, tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "demo" / "summary.json").read_text())["schema"] == "armlink.demo/1"

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from test_extras import DEMO, EXTRAS, run_without
 
 sys.path.append(str(Path(__file__).parents[1] / "calib" / "daemon" / "web"))
 from small_arm import small_arm
@@ -68,9 +69,9 @@ def write_small_arm(path: Path) -> Path:
 
 
 def demo_of(out: Path, *arm: str) -> Path:
-    """What a demo of this arm, by default of the default one, wrote."""
-    command = [sys.executable, "-m", "armlink.cli", "demo", "--seed", "3", "--out", str(out), *arm]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=1200, cwd=out.parent)
+    """What a demo of this arm, by default of the default one, wrote; without any extra but what draws its report."""
+    source = DEMO.format(words=["demo", "--seed", "3", "--out", str(out), *arm])
+    done = run_without(EXTRAS.keys() - {"reports"}, source, out.parent)
     assert done.returncode == 0, done.stderr[-3000:]
     for step in ("sweeping", "reference mass", "verifying"):
         assert step in done.stderr, f"says nothing of {step}"

@@ -1,5 +1,6 @@
 """Electronic data sheets (EDS, CiA 306) of joint controllers: named in the arm file, by default the bundled one."""
 
+import functools
 import re
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
@@ -51,8 +52,9 @@ def bundled_path() -> str:
     return str(files("armlink.drives.canopen").joinpath("eds/joint.eds"))
 
 
+@functools.cache
 def bundled() -> Any:
-    """Object dictionary of a joint controller from the bundled data sheet, for node 1."""
+    """Object dictionary of a joint controller from the bundled data sheet, for node 1; read once, nobody changes it."""
     return canopen.import_od(bundled_path(), 1)
 
 

@@ -35,8 +35,11 @@ FLOODS: dict[str, Callable[[list[Frame]], list[Frame]]] = {
     "the drives' own": lambda sent: sent,
 }
 FAMILIES = ("cia402", "damiao", "robstride", "cubemars", "moteus", "odrive")
-ROWS = sorted(random.Random(3).sample([*product(FAMILIES, FLOODS, (100, 1100))], 48), key=lambda row: row[2])
-"""Drawn, so that the first few have little in common; the small floods, which are simulated faster, first."""
+ROWS = sorted(
+    random.Random(3).sample([*product(FAMILIES, FLOODS, (100, 1100))], 48),
+    key=lambda row: (row[2], row[0] == "moteus"),
+)
+"""Drawn, so that the first few have little in common; small floods, and arms that are simulated faster, first."""
 
 
 class FloodedBus(LockStepBus):

@@ -129,7 +129,7 @@ def arm_file(family: str, bus: Bus) -> dict[str, object]:
     }
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(
     ("pendulum", "number"),
     [(list(DRIVES)[(first + place) % 5], number) for first in range(5) for place, number in enumerate(SIGNALS)],
@@ -144,6 +144,7 @@ def test_a_signal_to_the_job_s_group_parks_the_arm(pendulum: Pendulum, number: s
     assert number is signal.SIGKILL or "parking, " in told
 
 
+@pytest.mark.long
 def test_a_job_that_is_stopped_holds_the_arm_and_parks_it_once_it_ends(pendulum: Pendulum) -> None:
     pendulum.hold_out()
     pendulum.send(signal.SIGSTOP)
@@ -156,6 +157,7 @@ def test_a_job_that_is_stopped_holds_the_arm_and_parks_it_once_it_ends(pendulum:
     pendulum.require_parked()
 
 
+@pytest.mark.long
 def test_no_signal_to_the_process_that_makes_the_cycles_ends_it(pendulum: Pendulum) -> None:
     """`systemctl kill -s USR1` reaches every process of a unit."""
     loop = pendulum.hold_out()
@@ -168,6 +170,7 @@ def test_no_signal_to_the_process_that_makes_the_cycles_ends_it(pendulum: Pendul
     pendulum.require_parked()
 
 
+@pytest.mark.long
 def test_a_killed_job_is_missed_where_a_process_that_it_forked_lives_on(pendulum: Pendulum) -> None:
     forked = "    import multiprocessing, time\n    fork = multiprocessing.get_context('fork')\n"
     forked += "    fork.Process(target=time.sleep, args=(60,), daemon=True).start()\n    print("

@@ -217,6 +217,7 @@ def test_an_arm_that_stands_still_is_not_called_broken(
     assert all(state_of(int(status)) is DriveState.ENABLED for status in sample.status)
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("who", ["job", "loop"])
 def test_the_joints_stop_when_job_or_loop_is_killed(tmp_path: Path, who: str) -> None:
     with simulated(tmp_path, OWN) as (arm, bus, _):

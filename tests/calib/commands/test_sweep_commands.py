@@ -37,7 +37,7 @@ def arm_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "links": [link.model_dump(mode="json") for link in arm.sim.links],
         "effects": [{"effect": each.effect, "joint": each.joint, **each.parameters} for each in arm.sim.effects],
     }
-    content["link"]["rate"] = 100
+    content["link"]["rate"] = 50
     content["sweep"] = {"steps": 5, "acceleration": 10.0, "gain_std": 0.003}
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path

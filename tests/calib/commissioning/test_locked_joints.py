@@ -1,15 +1,18 @@
 """Joints within the chain that other means than the arm's drives hold: calibrated around, their load counted."""
 
+import contextlib
+import io
 import json
-import subprocess
-import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 import pytest
+import yaml
 
 from armlink.arm_file import load_arm
+from armlink.cli import run
 from armlink.errors import BadInput
 from armlink.model_file import compile_model
 from calib.arm.kinematics import model_arm
@@ -41,9 +44,18 @@ LIFT = """<robot name="lift">
 JOINTS = ("shoulder", "elbow", "wrist")
 
 
-def run_armlink(*words: str) -> subprocess.CompletedProcess[str]:
-    command = [str(Path(sys.executable).with_name("armlink")), *words]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+class Done(NamedTuple):
+    """What a command answered."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run_armlink(*words: str) -> Done:
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as error:
+        status = run([*words])
+    return Done(status, out.getvalue(), error.getvalue())
 
 
 @pytest.fixture
@@ -124,6 +136,10 @@ def test_doctor_and_a_rehearsal_take_it(model: Path, tmp_path: Path) -> None:
     assert run_armlink("new", str(model), "--out", str(out), "--lock", "lift:0.1").returncode == 0
     doctor = run_armlink("doctor", str(out), "--offline", "--json", "-")
     assert not [found for found in json.loads(doctor.stdout)["findings"] if found["level"] == "error"]
+    content = yaml.safe_load(out.read_text())
+    content["link"]["rate"] = 50
+    content["sweep"] = {"steps": 5, "poses": 1, "gain_std": 0.01, "acceleration": 10.0}
+    out.write_text(yaml.safe_dump(content))
     swept = run_armlink("sweep", str(out), "--dry-run", "--out", str(tmp_path / "unloaded"))
     assert swept.returncode == 0, swept.stderr
 

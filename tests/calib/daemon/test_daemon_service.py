@@ -468,6 +468,7 @@ def test_where_watching_cannot_decide_a_sweep_follows_and_decides(tmp_path: Path
     assert np.abs(offset).max() < 0.05
 
 
+@pytest.mark.long
 def test_without_leave_no_sweep_follows_and_nothing_is_written(tmp_path: Path) -> None:
     daemon = at_a_job_of_few_poses(tmp_path)
     daemon.run(400)
@@ -498,7 +499,7 @@ def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
 
 def test_history_is_thinned_evenly_and_ends_with_the_newest(tmp_path: Path) -> None:
     daemon = FastDaemon(tmp_path, 1, settings("apply"))
-    daemon.run(400)
+    daemon.run(250)
     points = daemon.view.history("joint_3")
     assert len(points) >= 6
     few = daemon.view.history("joint_3", most=3)

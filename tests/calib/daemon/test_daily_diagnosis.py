@@ -139,6 +139,7 @@ def test_why_there_is_none_is_said_once(tmp_path: Path) -> None:
     assert "\n" not in text
 
 
+@pytest.mark.long
 def test_the_answer_of_one_that_was_ended_is_not_that_of_the_next(tmp_path: Path) -> None:
     bench, folder = Bench(tmp_path / "diagnosis"), tmp_path / "diagnosis"
     folder.mkdir()

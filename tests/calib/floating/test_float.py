@@ -58,6 +58,7 @@ def floated(arm: ArmFile, script: list[tuple[float, list[float]]], seconds: floa
     return np.array(hand.positions), link
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("friction", [True, False])
 def test_the_arm_stays_where_a_hand_leaves_it(friction: bool) -> None:
     arm = load_arm("sarcos")
@@ -109,6 +110,7 @@ class Peer:
         self.simulated.plant.data.xfrc_applied[-1, :3] = force
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("pushed", [True, False])
 def test_a_master_arm_is_a_float_plus_a_peer(pushed: bool) -> None:
     """A push at the peer's tip moves the master, which nobody touches, the way that the push would; else it rests."""

@@ -1,5 +1,6 @@
 """The page without a mouse or without sight: axe finds nothing, every control has a name and is reached by Tab."""
 
+import pytest
 from axe_playwright_python.sync_playwright import Axe
 from made_up_view import NAMES, MadeUpView
 from playwright.sync_api import Browser, Page, expect
@@ -48,6 +49,7 @@ def test_axe_finds_nothing_and_would_find_a_button_without_a_name(
     assert [each.partition(":")[0] for each in complaints(page)] == ["button-name"]
 
 
+@pytest.mark.long
 def test_axe_finds_nothing_on_a_dark_phone(browser: Browser, server: Served, view: MadeUpView) -> None:
     page = opened(browser, server, view, 390, color_scheme="dark", is_mobile=True, has_touch=True)
     assert complaints(page) == []
@@ -82,6 +84,7 @@ def test_a_decision_by_keyboard_alone(browser: Browser, server: Served, view: Ma
     expect(page.locator("#decided-list")).to_contain_text("approved by ann")
 
 
+@pytest.mark.long
 def test_the_focus_stays_where_it_is_while_the_page_is_brought_up_to_date(
     browser: Browser, server: Served, view: MadeUpView
 ) -> None:

@@ -60,6 +60,7 @@ def daemon(tmp_path: Path) -> Iterator[Simulated]:
         yield simulated
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_through_a_drift_and_a_fault(browser: Browser, daemon: Simulated) -> None:
     page = open_page(browser, daemon.server)
