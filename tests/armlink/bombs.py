@@ -34,7 +34,7 @@ def parquet_of_one_number(folder: Path) -> Path:
     path = folder / "run.parquet"
     column = pa.array(np.zeros(40_000_000))
     pq.write_table(
-        pa.table(dict.fromkeys(["t", *(f"{c}_{i}" for c in ("q", "tau") for i in range(1, 9))], column)), path
+        pa.table(dict.fromkeys(["t", *(f"{c}_{i}" for c in ("q", "tau") for i in range(1, 3))], column)), path
     )
     return path
 

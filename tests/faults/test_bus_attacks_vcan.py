@@ -52,7 +52,7 @@ def need_ip(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CLOSED)
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 def test_an_attack_on_the_guard_leaves_the_joints_holding(name: str, place: Scene) -> None:
     need_ip(name)
     found = place.attack(GUARDED[name], guarded=True)
@@ -63,7 +63,7 @@ def test_an_attack_on_the_guard_leaves_the_joints_holding(name: str, place: Scen
 
 
 @pytest.mark.parametrize("name", SAID)
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 def test_an_attack_on_the_bus_leaves_the_joints_holding(name: str, place: Scene) -> None:
     need_ip(name)
     found = place.attack(BARE[name], guarded=False)
@@ -73,6 +73,7 @@ def test_an_attack_on_the_bus_leaves_the_joints_holding(name: str, place: Scene)
     assert re.search(f"{SAID[name]}|{LATE}", found.host), found.host
 
 
+@pytest.mark.long
 def test_an_interface_that_is_removed_during_work_is_one_line(place: Scene) -> None:
     """Last, since it takes vcan1 away, and makes it again."""
     need_ip("down")

@@ -85,7 +85,7 @@ def enabled(link: Link) -> Command:
     return command
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("row", [row for row in PIPED if row.cycles is not None], ids=lambda row: row.key)
 def test_a_fault_is_seen_and_leaves_every_joint_safe(row: Row, bench: Bench) -> None:
     with Link.open(load_arm(str(bench.path)), BUS) as link:
@@ -101,7 +101,7 @@ def test_a_fault_is_seen_and_leaves_every_joint_safe(row: Row, bench: Bench) -> 
     assert bench.ear.see(SAFE)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("key", ["SDO abort", "SDO time-out"])
 def test_a_node_without_sdo_is_named_and_nothing_is_powered(key: str, bench: Bench) -> None:
     bench.inject(BY_KEY[key])
@@ -126,7 +126,7 @@ def test_an_interface_that_goes_down_is_named_and_works_again_when_it_is_up(benc
     assert bench.ear.see(SAFE)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_host_that_is_killed_or_stopped_leaves_every_joint_safe(number: int, bench: Bench) -> None:
     host = start_host(bench.path, BUS)

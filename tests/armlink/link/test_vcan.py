@@ -115,6 +115,7 @@ def test_a_killed_host_leaves_every_joint_in_quick_stop(simulated, arm_file, lis
     }
 
 
+@pytest.mark.long
 def test_an_interrupted_host_quick_stops_itself(simulated, arm_file, listener):
     process = host(arm_file, 100_000)
     assert process.stdout.readline() == "pushing\n"
@@ -126,6 +127,7 @@ def test_an_interrupted_host_quick_stops_itself(simulated, arm_file, listener):
     }
 
 
+@pytest.mark.long
 def test_the_host_keeps_no_higher_rate_than_it_should(simulated, arm_file):
     process = host(arm_file, 250)
     out, _ = process.communicate(timeout=60)
@@ -156,6 +158,7 @@ def test_the_self_test_shows_that_the_joints_stop_without_their_host(simulated, 
     assert all(0.9 < each["seconds"] < 1.6 for each in alone)
 
 
+@pytest.mark.long
 def test_a_second_host_is_noticed(simulated, arm_file):
     process = host(arm_file, 100_000)
     assert process.stdout.readline() == "pushing\n"

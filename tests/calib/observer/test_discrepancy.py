@@ -142,7 +142,8 @@ def lacking(share: float, seed: int) -> RestArm:
     return arm
 
 
-@pytest.mark.parametrize("share", [0.0008, 0.003])
+@pytest.mark.sample(1)
+@pytest.mark.parametrize("share", [0.003, 0.0008])
 def test_a_quiet_arm_with_discrepancy_is_quiet_and_its_drift_is_found(share: float) -> None:
     """Of 0.08 and 0.3 % of rated torque, which no record tells: then 3 % of gain on joint 2."""
     arm = lacking(share, 1)
@@ -185,5 +186,6 @@ def test_an_observer_restored_while_it_learns_goes_on_the_same() -> None:
         arm.offset[3] += 0.6
         return [(event.t, event.kind) for event in arm.work(observer, 60)]
 
-    assert run(True) == run(False)
-    assert run(True)
+    restored = run(True)
+    assert restored == run(False)
+    assert restored

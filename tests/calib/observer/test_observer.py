@@ -243,7 +243,8 @@ def test_zeros_that_move_together_are_temperature_and_not_written(sarcos, sarcos
     assert bench.work(60)[-1].evidence["cause"] == "none"
 
 
-@pytest.mark.parametrize("rows", [15, 75, 95])
+@pytest.mark.sample(1)
+@pytest.mark.parametrize("rows", [95, 15, 75])
 def test_a_restored_observer_goes_on_as_if_nothing_had_been(sarcos, sarcos_beta, rows) -> None:
     """In quiet work, under an alarm, and between two windows that agree."""
 

@@ -34,7 +34,7 @@ def readings(folder: Path) -> int:
     return sum(json.loads(line)["kind"] == "reading" for line in lines if line.endswith("\n"))
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("who", ["loop", "arm"])
 def test_keep_going_repeats_the_reading_that_a_stall_interrupted(tmp_path: Path, who: str) -> None:
     describe(tmp_path, rate=100, deadline=0.25)

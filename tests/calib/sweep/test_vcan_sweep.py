@@ -10,7 +10,7 @@ from armlink.arm_file import load_arm
 from calib.sweep.dataset import load_data
 from sim_bus.truth import Truth
 
-pytestmark = [pytest.mark.vcan, pytest.mark.sweep]
+pytestmark = pytest.mark.vcan
 
 BUS = "socketcan:vcan0"
 OPTIONS = ("--bus", BUS, "--yes", "--keep-going", "5", "--no-check-stops")

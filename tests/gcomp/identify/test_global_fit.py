@@ -116,7 +116,7 @@ def test_position_noise_widens_the_intervals_to_what_happens(sarcos) -> None:
     true = Parameters.nominal(7, beta=SARCOS_BETA)
     positions, marks = sweep_rows(sarcos, 2, 13, rng)
     noise, scores, naive = 0.003, [], []
-    for _ in range(40):
+    for _ in range(20):
         exact = make_readings(sarcos, true, positions, marks, sigma=0.01, rng=rng)
         rows = StaticReadings(
             exact.position + noise * rng.normal(size=positions.shape), exact.torque, exact.sigma, exact.load

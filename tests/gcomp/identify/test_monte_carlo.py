@@ -147,6 +147,7 @@ def averaged_recursion(rows: StaticReadings) -> Array:
     return beta
 
 
+@pytest.mark.long
 def test_separate_fits_averaged_are_far_worse_than_stacked_ones() -> None:
     found = [averaged_recursion(rows) for rows in trials(GAINS_KNOWN, 2, 300)]
     expected = [0.122, 0.138, 0.032, 0.035, 0.011, 0.015, 0.0106]
