@@ -81,6 +81,7 @@ def drafted(model: Path, ratings: Mapping[str, float] | None = None) -> NewArm:
     return made
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("seed", range(12))
 def test_an_arm_that_could_be_built_is_believed(seed: int, tmp_path: Path) -> None:
     made = drafted(DrawnModel(seed).write(tmp_path))
@@ -88,6 +89,7 @@ def test_an_arm_that_could_be_built_is_believed(seed: int, tmp_path: Path) -> No
     assert not list(model_errors(made.parsed()))
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 def test_masses_in_another_unit_are_named(seed: int, factor: float, tmp_path: Path) -> None:
@@ -96,6 +98,7 @@ def test_masses_in_another_unit_are_named(seed: int, factor: float, tmp_path: Pa
         drafted(DrawnModel(seed, mass_factor=factor).write(tmp_path))
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_model_without_masses_has_nothing_to_calibrate(seed: int, tmp_path: Path) -> None:
     model = DrawnModel(seed, massless=True).write(tmp_path)
@@ -103,6 +106,7 @@ def test_a_model_without_masses_has_nothing_to_calibrate(seed: int, tmp_path: Pa
         new_arm(model, tmp_path / "arm.yaml")
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", [3, 7])
 def test_an_arm_whose_axes_are_all_vertical_has_nothing_to_calibrate_by(seed: int, tmp_path: Path) -> None:
     """Its file is written all the same: its base can be inclined."""
@@ -116,6 +120,7 @@ def test_an_arm_whose_axes_are_all_vertical_has_nothing_to_calibrate_by(seed: in
     refuse_impossible_model(flat.model_copy(update={"kinematics": inclined}))
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("effort", [1.0, 10.0, 100.0, 1000.0])
 def test_a_placeholder_for_every_joint_is_no_rating(seed: int, effort: float, tmp_path: Path) -> None:
@@ -128,12 +133,14 @@ def test_a_placeholder_for_every_joint_is_no_rating(seed: int, effort: float, tm
     assert not list(model_errors(made.parsed()))
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("seed", range(6))
 def test_limits_of_a_far_stronger_arm_are_no_ratings(seed: int, tmp_path: Path) -> None:
     made = drafted(DrawnModel(seed, effort_factor=30.0).write(tmp_path))
     assert any("are all more than 10 times the load" in note for note in made.draft.notes)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_limit_below_the_load_is_replaced_where_it_stands(seed: int, tmp_path: Path) -> None:
     model = DrawnModel(seed).write(tmp_path)
@@ -205,6 +212,7 @@ DEFECTS: dict[str, tuple[Callable[[DrawnModel], None], Callable[[str], str], str
 }
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("seed", range(40))
 @pytest.mark.sample(8)
 def test_a_drawn_defect_is_named_before_anything_moves(seed: int, tmp_path: Path) -> None:
@@ -221,6 +229,7 @@ def test_a_drawn_defect_is_named_before_anything_moves(seed: int, tmp_path: Path
     assert re.search(said, named), named
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("seed", range(8))
 def test_rounded_angles_and_mirrored_axes_are_no_defects(seed: int, tmp_path: Path) -> None:
     """Gravity is that of the exact model, with the sign of each joint that turns the other way."""

@@ -221,6 +221,7 @@ def draw(random: np.random.Generator, arm: ArmFile) -> list[EffectEntry]:
     return entries
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_all_effects_together_change_while_the_arm_holds(seed: int) -> None:
     random, described = np.random.default_rng(seed), load_arm("sarcos")

@@ -36,6 +36,7 @@ def smooth_step(t: np.ndarray, start: np.ndarray, goal: np.ndarray) -> tuple[np.
     return t, q, v, a
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_efforts_without_gravity_are_known_as_such(seed: int) -> None:
     """As drivers publish them that subtract their own model of gravity: nothing is left at rest."""
@@ -64,6 +65,7 @@ def test_efforts_without_gravity_are_known_as_such(seed: int) -> None:
     np.testing.assert_allclose(again.motor_torque, whole[0].motor_torque, atol=1e-9)
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_joint_that_went_one_way_rubs(seed: int) -> None:
     """Its torque may as well have an offset, in what is fitted; every gear rubs, and the way back shows which it is."""
@@ -97,6 +99,7 @@ PENDULUM = """<mujoco><option timestep="0.0005" integrator="implicitfast"/><worl
 </body></worldbody></mujoco>"""
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_pendulum_that_swings_free_shows_its_friction(seed: int) -> None:
     """The drive is off and reads nothing: all that brakes the arm is friction, and no gear that its load locks."""
@@ -113,6 +116,7 @@ def test_a_pendulum_that_swings_free_shows_its_friction(seed: int) -> None:
     assert (answer.heldout_after < 0.1 * answer.heldout_before).all()
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(2))
 def test_one_swing_that_ends_at_rest_is_judged_where_it_moves(seed: int) -> None:
     random = np.random.default_rng([seed, 8])
@@ -126,6 +130,7 @@ def test_one_swing_that_ends_at_rest_is_judged_where_it_moves(seed: int) -> None
     assert values(answer, "friction.coulomb", "torque") == pytest.approx([coulomb], rel=0.15)
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(2))
 def test_friction_behind_the_sensor_is_told_from_that_before_it(seed: int) -> None:
     """Bearings and seals rub on the link side of the sensor: both channels hold that, the motor's the gear's, too."""
@@ -151,6 +156,7 @@ def test_recordings_of_some_seconds_are_diagnosed_together() -> None:
     assert values(answer, "friction.coulomb", "torque") == pytest.approx(np.full(N, 0.8), rel=0.25)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("seed", range(6))
 def test_no_column_of_a_short_piece_of_a_sound_arm_is_corrected(seed: int) -> None:
     """Three seconds of two joints in motion, with friction and a payload, may look like a turned zero."""
