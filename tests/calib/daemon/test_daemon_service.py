@@ -33,9 +33,9 @@ from calib.records.records import CalibrationRecord
 def drifted(directory: Path, policy: str, seed: int = 1, **more: object) -> FastDaemon:
     """A daemon whose joint 3 has drifted and been watched until something was made of it."""
     daemon = FastDaemon(directory, seed, settings(policy), **more)
-    daemon.run(60)
+    daemon.run(40)
     daemon.drift()
-    daemon.run(120)
+    daemon.run(80)
     return daemon
 
 
@@ -44,6 +44,7 @@ def drifted(directory: Path, policy: str, seed: int = 1, **more: object) -> Fast
 
 def test_under_apply_a_drift_is_written_and_every_step_is_kept(tmp_path: Path) -> None:
     daemon = drifted(tmp_path, "apply")
+    daemon.run(40)  # until it is checked
     kinds = [event.kind for event in daemon.view.events()]
     order = ["started", "alarm", "drift", "proposal", "approved", "recalibration", "check"]
     places = [kinds.index(kind) for kind in order]
@@ -499,7 +500,7 @@ def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
 
 def test_history_is_thinned_evenly_and_ends_with_the_newest(tmp_path: Path) -> None:
     daemon = FastDaemon(tmp_path, 1, settings("apply"))
-    daemon.run(250)
+    daemon.run(320)
     points = daemon.view.history("joint_3")
     assert len(points) >= 6
     few = daemon.view.history("joint_3", most=3)
@@ -517,7 +518,7 @@ def test_history_older_than_a_month_is_thinned_the_rest_stays_whole(tmp_path: Pa
     journal, old = daemon.service.journal, daemon.wall() - timedelta(days=31)
     for minute in range(100):
         journal.add_history(old + timedelta(minutes=minute), 60.0 * minute, None, {"gain": []})
-    daemon.run(400)
+    daemon.run(320)
     reader = HistoryReader(journal.path)
     times = [point[0] for page in reader.pages(reader.chosen(None, None, 1000)) for point in page]
     assert sum(time < daemon.wall() - timedelta(days=30) for time in times) == 10

@@ -150,6 +150,7 @@ def test_the_answer_of_one_that_was_ended_is_not_that_of_the_next(tmp_path: Path
     assert "no model file" in bench.said[0][2]
 
 
+@pytest.mark.long
 def test_a_directory_that_cannot_be_written_is_no_end_of_the_daemon(tmp_path: Path) -> None:
     (tmp_path / "diagnosis").write_text("a file")
     bench = Bench(tmp_path / "diagnosis")
@@ -195,7 +196,8 @@ def test_one_that_takes_too_long_is_ended(tmp_path: Path) -> None:
 def test_the_service_diagnoses_what_it_has_recorded(tmp_path: Path) -> None:
     """Its recordings of the arm at work, against the arm file's own masses, after its day of three minutes."""
     settings = DaemonSection.model_validate({"diagnosis": {"hours": 0.05}})
-    daemon = FastDaemon(tmp_path, 1, settings)
+    planar = Path(__file__).parents[3] / "examples" / "planar3.yaml"
+    daemon = FastDaemon(tmp_path, 1, settings, str(planar))
     daemon.run(300)
     end = time.monotonic() + PATIENCE
     while not daemon.of_kind("diagnosis") and time.monotonic() < end:

@@ -158,6 +158,7 @@ def test_one_document_and_one_answer_show_everything(browser: Browser, server: S
     assert before_the_stream[:3] in (["/", "/api/overview"], ["/", "/api/overview", "/api/stream"])
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_a_phone(browser: Browser, server: Served, view: MadeUpView, scheme: str) -> None:
     server.do(view.propose)
@@ -236,6 +237,7 @@ def test_a_text_from_the_bus_is_never_markup(browser: Browser, server: Served, v
     expect(page.locator("#events img")).to_have_count(0)
 
 
+@pytest.mark.long
 def test_a_daemon_that_goes_is_missed_and_found_again(browser: Browser, tmp_path: Path) -> None:
     view = MadeUpView()
     with served(lambda: view, tmp_path / "api.sock") as server:
@@ -285,6 +287,7 @@ def test_live_torque_beside_the_model_and_its_window_as_a_recording(
     assert page.complaints == []
 
 
+@pytest.mark.long
 def test_it_opens_on_what_was_before_it(browser: Browser, server: Served, view: MadeUpView) -> None:
     server.do(lambda: setattr(view, "t", 250.0))
     page = open_page(browser, server)
