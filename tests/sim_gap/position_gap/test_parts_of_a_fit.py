@@ -191,7 +191,7 @@ def test_a_limit_is_fitted_by_its_inverse_and_none_is_nothing() -> None:
     assert step_parameter("limit", 2.0, -0.5, scales, 0) == np.inf
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "effects"),
     [
