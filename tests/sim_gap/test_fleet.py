@@ -31,7 +31,7 @@ def write_case(folder: Path, name: str, wrong: wrong_arms.Wrong) -> None:
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("fleet")
-    for number in range(3):
+    for number in range(2):
         write_case(folder, f"arm_a/run_{number}", wrong_arms.Wrong(coulomb=0.5 + 0.1 * number))
     write_case(folder, "arm_b/run_0", wrong_arms.Wrong())
     (folder / "arm_b" / "run_0" / "heldout.csv").write_text("t,q_1\n0,1\n", encoding="utf-8")
@@ -40,7 +40,7 @@ def fleet(tmp_path_factory) -> Path:
 
 def test_cases_are_folders_with_a_model_and_recordings(fleet: Path, tmp_path: Path) -> None:
     cases = find_cases(fleet)
-    assert [case.name for case in cases] == ["arm_a/run_0", "arm_a/run_1", "arm_a/run_2", "arm_b/run_0"]
+    assert [case.name for case in cases] == ["arm_a/run_0", "arm_a/run_1", "arm_b/run_0"]
     assert cases[0].sim.name == "sim.xml"
     assert [path.name for path in (*cases[0].train, *cases[0].heldout)] == ["train.parquet", "heldout.csv"]
     with pytest.raises(BadInput, match="contains no case"):
@@ -61,7 +61,7 @@ def test_recordings_of_one_folder_share_a_model(fleet: Path, tmp_path: Path) -> 
 
 
 def test_a_case_that_cannot_be_diagnosed_says_why_in_one_line(fleet: Path) -> None:
-    answer = diagnose_case(find_cases(fleet)[3])
+    answer = diagnose_case(find_cases(fleet)[2])
     assert list(answer) == ["error"]
     assert "heldout.csv" in answer["error"]
 
@@ -84,8 +84,8 @@ def test_the_command_gathers_a_table_by_arm_and_effect_and_goes_on_where_it_stop
     whole = Path(out).read_bytes()
     Path(out).write_bytes(whole[:-40])  # as a kill leaves it
     again = CliRunner().invoke(app, arguments, standalone_mode=False)
-    assert "3 of 4 cases are done already" in " ".join(again.stderr.split())
-    assert len(Answers(Path(out)).found) == 4
+    assert "2 of 3 cases are done already" in " ".join(again.stderr.split())
+    assert len(Answers(Path(out)).found) == 3
 
 
 def sleeper(case: Case) -> dict[str, object]:
@@ -96,6 +96,7 @@ def sleeper(case: Case) -> dict[str, object]:
     return {"verdict": "no_gap", "causes": []}
 
 
+@pytest.mark.long
 def test_a_worker_killed_in_the_middle_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each first worker that takes a case is killed (SIGKILL) before it answers."""
     monkeypatch.setattr("sim_gap.fleet.diagnose_case", sleeper)

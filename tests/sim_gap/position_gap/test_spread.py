@@ -47,6 +47,7 @@ def test_an_interval_holds_what_other_recordings_of_the_arm_show(several) -> Non
         assert own_high < FRICTION[1]
 
 
+@pytest.mark.long
 def test_recordings_that_agree_leave_the_interval_nearly_as_it_is() -> None:
     search, fit = fitted(0.2, 0.2, 0.2, 0.2)
     wide, own = covariance(search, fit), within(search, fit)
