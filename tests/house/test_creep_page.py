@@ -58,6 +58,7 @@ def here(line: str) -> str:
     return f"{line} --yes" if line.startswith("armlink check") else line
 
 
+@pytest.mark.long
 def test_every_command_of_the_page_and_the_same_in_python(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -43,7 +43,11 @@ def test_it_is_short(notebook):
     assert len(lines) <= MOST_LINES
 
 
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda each: each.stem)
+@pytest.mark.parametrize(
+    "notebook",
+    [pytest.param(each, marks=[] if each.stem == "diagnose" else pytest.mark.long) for each in NOTEBOOKS],
+    ids=lambda each: each.stem,
+)
 def test_it_runs(notebook, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     names: dict[str, object] = {}

@@ -33,7 +33,7 @@ COMMANDS = {
     "replay": ["replay", "arm.yaml", "run.csv"],
     "drives": ["drives"],
     "history": ["history", "arm.yaml", "--store", "records.db"],
-    "gap plan": ["gap", "plan", "arm.yaml", "--out", "motion.csv"],
+    "gap plan": ["gap", "plan", "arm.yaml", "--out", "motion.csv", "--joint", f"{LONG}2"],
     "gap diagnose": ["gap", "diagnose", "--sim", "wrong.xml", "--train", "wrong.csv"],
 }
 WITHOUT_NAMES = {"doctor", "convert", "replay", "drives", "history", "check"}

@@ -186,6 +186,7 @@ def test_a_quiet_history_allows_less_and_an_unsure_record_more(store: RecordStor
 @pytest.fixture(scope="module")
 def simulated() -> SimulatedArm:
     arm = load_arm("sarcos")
+    arm = arm.model_copy(update={"link": arm.require_link().model_copy(update={"rate": 50.0})})
     return SimulatedArm(arm, Truth.draw(arm, 3), 3)
 
 

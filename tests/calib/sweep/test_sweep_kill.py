@@ -6,7 +6,8 @@ import pytest
 from loaded_campaign import campaign
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(3, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("kills", [1, 3])
 def test_kills_leave_the_data_of_a_sweep_left_alone(tmp_path: Path, kills: int) -> None:
     made, _, wrong, scores = campaign("kill_sweep").campaign(kills, 5, tmp_path)
     assert made == kills

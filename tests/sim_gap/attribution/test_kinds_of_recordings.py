@@ -184,7 +184,7 @@ def swing(real: mujoco.MjModel, start: float, random: np.random.Generator, noise
 
 def test_a_doubtful_unit_leaves_the_answer_open() -> None:
     wrong = Wrong(coulomb=0.5, viscous=0.3)
-    made = [record(model(), wrong, seed=k, seconds=20.0, rate=100.0, channels=("tau_motor",)) for k in range(2)]
+    made = [record(model(), wrong, seed=k, seconds=20.0, channels=("tau_motor",)) for k in range(2)]
     amperes = [replace(each, motor_torque=each.motor_torque / 12.0) for each in made]
     answer = diagnose(model(), amperes[:1], amperes[1:])
     assert answer.verdict in ("ambiguous", "unexplained")
