@@ -350,7 +350,6 @@ def lies(name, draw, bench, joint):
     return row.node << 5 | draw.draw(st.integers(0, 31)), draw.draw(st.binary(max_size=8))
 
 
-@pytest.mark.sample(2)
 @every_arm
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(draw=st.data())

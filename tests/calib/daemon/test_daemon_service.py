@@ -469,11 +469,11 @@ def test_where_watching_cannot_decide_a_sweep_follows_and_decides(tmp_path: Path
     assert np.abs(offset).max() < 0.05
 
 
-@pytest.mark.long
 def test_without_leave_no_sweep_follows_and_nothing_is_written(tmp_path: Path) -> None:
     daemon = at_a_job_of_few_poses(tmp_path)
-    daemon.run(400)
+    daemon.run(400, until=lambda: bool(daemon.of_kind("undecided")))
     assert daemon.of_kind("undecided")
+    daemon.run(30)
     assert not daemon.of_kind("sweep", "recalibration", "proposal")
 
 

@@ -4,6 +4,7 @@ import json
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from armlink.link.types import Stats
 from armlink.recording.files import load_recording
 from calib.daemon.environment import Environment
 from calib.daemon.loop.loop_messages import CHANNELS, Batch
+from calib.daemon.observation import daily_diagnosis
 from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.settings import Configuration, DaemonSection, DiagnosisSettings
 from calib.daemon.state.busiest_minute import SECONDS, BusiestMinute
@@ -67,6 +69,15 @@ class Bench:
                 time.sleep(0.02)
             elif self.daily._writing is None:
                 return
+
+
+@pytest.fixture
+def without_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of a diagnosis, whose start takes seconds, a program that says at once that there is no model."""
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\necho 'armlink: no model file absent.xml' >&2\nexit 2\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(daily_diagnosis, "sys", SimpleNamespace(executable=str(program)))
 
 
 def test_the_minute_with_the_most_motion_is_taken_once_a_day(tmp_path: Path) -> None:
@@ -139,8 +150,7 @@ def test_why_there_is_none_is_said_once(tmp_path: Path) -> None:
     assert "\n" not in text
 
 
-@pytest.mark.long
-def test_the_answer_of_one_that_was_ended_is_not_that_of_the_next(tmp_path: Path) -> None:
+def test_the_answer_of_one_that_was_ended_is_not_that_of_the_next(tmp_path: Path, without_model: None) -> None:
     bench, folder = Bench(tmp_path / "diagnosis"), tmp_path / "diagnosis"
     folder.mkdir()
     left = {"newest": {"case": "old", "answer": {"verdict": "no_gap", "causes": []}}, "trends": []}
@@ -150,8 +160,7 @@ def test_the_answer_of_one_that_was_ended_is_not_that_of_the_next(tmp_path: Path
     assert "no model file" in bench.said[0][2]
 
 
-@pytest.mark.long
-def test_a_directory_that_cannot_be_written_is_no_end_of_the_daemon(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_written_is_no_end_of_the_daemon(tmp_path: Path, without_model: None) -> None:
     (tmp_path / "diagnosis").write_text("a file")
     bench = Bench(tmp_path / "diagnosis")
     bench.work(30.0)

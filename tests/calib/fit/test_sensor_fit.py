@@ -87,7 +87,6 @@ def test_a_single_joint_tells_its_gain_once_it_is_known_where_the_mass_hangs() -
     assert abs(known.value("gain")[0] / truth.gain[0] - 1) < known.half95("gain")[0] < 0.03
 
 
-@pytest.mark.long
 def test_where_all_axes_nearly_meet_it_says_so_and_a_measured_point_helps() -> None:
     """The mass has no lever but the one that is fitted with it: gains are right, but not to half a percent."""
     arm = random_arm(61, 3)

@@ -16,7 +16,13 @@ from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
 ARM = with_section(
-    at_rate(random_arm(31, 2), 100.0), steps=5, poses=1, max_samples=10, settle_window=0.08, gain_std=0.5, travel_speed=0.95
+    at_rate(random_arm(31, 2), 100.0),
+    steps=5,
+    poses=1,
+    max_samples=10,
+    settle_window=0.08,
+    gain_std=0.5,
+    travel_speed=0.95,
 )
 TORQUE_MODE, PRESSED_CYCLES = 10, 160
 SAFE = (PowerState.QUICK_STOP, PowerState.SWITCH_ON_DISABLED, PowerState.FAULT)

@@ -64,7 +64,6 @@ def test_the_same_effect_on_several_joints_is_one_cause():
     assert answer.causes[0].joints == ("joint_1", "joint_2", "joint_3")
 
 
-@pytest.mark.long
 def test_two_effects_on_different_sides_are_both_found():
     answer = diagnosed(Wrong(coulomb=at(1, 0.8), gain=at(0, 1.08, 1.0)))
     assert {cause.effect for cause in answer.causes if cause.confidence > 0.8} == {"friction.coulomb", "torque.gain"}
