@@ -31,16 +31,10 @@ def parse_yaml(content: bytes | str, path: Path) -> Any:
     """The content of a YAML file; raises BadInput, in one line, where it is none or its aliases make it too large."""
     try:
         text = content.decode("utf-8") if isinstance(content, bytes) else content
-        loader = yaml.SafeLoader(text)
-        try:
-            root = loader.get_single_node()
-            if root is None:
-                return None
-            if "&" in text:  # an anchor, so aliases may be there
-                _require_few_nodes(root, path)
-            return loader.construct_document(root)
-        finally:
-            loader.dispose()
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        if root is not None and "&" in text:  # an anchor, so aliases may be there
+            _require_few_nodes(root, path)
+        return None if root is None else yaml.SafeLoader("").construct_document(root)
     except RecursionError:
         raise BadInput(f"{path}: not YAML that can be used: nested too deeply") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date or number that does not exist, for example

@@ -21,7 +21,7 @@ from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.settings import Configuration, DaemonSection, DiagnosisSettings
 from calib.daemon.state.busiest_minute import SECONDS, BusiestMinute
 
-PATIENCE = 300.0
+PATIENCE = 3600.0
 """A process of low priority is given this time on a busy machine [s]."""
 
 
