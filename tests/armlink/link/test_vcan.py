@@ -24,6 +24,7 @@ ARMLINK = str(Path(sys.executable).with_name("armlink"))
 # Slow enough for one core of a user-mode kernel that runs everything; the deadline leaves room for a busy machine.
 ARM = pair_text(0.5, None, 60.0)
 STARTS = 4
+"""What a busy machine makes late may be tried so often."""
 HOST = """
 import sys
 from armlink.arm_file import load_arm
@@ -157,7 +158,10 @@ def test_scan_and_monitor_see_the_arm(simulated, arm_file):
 
 
 def test_the_self_test_shows_that_the_joints_stop_without_their_host(simulated, arm_file):
-    check = armlink("check", arm_file, "--yes", "--json", "-")
+    for _ in range(STARTS):  # on a busy machine replies are late
+        check = armlink("check", arm_file, "--yes", "--json", "-")
+        if check.returncode == 0:
+            break
     answer = json.loads(check.stdout)
     assert check.returncode == 0, check.stderr
     silent = [each for each in answer["checks"] if each["check"] == "RPDO deadline"]
