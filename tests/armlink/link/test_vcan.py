@@ -25,6 +25,8 @@ ARMLINK = str(Path(sys.executable).with_name("armlink"))
 ARM = pair_text(0.5, None, 60.0)
 STARTS = 4
 """What a busy machine makes late may be tried so often."""
+PATIENCE = 600.0
+"""A command that takes longer hangs, on a busy machine too [s]."""
 HOST = """
 import sys
 from armlink.arm_file import load_arm
@@ -89,7 +91,7 @@ def pushing(arm_file):
 
 def armlink(*arguments):
     command = [ARMLINK, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, cwd=ROOT)
 
 
 def states_of(bus, done, seconds):
