@@ -9,11 +9,9 @@ class Clock(Protocol):
 
     def now(self) -> float:
         """Seconds since an arbitrary instant."""
-        ...
 
     def sleep_until(self, instant: float) -> None:
         """Return when `now()` has reached `instant` [s]; at once if it already has."""
-        ...
 
 
 class MonotonicClock:

@@ -36,7 +36,6 @@ class FoundDrives(Protocol):
 
     def positions(self) -> dict[int, float]:
         """Position reading of every drive by its id [rad]; raises BusFault."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class SelfTest:
         own = link.groups[0].family.self_test if len(link.groups) == 1 else None
         if own is not None:
             link.correct_turns()
-            limits = [link.values.limits(joint, limit) for joint, limit in enumerate(link.wanted_limits())]
+            limits = [link.values.limits(joint, limit) for joint, limit in enumerate(link.limits)]
             return own(link, link.groups[0].drives, limits, power, self.progress)
         reason = "not asked for"
         try:
@@ -228,7 +228,7 @@ class SelfTest:
         """Lead a joint away from where it hangs, towards the middle of its way."""
         link = self.link
         start = np.array(link.commander.loop.latest_position)
-        goal, middle = start.copy(), sum(link.windows[joint]) / 2
+        goal, middle = start.copy(), (link.limits[joint].lower + link.limits[joint].upper) / 2
         goal[joint] += LEAN if middle > start[joint] else -LEAN
         for target in straight(start, goal, speeds(link, LEAN), link.period):
             link.cycle(Command.hold(target))

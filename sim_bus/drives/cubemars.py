@@ -6,7 +6,7 @@ from collections.abc import Callable
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, pack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
-from armlink.drives.mit_packing import Ranges, Special, special_of, unpack_command
+from armlink.drives.mit_packing import Grid, Special, grid_of, special_of, unpack_command
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
 
@@ -29,9 +29,9 @@ class CubeMarsDrive(SimulatedDrive):
         self._zero, self._deaf_until = 0.0, -math.inf
 
     @property
-    def coding(self) -> Ranges:
-        """Ranges by which it really codes and decodes."""
-        return self.miscoded(self._ranges)
+    def coding(self) -> Grid:
+        """By which it really codes and decodes."""
+        return grid_of(self.miscoded(self._ranges))
 
     @property
     def patience(self) -> float:
@@ -63,11 +63,11 @@ class CubeMarsDrive(SimulatedDrive):
         command, coding = self.command, self.coding
         position = self.motor.position
         target = command.position + position - self._shown(position)
-        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.torque)
+        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.t)
 
     def _shown(self, position: float) -> float:
         """Position as the drive shows it, within its range."""
-        largest = self.coding.position
+        largest = self.coding.q
         return (position - self._zero + largest) % (2 * largest) - largest
 
     def _answer(self) -> None:

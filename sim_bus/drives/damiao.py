@@ -20,7 +20,7 @@ from armlink.drives.damiao.frames import (
     unpack_value,
 )
 from armlink.drives.damiao.settings import MODELS
-from armlink.drives.mit_packing import MitCommand, Ranges, Special, special_of, unpack_command
+from armlink.drives.mit_packing import Grid, MitCommand, Ranges, Special, grid_of, special_of, unpack_command
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
 
@@ -56,17 +56,17 @@ class DamiaoDrive(SimulatedDrive):
         self.command = NO_COMMAND
         self._coded: object = None
         """Source of `coding`."""
-        self._coding = Ranges(position, velocity, torque)
+        self._coding = grid_of(Ranges(position, velocity, torque))
 
     @property
-    def coding(self) -> Ranges:
-        """Ranges by which it really codes and decodes."""
+    def coding(self) -> Grid:
+        """By which it really codes and decodes."""
         registers, faults = self.registers, self.faults
         told = (registers[21], registers[22], registers[23])
         made_of = (told, tuple(faults.items()) if faults else ())
         if made_of != self._coded:
             self._coded = made_of
-            self._coding = self.miscoded(Ranges(*(max(each, LEAST_RANGE) for each in told)))
+            self._coding = grid_of(self.miscoded(Ranges(*(max(each, LEAST_RANGE) for each in told))))
         return self._coding
 
     @property
@@ -101,8 +101,8 @@ class DamiaoDrive(SimulatedDrive):
     def _follow(self) -> None:
         command, coding = self.command, self.coding
         position = self.motor.position
-        target = command.position + position - _wrapped(position, coding.position)
-        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.torque)
+        target = command.position + position - _wrapped(position, coding.q)
+        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.t)
 
     def _stop(self, state: DamiaoStatus) -> None:
         self.state, self.command = state, NO_COMMAND
@@ -116,7 +116,7 @@ class DamiaoDrive(SimulatedDrive):
     def _feed_back(self) -> None:
         motor, coding = self.motor, self.coding
         told = self.told()
-        feedback = told._replace(position=_wrapped(told.position, coding.position))
+        feedback = told._replace(position=_wrapped(told.position, coding.q))
         drive = int(self.registers[DamiaoRegister.COMMAND_ID])
         reply = DamiaoReply(drive, self.state, feedback, STAGE, int(MOTOR_TEMPERATURE + motor.heating))
         self.answer(int(self.registers[DamiaoRegister.REPLY_ID]), pack_reply(reply, coding))

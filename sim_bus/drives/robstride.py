@@ -4,8 +4,9 @@ import math
 from collections.abc import Callable
 
 from armlink.bus.port import EXTENDED, REMOTE
-from armlink.drives.mit_packing import MitCommand, Ranges
+from armlink.drives.mit_packing import Grid, MitCommand, grid_of
 from armlink.drives.robstride.frames import (
+    MOTION_BITS,
     MOTION_MODE,
     NEVER_READ,
     RANGES,
@@ -74,9 +75,9 @@ class RobStrideDrive(SimulatedDrive):
         self._host, self._reports_at = HOST, math.inf
 
     @property
-    def coding(self) -> Ranges:
-        """Ranges by which it really codes and decodes."""
-        return self.miscoded(self._ranges)
+    def coding(self) -> Grid:
+        """By which it really codes and decodes."""
+        return grid_of(self.miscoded(self._ranges), MOTION_BITS)
 
     @property
     def patience(self) -> float:
@@ -127,7 +128,7 @@ class RobStrideDrive(SimulatedDrive):
 
     def _follow(self) -> None:
         command = self.command
-        limit = min(self.coding.torque, max(self.parameters[RobStrideParameter.LIMIT_TORQUE], 0.0))
+        limit = min(self.coding.t, max(self.parameters[RobStrideParameter.LIMIT_TORQUE], 0.0))
         self.motor.impede(command.kp, command.kd, command.position, command.velocity, command.torque, limit)
 
     def _stop(self) -> None:

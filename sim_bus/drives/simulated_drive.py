@@ -159,7 +159,6 @@ class Front(Protocol):
 
     def joint_of(self, can_id: int) -> int | None:
         """Joint whose drive sends frames of this identifier, or None."""
-        ...
 
 
 class AddressedFront(Generic[D]):

@@ -8,7 +8,7 @@ import struct
 from enum import IntEnum
 from typing import NamedTuple
 
-from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, grid_of
+from armlink.drives.mit_packing import Grid, MitCommand, MitFeedback, Ranges, grid_of
 
 RANGES = {
     "RS00": Ranges(12.57, 33.0, 14.0),
@@ -23,6 +23,8 @@ RANGES = {
 MOTION_BITS = (16, 16, 16, 16, 16)
 """Bits of q, dq, kp, kd and τ in the private protocol."""
 MOTION = struct.Struct(">4H")
+GRIDS = {model: grid_of(ranges, MOTION_BITS) for model, ranges in RANGES.items()}
+"""What the frames of each model can carry."""
 NEVER_READ = 0x01
 """Bits 16 to 23 of the identifier that answers the reading of an unknown parameter."""
 
@@ -104,20 +106,15 @@ def data_of(can_id: int) -> int:
     return can_id >> 8 & 0xFFFF
 
 
-def motion_frame(drive: int, command: MitCommand, ranges: Ranges) -> tuple[int, bytes]:
-    """Motion command (type 1): the torque is in the identifier. Raises ValueError for numbers that are not finite."""
-    return motion_of_steps(drive, *grid_of(ranges, MOTION_BITS).steps(command))
-
-
-def motion_of_steps(drive: int, q: int, dq: int, kp: int, kd: int, torque: int) -> tuple[int, bytes]:
-    """Motion command of packed steps."""
+def motion_frame(drive: int, q: int, dq: int, kp: int, kd: int, torque: int) -> tuple[int, bytes]:
+    """Motion command (type 1) of packed steps: the torque is in the identifier."""
     return identifier(Type.MOTION, torque, drive), MOTION.pack(q, dq, kp, kd)
 
 
-def unpack_motion(can_id: int, data: bytes, ranges: Ranges) -> MitCommand:
+def unpack_motion(can_id: int, data: bytes, grid: Grid) -> MitCommand:
     """A motion command as the drive understands it; `data` has eight bytes."""
     q, dq, kp, kd = MOTION.unpack(data)
-    return grid_of(ranges, MOTION_BITS).command(q, dq, kp, kd, data_of(can_id))
+    return grid.command(q, dq, kp, kd, data_of(can_id))
 
 
 def enable_frame(drive: int, host: int) -> tuple[int, bytes]:
@@ -169,23 +166,20 @@ def parameter_answer(can_id: int, data: bytes) -> tuple[int, int, float | None] 
     return can_id >> 8 & 0xFF, parameter, None if unknown else unpack_value(parameter, data[4:8])
 
 
-def pack_feedback(feedback: Feedback, host: int, ranges: Ranges, kind: int = Type.FEEDBACK) -> tuple[int, bytes]:
+def pack_feedback(feedback: Feedback, host: int, grid: Grid, kind: int = Type.FEEDBACK) -> tuple[int, bytes]:
     """Feedback to `host`."""
     head = feedback.drive | feedback.faults << 8 | feedback.mode << 14
-    motion = feedback.motion
-    steps = grid_of(ranges, MOTION_BITS).feedback_steps(motion)
-    data = MOTION.pack(*steps, round(feedback.temperature * 10) & 0xFFFF)
+    data = MOTION.pack(*grid.feedback_steps(feedback.motion), round(feedback.temperature * 10) & 0xFFFF)
     return identifier(kind, head, host), data
 
 
-def unpack_feedback(can_id: int, data: bytes, ranges: Ranges) -> Feedback | None:
+def unpack_feedback(can_id: int, data: bytes, grid: Grid) -> Feedback | None:
     """Feedback or report in a frame, or None for another type or length."""
     if kind_of(can_id) not in (Type.FEEDBACK, Type.REPORT) or len(data) != 8:
         return None
     q, dq, torque, temperature = MOTION.unpack(data)
     head = data_of(can_id)
-    motion = grid_of(ranges, MOTION_BITS).feedback(q, dq, torque)
-    return Feedback(head & 0xFF, head >> 8 & 0x3F, head >> 14, motion, temperature / 10)
+    return Feedback(head & 0xFF, head >> 8 & 0x3F, head >> 14, grid.feedback(q, dq, torque), temperature / 10)
 
 
 def fault_names(bits: int) -> str:

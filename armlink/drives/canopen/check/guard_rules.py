@@ -110,7 +110,7 @@ class NodeRules:
 
     @property
     def _answers(self) -> int:
-        return 0x580 + self.node
+        return objects.SDO_RESPONSE_ID + self.node
 
     def frames(self) -> dict[str, Any]:
         """RPDO1, RPDO2 and SDO requests."""

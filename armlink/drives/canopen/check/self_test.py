@@ -199,3 +199,10 @@ class CanopenSelfTest:
 def _written(services: NodeServices, entry: Entry, value: int) -> str:
     services.write_checked(entry, value)
     return f"{value}, read back"
+
+
+def self_test(
+    link: Any, drives: CanopenDrives, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
+) -> list[Result]:
+    """The self-test of an arm with these drives alone."""
+    return CanopenSelfTest(link, drives, limits, progress).run(power)
