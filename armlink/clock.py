@@ -18,11 +18,9 @@ class MonotonicClock:
     """The machine's own monotonic clock."""
 
     def now(self) -> float:
-        """Seconds since an arbitrary instant."""
         return time.monotonic()
 
     def sleep_until(self, instant: float) -> None:
-        """Sleep until `now()` has reached `instant` [s]."""
         remaining = instant - time.monotonic()
         if remaining > 0:
             time.sleep(remaining)

@@ -61,7 +61,6 @@ class InProcessPort:
 
     @property
     def dropped(self) -> int:
-        """Frames lost because they were not taken in time."""
         return self._bus.dropped
 
     def send_all(self, frames: Sequence[Frame]) -> None:

@@ -178,7 +178,6 @@ class BasicDrives(Generic[M]):
         return [self.prepare(ask, joint, limit) for joint, limit in enumerate(limits)]
 
     def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
-        """Set up one drive."""
         raise NotImplementedError
 
     def limits_of(self, joint: int) -> Limits:
@@ -204,7 +203,6 @@ class BasicDrives(Generic[M]):
         return found
 
     def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
-        """Frames of one drive."""
         raise NotImplementedError
 
     def sent(self, joint: int) -> Order | None:

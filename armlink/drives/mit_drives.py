@@ -83,7 +83,6 @@ class MitDrives(BasicDrives[K]):
         return grid
 
     def command(self, joint: int, order: Order) -> Frame:
-        """The command of an order, within the drive's limits after rounding."""
         known, limits, grid = self.memory[joint], self.limits_of(joint), self.grid_of(joint)
         _, _, mode, position, velocity, torque, kp, kd, _ = order
         asked = MitCommand(position, velocity, kp, kd, torque)

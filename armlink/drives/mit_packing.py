@@ -28,12 +28,10 @@ SPECIALS = frozenset(int(command) for command in Special)
 
 
 def special(command: Special) -> bytes:
-    """The eight bytes of a special command."""
     return bytes([0xFF] * 7 + [command])
 
 
 def special_of(data: bytes) -> Special | None:
-    """The special command in `data`, or None."""
     if len(data) == 8 and data[:7] == b"\xff" * 7 and data[7] in SPECIALS:
         return Special(data[7])
     return None
@@ -104,7 +102,6 @@ class Grid:
         )
 
     def command(self, q: int, dq: int, kp: int, kd: int, torque: int) -> MitCommand:
-        """The command that steps stand for."""
         return MitCommand(
             q * self.q_span / self.q_most - self.q,
             dq * self.v_span / self.v_most - self.v,
@@ -125,7 +122,6 @@ class Grid:
         )
 
     def feedback(self, q: int, dq: int, torque: int) -> MitFeedback:
-        """The feedback that steps stand for."""
         return MitFeedback(
             q * self.q_span / self.q_most - self.q,
             dq * self.v_span / self.v_most - self.v,
@@ -143,7 +139,6 @@ def grid_of(ranges: Ranges, bits: tuple[int, int, int, int, int] = MIT_BITS) -> 
 
 
 def pack_steps(q: int, dq: int, kp: int, kd: int, torque: int) -> bytes:
-    """The eight bytes of a command's steps."""
     return (q << 48 | dq << 36 | kp << 24 | kd << 12 | torque).to_bytes(8, "big")
 
 

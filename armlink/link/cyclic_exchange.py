@@ -355,7 +355,6 @@ class Loop:
         self.bits += FIXED_BITS * frames + 8 * size
 
     def _take_drive(self, group: Group, can_id: int, data: bytes) -> None:
-        """A frame for a family's own `take`."""
         if self.on_frame is not None:
             self.on_frame(can_id, data)
         if can_id & ~_UNTAGGED != group.tag:

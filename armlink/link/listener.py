@@ -165,7 +165,6 @@ class Listener(Calibrations):
         self._sync = now
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
-        """Go on listening until `done` or the time is over."""
         end = self.clock.now() + timeout
         while not done():
             remaining = end - self.clock.now()

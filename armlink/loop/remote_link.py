@@ -22,7 +22,7 @@ from armlink.link.link import Link
 from armlink.link.park import park
 from armlink.link.types import Calibration, Command, Controller, DriveSerial, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.channel import Channel, Closed
-from armlink.loop.ending import see_out
+from armlink.loop.ending import TOLD_EVERY, see_out
 from armlink.loop.messages import Alive, Call, Cut, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, said
@@ -32,8 +32,6 @@ P = ParamSpec("P")
 
 CHUNK = 50
 """Rows of one message: unpickling more would hold up a cycle."""
-TOLD_EVERY = 0.2
-"""The loop hears from a job that reads samples at least so often [s]."""
 ANSWER = 60.0
 """Longest wait for an answer of the loop [s]; starting an arm takes some seconds."""
 SAMPLE = 5.0
@@ -177,7 +175,6 @@ class RemoteLink:
         self._in_force = _copy(setpoints.command(len(setpoints) - 1))
 
     def run(self, controller: Controller) -> Samples:
-        """As Link.run, in the other process."""
         number = next(self._numbers)
         self._put(RunController(number, pickle.dumps(controller)))
         yield from self._take(number, sys.maxsize)

@@ -9,6 +9,7 @@ import numpy as np
 from armlink.arrays import Array
 from armlink.errors import BadInput
 from armlink.recording.recording import MOST_JOINTS, Recording
+from armlink.recording.ros_joint_state import NANO
 
 Lists = tuple[str | None, str | None, str | None]
 """Channels carried as position, velocity and effort."""
@@ -19,7 +20,6 @@ TOPICS: dict[str, Lists] = {
     "/joint_commands": ("position_command", None, "torque_command"),
     "/joint_temperatures": (None, None, "temperature"),
 }
-NANO = 1_000_000_000
 
 
 class JointMessage(NamedTuple):

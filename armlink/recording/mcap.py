@@ -26,7 +26,6 @@ from armlink.arrays import Array
 from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
 from armlink.recording.joint_messages import (
-    NANO,
     STATES,
     TOPICS,
     JointMessage,
@@ -36,7 +35,7 @@ from armlink.recording.joint_messages import (
     recording_of_messages,
 )
 from armlink.recording.recording import MOST_BYTES, Recording, require_size
-from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, JointStateDecoder, joint_state_encoder
+from armlink.recording.ros_joint_state import NANO, SCHEMA, SCHEMA_NAME, JointStateDecoder, joint_state_encoder
 
 FLUSH_SECONDS = 0.5
 """Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
@@ -67,7 +66,6 @@ class RecordingWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Complete the file with index and footer."""
         self._writer.finish()
         if self._own:
             self._stream.close()

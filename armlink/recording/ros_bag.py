@@ -18,7 +18,6 @@ from rosbags.typesys import Stores, get_typestore
 from armlink.errors import ArmlinkError, BadInput
 from armlink.recording.bag_sizes import require_bag_sizes
 from armlink.recording.joint_messages import (
-    NANO,
     STATES,
     TOPICS,
     JointMessage,
@@ -27,6 +26,7 @@ from armlink.recording.joint_messages import (
     recording_of_messages,
 )
 from armlink.recording.recording import Recording, require_size
+from armlink.recording.ros_joint_state import NANO
 
 BESIDES = TOPICS.keys() - {STATES}
 """Topics beside the states."""

@@ -100,7 +100,6 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         return [known.position for known in self.memory]
 
     def _exit(self, ask: Ask, joint: int) -> CubeMarsReply | None:
-        """Leave motor mode; the reply, None where there is none."""
         return ask((self.settings[joint].id, special(Special.DISABLE)), self._reply_of(joint))
 
     def _reply_of(self, joint: int) -> Callable[[int, bytes], CubeMarsReply | None]:
@@ -131,7 +130,6 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
     # ---- cycle
 
     def _quiet(self, joint: int) -> Frame:
-        """A command of no torque."""
         return self.settings[joint].id, pack_command(NO_COMMAND, self.grid_of(joint))
 
     def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:

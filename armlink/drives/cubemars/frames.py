@@ -46,13 +46,11 @@ class CubeMarsReply(NamedTuple):
 
 
 def pack_reply(reply: CubeMarsReply, grid: Grid) -> bytes:
-    """The eight or six bytes of a reply."""
     tail = b"" if reply.temperature is None else bytes([max(0, min(255, reply.temperature)), reply.error or 0])
     return bytes([reply.drive]) + pack_feedback(reply.feedback, grid) + tail
 
 
 def unpack_reply(data: bytes, grid: Grid) -> CubeMarsReply | None:
-    """The reply in `data`, or None for another length."""
     if len(data) not in (6, 8):
         return None
     temperature, error = (data[6], data[7]) if len(data) == 8 else (None, None)

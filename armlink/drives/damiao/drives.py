@@ -134,7 +134,6 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
         return grid_of(Ranges(*(values[register] for register in RANGE_FIELDS)))
 
     def _state(self, ask: Ask, joint: int, grid: Grid) -> frames.DamiaoReply | None:
-        """Feedback that is asked for; None where none comes."""
         settings = self.settings[joint]
 
         def state_of(can_id: int, data: bytes) -> frames.DamiaoReply | None:

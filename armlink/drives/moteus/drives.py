@@ -16,6 +16,7 @@ from armlink.drives.moteus.frames import (
     COMMAND,
     CYCLE_COMMAND,
     CYCLE_REPLY,
+    HOMED_AT_OUTPUT,
     QUERY,
     READ_ERROR,
     REPLY,
@@ -57,7 +58,6 @@ class MoteusSettings(DriveSettings):
 
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("torque",), cadence="reply", frame="fd")
-HOMED_AT_OUTPUT = 2
 NOMINAL_BITS, FAST_BITS, FASTER = 60, 40, 5
 """Bits of a CAN FD frame at the nominal rate (29-bit identifier, end) and besides the payload at the fast one, and how
 many times faster that is."""

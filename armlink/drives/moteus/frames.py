@@ -52,6 +52,10 @@ class MoteusRegister(IntEnum):
     SERIAL3 = 0x122
 
 
+HOMED_AT_OUTPUT = 2
+"""Home state: positions are those of the output."""
+
+
 class MoteusMode(IntEnum):
     """Modes that armlink uses."""
 
@@ -230,7 +234,6 @@ def pack_value(register: int, value: float, resolution: int) -> bytes:
 
 
 def unpack_value(register: int, data: bytes, place: int, resolution: int) -> float:
-    """A register's value from `data` at `place`."""
     value: float = LAYOUTS[resolution].unpack_from(data, place)[0]
     if resolution == FLOAT or register not in SCALES:
         return value

@@ -334,7 +334,6 @@ def _fault_text(known: ODriveMemory) -> str:
 
 
 def _order_of(message: int, data: bytes) -> Order | None:
-    """The order that a host's message gives, or None."""
     values = unpack(message, data)
     if message == Message.ESTOP:
         return no_order()._replace(power=Power.OFF)

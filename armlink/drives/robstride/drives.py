@@ -118,8 +118,6 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         return None if answer is None else answer[0]
 
     def _fed_back(self, ask: Ask, joint: int, frame: Frame) -> frames.Feedback | None:
-        """The feedback that answers a frame; None where none comes."""
-
         def feedback(can_id: int, data: bytes) -> frames.Feedback | None:
             found = frames.unpack_feedback(can_id, data, self.grid_of(joint)) if can_id & EXTENDED else None
             return found if found is not None and found.drive == self.settings[joint].id else None

@@ -97,12 +97,10 @@ def identifier(kind: int, data: int, target: int) -> int:
 
 
 def kind_of(can_id: int) -> int:
-    """Type of a frame by its identifier."""
     return can_id >> 24 & 0x1F
 
 
 def data_of(can_id: int) -> int:
-    """The 16 bits of data in an identifier."""
     return can_id >> 8 & 0xFFFF
 
 
@@ -118,7 +116,6 @@ def unpack_motion(can_id: int, data: bytes, grid: Grid) -> MitCommand:
 
 
 def enable_frame(drive: int, host: int) -> tuple[int, bytes]:
-    """Enable (type 3)."""
     return identifier(Type.ENABLE, host, drive), bytes(8)
 
 
@@ -128,12 +125,10 @@ def stop_frame(drive: int, host: int, clear_fault: bool = False) -> tuple[int, b
 
 
 def identity_frame(drive: int, host: int) -> tuple[int, bytes]:
-    """Ask for the 64-bit unique id (type 0)."""
     return identifier(Type.IDENTITY, host, drive), bytes(8)
 
 
 def read_frame(drive: int, host: int, parameter: int) -> tuple[int, bytes]:
-    """Read a parameter (type 17)."""
     return identifier(Type.READ, host, drive), struct.pack("<H6x", parameter)
 
 
@@ -143,13 +138,11 @@ def write_frame(drive: int, host: int, parameter: int, value: float) -> tuple[in
 
 
 def pack_value(parameter: int, value: float) -> bytes:
-    """Four bytes of a parameter's value."""
     layout = INTEGERS.get(parameter)
     return struct.pack("<f", value) if layout is None else struct.pack(layout, int(value))
 
 
 def unpack_value(parameter: int, data: bytes) -> float:
-    """Value of a parameter from its four bytes."""
     value: float = struct.unpack(INTEGERS.get(parameter, "<f"), data)[0]
     return value
 
@@ -167,7 +160,6 @@ def parameter_answer(can_id: int, data: bytes) -> tuple[int, int, float | None] 
 
 
 def pack_feedback(feedback: Feedback, host: int, grid: Grid, kind: int = Type.FEEDBACK) -> tuple[int, bytes]:
-    """Feedback to `host`."""
     head = feedback.drive | feedback.faults << 8 | feedback.mode << 14
     data = MOTION.pack(*grid.feedback_steps(feedback.motion), round(feedback.temperature * 10) & 0xFFFF)
     return identifier(kind, head, host), data

@@ -47,11 +47,9 @@ class JointValues:
 
     @property
     def plain(self) -> bool:
-        """Whether orders need no conversion."""
         return self._direct and (self._all_sensors or not self._calibrated)
 
     def calibrate(self, calibration: TorqueCalibration[Array]) -> None:
-        """Put gains and offsets (n,) into force."""
         self.calibration = calibration
         self._calibrated = bool((calibration.gain != 1).any() or (calibration.offset != 0).any())
         pairs = zip(self._current, calibration.gain.tolist(), calibration.offset.tolist(), strict=True)
