@@ -52,7 +52,6 @@ class Fault:
 
     @property
     def amount(self) -> float:
-        """The value, or the default of the kind."""
         return self.kind.default if math.isnan(self.value) else self.value
 
 

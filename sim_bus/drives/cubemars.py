@@ -3,12 +3,12 @@
 import math
 from collections.abc import Callable
 
-from armlink.bus.port import EXTENDED, REMOTE
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, pack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.mit_packing import Grid, Special, grid_of, special_of, unpack_command
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, SimulatedDrive
 
 LOOP_RATE = 40_000.0
 """Cycles of the drive's loop a second: those of the open firmware that it descends from, bgkatz/motorcontrol."""
@@ -20,8 +20,9 @@ ZEROING = 1.0
 class CubeMarsDrive(SimulatedDrive):
     """One AK drive, with the CAN timeout that its arm file states."""
 
-    def __init__(self, motor: Motor, send: Callable[[int, bytes], None], settings: CubeMarsSettings) -> None:
+    def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         super().__init__(motor, send)
+        settings: CubeMarsSettings = joint.settings
         self.address, self.reply = settings.id, settings.reply
         self.can_timeout = settings.can_timeout
         self._ranges = settings.ranges
@@ -36,6 +37,12 @@ class CubeMarsDrive(SimulatedDrive):
     @property
     def patience(self) -> float:
         return self.can_timeout / LOOP_RATE
+
+    def takes(self, can_id: int) -> bool:
+        return can_id == self.address
+
+    def sends(self, can_id: int) -> bool:
+        return can_id == self.reply
 
     def receive(self, can_id: int, data: bytes) -> None:
         """A command; in another mode than MIT none is understood."""
@@ -90,16 +97,3 @@ class CubeMarsDrive(SimulatedDrive):
         """Encoder fault: out of motor mode."""
         self.error, self.motor_mode = ENCODER_FAULT, False
         self.motor.free()
-
-
-class CubeMarsFront(AddressedFront[CubeMarsDrive]):
-    """All CubeMars drives on one bus: which of them a frame is for."""
-
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        if not can_id & (EXTENDED | REMOTE) and (drive := self._addressed.get(can_id)) is not None:
-            drive.on_frame(can_id, data)
-
-    def joint_of(self, can_id: int) -> int | None:
-        """See Front; None where several drives share a reply id."""
-        found = [drive.joint for drive in self.drives if drive.reply == can_id]
-        return found[0] if len(found) == 1 else None

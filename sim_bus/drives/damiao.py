@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable
 
-from armlink.bus.port import EXTENDED, REMOTE
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.damiao.frames import (
     INTEGER_REGISTERS,
     MIT_MODE,
@@ -21,8 +21,10 @@ from armlink.drives.damiao.frames import (
 )
 from armlink.drives.damiao.settings import MODELS
 from armlink.drives.mit_packing import Grid, MitCommand, Ranges, Special, grid_of, special_of, unpack_command
+from armlink.errors import BadInput
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+from sim_bus.sim_section import serial_of
 
 LEAST_RANGE = 1e-3
 """A range register of 0 counts as this."""
@@ -35,14 +37,19 @@ WRITABLE = frozenset((0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 21, 22, 23, 24, 25, 26, 
 
 
 class DamiaoDrive(SimulatedDrive):
-    """One DM-J drive with command id `drive` and reply id `reply`."""
+    """One DM-J drive."""
 
-    def __init__(
-        self, motor: Motor, send: Callable[[int, bytes], None], drive: int, reply: int, model: str, serial: int
-    ) -> None:
+    def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """As the maker delivers it, but for the ids: the deadman is off, the mode is MIT."""
         super().__init__(motor, send)
-        position, velocity, torque, _, _ = MODELS[model]
+        settings = joint.settings
+        if settings.model not in MODELS:
+            raise BadInput(
+                f"{arm.path}: {joint.name}: drive.model is {settings.model!r}; simulated are {', '.join(MODELS)}"
+            )
+        position, velocity, torque, _, _ = MODELS[settings.model]
+        drive, reply, serial = settings.id, settings.reply, serial_of(arm, joint)
+        self._taken = frozenset(drive + offset for offset in (0, *OTHER_MODES)) | {REGISTERS_ID}
         self._stored: dict[int, float] = {
             0: 15.0, 1: 1.2, 2: 100.0, 3: 0.95, 4: 50.0, 5: -50.0, 6: 200.0, 7: reply, 8: drive, 9: 0, 10: MIT_MODE,
             11: 1e-4, 12: 1e-4, 13: 3, 14: 5016, 15: serial, 16: 14, 17: 0.6, 18: 4e-4, 19: 0.005, 20: 10.0,
@@ -72,6 +79,12 @@ class DamiaoDrive(SimulatedDrive):
     @property
     def patience(self) -> float:
         return self.registers[DamiaoRegister.TIMEOUT] * TIMEOUT_UNIT
+
+    def takes(self, can_id: int) -> bool:
+        return can_id in self._taken
+
+    def sends(self, can_id: int) -> bool:
+        return can_id == self.registers[DamiaoRegister.REPLY_ID]
 
     def receive(self, can_id: int, data: bytes) -> None:
         """A command, or a register request that names this drive."""
@@ -165,34 +178,6 @@ class DamiaoDrive(SimulatedDrive):
 
     def lose_feedback(self) -> None:
         """Replies stop; the drive itself goes on."""
-
-
-class DamiaoFront:
-    """All Damiao drives on one bus: which of them a frame is for."""
-
-    def __init__(self, drives: list[DamiaoDrive]) -> None:
-        """`drives` have different command ids."""
-        self.drives = drives
-        ids = [int(drive.registers[DamiaoRegister.COMMAND_ID]) for drive in drives]
-        self._commanded = {
-            drive_id + offset: drive
-            for drive_id, drive in zip(ids, drives, strict=True)
-            for offset in (0, *OTHER_MODES)
-        }
-
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        if can_id & (EXTENDED | REMOTE):
-            return
-        if can_id == REGISTERS_ID:
-            for drive in self.drives:
-                drive.on_frame(can_id, data)
-        elif (addressed := self._commanded.get(can_id)) is not None:
-            addressed.on_frame(can_id, data)
-
-    def joint_of(self, can_id: int) -> int | None:
-        """See Front; None where several drives share a reply id."""
-        found = [drive.joint for drive in self.drives if drive.registers[DamiaoRegister.REPLY_ID] == can_id]
-        return found[0] if len(found) == 1 else None
 
 
 def _wrapped(position: float, largest: float) -> float:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.mit_packing import Grid, MitCommand, grid_of
 from armlink.drives.robstride.frames import (
@@ -24,7 +25,8 @@ from armlink.drives.robstride.frames import (
     unpack_value,
 )
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, SimulatedDrive
+from sim_bus.sim_section import serial_of
 
 NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 HOST = 0xFD
@@ -44,13 +46,13 @@ READ_ONLY = frozenset(
 
 
 class RobStrideDrive(SimulatedDrive):
-    """One drive with id `drive`."""
+    """One drive."""
 
-    def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, model: str, serial: int) -> None:
+    def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """As the maker delivers it: deadman off, motion mode."""
         super().__init__(motor, send)
-        self.address, self.serial = drive, serial
-        self._ranges = RANGES[model]
+        self.address, self.serial = joint.settings.id, serial_of(arm, joint)
+        self._ranges = RANGES[joint.settings.model]
         self._stored: dict[int, float] = {
             RobStrideParameter.RUN_MODE: MOTION_MODE,
             0x7006: 0.0,
@@ -86,6 +88,12 @@ class RobStrideDrive(SimulatedDrive):
     @property
     def due(self) -> float:
         return min(super().due, self._reports_at)
+
+    def takes(self, can_id: int) -> bool:
+        return bool(can_id & EXTENDED) and not can_id & REMOTE and can_id & 0xFF == self.address
+
+    def sends(self, can_id: int) -> bool:
+        return bool(can_id & EXTENDED) and can_id >> 8 & 0xFF == self.address
 
     def receive(self, can_id: int, data: bytes) -> None:
         kind = kind_of(can_id)
@@ -193,17 +201,3 @@ class RobStrideDrive(SimulatedDrive):
         """Encoder fault: free, with the bit set."""
         self.fault_bits |= ENCODER_FAULT
         self._stop()
-
-
-class RobStrideFront(AddressedFront[RobStrideDrive]):
-    """All RobStride drives on one bus: which of them a frame is for."""
-
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        if not can_id & EXTENDED or can_id & REMOTE:
-            return
-        drive = self._addressed.get(can_id & 0xFF)
-        if drive is not None:
-            drive.on_frame(can_id & 0x1FFFFFFF, data)
-
-    def joint_of(self, can_id: int) -> int | None:
-        return self.joint_at(can_id >> 8 & 0xFF) if can_id & EXTENDED else None

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Generic, Protocol, TypeVar
 
 from armlink.bus.port import CLASSICAL
 from armlink.drives.mit_packing import MitFeedback, Ranges
@@ -15,13 +14,9 @@ BUS_VOLTAGE = 48.0
 
 
 class SimulatedDrive:
-    """One drive on one joint. A family's drive overrides receive(), control(), and what a fault does."""
-
-    address: int
-    """Its id on the bus, where its family has but one."""
+    """One drive on one joint. A family's drive overrides what is addressed to it, and what commands and faults do."""
 
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None]) -> None:
-        """`send(can_id, data)` puts a frame on the drive's bus."""
         self.motor, self.joint = motor, motor.joint
         self.now = 0.0
         self.heard = 0.0
@@ -38,9 +33,17 @@ class SimulatedDrive:
 
     # ---- bus
 
+    def takes(self, can_id: int) -> bool:
+        """Whether a frame of this identifier, with its flags, is addressed to it; here any, and receive() sifts."""
+        return True
+
+    def sends(self, can_id: int) -> bool:
+        """Whether it sends frames of this identifier."""
+        raise NotImplementedError
+
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame that its family takes as addressed to it; lost where it is unplugged."""
-        if not self.unplugged:
+        """A frame on its bus; lost where it is unplugged."""
+        if not self.unplugged and self.takes(can_id):
             self.receive(can_id, data)
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -119,7 +122,6 @@ class SimulatedDrive:
             self.lose_feedback()
 
     def lose_feedback(self) -> None:
-        """The encoder no longer answers the drive."""
         self.motor.free()
 
     def end_faults(self) -> None:
@@ -146,30 +148,17 @@ class SimulatedDrive:
         )
 
 
-D = TypeVar("D", bound=SimulatedDrive)
-
-
-class Front(Protocol):
+class Front:
     """The drives of one family on one bus."""
 
-    @property
-    def drives(self) -> Sequence[SimulatedDrive]: ...
+    def __init__(self, drives: Sequence[SimulatedDrive]) -> None:
+        self.drives = drives
 
-    def on_frame(self, can_id: int, data: bytes) -> None: ...
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        for drive in self.drives:
+            drive.on_frame(can_id, data)
 
     def joint_of(self, can_id: int) -> int | None:
-        """Joint whose drive sends frames of this identifier, or None."""
-
-
-class AddressedFront(Generic[D]):
-    """All drives of a family on one bus: which of them a frame is for. A family says where the address stands."""
-
-    def __init__(self, drives: list[D]) -> None:
-        """`drives` in arm order, each with an address of its own."""
-        self.drives = drives
-        self._addressed = {drive.address: drive for drive in drives}
-
-    def joint_at(self, address: int) -> int | None:
-        """Joint of the drive with this address."""
-        drive = self._addressed.get(address)
-        return None if drive is None else drive.joint
+        """Joint whose drive sends frames of this identifier, or None; None too where several share it."""
+        found = [drive.joint for drive in self.drives if drive.sends(can_id)]
+        return found[0] if len(found) == 1 else None

@@ -55,7 +55,6 @@ class SimulatedParameter:
 
     @property
     def joint(self) -> bool:
-        """Whether the value is a joint's name."""
         return self.unit == catalogue.JOINT
 
     @property

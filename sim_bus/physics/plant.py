@@ -179,7 +179,6 @@ class Plant:
 
     @property
     def motor_velocity(self) -> Array:
-        """Motor velocities referred to the joints."""
         return self.velocity if self._gears is None else self._gears.shown(self._velocities)
 
     @property
@@ -311,7 +310,6 @@ class Plant:
         self._seat("frictionloss", np.where(self._braked, self._brake_torque, np.maximum(level + self._uneven, 0.0)))
 
     def _seat(self, quantity: str, values: Array) -> None:
-        """Set friction, damping or inertia of the motors."""
         on_dofs = getattr(self.model, f"dof_{quantity}")
         if self._gears is None:
             on_dofs[self._dof] = values
