@@ -19,8 +19,7 @@ from armlink.drives.canopen.cyclic.commands import SYNC, TARGETS, CommandFrames
 from armlink.drives.canopen.cyclic.readings import ReadingFrames
 from armlink.drives.canopen.cyclic.wire import Wire, check_fits
 from armlink.drives.canopen.eds_file import of_joints
-from armlink.drives.canopen.host_frames import HostFrames
-from armlink.drives.canopen.pdo import RPDO1, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
+from armlink.drives.canopen.pdo import RPDO1, RPDO_BASES, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
 from armlink.drives.canopen.profile import Profile, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
 from armlink.drives.canopen.settings import TRAITS
@@ -41,6 +40,10 @@ _POWERS = {
     DriveState.READY: Power.READY,
     DriveState.SWITCHED_ON: Power.READY,
 }
+_DOWNLOADS = (1, 6)
+"""Command specifiers of SDO requests that write: initiate download, block download (CiA 301, 7.2.4.3)."""
+_HARMLESS_WRITES = (0x1010, 0x2100)
+"""Objects that another program may write: they store settings or hold the torque sensor's calibration."""
 
 
 class CanopenDrives(BasicDrives[DriveMemory]):
@@ -51,7 +54,13 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         section = arm.require_link()
         self.arm, self.nodes = arm, tuple(settings.node for settings in self.settings)
         self.protection = device.protection_of(section, self.nodes)
-        self._host_frames = HostFrames(self.nodes, self.protection.host)
+        self._commands = {
+            objects.NMT_ID: "NMT command",
+            objects.SYNC_ID: "SYNC",
+            objects.LSS_ID: "LSS command",
+            objects.HEARTBEAT_ID + self.protection.host: "heartbeat of the host",
+            **{base + node: f"RPDO{k} of node {node}" for k, base in enumerate(RPDO_BASES, 1) for node in self.nodes},
+        }
         self._deadline = section.deadline
         self._joint_of = {node: joint for joint, node in enumerate(self.nodes)}
         self.known = faults.JointStates(self.names)
@@ -104,11 +113,15 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         return {base + node: joint for joint, node in enumerate(self.nodes) for base in services}
 
     def commands(self) -> Mapping[int, str]:
-        return self._host_frames.by_id
+        return self._commands
 
     def intrusion(self, can_id: int, data: bytes) -> str:
         """What only a host sends, and SDO requests that write, but of settings and calibration."""
-        return self._host_frames(can_id, data)
+        node = can_id - objects.SDO_REQUEST_ID
+        if node not in self._joint_of or len(data) < 4 or data[0] >> 5 not in _DOWNLOADS:
+            return self._commands.get(can_id, "")
+        index = int.from_bytes(data[1:3], "little")
+        return "" if index in _HARMLESS_WRITES else f"SDO write of {index:04X}h to node {node}"
 
     def cycle_bits(self) -> float:
         """RPDO1 and TPDO1 in every cycle, TPDO2 in every fourth, SYNC."""
