@@ -20,10 +20,10 @@ from armlink.drives.damiao.frames import (
     unpack_value,
 )
 from armlink.drives.damiao.settings import MODELS
-from armlink.drives.mit_packing import Grid, MitCommand, Ranges, Special, grid_of, special_of, unpack_command
+from armlink.drives.mit_packing import Grid, Ranges, Special, grid_of, special_of, unpack_command
 from armlink.errors import BadInput
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, NO_COMMAND, STAGE_TEMPERATURE, WrappingDrive
 from sim_bus.sim_section import serial_of
 
 LEAST_RANGE = 1e-3
@@ -32,11 +32,10 @@ STORE = 0xAA
 STAGE = int(STAGE_TEMPERATURE)
 OTHER_MODES = 0x100, 0x200, 0x300
 """Offsets of the command ids of the position, velocity and force modes."""
-NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 WRITABLE = frozenset((0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35))
 
 
-class DamiaoDrive(SimulatedDrive):
+class DamiaoDrive(WrappingDrive):
     """One DM-J drive."""
 
     def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
@@ -60,14 +59,12 @@ class DamiaoDrive(SimulatedDrive):
         }  # fmt: skip
         self.registers = dict(self._stored)
         self.state = DamiaoStatus.DISABLED
-        self.command = NO_COMMAND
         self._coded: object = None
         """Source of `coding`."""
         self._coding = grid_of(Ranges(position, velocity, torque))
 
     @property
     def coding(self) -> Grid:
-        """By which it really codes and decodes."""
         registers, faults = self.registers, self.faults
         told = (registers[21], registers[22], registers[23])
         made_of = (told, tuple(faults.items()) if faults else ())
@@ -100,7 +97,7 @@ class DamiaoDrive(SimulatedDrive):
             self.command = unpack_command(data, self.coding)
         self.heard = self.now
         if self.state is DamiaoStatus.ENABLED:
-            self._follow()
+            self.follow()
         self._reply()
 
     def _obey(self, special: Special) -> None:
@@ -110,12 +107,6 @@ class DamiaoDrive(SimulatedDrive):
             special is Special.CLEAR_ERROR and self.state is not DamiaoStatus.ENABLED and not self.latched
         ):
             self._stop(DamiaoStatus.DISABLED)
-
-    def _follow(self) -> None:
-        command, coding = self.command, self.coding
-        position = self.motor.position
-        target = command.position + position - _wrapped(position, coding.q)
-        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.t)
 
     def _stop(self, state: DamiaoStatus) -> None:
         self.state, self.command = state, NO_COMMAND
@@ -127,12 +118,9 @@ class DamiaoDrive(SimulatedDrive):
         self.tell(self._feed_back)
 
     def _feed_back(self) -> None:
-        motor, coding = self.motor, self.coding
-        told = self.told()
-        feedback = told._replace(position=_wrapped(told.position, coding.q))
-        drive = int(self.registers[DamiaoRegister.COMMAND_ID])
-        reply = DamiaoReply(drive, self.state, feedback, STAGE, int(MOTOR_TEMPERATURE + motor.heating))
-        self.answer(int(self.registers[DamiaoRegister.REPLY_ID]), pack_reply(reply, coding))
+        drive, warm = int(self.registers[DamiaoRegister.COMMAND_ID]), int(MOTOR_TEMPERATURE + self.motor.heating)
+        reply = DamiaoReply(drive, self.state, self.feedback(), STAGE, warm)
+        self.answer(int(self.registers[DamiaoRegister.REPLY_ID]), pack_reply(reply, self.coding))
 
     def _register(self, data: bytes) -> None:
         drive, request, register = struct.unpack_from("<HBB", data)
@@ -158,7 +146,7 @@ class DamiaoDrive(SimulatedDrive):
                 return
             self.command = NO_COMMAND
             if self.state is DamiaoStatus.ENABLED:
-                self._follow()
+                self.follow()
         if register in (21, 22, 23) and not 0.0 < value < 1e6:
             return
         self.registers[register] = value
@@ -178,8 +166,3 @@ class DamiaoDrive(SimulatedDrive):
 
     def lose_feedback(self) -> None:
         """Replies stop; the drive itself goes on."""
-
-
-def _wrapped(position: float, largest: float) -> float:
-    """Position as the drive shows it, within ±largest."""
-    return (position + largest) % (2 * largest) - largest

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, REMOTE
-from armlink.drives.mit_packing import Grid, MitCommand, grid_of
+from armlink.drives.mit_packing import Grid, grid_of
 from armlink.drives.robstride.frames import (
     MOTION_BITS,
     MOTION_MODE,
@@ -25,10 +25,9 @@ from armlink.drives.robstride.frames import (
     unpack_value,
 )
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, NO_COMMAND, SimulatedDrive
 from sim_bus.sim_section import serial_of
 
-NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 HOST = 0xFD
 """Host id to which feedback goes before a host has shown its own."""
 ENCODER_FAULT = 1 << 3

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from armlink.bus.port import CLASSICAL
-from armlink.drives.mit_packing import MitFeedback, Ranges
+from armlink.drives.mit_packing import Grid, MitCommand, MitFeedback, Ranges
 from sim_bus.drives.drive_faults import FALSE_READINGS, QUANTITIES, FalseReadings
 from sim_bus.drives.motor import Motor
 
@@ -146,6 +146,36 @@ class SimulatedDrive:
         return ranges._replace(
             position=ranges.position * position, velocity=ranges.velocity * velocity, torque=ranges.torque * torque
         )
+
+
+NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class WrappingDrive(SimulatedDrive):
+    """A drive with the MIT law whose position wraps within the range of its coding."""
+
+    command = NO_COMMAND
+    zero = 0.0
+    """Where its position is zero [rad]."""
+
+    @property
+    def coding(self) -> Grid:
+        """By which it really codes and decodes."""
+        raise NotImplementedError
+
+    def feedback(self) -> MitFeedback:
+        told = self.told()
+        return told._replace(position=self._wrapped(told.position))
+
+    def follow(self) -> None:
+        """Follow the newest command."""
+        command, coding, position = self.command, self.coding, self.motor.position
+        target = command.position + position - self._wrapped(position)
+        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.t)
+
+    def _wrapped(self, position: float) -> float:
+        largest = self.coding.q
+        return (position - self.zero + largest) % (2 * largest) - largest
 
 
 class Front:
