@@ -22,7 +22,7 @@ from armlink.drives.moteus.frames import (
     MoteusRegister,
     Subframe,
     identifier,
-    pack_reply,
+    pack_subframes,
     unpack,
 )
 from sim_bus.drives.motor import Motor
@@ -109,7 +109,7 @@ class MoteusDrive(SimulatedDrive):
 
         def reply() -> None:
             shown = self._shown_registers() if asked else {}
-            self._reply(source, pack_reply([*errors, *(_shown(each, shown) for each in asked)]))
+            self._reply(source, pack_subframes([*errors, *(_shown(each, shown) for each in asked)]))
 
         with contextlib.suppress(ValueError):  # more than a frame holds: the controller sends none
             self.tell(reply)

@@ -242,7 +242,7 @@ def test_moteus_identifiers():
     st.sampled_from([moteus.INT16, moteus.INT32, moteus.FLOAT]),
 )
 def test_moteus_replies_are_what_mjbots_reads(values, resolution):
-    data = moteus.pack_reply([moteus.Subframe(moteus.REPLY, r, v, resolution) for r, v in sorted(values.items())])
+    data = moteus.pack_subframes([moteus.Subframe(moteus.REPLY, r, v, resolution) for r, v in sorted(values.items())])
     theirs = protocol.parse_reply(data)
     assert theirs.keys() == values.keys()
     for register, value in values.items():
@@ -269,7 +269,7 @@ def test_any_bytes_are_read_as_mjbots_reads_them(data):
 
 
 def test_nan_in_integers():
-    data = moteus.pack_reply([moteus.Subframe(moteus.REPLY, 0x001, math.nan, moteus.INT16)])
+    data = moteus.pack_subframes([moteus.Subframe(moteus.REPLY, 0x001, math.nan, moteus.INT16)])
     assert data[2:4].hex() == "0080"
     assert math.isnan(next(moteus.unpack(data)).value)
 
@@ -343,7 +343,7 @@ def test_the_cycles_payload_is_what_the_general_way_packs():
     assert CYCLE_COMMAND.unpack(data) == values
     assert CYCLE_COMMAND.unpack(data[:-1] + b"\1") is None
     assert CYCLE_REPLY.unpack(data) is None
-    reply = moteus.pack_reply(
+    reply = moteus.pack_subframes(
         [moteus.Subframe(moteus.REPLY, r, 1.0, moteus.INT8 if r in moteus.SMALL else moteus.FLOAT) for r in QUERY]
     )
     assert CYCLE_REPLY.unpack(reply) == dict.fromkeys(sorted(QUERY), 1.0)
