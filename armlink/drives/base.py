@@ -59,7 +59,7 @@ class Ask(Protocol):
 
 @dataclass
 class DriveMemory:
-    """What is known of one drive; a family extends it by what its frames tell."""
+    """Knowledge of one drive, which a family extends by what its frames tell."""
 
     limits: Limits | None = None
     """None before the set-up."""

@@ -15,7 +15,7 @@ RESET_NODE, RESET_COMMUNICATION = 0x81, 0x82
 STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}
 """Commands of network management and the states that they lead to (CiA 301, 7.3.2)."""
 OWN_HEARTBEAT, HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST = 0, 0x8130, 0x8250, 0x8700
-"""What a timer does when it is due: send a heartbeat, or an EMCY with this code."""
+"""A timer that is due sends a heartbeat, or an EMCY with this code."""
 COMMUNICATION_ERROR = 0x11
 """Error register: generic and communication."""
 SYNC_PATIENCE = 3.0

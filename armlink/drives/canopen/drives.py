@@ -116,7 +116,7 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         return self._commands
 
     def intrusion(self, can_id: int, data: bytes) -> str:
-        """What only a host sends, and SDO requests that write, but of settings and calibration."""
+        """Frames that only a host sends, and SDO requests that write, but of settings and calibration."""
         node = can_id - objects.SDO_REQUEST_ID
         if node not in self._joint_of or len(data) < 4 or data[0] >> 5 not in _DOWNLOADS:
             return self._commands.get(can_id, "")

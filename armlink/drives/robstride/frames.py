@@ -24,7 +24,7 @@ MOTION_BITS = (16, 16, 16, 16, 16)
 """Bits of q, dq, kp, kd and τ in the private protocol."""
 MOTION = struct.Struct(">4H")
 GRIDS = {model: grid_of(ranges, MOTION_BITS) for model, ranges in RANGES.items()}
-"""What the frames of each model can carry."""
+"""Steps that the frames of each model can carry."""
 NEVER_READ = 0x01
 """Bits 16 to 23 of the identifier that answers the reading of an unknown parameter."""
 
