@@ -88,19 +88,19 @@ class MitDrives(BasicDrives[K]):
         asked = MitCommand(position, velocity, kp, kd, torque)
         if mode != POSITION:
             asked = MitCommand(position, velocity, 0.0, 0.0, torque)
-        return self._sent(joint, round_within(asked, grid, limits, known.position, known.velocity), ON)
+        return self._sent(joint, grid, round_within(asked, grid, limits, known.position, known.velocity), ON)
 
     def damp(self, joint: int) -> Frame:
         """No stiffness, no torque: the joint sinks slowly, and no torque leaves the limit on the way."""
-        known = self.memory[joint]
+        known, grid = self.memory[joint], self.grid_of(joint)
         known.damping = True
         most = self.limits_of(joint).max_torque
         command = damping(self.settings[joint].kd, known.position, known.velocity, most)
-        return self._sent(joint, self.grid_of(joint).steps(command), Power.STOPPED)
+        return self._sent(joint, grid, grid.steps(command), Power.STOPPED)
 
-    def _sent(self, joint: int, steps: Steps, power: Power) -> Frame:
+    def _sent(self, joint: int, grid: Grid, steps: Steps, power: Power) -> Frame:
         frame = self.coded(joint, steps)
-        self.memory[joint].sent = order_of(self.decoded(*frame, self.grid_of(joint)))._replace(power=power)
+        self.memory[joint].sent = order_of(self.decoded(*frame, grid))._replace(power=power)
         return frame
 
     def mit_setup(

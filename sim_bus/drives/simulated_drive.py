@@ -42,8 +42,8 @@ class SimulatedDrive:
         raise NotImplementedError
 
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame on its bus; lost where it is unplugged."""
-        if not self.unplugged and self.takes(can_id):
+        """A frame that is addressed to it; lost where it is unplugged."""
+        if not self.unplugged:
             self.receive(can_id, data)
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -186,7 +186,8 @@ class Front:
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         for drive in self.drives:
-            drive.on_frame(can_id, data)
+            if drive.takes(can_id):
+                drive.on_frame(can_id, data)
 
     def joint_of(self, can_id: int) -> int | None:
         """Joint whose drive sends frames of this identifier, or None; None too where several share it."""

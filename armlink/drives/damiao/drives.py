@@ -208,28 +208,25 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
     # ---- cycle
 
     def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
-        return (self._frame(joint, order),)
-
-    def _frame(self, joint: int, order: Order) -> Frame:
         known, drive = self.memory[joint], self.settings[joint].id
         known.damping = False
         if known.limits is None:
             known.sent = None
-            return self._refresh(joint)
+            return (self._refresh(joint),)
         on = known.state == ENABLED
         if order.power is Power.ON and on:
-            return self.command(joint, order)
+            return (self.command(joint, order),)
         if order.power is Power.STOPPED and on:
-            return self.damp(joint)
+            return (self.damp(joint),)
         known.sent = None
         if order.power is Power.OFF and on:
-            return drive, special(Special.DISABLE)
+            return ((drive, special(Special.DISABLE)),)
         if order.power is Power.ON and order.walk:
             if known.state == DamiaoStatus.DISABLED:
-                return drive, special(Special.ENABLE)
+                return ((drive, special(Special.ENABLE)),)
             if known.state is not None:
-                return drive, special(Special.CLEAR_ERROR)
-        return self._refresh(joint)
+                return ((drive, special(Special.CLEAR_ERROR)),)
+        return (self._refresh(joint),)
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         joint = self._replies.get((can_id, data[0] & 0xF)) if len(data) == 8 else None
