@@ -58,8 +58,6 @@ class PythonCanBus:
 
 
 class SocketCanBus(PythonCanBus):
-    """Linux's SocketCAN."""
-
     def open_port(self, as_node: bool = False) -> Port:
         return SocketPort(self.bus.socket, self.channel_info, self.fd, as_node)
 

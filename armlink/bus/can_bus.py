@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 
 class CanBus(Protocol):
-    """An open bus."""
-
     @property
     def channel_info(self) -> str: ...
 

@@ -46,8 +46,6 @@ class InProcessBus(ABC):
 
 
 class InProcessPort:
-    """Port of an InProcessBus."""
-
     def __init__(self, bus: InProcessBus) -> None:
         self._bus = bus
         self.send: Callable[[int, bytes], None] = bus.put

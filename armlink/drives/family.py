@@ -21,8 +21,6 @@ from armlink.drives.traits import Traits
 
 @dataclass(frozen=True)
 class Family:
-    """A drive family."""
-
     name: str
     traits: Traits
     """Of a drive with the default keys; for `armlink drives`."""

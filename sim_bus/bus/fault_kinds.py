@@ -37,8 +37,6 @@ CANOPEN_FAULTS = frozenset(("emcy.storm", "sdo.abort", "sdo.timeout"))
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault to inject."""
-
     id: str
     joint: str = ""
     value: float = math.nan

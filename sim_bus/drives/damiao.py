@@ -36,8 +36,6 @@ WRITABLE = frozenset((0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 21, 22, 23, 24, 25, 26, 
 
 
 class DamiaoDrive(WrappingDrive):
-    """One DM-J drive."""
-
     def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """As the maker delivers it, but for the ids: the deadman is off, the mode is MIT."""
         super().__init__(motor, send)

@@ -63,8 +63,6 @@ COMMANDS = {
 
 
 class MoteusDrive(SimulatedDrive):
-    """One controller."""
-
     def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """As configured for its joint: gains tuned, encoder at the output."""
         super().__init__(motor, send)

@@ -28,8 +28,6 @@ RATES = {Message.HEARTBEAT: HEARTBEAT_PERIOD, Message.TEMPERATURE: 0.5}
 
 
 class ODriveAxis(SimulatedDrive):
-    """One axis."""
-
     def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """As it was configured over USB: gains tuned, watchdog on, estimates and torques once a cycle in whole ms."""
         super().__init__(motor, send)

@@ -45,8 +45,6 @@ READ_ONLY = frozenset(
 
 
 class RobStrideDrive(SimulatedDrive):
-    """One drive."""
-
     def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """As the maker delivers it: deadman off, motion mode."""
         super().__init__(motor, send)

@@ -71,8 +71,6 @@ class SimulatedParameter:
 
 @dataclass(frozen=True)
 class SimulatedEffect:
-    """One effect on the simulated arm."""
-
     id: str
     parameters: tuple[SimulatedParameter, ...]
     apply: Apply

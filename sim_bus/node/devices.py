@@ -25,8 +25,6 @@ _ABSENT_IN_ALL = frozenset({0x2101})
 
 @dataclass(frozen=True)
 class Device:
-    """A kind of device."""
-
     absent: frozenset[int | Key] = frozenset()
     """Objects, whole or by sub-index, that it lacks."""
     values: Mapping[Key, int | str] = field(default_factory=dict)

@@ -35,8 +35,6 @@ class MappingRefused(Exception):
 
 @dataclass(frozen=True)
 class Pdo:
-    """One PDO of every joint."""
-
     name: str
     cob_base: int
     """COB-ID without the node id."""

@@ -51,8 +51,6 @@ class CubeMarsMemory(MitMemory):
 
 
 class CubeMarsDrives(MitDrives[CubeMarsMemory]):
-    """The drives of one bus."""
-
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent. Raises BadInput where one drive's replies have another's id."""
         super().__init__(joints, TRAITS, CubeMarsMemory)

@@ -62,8 +62,6 @@ class DamiaoMemory(MitMemory):
 
 
 class DamiaoDrives(MitDrives[DamiaoMemory]):
-    """The drives of one bus."""
-
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         super().__init__(joints, TRAITS, DamiaoMemory)
         for known, settings in zip(self.memory, self.settings, strict=True):

@@ -100,8 +100,6 @@ class MoteusMemory(DriveMemory):
 
 
 class MoteusDrives(BasicDrives[MoteusMemory]):
-    """The controllers of one bus."""
-
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent. Raises BadInput for a bus without CAN FD."""
         super().__init__(joints, TRAITS, MoteusMemory)

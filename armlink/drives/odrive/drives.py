@@ -100,8 +100,6 @@ class ODriveMemory(DriveMemory):
 
 
 class ODriveDrives(BasicDrives[ODriveMemory]):
-    """The axes of one bus."""
-
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         super().__init__(joints, TRAITS, ODriveMemory)
         self._joint_of = {settings.node: joint for joint, settings in enumerate(self.settings)}

@@ -72,8 +72,6 @@ class RobStrideMemory(MitMemory):
 
 
 class RobStrideDrives(MitDrives[RobStrideMemory]):
-    """The drives of one bus."""
-
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         super().__init__(joints, TRAITS, RobStrideMemory)
         for known, settings in zip(self.memory, self.settings, strict=True):

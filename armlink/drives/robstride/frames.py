@@ -30,8 +30,6 @@ NEVER_READ = 0x01
 
 
 class Type(IntEnum):
-    """Type of a frame."""
-
     IDENTITY = 0
     MOTION = 1
     FEEDBACK = 2
@@ -47,8 +45,6 @@ class Type(IntEnum):
 
 
 class RobStrideParameter(IntEnum):
-    """Parameters by index."""
-
     RUN_MODE = 0x7005
     LIMIT_TORQUE = 0x700B
     LIMIT_CURRENT = 0x7018

@@ -60,7 +60,6 @@ class JointValues:
         return values if self._direct else self.direction * (values - self._zero) / self.gear
 
     def position_of(self, joint: int, value: float) -> float:
-        """Position of one joint [rad]."""
         if self._direct:
             return value
         return float(self._signs[joint] * (value - self._zeros[joint]) / self._gears[joint])
