@@ -9,22 +9,18 @@ class Clock(Protocol):
 
     def now(self) -> float:
         """Seconds since an arbitrary instant."""
-        ...
 
     def sleep_until(self, instant: float) -> None:
         """Return when `now()` has reached `instant` [s]; at once if it already has."""
-        ...
 
 
 class MonotonicClock:
     """The machine's own monotonic clock."""
 
     def now(self) -> float:
-        """Seconds since an arbitrary instant."""
         return time.monotonic()
 
     def sleep_until(self, instant: float) -> None:
-        """Sleep until `now()` has reached `instant` [s]."""
         remaining = instant - time.monotonic()
         if remaining > 0:
             time.sleep(remaining)

@@ -13,8 +13,6 @@ JOINT = "joint"
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of an effect."""
-
     name: str
     unit: str
     components: tuple[str, ...] = ()

@@ -1,10 +1,11 @@
 """The arm file's `sim` section: true parameters of the simulated arm, which no fit may read."""
 
 from typing import Annotated, Any, Literal
+from zlib import crc32
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from armlink.arm_file import ArmFile, Positive, Section
+from armlink.arm_file import ArmFile, LinkJoint, Positive, Section
 from armlink.errors import BadInput
 from armlink.key_errors import describe
 from sim_bus.effects.quasi_direct import QuasiDirect
@@ -149,3 +150,8 @@ def sim_section(arm: ArmFile) -> SimSection:
                 f"{', '.join(arm.joint_names)}"
             )
     return section
+
+
+def serial_of(arm: ArmFile, joint: LinkJoint) -> int:
+    """Serial number of a joint's drive: its own on every arm."""
+    return crc32(f"{arm.name} {arm.serial} {joint.name}".encode())

@@ -20,14 +20,12 @@ from sim_bus.effects.realism import add_realism
 from sim_bus.effects.registry import imperfections
 from sim_bus.effects.state import Imperfections
 from sim_bus.node.cia402 import PowerState
-from sim_bus.node.controller_settings import APPLIED, bring_into_force, power_on_values
-from sim_bus.node.devices import device_of
-from sim_bus.node.drives import SimulatedDrives
-from sim_bus.node.nmt import RESET_NODE, NetworkManagement
+from sim_bus.node.devices import device_of, power_on_values
+from sim_bus.node.drives import APPLIED, SimulatedDrives
 from sim_bus.node.node import Node
 from sim_bus.node.object_arrays import Key, ObjectArrays
 from sim_bus.node.pdo import Frame, PdoGroup, PdoTable
-from sim_bus.node.supervision import Supervision
+from sim_bus.node.supervision import RESET_NODE, Supervision
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import JointSensors
 from sim_bus.sim_section import sim_section
@@ -76,9 +74,8 @@ class SimulatedArm:
         self._tags: dict[str, int] = {}
         """Name of each bus → what identifiers on it have in addition; empty: all joints are on one bus."""
         self._address()
-        self.supervision = Supervision(self.nodes, self.drives)
-        self._nmt = NetworkManagement(self.nodes, self.drives, self.supervision, self._apply)
-        self._operational = self._nmt.operational
+        self.supervision = Supervision(self.nodes, self.drives, self._apply)
+        self._operational = self.supervision.operational
         self._pdos = PdoTable(self._signals, self._operational, self._send)
         for node in self.nodes:
             joint = link.joints[node.place]
@@ -137,7 +134,7 @@ class SimulatedArm:
         if can_id == SYNC_ID:
             self._sync()
         elif can_id == 0:
-            self._nmt.frame(data, self.time, tag)
+            self.supervision.frame(data, tag)
             self._pdos.send_events()
         elif 0x700 < can_id < 0x780 and data:
             self.supervision.heartbeat(can_id - 0x700, self.time, tag)
@@ -167,7 +164,6 @@ class SimulatedArm:
                 drive.pass_time(self.time)
             if self.supervision.due <= self.time:
                 self.supervision.check(self.time)
-                self._nmt.update()
             if self._watching:
                 self.drives.watch()
             if self.sensors.warms and self.time >= self._warmed + WARMING_STEP:
@@ -179,7 +175,7 @@ class SimulatedArm:
     def reboot(self, joint: int) -> None:
         """Power-cycle one joint's controller: volatile settings are lost."""
         if joint in self._node_at:
-            self._nmt.command(self._node_at[joint], RESET_NODE, self.time)
+            self.supervision.command(self._node_at[joint], RESET_NODE)
         else:
             self.drive_at[joint].reboot()
 
@@ -290,7 +286,6 @@ class SimulatedArm:
         self.drives.loops.reconfigure()
 
     def _sender(self, bus: str) -> Callable[[int, bytes], None]:
-        """Puts frames of the drives on one bus."""
         return lambda can_id, data: self.outbox.append((can_id | self._tags.get(bus, 0), data))
 
     def _send(self, frame: Frame) -> None:
@@ -379,8 +374,7 @@ class SimulatedArm:
             self._apply(node)
 
     def _apply(self, node: Node) -> None:
-        """Apply objects that were written."""
-        bring_into_force(node, self.drives)
+        self.drives.bring_into_force(node)
         self._watching = self.drives.needs_watch
         self.supervision.configure(node, self.time)
         given = self.nodes[0].value(0x1006)

@@ -47,7 +47,6 @@ class PythonCanBus:
         return self.open_port()
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """See MessageSource; raises BusFault."""
         return receive_message(self.bus, self.channel_info, timeout)
 
     def shutdown(self) -> None:
@@ -59,8 +58,6 @@ class PythonCanBus:
 
 
 class SocketCanBus(PythonCanBus):
-    """Linux's SocketCAN."""
-
     def open_port(self, as_node: bool = False) -> Port:
         return SocketPort(self.bus.socket, self.channel_info, self.fd, as_node)
 
@@ -77,13 +74,11 @@ class MulticastBus(PythonCanBus):
         self._ports: list[MulticastPort] = []
 
     def open_port(self, as_node: bool = False) -> Port:
-        """See CanBus; raises BusFault if there is no route to the group."""
         from armlink.bus.sockets.multicast_port import MulticastPort
 
         return self._open(MulticastPort, as_node)
 
     def open_listening_port(self) -> Port:
-        """See CanBus; raises BusFault if there is no route to the group."""
         from armlink.bus.sockets.multicast_port import StampedMulticastPort
 
         return self._open(StampedMulticastPort)

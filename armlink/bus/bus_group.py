@@ -67,7 +67,6 @@ class GroupPort:
 
     @property
     def errors(self) -> int:
-        """Error frames received on all buses."""
         return sum(port.errors for port in self.members)
 
     @property
@@ -75,16 +74,13 @@ class GroupPort:
         return sum(port.dropped for port in self.members)
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame to its bus; raises BusFault."""
         self.members[can_id >> BUS_SHIFT].send(can_id & _ID, data)
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send the frames in this order, bus by bus; raises BusFault."""
         for index, port in enumerate(self.members):
             port.send_all([(can_id & _ID, data) for can_id, data in frames if can_id >> BUS_SHIFT == index])
 
     def receive(self, timeout: float) -> Frame | None:
-        """The next frame of any bus, or None after `timeout` seconds."""
         frame = self._poll(0.0)
         if frame is not None or timeout <= 0:
             return frame
@@ -114,13 +110,11 @@ class StampedGroup(GroupPort):
     """Stamped ports as one, frames in the order of their timestamps."""
 
     def __init__(self, members: Sequence[Port]) -> None:
-        """`members` are stamped ports."""
         super().__init__(members)
         self._stamped = tuple(port for port in members if isinstance(port, StampedPort))
         self._early: list[Stamped] = []
 
     def wait(self, timeout: float) -> None:
-        """Return when a frame is there, or after `timeout` seconds."""
         select.select(self._numbers, [], [], timeout)
 
     def take_all(self) -> list[Stamped]:

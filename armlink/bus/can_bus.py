@@ -14,15 +14,12 @@ if TYPE_CHECKING:
 
 
 class CanBus(Protocol):
-    """An open bus."""
-
     @property
     def channel_info(self) -> str: ...
 
     @property
     def clock(self) -> Clock | None:
         """The bus's own time (simulation in lock-step, log); None if it runs in the machine's time."""
-        ...
 
     def open_port(self, as_node: bool = False) -> Port:
         """A port to send and receive; a bus has one owner.
@@ -30,11 +27,9 @@ class CanBus(Protocol):
         `as_node` is for a node's end of the bus: it answers in the kind of frames it receives (classical or CAN FD)
         and ignores error frames.
         """
-        ...
 
     def open_listening_port(self) -> Port:
         """A port for a listener: a StampedPort if the interface timestamps frames."""
-        ...
 
     def shutdown(self) -> None: ...
 
@@ -48,11 +43,9 @@ class MessageSource(Protocol):
     @property
     def clock(self) -> Clock | None:
         """The bus's own time, as of CanBus."""
-        ...
 
     def recv(self, timeout: float | None = None) -> "can.Message | None":
         """The next message, or None after `timeout` seconds (None: wait without limit)."""
-        ...
 
     def shutdown(self) -> None: ...
 
@@ -70,4 +63,3 @@ class TimedBus(Protocol):
 
     def stamp(self) -> float:
         """Time of the newest frame since the first [s]."""
-        ...

@@ -130,15 +130,12 @@ class LogBus(InProcessBus):
         return self._next is None
 
     def now(self) -> float:
-        """Time of the newest frame since the first [s]."""
         return self._time
 
     def stamp(self) -> float:
-        """Time of the newest frame since the first [s]."""
         return self._time
 
     def sleep_until(self, instant: float) -> None:
-        """Advance the log's time to `instant` [s]."""
         self._time = max(self._time, instant)
 
     def take(self, timeout: float = 0.0) -> Frame | None:
@@ -152,7 +149,6 @@ class LogBus(InProcessBus):
         return can_id, data
 
     def put(self, can_id: int, data: bytes) -> None:
-        """Raise BusFault: a log cannot be sent to."""
         raise BusFault(f"{self.channel_info}: a log cannot be sent to")
 
     def shutdown(self) -> None:

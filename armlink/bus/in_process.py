@@ -46,8 +46,6 @@ class InProcessBus(ABC):
 
 
 class InProcessPort:
-    """Port of an InProcessBus."""
-
     def __init__(self, bus: InProcessBus) -> None:
         self._bus = bus
         self.send: Callable[[int, bytes], None] = bus.put
@@ -61,7 +59,6 @@ class InProcessPort:
 
     @property
     def dropped(self) -> int:
-        """Frames lost because they were not taken in time."""
         return self._bus.dropped
 
     def send_all(self, frames: Sequence[Frame]) -> None:

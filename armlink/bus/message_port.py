@@ -16,19 +16,16 @@ class MessagePort:
         self._bus, self._name, self._fd, self._as_node = bus, name, fd, as_node
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame; raises BusFault if python-can cannot."""
         try:
             self._bus.send(as_message(can_id, data, self._fd))
         except Exception as error:
             raise interface_fault(error, self._name, "send") from None
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send the frames in this order; raises BusFault as send."""
         for can_id, data in frames:
             self.send(can_id, data)
 
     def receive(self, timeout: float) -> Frame | None:
-        """The next frame that is no error frame, or None after `timeout` seconds."""
         while True:
             message = receive_message(self._bus, self._name, timeout)
             if message is None:
@@ -64,7 +61,6 @@ def as_frame(message: can.Message) -> Frame:
 
 
 def is_data(message: can.Message) -> bool:
-    """Whether a message is a data frame."""
     return not (message.is_error_frame or message.is_remote_frame)
 
 

@@ -40,21 +40,17 @@ class Port(Protocol):
     @property
     def dropped(self) -> int:
         """Frames lost because they were not read in time, if the interface reports them."""
-        ...
 
     @property
     def send(self) -> Callable[[int, bytes], None]:
         """Sends one frame; raises BusFault if the interface cannot take it."""
-        ...
 
     @property
     def receive(self) -> Callable[[float], Frame | None]:
         """The next frame, or None after a timeout [s] (0: only frames that are there already)."""
-        ...
 
     def send_all(self, frames: Sequence[Frame]) -> None:
         """Send the frames of a cycle in this order; raises BusFault if the interface cannot take them."""
-        ...
 
 
 @runtime_checkable
@@ -70,11 +66,9 @@ class StampedPort(Protocol):
 
     def wait(self, timeout: float) -> None:
         """Return when a frame is there, or after `timeout` seconds."""
-        ...
 
     def take_all(self) -> list[Stamped]:
         """All frames that are there, in the order of their timestamps; raises BusFault."""
-        ...
 
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # else what it logs goes to standard error, unasked

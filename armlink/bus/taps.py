@@ -30,7 +30,6 @@ class TappedBus(InProcessBus):
         return self._newest / 1e6
 
     def take(self, timeout: float = 0.0) -> Frame | None:
-        """The next data frame, or None after `timeout` seconds; raises BusFault."""
         while True:
             message = receive_message(self._source, self.channel_info, timeout)
             if message is None:
@@ -43,7 +42,6 @@ class TappedBus(InProcessBus):
                 return as_frame(message)
 
     def put(self, can_id: int, data: bytes) -> None:
-        """Raise BusFault: the bus is listen-only."""
         raise BusFault(f"bus {self.channel_info}: listen-only")
 
     def shutdown(self) -> None:
@@ -63,22 +61,18 @@ class TappedPort:
 
     @property
     def dropped(self) -> int:
-        """Frames lost because they were not read in time."""
         return self._port.dropped
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame; raises BusFault."""
         self.send_all(((can_id, data),))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send the frames in this order; raises BusFault."""
         now = self._now()
         for frame in frames:
             self._tap(now, *frame)
         self._port.send_all(frames)
 
     def receive(self, timeout: float) -> Frame | None:
-        """The next frame, or None after `timeout` seconds."""
         frame = self._port.receive(timeout)
         if frame is not None:
             self._tap(self._now(), *frame)

@@ -14,9 +14,11 @@ if TYPE_CHECKING:
 
     from armlink.arm_file import ArmFile
     from armlink.drives.findings import Result
+    from armlink.selftest.scale_motion import JointScales
 
 SCHEMA = "armlink.check/1"
 HOST_SCHEMA = "armlink.check-host/1"
+SCALES_SCHEMA = "armlink.check-scales/1"
 WARNING = (
     "This test enables every joint of {arm} and lets it hold where it stands (at most its max_torque). One after the "
     "other is then quick-stopped, and left without commands for {deadline:.0f} ms; then all are left without the "
@@ -111,10 +113,11 @@ def check(
 def _check_scales(
     console: "Console", arm: "ArmFile", bus: str | None, how: str, seconds: float, yes: bool, json: Path | None
 ) -> int:
-    """Scales of the drives' readings; asks before this host moves the arm."""
-    from armlink.commands.plain_console import confirm
-    from armlink.commands.scale_report import check_scales
-    from armlink.errors import BadInput
+    """Judge the scales of readings; asks before this host moves the arm. Raises Refused where one is off."""
+    from armlink.commands.early_end import early_end
+    from armlink.commands.output import write_json
+    from armlink.commands.plain_console import confirm, results
+    from armlink.errors import BadInput, Refused
     from armlink.loop.open import is_in_process
 
     if how not in ("hand", "move", "listen"):
@@ -123,7 +126,57 @@ def _check_scales(
         if not console.is_terminal:
             raise BadInput("check --scales move: nobody to ask: give --yes, or --scales hand")
         confirm(f"All joints of {arm.name} will turn by 0.35 rad to both sides. Is it clear?")
-    return check_scales(console, arm, bus, how, seconds, json)  # type: ignore[arg-type]
+    with early_end(arm) as work:
+        work.enabled = how == "move"
+        found, channel = _judge_scales(console, arm, bus, how, seconds)
+    out = results(json)
+    for each in found:
+        out.print(f"{each.joint}: judged: {', '.join(each.judged) or 'nothing: it hardly moved'}")
+        for finding in each.findings:
+            out.print(f"{each.joint}: {finding.text}", style="red")
+    joints = [_scales_answer(each) for each in found]
+    write_json(json, {"schema": SCALES_SCHEMA, "arm": arm.name, "bus": channel, "how": how, "joints": joints})
+    wrong = [(each.joint, finding.text) for each in found for finding in each.findings]
+    if wrong:
+        raise Refused(f"check --scales: {wrong[0][0]}: {wrong[0][1]}")
+    if not any(each.evidence for each in found):
+        raise Refused("check --scales: no joint moved enough to judge a scale: move every joint by a third of a radian")
+    out.print("every scale that could be judged is right")
+    return 0
+
+
+def _judge_scales(
+    console: "Console", arm: "ArmFile", bus: str | None, how: str, seconds: float
+) -> "tuple[list[JointScales], str]":
+    from armlink.bus.open import open_link_bus
+    from armlink.link.listener import Listener
+    from armlink.loop.open import open_arm
+    from armlink.selftest.scale_motion import by_hand, by_listening, by_moving
+
+    with console.status("scales") as status:
+        if how == "listen":
+            with Listener(arm, open_link_bus(bus, arm.require_link())) as listener:
+                return by_listening(listener, status.update, seconds), str(listener.bus.channel_info)
+        with open_arm(arm, bus) as link:
+            if how == "hand":
+                return link.inside(by_hand, status.update, seconds), arm.name
+            return link.inside(by_moving, status.update), arm.name
+
+
+def _scales_answer(each: "JointScales") -> dict[str, Any]:
+    return {
+        "joint": each.joint,
+        "judged": list(each.judged),
+        "evidence": [{"what": one.text, "ratio": one.ratio if one.ratio > 0 else None} for one in each.evidence],
+        "findings": [
+            {
+                "scale": list(one.quantities),
+                "reads": None if one.factor != one.factor else 1 / one.factor,
+                "text": one.text,
+            }
+            for one in each.findings
+        ],
+    }
 
 
 def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path | None) -> int:
@@ -186,26 +239,30 @@ def _table(title: str, names: tuple[str, ...], results: "list[Result]") -> "Tabl
         groups.setdefault(each.check.partition(":")[0], {}).setdefault(each.joint, []).append(each)
     table = Table("check", "every joint" if len(names) > 1 else names[0], box=SIMPLE, title=title)
     for group, joints in groups.items():
-        table.add_row(group, _outcomes({name: _outcome(joints.get(name, [])) for name in names}))
+        table.add_row(group, _outcomes({name: joints.get(name, []) for name in names}))
     return table
 
 
-def _outcomes(found: dict[str, str]) -> "Text":
+def _outcomes(joints: "dict[str, list[Result]]") -> "Text":
     from rich.text import Text
 
-    told = [*dict.fromkeys(found.values())]
-    if all(each.endswith(" ms") for each in told):
-        times = sorted(float(each.removesuffix(" ms")) for each in told)
-        return Text(f"{times[0]:g} ms" if len(times) == 1 else f"{times[0]:g} to {times[-1]:g} ms", "green")
-    rows = [(each, ", ".join(name for name in found if found[name] == each)) for each in told]
+    found = {name: _outcome(results) for name, results in joints.items()}
+    times = [each for each in found.values() if isinstance(each, float)]
+    if len(times) == len(found):
+        least, most = f"{min(times) * 1e3:.0f}", f"{max(times) * 1e3:.0f}"
+        return Text(f"{least} ms" if least == most else f"{least} to {most} ms", "green")
+    words = {name: f"{each * 1e3:.0f} ms" if isinstance(each, float) else each for name, each in found.items()}
+    told = [*dict.fromkeys(words.values())]
+    rows = [(each, ", ".join(name for name in words if words[name] == each)) for each in told]
     text = rows[0][0] if len(rows) == 1 else "; ".join(f"{each}: {who}" for each, who in rows)
     return Text(text, "red" if "FAILED" in told else "green" if told != ["–"] else "")
 
 
-def _outcome(results: "list[Result]") -> str:
+def _outcome(results: "list[Result]") -> float | str:
+    """How long the device took [s], or a word."""
     outcomes = {each.outcome for each in results}
     if "failed" in outcomes:
         return "FAILED"
     if times := [each.seconds for each in results if each.seconds is not None]:
-        return f"{max(times) * 1e3:.0f} ms"
+        return max(times)
     return "ok" if "passed" in outcomes else "–"

@@ -33,17 +33,7 @@ def convert(
     from armlink.recording.files import keeps_names, load_recording, save_recording
     from armlink.recording.recording import default_names
 
-    stated = parse_corrections(
-        columns=columns or (),
-        header=header,
-        sign=sign or (),
-        units=units or (),
-        zero=zero or (),
-        clock=clock or (),
-        effort=effort_is,
-        joints=joints,
-        topic=topic,
-    )
+    stated = parse_corrections(columns, header, sign, units, zero, clock, effort_is, joints, topic)
     if stated.without_gravity:
         raise BadInput(
             f"--effort-is {effort_is}: it takes the arm's model to add gravity, which convert does not have: convert "

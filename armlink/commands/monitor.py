@@ -103,13 +103,13 @@ def _stream(
     with contextlib.ExitStack() as open_streams:
         sends: list[Callable[[Sample], None]] = []
         if foxglove is not None:
-            from armlink.monitor.foxglove_stream import FoxgloveStream
+            from armlink.monitor.streams import FoxgloveStream
 
             served = open_streams.enter_context(FoxgloveStream(arm.name, names, foxglove))
             console.print(f"Foxglove: open ws://localhost:{served.port}")
             sends.append(served.send)
         if rerun is not None:
-            from armlink.monitor.rerun_stream import RerunStream
+            from armlink.monitor.streams import RerunStream
 
             sends.append(open_streams.enter_context(RerunStream(arm.name, names, rerun)).send)
 

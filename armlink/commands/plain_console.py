@@ -98,7 +98,6 @@ class PlainColumn(TextColumn):
         super().__init__(text_format, markup=False, table_column=Column(overflow="fold"))
 
     def render(self, task: Any) -> Text:
-        """The text, measured as it is shown."""
         return _plain(super().render(task).plain)
 
 

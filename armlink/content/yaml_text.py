@@ -57,7 +57,6 @@ def yaml_comment(text: str, indent: int = 0) -> str:
 
 
 def yaml_document(content: Any) -> str:
-    """Lines in block style."""
     text: str = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=WIDTH)
     return text
 

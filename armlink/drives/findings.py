@@ -1,8 +1,10 @@
 """Drives on a bus that no arm file describes yet; findings about drives, and results of their self-test."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
+
+from armlink.errors import ArmlinkError
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,6 @@ class FoundDrives(Protocol):
 
     def positions(self) -> dict[int, float]:
         """Position reading of every drive by its id [rad]; raises BusFault."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -63,3 +64,42 @@ class Result:
     found: str
     seconds: float | None = None
     """How long the device took, where that was measured [s]."""
+
+
+ANSWER_CYCLES = 50
+"""Cycles without power, to see whether each is answered."""
+ANSWERED = 0.9
+"""Share of them whose answer must come in its cycle; a busy host misses some."""
+PATIENCE = 3.0
+"""So many deadlines are waited for a reaction to a silent host."""
+HELD = 0.05
+"""A joint that moves further than this while it should hold ends a self-test [rad]."""
+
+
+class Checks:
+    """Results of a self-test, as they gather."""
+
+    def __init__(self) -> None:
+        self.results: list[Result] = []
+
+    def add(self, joint: str, check: str, outcome: Outcome, found: str, seconds: float | None = None) -> None:
+        self.results.append(Result(joint, check, outcome, found, seconds))
+
+    def judge(self, joint: str, check: str, passed: bool, found: str, seconds: float | None = None) -> None:
+        self.add(joint, check, "passed" if passed else "failed", found, seconds)
+
+    def attempt(self, joint: str, check: str, work: Callable[[], str]) -> None:
+        """Add what `work` found, or what it raised."""
+        try:
+            self.add(joint, check, "passed", work())
+        except ArmlinkError as error:
+            self.add(joint, check, "failed", str(error))
+
+    @property
+    def failed(self) -> list[Result]:
+        return [each for each in self.results if each.outcome == "failed"]
+
+    def missing(self, checks: Sequence[str], names: Sequence[str]) -> Iterator[tuple[str, str]]:
+        """Joint and check of those without a result yet."""
+        reached = {(each.joint, each.check) for each in self.results}
+        return ((name, check) for check in checks for name in names if (name, check) not in reached)

@@ -1,100 +1,68 @@
-"""Drives whose MIT command is packed alike (Damiao, CubeMars): commands within limits, damping,
-orders of another host. Each family adds its set-up, its power states and its replies.
+"""Drives with the MIT law kp (q* − q) + kd (dq* − dq) + τ: commands within limits, damping, set-up, another host.
+
+Nothing in such a drive bounds that sum but its own saturation. A family adds what its frames look like, where its
+scales come from, its power states and its replies.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from armlink.arm_file import LinkJoint
 from armlink.bus.port import Frame
-from armlink.drives.base import BasicDrives, no_order
-from armlink.drives.family import BROADCAST
-from armlink.drives.mit_leash import damping, order_of, round_within
-from armlink.drives.mit_packing import (
-    Grid,
-    MitCommand,
-    Ranges,
-    Special,
-    command_in,
-    grid_of,
-    pack_command,
-    pack_steps,
-    special_of,
-    unpack_command,
-)
-from armlink.drives.orders import Limits, Mode, Order, Power
+from armlink.drives.base import BROADCAST, BasicDrives, DriveMemory, no_order
+from armlink.drives.mit_packing import Grid, MitCommand, Special, pack_steps, special_of, unpack_command
+from armlink.drives.orders import Gains, Limits, Mode, Order, Power, ReadingRange, Setup
 from armlink.drives.traits import Traits
-from armlink.errors import BusFault
+from armlink.errors import BadInput, BusFault
 
-POSITION = int(Mode.POSITION)
+DAMPING_SHARE = 0.9
+"""Damping takes at most this share of the torque limit; the rest is for rounding."""
+SOFTER, SOFTER_STEPS = 0.8, 30
+"""Factor by which both gains are lowered, again and again, while the sum of the law is beyond the limit."""
+Steps = tuple[int, int, int, int, int]
+ON, POSITION, TORQUE = Power.ON, int(Mode.POSITION), int(Mode.TORQUE)
 
 
 @dataclass
-class MitKnown:
-    """Newest state of one drive."""
+class MitMemory(DriveMemory):
+    """Positions are unwrapped."""
 
-    ranges: Ranges | None = None
-    """By which frames are coded; None: not known yet."""
     grid: Grid | None = None
-    """Of these ranges."""
-    limits: Limits | None = None
-    position: float = math.nan
-    """Unwrapped [rad]."""
-    velocity: float = math.nan
+    """By which frames are coded; None: not known yet."""
     damping: bool = False
     """The newest frame damps, whatever was ordered."""
-    sent: Order | None = None
-
-    def use(self, ranges: Ranges | None) -> None:
-        """Code and decode by these ranges from now on."""
-        self.ranges, self.grid = ranges, None if ranges is None else grid_of(ranges)
 
 
-class MitDrives(BasicDrives):
-    """The drives of one bus; their settings have `id` (of commands), `reply` (of replies) and `kd`."""
+K = TypeVar("K", bound=MitMemory)
 
-    def __init__(self, joints: Sequence[LinkJoint], traits: Traits, known: Sequence[MitKnown]) -> None:
-        super().__init__(joints, traits)
-        self._settings = [joint.settings for joint in joints]
-        self._known = known
-        self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
+
+class MitDrives(BasicDrives[K]):
+    """The drives of one bus; their settings have `id` (of commands), `reply` (of replies), `kp` and `kd`.
+
+    Frames are those of `mit_packing`; a family with others overrides what codes and decodes them.
+    """
+
+    def __init__(self, joints: Sequence[LinkJoint], traits: Traits, memory: type[K]) -> None:
+        super().__init__(joints, traits, memory)
+        self._joint_of = {settings.id: joint for joint, settings in enumerate(self.settings)}
 
     def routes(self) -> Mapping[int, int]:
         """Reply ids; drives that share one are told apart by the id in their replies."""
-        replies = [settings.reply for settings in self._settings]
+        replies = [settings.reply for settings in self.settings]
         return {reply: joint if replies.count(reply) == 1 else BROADCAST for joint, reply in enumerate(replies)}
 
     def commands(self) -> Mapping[int, str]:
         return {drive: f"MIT command to {self.names[joint]}" for drive, joint in self._joint_of.items()}
 
-    def sent(self, joint: int) -> Order | None:
-        return self._known[joint].sent
+    def coded(self, joint: int, steps: Steps) -> Frame:
+        """The command frame of packed steps."""
+        return self.settings[joint].id, pack_steps(*steps)
 
-    def _command(self, joint: int, order: Order) -> Frame:
-        """The command of an order, within the drive's limits after rounding."""
-        known = self._known[joint]
-        grid, limits = known.grid, known.limits
-        if grid is None or limits is None:
-            raise BusFault(f"{self.names[joint]}: a command before the set-up")
-        _, _, mode, position, velocity, torque, kp, kd, _ = order
-        asked = MitCommand(position, velocity, kp, kd, torque)
-        if mode != POSITION:
-            asked = MitCommand(position, velocity, 0.0, 0.0, torque)
-        data = pack_steps(*round_within(asked, grid, limits, known.position, known.velocity))
-        known.sent = order_of(command_in(data, grid))
-        return self._settings[joint].id, data
-
-    def _damp(self, joint: int) -> Frame:
-        """No stiffness, no torque: the joint sinks slowly, and no torque leaves the limit on the way."""
-        known = self._known[joint]
-        assert known.ranges is not None
-        assert known.limits is not None
-        known.damping = True
-        command = damping(self._settings[joint].kd, known.position, known.velocity, known.limits.max_torque)
-        data = pack_command(command, known.ranges)
-        known.sent = order_of(unpack_command(data, known.ranges))._replace(power=Power.STOPPED)
-        return self._settings[joint].id, data
+    def decoded(self, can_id: int, data: bytes, grid: Grid) -> MitCommand:
+        """A command frame as the drive understands it; `data` has eight bytes."""
+        return unpack_command(data, grid)
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
         joint = self._joint_of.get(can_id)
@@ -104,5 +72,141 @@ class MitDrives(BasicDrives):
         if special is not None:
             power = {Special.ENABLE: Power.ON, Special.DISABLE: Power.OFF}.get(special)
             return None if power is None else (joint, no_order()._replace(power=power))
-        ranges = self._known[joint].ranges
-        return None if ranges is None else (joint, order_of(unpack_command(data, ranges)))
+        grid = self.memory[joint].grid
+        return None if grid is None else (joint, order_of(self.decoded(can_id, data, grid)))
+
+    def grid_of(self, joint: int) -> Grid:
+        """The grid of a drive that was set up."""
+        grid = self.memory[joint].grid
+        if grid is None:
+            raise BusFault(f"{self.names[joint]}: a command before the set-up")
+        return grid
+
+    def command(self, joint: int, order: Order) -> Frame:
+        known, limits, grid = self.memory[joint], self.limits_of(joint), self.grid_of(joint)
+        _, _, mode, position, velocity, torque, kp, kd, _ = order
+        asked = MitCommand(position, velocity, kp, kd, torque)
+        if mode != POSITION:
+            asked = MitCommand(position, velocity, 0.0, 0.0, torque)
+        return self._sent(joint, grid, round_within(asked, grid, limits, known.position, known.velocity), ON)
+
+    def damp(self, joint: int) -> Frame:
+        """No stiffness, no torque: the joint sinks slowly, and no torque leaves the limit on the way."""
+        known, grid = self.memory[joint], self.grid_of(joint)
+        known.damping = True
+        most = self.limits_of(joint).max_torque
+        command = damping(self.settings[joint].kd, known.position, known.velocity, most)
+        return self._sent(joint, grid, grid.steps(command), Power.STOPPED)
+
+    def _sent(self, joint: int, grid: Grid, steps: Steps, power: Power) -> Frame:
+        frame = self.coded(joint, steps)
+        self.memory[joint].sent = order_of(self.decoded(*frame, grid))._replace(power=power)
+        return frame
+
+    def mit_setup(
+        self,
+        joint: int,
+        limits: Limits,
+        position: float,
+        grid: Grid,
+        notes: Sequence[str],
+        where: tuple[str, str, str],
+        remedy: str,
+    ) -> Setup:
+        """Set-up of a drive without power at `position` [rad], from which its cycles start.
+
+        `where` the ranges of position, velocity and torque come from, and how they are made larger.
+        """
+        known, settings, ranges = self.memory[joint], self.settings[joint], grid.ranges
+        known.grid, known.limits, known.position = grid, limits, position
+        quantities = zip(("position", "velocity", "torque"), ranges[:3], where, strict=True)
+        return Setup(
+            position=position,
+            torque=0.0,
+            position_step=ranges.position_quantum,
+            modes=frozenset((POSITION, TORQUE)),
+            gains=Gains(settings.kp, settings.kd, ranges.kp, ranges.kd),
+            notes=tuple(notes),
+            scales={
+                "position range, rad": ranges.position,
+                "velocity range, rad/s": ranges.velocity,
+                "torque range, N·m": ranges.torque,
+            },
+            ranges=tuple(ReadingRange(*each, remedy) for each in quantities),
+        )
+
+    def require_window(self, joint: int, limits: Limits, grid: Grid, where: str = "") -> None:
+        """Raise BadInput unless a joint's position window lies in the range of its drive's frames, which is `where`."""
+        most = grid.ranges.position
+        if not (-most <= limits.lower and limits.upper <= most):
+            raise BadInput(
+                f"{self.names[joint]}: its position window {limits.lower:.2f} to {limits.upper:.2f} rad at the drive "
+                f"exceeds the range ±{most:.2f} rad of its frames{where}: correct zero and direction, or limit the "
+                "joint"
+            )
+
+
+def order_of(command: MitCommand) -> Order:
+    """The order that a command stands for: position control where it has stiffness."""
+    position, velocity, kp, kd, torque = command
+    return Order(ON, False, POSITION if kp > 0 else TORQUE, position, velocity, torque, kp, kd)
+
+
+def round_within(command: MitCommand, grid: Grid, limits: Limits, position: float, velocity: float) -> Steps:
+    """Steps of a command, moved by as few as it takes to stay within `limits` after rounding.
+
+    `position` and `velocity` are the newest readings (NaN if there are none), by which the sum of the law is bounded;
+    the torque alone and the target position are bounded in any case.
+
+    Raises ValueError for numbers that are not finite.
+    """
+    most = limits.max_torque
+    wanted = command.position
+    if most < abs(command.torque) < math.inf:
+        command = command._replace(torque=math.copysign(most, command.torque))
+    q, dq, kp, kd, t = grid.steps(command)
+    if kp and limits.lower <= wanted <= limits.upper:
+        at = q * grid.q_span / grid.q_most - grid.q
+        q += (at < limits.lower) - (at > limits.upper)
+    t = _torque_within(t, grid, most)
+    if not math.isfinite(position + velocity):
+        return q, dq, kp, kd, t
+    pull = _pull(q, dq, kp, kd, grid, position, velocity)
+    total = pull + t * grid.t_span / grid.t_most - grid.t
+    if abs(total) <= most:
+        return q, dq, kp, kd, t
+    beyond = total - math.copysign(most, total)
+    quantum = grid.t_span / grid.t_most
+    t = _torque_within(t - math.ceil(abs(beyond) / quantum) * (1 if beyond > 0 else -1), grid, most)
+    torque = t * grid.t_span / grid.t_most - grid.t
+    for _ in range(SOFTER_STEPS):  # where the torque, limited by itself, cannot keep the sum within the limit
+        if abs(pull + torque) <= most:
+            return q, dq, kp, kd, t
+        kp, kd = int(SOFTER * kp), int(SOFTER * kd)
+        pull = _pull(q, dq, kp, kd, grid, position, velocity)
+    return q, dq, 0, 0, t
+
+
+def damping(kd: float, position: float, velocity: float, most: float) -> MitCommand:
+    """A command that damps with at most `kd`, and with no more torque than `most` [N·m] at the present velocity."""
+    if abs(velocity) * kd > DAMPING_SHARE * most:
+        kd = DAMPING_SHARE * most / abs(velocity)
+    return MitCommand(position if math.isfinite(position) else 0.0, 0.0, 0.0, kd, 0.0)
+
+
+def _pull(q: int, dq: int, kp: int, kd: int, grid: Grid, position: float, velocity: float) -> float:
+    """Torque of both gains where the drive stands [N·m]."""
+    stiff = kp * grid.kp / grid.kp_most * (q * grid.q_span / grid.q_most - grid.q - position)
+    return stiff + kd * grid.kd / grid.kd_most * (dq * grid.v_span / grid.v_most - grid.v - velocity)
+
+
+def _torque_within(steps: int, grid: Grid, most: float) -> int:
+    """Steps of a torque, moved inwards until it is within ±most [N·m] and the range."""
+    steps = max(0, min(int(grid.t_most), steps))
+    torque = steps * grid.t_span / grid.t_most - grid.t
+    if abs(torque) <= most:
+        return steps
+    bound = math.copysign(most, torque)
+    steps = round((bound + grid.t) / grid.t_span * grid.t_most)
+    beyond = abs(steps * grid.t_span / grid.t_most - grid.t) > most  # the limit lies between two steps
+    return steps - (1 if torque > 0 else -1) * beyond

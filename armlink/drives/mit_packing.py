@@ -28,12 +28,10 @@ SPECIALS = frozenset(int(command) for command in Special)
 
 
 def special(command: Special) -> bytes:
-    """The eight bytes of a special command."""
     return bytes([0xFF] * 7 + [command])
 
 
 def special_of(data: bytes) -> Special | None:
-    """The special command in `data`, or None."""
     if len(data) == 8 and data[:7] == b"\xff" * 7 and data[7] in SPECIALS:
         return Special(data[7])
     return None
@@ -80,27 +78,13 @@ class Grid:
     A field with b bits has 2^b − 1 steps from its lowest to its highest value.
     """
 
-    __slots__ = (
-        "kd",
-        "kd_most",
-        "kp",
-        "kp_most",
-        "q",
-        "q_most",
-        "q_span",
-        "t",
-        "t_most",
-        "t_span",
-        "v",
-        "v_most",
-        "v_span",
-    )
+    __slots__ = ("kd", "kd_most", "kp", "kp_most", "q", "q_most", "q_span", "ranges", "t", "t_most", "t_span",
+                 "v", "v_most", "v_span")  # fmt: skip
 
     def __init__(self, ranges: Ranges, bits: tuple[int, int, int, int, int]) -> None:
         """`bits` of position, velocity, kp, kd and torque."""
-        self.q, self.v, self.t, self.kp, self.kd = (
-            ranges.position, ranges.velocity, ranges.torque, ranges.kp, ranges.kd,
-        )  # fmt: skip
+        self.ranges = ranges
+        self.q, self.v, self.t, self.kp, self.kd = ranges
         self.q_span, self.v_span, self.t_span = 2 * self.q, 2 * self.v, 2 * self.t
         self.q_most, self.v_most, self.kp_most, self.kd_most, self.t_most = (float((1 << each) - 1) for each in bits)
 
@@ -118,7 +102,6 @@ class Grid:
         )
 
     def command(self, q: int, dq: int, kp: int, kd: int, torque: int) -> MitCommand:
-        """The command that steps stand for."""
         return MitCommand(
             q * self.q_span / self.q_most - self.q,
             dq * self.v_span / self.v_most - self.v,
@@ -139,7 +122,6 @@ class Grid:
         )
 
     def feedback(self, q: int, dq: int, torque: int) -> MitFeedback:
-        """The feedback that steps stand for."""
         return MitFeedback(
             q * self.q_span / self.q_most - self.q,
             dq * self.v_span / self.v_most - self.v,
@@ -157,39 +139,28 @@ def grid_of(ranges: Ranges, bits: tuple[int, int, int, int, int] = MIT_BITS) -> 
 
 
 def pack_steps(q: int, dq: int, kp: int, kd: int, torque: int) -> bytes:
-    """The eight bytes of a command's steps."""
     return (q << 48 | dq << 36 | kp << 24 | kd << 12 | torque).to_bytes(8, "big")
 
 
-def pack_command(command: MitCommand, ranges: Ranges) -> bytes:
+def pack_command(command: MitCommand, grid: Grid) -> bytes:
     """The eight bytes of a command. Raises ValueError for numbers that are not finite."""
-    return pack_steps(*grid_of(ranges).steps(command))
+    return pack_steps(*grid.steps(command))
 
 
-def unpack_command(data: bytes, ranges: Ranges) -> MitCommand:
+def unpack_command(data: bytes, grid: Grid) -> MitCommand:
     """A command as the drive understands it; `data` has eight bytes."""
-    return command_in(data, grid_of(ranges))
-
-
-def command_in(data: bytes, grid: Grid) -> MitCommand:
-    """As `unpack_command`, on a grid that is known."""
     bits = int.from_bytes(data, "big")
     return grid.command(bits >> 48, bits >> 36 & 0xFFF, bits >> 24 & 0xFFF, bits >> 12 & 0xFFF, bits & 0xFFF)
 
 
-def pack_feedback(feedback: MitFeedback, ranges: Ranges) -> bytes:
+def pack_feedback(feedback: MitFeedback, grid: Grid) -> bytes:
     """Bytes 1 to 5 of a reply: q 16 | dq 12 | τ 12 bits."""
-    q, dq, torque = grid_of(ranges).feedback_steps(feedback)
+    q, dq, torque = grid.feedback_steps(feedback)
     return (q << 24 | dq << 12 | torque).to_bytes(5, "big")
 
 
-def unpack_feedback(data: bytes, ranges: Ranges) -> MitFeedback:
+def unpack_feedback(data: bytes, grid: Grid) -> MitFeedback:
     """Feedback from bytes 1 to 5 of a reply, which `data` is."""
-    return feedback_in(data, grid_of(ranges))
-
-
-def feedback_in(data: bytes, grid: Grid) -> MitFeedback:
-    """As `unpack_feedback`, on a grid that is known."""
     bits = int.from_bytes(data, "big")
     return grid.feedback(bits >> 24, bits >> 12 & 0xFFF, bits & 0xFFF)
 

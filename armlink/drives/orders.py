@@ -96,6 +96,17 @@ def law_torque(order: Order, position: float, velocity: float) -> float:
     return torque
 
 
+def real32_within(value: float, most: float) -> float:
+    """A value within ±most that stays within after rounding to a 32-bit float."""
+    shrunk = most * (1 - 2.0**-23)
+    return max(-shrunk, min(shrunk, value))
+
+
+def real32_step(value: float) -> float:
+    """Step from a 32-bit float to the next, at the most; of values below 1 as of 1."""
+    return 2.0**-23 * max(1.0, abs(value))
+
+
 class Reading(NamedTuple):
     """Values of one frame of a drive; NaN or None where it has none."""
 

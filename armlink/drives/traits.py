@@ -13,8 +13,6 @@ FrameKind = Literal["11", "29", "fd"]
 
 @dataclass(frozen=True)
 class Traits:
-    """Traits of a drive."""
-
     torque: TorqueSource
     """Whether its torque reading is of a sensor at the joint (link side), or current times torque constant."""
     calibration: CalibrationPlace

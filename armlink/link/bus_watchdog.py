@@ -47,7 +47,6 @@ class BusWatch:
         self.clear()
 
     def clear(self) -> None:
-        """Reset everything for a new start of the link."""
         self.restarted.clear()
         self.syncs, self.readings[:] = 0, [0] * len(self.readings)
         self.intruder = ""

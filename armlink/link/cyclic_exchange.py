@@ -12,8 +12,8 @@ from armlink.arrays import Array
 from armlink.bus.frame_bits import FIXED_BITS
 from armlink.bus.port import BUS_SHIFT, Frame, Port
 from armlink.clock import Clock
+from armlink.drives.base import ANY
 from armlink.drives.board import Board, DriveEvent
-from armlink.drives.family import ANY, FillsBoard
 from armlink.drives.orders import Order, Reading, power_code
 from armlink.errors import BusFault, HostLate
 from armlink.link.bus_watchdog import MOST_FRAMES, BusWatch
@@ -115,7 +115,7 @@ class Loop:
 
     def _route(self, group: Group) -> None:
         drives, tag = group.drives, group.tag
-        fast = drives.fill(self.board, group.places) if isinstance(drives, FillsBoard) else {}
+        fast = drives.fill(self.board, group.places)
         self._fast |= {can_id | tag: take for can_id, take in fast.items()}
         take = partial(self._take_drive, group)
         for can_id in drives.routes():
@@ -355,7 +355,6 @@ class Loop:
         self.bits += FIXED_BITS * frames + 8 * size
 
     def _take_drive(self, group: Group, can_id: int, data: bytes) -> None:
-        """A frame for a family's own `take`."""
         if self.on_frame is not None:
             self.on_frame(can_id, data)
         if can_id & ~_UNTAGGED != group.tag:

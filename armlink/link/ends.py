@@ -61,18 +61,15 @@ class Ended(Parked, Protocol):
     @property
     def held(self) -> bool:
         """Whether the joints are held by the host alone."""
-        ...
 
     @property
     def falls(self) -> bool:
         """Whether some drive lets go when its host falls silent."""
-        ...
 
     def stop(self) -> None: ...
 
     def let_go(self) -> None:
         """Stop every joint and hold none."""
-        ...
 
 
 def cause_of(error: BaseException | None) -> EndCause:

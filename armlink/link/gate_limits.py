@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from armlink.arm_file import ArmFile, LinkJoint
+from armlink.arm_file import ArmFile, LinkJoint, LinkSection
 from armlink.drives.orders import Gains, Limits, ReadingRange
 from armlink.errors import BadInput, Refused
 from armlink.link.gate import JointLimits
@@ -93,6 +93,12 @@ def drive_limits(joint: LinkJoint, window: tuple[float, float], period: float, d
         deadline=deadline,
         period=period,
     )
+
+
+def arm_limits(section: LinkSection, stops: Sequence[tuple[float, float]]) -> list[Limits]:
+    """Limits of every joint by the arm file, with its stops [rad]."""
+    rows = zip(section.joints, stops, strict=True)
+    return [drive_limits(row, target_window(*ends), 1.0 / section.rate, section.deadline) for row, ends in rows]
 
 
 def gate_limits(limits: Limits, gains: Gains | None = None, max_torque: float | None = None) -> JointLimits:

@@ -16,8 +16,7 @@ from armlink.bus.adapters import as_bus
 from armlink.bus.arm_hold import ArmHold
 from armlink.bus.can_bus import CanBus
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.family import Guarded, TellsPosition
-from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Setup, law_torque
+from armlink.drives.orders import DriveIdentity, Order, Power, Setup, law_torque
 from armlink.errors import BadInput, BusFault, HostLate, Silence
 from armlink.link.bus_load import overload
 from armlink.link.bus_watchdog import MOST_FRAMES
@@ -26,7 +25,7 @@ from armlink.link.cyclic_exchange import Loop
 from armlink.link.ends import EndCause, cause_of, end
 from armlink.link.faults import bus_fault
 from armlink.link.gate import JointLimits, start_from
-from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, require_ranges, target_window
+from armlink.link.gate_limits import arm_limits, gate_limits, joint_ranges, require_ranges
 from armlink.link.guard import Crossed
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.calibrations import Calibrations
@@ -73,7 +72,8 @@ class Link(Calibrations):
         self._lock_step = self.bus.clock is not None
         self.clock: Clock = clock or self.bus.clock or MonotonicClock()
         stops = joint_ranges(arm)
-        self.windows = [target_window(*limits) for limits in stops]
+        self.limits = arm_limits(section, stops)
+        """The arm file's limits of every joint."""
         self.groups: tuple[Group, ...] = make_groups(arm, self.bus)
         """The drives by family and bus."""
         self.values = values_of(arm, self.groups)
@@ -91,7 +91,6 @@ class Link(Calibrations):
         self.position_step = np.full(self.n, np.inf)
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
         self._last: Command | None = None
-        self._limits: list[Limits] = []
         self._hold: ArmHold | None = None
         self._overloaded = overloaded
         self.tell: Tell = lambda text: log.debug("%s: %s", self.arm.name, text)
@@ -250,17 +249,16 @@ class Link(Calibrations):
     def _set_up(self) -> None:
         """Set every drive up; what the first cycle starts from."""
         self.correct_turns()
-        wanted = self.wanted_limits()
         found: dict[int, Setup] = {}
         for group in self.groups:
-            own = [self.values.limits(place, wanted[place]) for place in group.places]
+            own = [self.values.limits(place, self.limits[place]) for place in group.places]
             found |= dict(zip(group.places, group.drives.set_up(self._ask(group), own), strict=True))
         self.setups = [found[joint] for joint in range(self.n)]
         self.position_step = np.array([each.position_step for each in self.setups]) / self.values.gear
-        self._limits, passed = wanted, []
+        passed = []
         limits = [self._gate_limits(joint) for joint in range(self.n)]
         for joint, (setup, limit) in enumerate(zip(self.setups, limits, strict=True)):
-            at_drive = self.values.limits(joint, wanted[joint])
+            at_drive = self.values.limits(joint, self.limits[joint])
             ends = (at_drive.lower, at_drive.upper)
             require_ranges(self.names[joint], setup.ranges, limit, self.section.joints[joint], ends)
             torque = self.values.torque_of(joint, setup.torque)
@@ -276,19 +274,13 @@ class Link(Calibrations):
         """Position of each joint as its drive tells it without being set up (n,) [rad]; NaN where it does not."""
         raw = np.full(self.n, np.nan)
         for group in self.groups:
-            if isinstance(group.drives, TellsPosition):
-                raw[list(group.places)] = group.drives.positions(self._ask(group))
+            raw[list(group.places)] = group.drives.positions(self._ask(group))
         return self.values.position(raw)
 
     def correct_turns(self) -> None:
         """Correct zeros by whole turns where the arm file has `turns: auto`, before limits are set in the drives."""
         if self.turns.any_automatic and self.turns.correct(self.read_positions()):
             self._loop.latest_position = [math.nan] * self.n  # by zeros of before
-
-    def wanted_limits(self) -> list[Limits]:
-        """The arm file's limits of every joint."""
-        pairs = zip(self.section.joints, self.windows, strict=True)
-        return [drive_limits(row, window, self.period, self.section.deadline) for row, window in pairs]
 
     def guard_rules(self) -> dict[str, Any]:
         """Frames that a guard of the bus may pass to these drives, as `armlink.guard.bus_guard` takes it; sets nothing.
@@ -298,28 +290,21 @@ class Link(Calibrations):
         rules: dict[str, Any] = {"frames": {}, "stop": [], "restarts": {}}
         watches = {"deadline": self.section.deadline, "fd": self.section.bus.fd}
         self.correct_turns()
-        wanted = self.wanted_limits()
         for group in self.groups:
-            name, family = self.names[group.places[0]], group.family.name
-            if not isinstance(group.drives, Guarded):
-                raise BadInput(
-                    f"{name}: a guard cannot judge frames to {family} drives: their bytes alone do not say it"
-                )
             if group.tag:
+                name = self.names[group.places[0]]
                 raise BadInput(f"{name}: a guard has one bus, this arm has several: describe each in a file of its own")
-            own = [self.values.limits(place, wanted[place]) for place in group.places]
+            own = [self.values.limits(place, self.limits[place]) for place in group.places]
             found = group.drives.guard_rules(self._ask(group), own)
-            rules = {
-                "frames": rules["frames"] | found["frames"],
-                "stop": rules["stop"] + found["stop"],
-                "restarts": rules["restarts"] | found["restarts"],
-            }
+            rules["frames"] |= found["frames"]
+            rules["stop"] += found["stop"]
+            rules["restarts"] |= found["restarts"]
         return rules | watches
 
     def _gate_limits(self, joint: int) -> JointLimits:
-        wanted = self._limits[joint]
+        limits = self.limits[joint]
         gains = self.values.gains(joint, self.setups[joint].gains)
-        return gate_limits(wanted, gains, self.values.reach(joint, wanted.max_torque))
+        return gate_limits(limits, gains, self.values.reach(joint, limits.max_torque))
 
     def calibration_changed(self, joint: int) -> None:
         """The gate's limits follow the host's calibration."""

@@ -16,7 +16,7 @@ from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.adapters import as_bus
 from armlink.bus.can_bus import CanBus
-from armlink.bus.port import StampedPort
+from armlink.bus.port import Port, StampedPort
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.board import DriveEvent
 from armlink.drives.orders import Order
@@ -40,25 +40,38 @@ RESOLUTION = 1e-9
 """Times closer than this are the same [s]: a simulated clock may not move by less."""
 
 
-class Listener(Calibrations):
-    """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
+class HeardArm:
+    """An arm on a bus whose joints another host commands: what a listener knows of its drives, and of that host."""
 
-    def __init__(self, arm: ArmFile, bus: "CanBus | can.BusABC") -> None:
-        """Take `bus` (python-can's too, closed on leaving); its own clock counts if it has one, else the machine's."""
-        self.arm, self.bus = arm, as_bus(bus)
+    def __init__(self, arm: ArmFile, bus: CanBus) -> None:
+        """Nothing is heard before `listen_on`; the bus's own clock counts if it has one, else the machine's."""
+        self.arm = arm
         self.section = section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.n, self.period = len(self.names), 1.0 / section.rate
-        self.clock: Clock = self.bus.clock or MonotonicClock()
-        self._port = self.bus.open_listening_port()
-        self.groups = make_groups(arm, self.bus)
+        self.clock: Clock = bus.clock or MonotonicClock()
+        self.lock_step = bus.clock is not None
+        self.groups = make_groups(arm, bus)
         self.values = values_of(arm, self.groups)
-        lock_step = self.bus.clock is not None
-        self._loop = Loop(self._port, self.clock, self.groups, self.values, self.period, lock_step)
-        self._loop.on_unknown = self._take_unknown
+
+    def listen_on(self, port: Port, unknown: Callable[[int, bytes], None], forgets: bool = False) -> None:
+        """Take the joints' frames from `port`; `unknown` gets those that no drive sends. `forgets` as ForeignHost."""
+        self._loop = Loop(port, self.clock, self.groups, self.values, self.period, self.lock_step)
+        self._loop.on_unknown = unknown
+        self._host = ForeignHost(self.groups, self.values, forgets)
+
+
+class Listener(HeardArm, Calibrations):
+    """Context manager: `with Listener(arm, bus) as listener: sample = listener.next(0.1)`."""
+
+    def __init__(self, arm: ArmFile, bus: "CanBus | can.BusABC") -> None:
+        """Take `bus` (python-can's too, closed on leaving)."""
+        self.bus = as_bus(bus)
+        super().__init__(arm, self.bus)
+        self._port = self.bus.open_listening_port()
+        self.listen_on(self._port, self._take_unknown)
         self.ask = LinkAsk(self._loop, self.clock, self._pump)
-        self.calibrate_host(simulated=lock_step)
-        self._host = ForeignHost(self.groups, self.values)
+        self.calibrate_host(simulated=self.lock_step)
         self._places = PlaceWatch(arm, self.values)
         self._ready: deque[tuple[Sample, Commands]] = deque()
         self._sent: Commands = ()
@@ -165,7 +178,6 @@ class Listener(Calibrations):
         self._sync = now
 
     def _pump(self, done: Callable[[], bool], timeout: float) -> bool:
-        """Go on listening until `done` or the time is over."""
         end = self.clock.now() + timeout
         while not done():
             remaining = end - self.clock.now()

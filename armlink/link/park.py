@@ -51,11 +51,9 @@ class Parked(Protocol):
     @property
     def latest_position(self) -> Array:
         """Newest position readings (n,) [rad]."""
-        ...
 
     def keep(self, goal: Array | None = None) -> Sample:
         """One cycle that holds every joint that can be held, or leads it towards `goal` (n,) [rad]."""
-        ...
 
     def disable(self) -> None: ...
 

@@ -81,7 +81,6 @@ class Controller(Protocol):
 
     def command(self, sample: "Sample") -> Command:
         """The next command, from the newest sample; within a fraction of a period."""
-        ...
 
 
 @dataclass(eq=False)

@@ -31,22 +31,18 @@ class ArmDriver(Protocol):
     @property
     def position_step(self) -> Array:
         """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
-        ...
 
     @property
     def position_sent(self) -> Array:
         """Target position of the newest cycle (n,) [rad]."""
-        ...
 
     @property
     def torque_sent(self) -> Array:
         """Target torque of the newest cycle (n,) [N·m]."""
-        ...
 
     @property
     def stats(self) -> Stats:
         """Counters since the first cycle."""
-        ...
 
     def __enter__(self) -> Self: ...
 
@@ -54,48 +50,38 @@ class ArmDriver(Protocol):
 
     def scan(self) -> list[DriveIdentity]:
         """Identity and state of each joint's controller."""
-        ...
 
     def start(self) -> None:
         """Check and set up the controllers and start them; raises Refused, BusFault, BadInput."""
-        ...
 
     def enable(self) -> Sample:
         """Enable every joint under position control where it stands; raises BusFault."""
-        ...
 
     def recover(self) -> Sample:
         """Enable again after a Stall; raises BusFault."""
-        ...
 
     def disable(self) -> None:
         """Take the power from every joint; raises BusFault."""
-        ...
 
     def park(self) -> None:
         """Stow the arm in the pose `link.park` of its file and take the power there; raises BadInput, Refused."""
-        ...
 
     def stop(self) -> None: ...
 
     def cycle(self, command: Command) -> Sample:
         """The sample of a cycle in which this command was in force; raises Refused, Crossed, BusFault."""
-        ...
 
     def play(self, setpoints: Setpoints) -> Samples:
         """One row a cycle, sent ahead, and the sample of each; raises as cycle.
 
         Closing the iterator early stops there.
         """
-        ...
 
     def run(self, controller: Controller) -> Samples:
         """A controller in the process that makes the cycles, until the iterator is closed; raises as cycle."""
-        ...
 
     def catch_up(self) -> None:
         """Forget samples of cycles that were made while the job did something else."""
-        ...
 
     def inside(self, function: Callable[Concatenate[Any, Tell, P], R], tell: Tell, *args: P.args, **kw: P.kwargs) -> R:
         """Call `function(link, tell, ...)` in the process that makes the cycles, which it then makes itself.
@@ -103,25 +89,19 @@ class ArmDriver(Protocol):
         Function, arguments and answer must be picklable. `tell` is called in this process; if this process ends, the
         function's call of it raises.
         """
-        ...
 
     def read_calibration(self, joint: int) -> Calibration:
         """The torque sensor record that joint 0 … n−1 works with; raises BusFault."""
-        ...
 
     def drive_serial(self, joint: int) -> DriveSerial:
         """Serial number of the drive of joint 0 … n−1; raises BusFault."""
-        ...
 
     @property
     def uncalibrated(self) -> tuple[str, ...]:
         """Joints whose calibration the host is to keep and that have no record in force."""
-        ...
 
     def read_temperatures(self) -> Array:
         """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
-        ...
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
         """Make a calibration active in joint 0 … n−1 (`store`: in flash too); raises BadInput, BusFault."""
-        ...

@@ -17,7 +17,7 @@ GRACE = 2.0
 SILENT_END = 10.0
 """A process that says nothing for this long while it brings its arm to the end hangs [s]."""
 TOLD_EVERY = 0.2
-"""[s]."""
+"""Job and loop hear from each other at least so often [s]."""
 OF_A_SERVICE = (signal.SIGTERM, signal.SIGABRT)
 """systemd sends them to every process of a unit: at its stop, and where its watchdog has run out."""
 OF_ITS_OWN = (

@@ -42,8 +42,6 @@ class Play:
 
 @dataclass(frozen=True)
 class RunController:
-    """A controller to run."""
-
     id: int
     controller: bytes
     """A pickled Controller: what it imports may take longer than a cycle, so that the loop unpickles it beside them."""

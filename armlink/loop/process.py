@@ -208,7 +208,6 @@ class DriveLoop:
             self._source = None
 
     def _hold_here(self) -> None:
-        """Every joint under position control where it stands."""
         self._chunks.clear()
         self._source, self._controlled, self._unpickled = None, False, None
         self._last = Command.hold(self._link.latest_position)

@@ -61,7 +61,6 @@ class CycleStats:
         self._bits = self._whole = self._missed = self._cycles = 0
 
     def take(self, stamp: float, can_id: int, data: bytes) -> None:
-        """Count a frame received at `stamp` [s]."""
         if self._first == self._first:  # frames before the first SYNC belong to no whole cycle
             self._bits += frame_bits(can_id, data)
         if self._begins is None and can_id in self._commands:

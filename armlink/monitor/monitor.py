@@ -11,14 +11,11 @@ from armlink.bus.can_bus import MessageBus
 from armlink.bus.message_port import as_frame, is_data
 from armlink.bus.port import Port
 from armlink.bus.taps import TappedBus, TappedPort
-from armlink.clock import Clock, MonotonicClock
 from armlink.drives.board import NO_STATUS
 from armlink.errors import BadInput
-from armlink.link.cyclic_exchange import Loop
-from armlink.link.joints.foreign_host import ForeignHost
-from armlink.link.joints.groups import by_joint, make_groups
-from armlink.link.joints.values import values_of
+from armlink.link.joints.groups import by_joint
 from armlink.link.joints.whole_turns import PlaceWatch
+from armlink.link.listener import HeardArm
 from armlink.link.types import Sample
 from armlink.monitor.cycle_stats import CycleStats
 
@@ -34,31 +31,23 @@ class View:
     """Share of the bus time taken by the frames received and sent."""
 
 
-class Monitor:
+class Monitor(HeardArm):
     """Listens to an arm's joints. With `sync` it acts as host where the family has frames that only make drives send
     readings (CANopen: NMT start and SYNC)."""
 
     def __init__(self, arm: ArmFile, bus: MessageBus, sync: bool = False, stats: bool = False) -> None:
         """`stats`: also measure the cycle from the timestamp of every frame, which takes more CPU time."""
-        self.section = section = arm.require_link()
-        self.names = tuple(joint.name for joint in section.joints)
-        self._groups = make_groups(arm, bus)
-        self._families = [joint.settings.family for joint in section.joints]
-        values = values_of(arm, self._groups)
-        self.clock: Clock = bus.clock or MonotonicClock()
-        self._sync, self._period = sync, 1.0 / section.rate
+        super().__init__(arm, bus)
+        self._sync = sync
         self.cycle_stats: CycleStats | None = None
         """Statistics of the cycle; None unless requested."""
         if stats:
-            self.cycle_stats = CycleStats(self._groups, self._period, section.bus.bitrate)
-        lock_step = bus.clock is not None
-        self._loop = Loop(self._open_port(bus), self.clock, self._groups, values, self._period, lock_step)
-        self._loop.on_unknown = self._count
-        self._host = ForeignHost(self._groups, values)
-        self._places = PlaceWatch(arm, values, tell=lambda text: None)  # `describe` does
+            self.cycle_stats = CycleStats(self.groups, self.period, self.section.bus.bitrate)
+        self.listen_on(self._open_port(bus), self._count)
+        self._places = PlaceWatch(arm, self.values, tell=lambda text: None)  # `describe` does
         self._syncs = 0
         if sync:
-            silent = [group.family.name for group in self._groups if not group.drives.poll(first=False)]
+            silent = [group.family.name for group in self.groups if not group.drives.poll(first=False)]
             if silent:
                 raise BadInput(
                     f"monitor --sync: drives of the family {silent[0]} send readings only in answer to commands"
@@ -66,7 +55,7 @@ class Monitor:
             self._poll(first=True)
 
     def _poll(self, first: bool) -> None:
-        for group in self._groups:
+        for group in self.groups:
             for can_id, data in group.drives.poll(first):
                 self._loop.send(can_id | group.tag, data)
 
@@ -113,11 +102,11 @@ class Monitor:
     def _joint(self, sample: Sample, joint: int) -> dict[str, Any]:
         sends = math.isfinite(sample.position[joint])
         status = int(sample.status[joint])
-        group, _ = by_joint(self._groups)[joint]
+        group, _ = by_joint(self.groups)[joint]
         misplaced = self._places.found.get(joint)
         return {
             "joint": self.names[joint],
-            "family": self._families[joint],
+            "family": group.family.name,
             "position": float(sample.position[joint]),
             "velocity": float(sample.velocity[joint]),
             "torque": float(sample.torque[joint]),
@@ -130,12 +119,12 @@ class Monitor:
 
     def _send_syncs(self, seconds: float) -> Sample:
         self._loop.drain()
-        count = max(1, round(seconds / self._period))
+        count = max(1, round(seconds / self.period))
         start = self.clock.now()
         for cycle in range(count):
             self._poll(first=False)
             self._syncs += 1
-            end = start + (cycle + 1) * self._period
+            end = start + (cycle + 1) * self.period
             while (remaining := end - self.clock.now()) > 0:
                 self._loop.receive(remaining)
             while self._loop.receive(0.0):

@@ -92,13 +92,12 @@ WITHOUT_GRAVITY = "without-gravity"
 
 
 def parse_corrections(
-    *,
-    columns: Sequence[str] = (),
+    columns: Sequence[str] | None = None,
     header: str = "",
-    sign: Sequence[str] = (),
-    units: Sequence[str] = (),
-    zero: Sequence[str] = (),
-    clock: Sequence[str] = (),
+    sign: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    zero: Sequence[str] | None = None,
+    clock: Sequence[str] | None = None,
     effort: str = "",
     joints: str = "",
     topic: str = "",
@@ -142,10 +141,10 @@ def _header(text: str) -> tuple[str, ...]:
     return tuple("" if name == "-" else name for name in names)
 
 
-def _pairs(option: str, texts: Sequence[str]) -> list[tuple[str, str]]:
+def _pairs(option: str, texts: Sequence[str] | None) -> list[tuple[str, str]]:
     """`COLUMN=VALUE` pairs of an option that may be repeated and may hold several, separated by commas."""
     found = []
-    for text in (part for whole in texts for part in whole.split(",")):
+    for text in (part for whole in texts or () for part in whole.split(",")):
         column, equals, value = text.strip().partition("=")
         if not equals or not column.strip() or not value.strip():
             raise BadInput(f"{option} {text.strip()}: expected COLUMN=VALUE")

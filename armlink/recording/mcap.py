@@ -13,7 +13,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
-import numpy as np
 from lz4.frame import LZ4FrameDecompressor
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
@@ -26,23 +25,22 @@ from zstandard import ZstdDecompressor, ZstdError
 from armlink.arrays import Array
 from armlink.content.atomic_file import open_whole
 from armlink.errors import BadInput
-from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
-from armlink.recording.recording import MOST_BYTES, MOST_JOINTS, Recording, require_size
-from armlink.recording.ros_joint_state import SCHEMA, SCHEMA_NAME, JointState, JointStateDecoder, joint_state_encoder
+from armlink.recording.joint_messages import (
+    STATES,
+    TOPICS,
+    JointMessage,
+    Lists,
+    left_out,
+    main_joints,
+    recording_of_messages,
+)
+from armlink.recording.recording import MOST_BYTES, Recording, require_size
+from armlink.recording.ros_joint_state import NANO, SCHEMA, SCHEMA_NAME, JointStateDecoder, joint_state_encoder
 
-Lists = tuple[str | None, str | None, str | None]
-"""Channels carried as position, velocity and effort."""
-TOPICS: dict[str, Lists] = {
-    "/joint_states": ("position", "velocity", "torque"),
-    "/motor_states": (None, None, "motor_torque"),
-    "/joint_commands": ("position_command", None, "torque_command"),
-    "/joint_temperatures": (None, None, "temperature"),
-}
 FLUSH_SECONDS = 0.5
 """Interval of flushes: a killed recorder loses at most this and what the operating system had not written."""
 MOST_CHUNK = 1 << 28
 """A chunk that unpacks to more bytes is refused; rosbag2 writes less than a thousandth of it."""
-_NANO = 1_000_000_000
 DAMAGED = (McapError, ValueError, OverflowError, OSError, struct.error, ZstdError)
 """Raised by the reading of a damaged file."""
 
@@ -68,14 +66,13 @@ class RecordingWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Complete the file with index and footer."""
         self._writer.finish()
         if self._own:
             self._stream.close()
 
     def append(self, t: float, channels: Mapping[str, Array]) -> None:
         """Add one row at time `t` [s]: channel names of Recording → (n,) values; absent channels are not written."""
-        stamp = round(t * _NANO)
+        stamp = round(t * NANO)
         for topic, of_topic in self._topics.items():
             lists = tuple(name is not None and name in channels for name in of_topic)
             if not any(lists):
@@ -85,7 +82,7 @@ class RecordingWriter:
                 encode = self._encoders[lists] = joint_state_encoder(self._names, lists)  # type: ignore[arg-type,index]
             numbers = [x for name in of_topic if name is not None and name in channels for x in channels[name].tolist()]
             self._writer.add_message(self._channel(topic), stamp, encode(stamp, numbers), stamp)
-        if stamp - self._flushed > FLUSH_SECONDS * _NANO:
+        if stamp - self._flushed > FLUSH_SECONDS * NANO:
             self._writer.flush()
             self._flushed = stamp
 
@@ -106,30 +103,17 @@ def save_mcap(recording: Recording, path: Path) -> None:
 def load_mcap(path: Path) -> Recording:
     """Load a recording or a ROS 2 bag in MCAP; a truncated file loads as far as it goes, noted in `warning`.
 
-    Time is that of `/joint_states` from its first message; other topics' messages go to the row nearest in time, if
-    nearer than half the median period, and are NaN elsewhere. Joints are those of the most frequent `/joint_states`
-    message.
+    Time is that of `/joint_states`, joints are those of its most frequent message.
     """
     messages, cut = _read(path)
-    states = messages.pop("/joint_states", [])
+    states = messages.pop(STATES, [])
     if not states:
-        raise BadInput(f"{path}: no {SCHEMA_NAME} on /joint_states{f'; {cut}' if cut else ''}")
-    stamps = np.array([state.stamp for state in states], dtype=np.int64)
-    names, alone = main_joints([state.names for state in states])
+        raise BadInput(f"{path}: no {SCHEMA_NAME} on {STATES}{f'; {cut}' if cut else ''}")
+    names, alone = main_joints(states)
     if alone:
         cut = "; ".join(filter(None, (cut, left_out(alone))))
         states = [state for state in states if set(names) <= set(state.names)]
-        stamps = np.array([state.stamp for state in states], dtype=np.int64)
-    if len(names) > MOST_JOINTS:
-        raise BadInput(f"{path}: {len(names)} joints in /joint_states, expected at most {MOST_JOINTS}")
-    channels = _channels_of("/joint_states", states, names, str(path))
-    for topic, others in messages.items():
-        times = np.array([state.stamp for state in others], dtype=np.int64)
-        for name, values in _channels_of(topic, others, names, str(path)).items():
-            channels[name] = nearest_rows(values, times, stamps)
-    if "position" not in channels:
-        raise BadInput(f"{path}: /joint_states carry no position")
-    return Recording(t=(stamps - stamps[0]) / _NANO, names=names, warning=cut, **channels)
+    return recording_of_messages(states, list(messages.values()), names, str(path), cut)
 
 
 def has_our_topics(path: Path) -> bool:
@@ -146,12 +130,12 @@ def has_our_topics(path: Path) -> bool:
         for channel in summary.channels.values()
         if channel.schema_id in summary.schemas
     }
-    return "/joint_states" in kinds and all(kinds.get(topic, SCHEMA_NAME) == SCHEMA_NAME for topic in TOPICS)
+    return STATES in kinds and all(kinds.get(topic, SCHEMA_NAME) == SCHEMA_NAME for topic in TOPICS)
 
 
-def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
+def _read(path: Path) -> tuple[dict[str, list[JointMessage]], str]:
     """Messages by topic in the order of the file, and a warning if the file is truncated."""
-    found: dict[str, list[JointState]] = defaultdict(list)
+    found: dict[str, list[JointMessage]] = defaultdict(list)
     topics: dict[int, str] = {}
     schemas: dict[int, Schema] = {}
     decode = JointStateDecoder()
@@ -162,7 +146,10 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
                 if isinstance(record, Message) and record.channel_id in topics:
                     size += len(record.data)
                     require_size(size, str(path))
-                    found[topics[record.channel_id]].append(decode(record.data))
+                    topic = topics[record.channel_id]
+                    stamp, of, *lists = decode(record.data)
+                    carried = {name: values for name, values in zip(TOPICS[topic], lists, strict=True) if name}
+                    found[topic].append(JointMessage(stamp, of, carried))
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel) and record.topic in TOPICS:
@@ -178,7 +165,7 @@ def _read(path: Path) -> tuple[dict[str, list[JointState]], str]:
         position = stream.tell()
     if complete:
         return found, ""
-    rows = len(found.get("/joint_states", []))
+    rows = len(found.get(STATES, []))
     return found, f"cut recording, {why}: loaded {rows} rows, up to about byte {position}"
 
 
@@ -226,31 +213,3 @@ def _check_schema(channel: Channel, schemas: dict[int, Schema], path: Path) -> N
     if kind != SCHEMA_NAME or channel.message_encoding != MessageEncoding.CDR:
         encoding = channel.message_encoding
         raise BadInput(f"{path}: {channel.topic} carries {kind} as {encoding}, expected {SCHEMA_NAME} as cdr")
-
-
-def _channels_of(topic: str, states: list[JointState], names: tuple[str, ...], source: str) -> dict[str, Array]:
-    """The topic's channels (K, n) in the order of `names`; NaN for joints that a message omits."""
-    channels: dict[str, Array] = {}
-    for field, name in zip(("position", "velocity", "effort"), TOPICS[topic], strict=True):
-        if name is None or not any(getattr(state, field) for state in states):
-            continue
-        rows = np.full((len(states), len(names)), np.nan)
-        orders: dict[tuple[str, ...], tuple[list[int], list[int]]] = {}
-        for row, state in enumerate(states):
-            values = getattr(state, field)
-            if not values:
-                continue
-            if len(values) != len(state.names):
-                found = f"{len(values)} values of {field} for {len(state.names)} names"
-                raise BadInput(f"{source}: {topic} message {row + 1}: {found}")
-            if state.names not in orders:
-                orders[state.names] = _order(state.names, names)
-            into, of = orders[state.names]
-            rows[row, into] = np.array(values)[of]
-        channels[name] = rows
-    return channels
-
-
-def _order(message: tuple[str, ...], names: tuple[str, ...]) -> tuple[list[int], list[int]]:
-    both = [name for name in names if name in message]
-    return [names.index(name) for name in both], [message.index(name) for name in both]

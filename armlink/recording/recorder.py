@@ -5,33 +5,23 @@ from collections.abc import Callable, Iterator
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.can_bus import CanBus, TimedBus
-from armlink.clock import Clock, MonotonicClock
-from armlink.link.cyclic_exchange import Loop
-from armlink.link.joints.foreign_host import ForeignHost
-from armlink.link.joints.groups import make_groups
-from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import PlaceWatch
+from armlink.link.listener import HeardArm
 
 WAIT_SECONDS = 0.1
 Row = tuple[float, dict[str, Array]]
 
 
-class Recorder:
+class Recorder(HeardArm):
     """Iterates over rows: time since the first SYNC [s] and channels of Recording, NaN if nothing was received."""
 
     def __init__(self, arm: ArmFile, bus: CanBus) -> None:
         """Listen to `bus`; times are the frames' own timestamps if the bus has them, else when frames were read."""
-        section = arm.require_link()
-        self.names = tuple(joint.name for joint in section.joints)
-        self.clock: Clock = bus.clock or MonotonicClock()
+        super().__init__(arm, bus)
         self._timed = bus if isinstance(bus, TimedBus) else None
         self._stamp: Callable[[], float] = self._timed.stamp if self._timed else self.clock.now
-        groups = make_groups(arm, bus)
-        values, lock_step = values_of(arm, groups), bus.clock is not None
-        self._loop = Loop(bus.open_port(), self.clock, groups, values, 1.0 / section.rate, lock_step)
-        self._loop.on_unknown = self._take
-        self._host = ForeignHost(groups, values, forgets=True)
-        self.places = PlaceWatch(arm, values)
+        self.listen_on(bus.open_port(), self._take, forgets=True)
+        self.places = PlaceWatch(arm, self.values)
         """Joints that cannot stand where they read."""
         self._start: float | None = None
         self._sync: float | None = None

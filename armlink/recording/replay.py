@@ -13,7 +13,6 @@ from armlink.bus.frame_log import READ_SUFFIXES, LogBus, LogReader, is_log
 from armlink.bus.open import is_virtual, open_bus, parse_bus
 from armlink.bus.port import Port, Stamped
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.family import Replays
 from armlink.drives.orders import Reading
 from armlink.errors import BadInput
 from armlink.link.joints.groups import make_groups
@@ -100,8 +99,7 @@ def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]
         raise BadInput(f"recording of {recording.n} joints, but {arm.name} has {len(joints)}")
     groups = make_groups(arm)
     for group in groups:
-        if not isinstance(group.drives, Replays):
-            raise BadInput(f"replay: drives of the family {group.family.name} cannot be replayed onto a bus")
+        group.drives.replayed(True, [])  # drives that cannot be replayed say so before anything is sent
     nothing = np.full_like(recording.position, math.nan)
     torque = nothing if recording.torque is None else recording.torque
     motor = nothing if recording.motor_torque is None else recording.motor_torque
@@ -113,7 +111,6 @@ def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]
                 Reading(joint, *[float(column[place]) for column in columns])  # type: ignore[arg-type]
                 for joint, place in enumerate(group.places)
             ]
-            assert isinstance(group.drives, Replays)
             for can_id, data in group.drives.replayed(row == 0, readings):
                 yield t, can_id, data
 

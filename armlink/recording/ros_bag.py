@@ -7,8 +7,7 @@ types.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +15,21 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from armlink.arrays import Array
 from armlink.errors import ArmlinkError, BadInput
 from armlink.recording.bag_sizes import require_bag_sizes
-from armlink.recording.joint_messages import left_out, main_joints, nearest_rows
-from armlink.recording.recording import MOST_JOINTS, Recording, require_size
+from armlink.recording.joint_messages import (
+    STATES,
+    TOPICS,
+    JointMessage,
+    left_out,
+    main_joints,
+    recording_of_messages,
+)
+from armlink.recording.recording import Recording, require_size
+from armlink.recording.ros_joint_state import NANO
 
-TOPICS = {"/motor_states": "motor_torque", "/joint_commands": "torque_command", "/joint_temperatures": "temperature"}
-"""Topics beside the states → channel that their efforts hold."""
-_NANO = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class BagMessage:
-    """One message: its stamp [ns], joint names, and the channels that it carries."""
-
-    stamp: int
-    names: tuple[str, ...]
-    channels: Mapping[str, Sequence[float]]
+BESIDES = TOPICS.keys() - {STATES}
+"""Topics beside the states."""
 
 
 def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
@@ -52,9 +48,9 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
         with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             readable = [c for c in reader.connections if isinstance(c.topic, str) and _short(c.msgtype) in _READERS]
             states = _state_connections(readable, topic, reader.connections, path)
-            samples: dict[str, list[BagMessage]] = defaultdict(list)
+            samples: dict[str, list[JointMessage]] = defaultdict(list)
             size = 0
-            wanted = [*states, *(c for c in readable if c.topic in TOPICS and c not in states)]
+            wanted = [*states, *(c for c in readable if c.topic in BESIDES and c not in states)]
             for connection, receipt, raw in reader.messages(connections=wanted):
                 size += len(raw)
                 require_size(size, str(path))
@@ -67,16 +63,20 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
     main = samples.pop(states[0].topic, [])
     if not main:
         raise BadInput(f"{path}: topic {states[0].topic} holds no message")
-    return _recording(main, samples, str(path))
+    names, alone = main_joints(main)
+    by_stamp = {each.stamp: each for each in reversed(main) if set(names) <= set(each.names)}
+    main = [by_stamp[stamp] for stamp in sorted(by_stamp)]
+    others = [[_besides(topic, each) for each in messages] for topic, messages in samples.items()]
+    return recording_of_messages(main, others, names, str(path), left_out(alone))
 
 
 def _state_connections(readable: Sequence[Any], topic: str, all_of_them: Iterable[Any], path: Path) -> list[Any]:
     """Connections of the topic that holds the joint states."""
-    topics = sorted({c.topic for c in readable if c.topic not in TOPICS})
+    topics = sorted({c.topic for c in readable if c.topic not in BESIDES})
     if topic and topic not in topics:
         known = ", ".join(topics) or ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in all_of_them})) or "nothing"
         raise BadInput(f"{path}: no joint states on --topic {topic}: the bag has {known}")
-    chosen = topic or ("/joint_states" if "/joint_states" in topics else topics[0] if len(topics) == 1 else "")
+    chosen = topic or (STATES if STATES in topics else topics[0] if len(topics) == 1 else "")
     if not topics:
         there = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in all_of_them})) or "nothing"
         raise BadInput(f"{path}: no sensor_msgs/msg/JointState on /joint_states or another topic: the bag has {there}")
@@ -85,56 +85,25 @@ def _state_connections(readable: Sequence[Any], topic: str, all_of_them: Iterabl
     return [c for c in readable if c.topic == chosen]
 
 
-def _recording(main: list[BagMessage], others: dict[str, list[BagMessage]], source: str) -> Recording:
-    names, alone = main_joints([sample.names for sample in main])
-    if len(names) > MOST_JOINTS:
-        raise BadInput(f"{source}: {len(names)} joints in the joint states, expected at most {MOST_JOINTS}")
-    main = sorted((s for s in main if set(names) <= set(s.names)), key=lambda s: s.stamp)
-    stamps, rows = np.unique(np.array([s.stamp for s in main], dtype=np.int64), return_index=True)
-    main = [main[row] for row in rows]
-    channels = _channels(main, names, source)
-    for topic, samples in others.items():
-        values = _channels(samples, names, source)
-        times = np.array([s.stamp for s in samples], dtype=np.int64)
-        effort = values.pop("torque", None)
-        if effort is not None:
-            channels[TOPICS[topic]] = nearest_rows(effort, times, stamps)
-        if topic == "/joint_commands" and "position" in values:
-            channels["position_command"] = nearest_rows(values["position"], times, stamps)
-    if "position" not in channels:
-        raise BadInput(f"{source}: the joint states carry no position")
-    return Recording(t=(stamps - stamps[0]) / _NANO, names=names, warning=left_out(alone), **channels)
-
-
-def _channels(samples: list[BagMessage], names: tuple[str, ...], source: str) -> dict[str, Array]:
-    """Channels of some samples (K, n) in the order of `names`, NaN for joints that a message lacks."""
-    found: dict[str, Array] = {}
-    for row, sample in enumerate(samples):
-        for channel, values in sample.channels.items():
-            if not len(values):
-                continue
-            if len(values) != len(sample.names):
-                raise BadInput(
-                    f"{source}: message {row + 1}: {len(values)} {channel} values of {len(sample.names)} joints"
-                )
-            table = found.setdefault(channel, np.full((len(samples), len(names)), np.nan))
-            place = {name: i for i, name in enumerate(sample.names)}
-            table[row] = [values[place[name]] if name in place else np.nan for name in names]
-    return found
+def _besides(topic: str, message: JointMessage) -> JointMessage:
+    """A message of a topic beside the states, with the channels that its lists stand for there."""
+    pairs = zip(TOPICS[STATES], TOPICS[topic], strict=True)
+    carried = {there: message.channels[name] for name, there in pairs if name and there and name in message.channels}
+    return message._replace(channels=carried)
 
 
 def _stamp(message: Any, receipt: int) -> int:
     """Stamp of the header, or the time of receipt where a driver leaves it empty [ns]."""
-    stamp = int(message.header.stamp.sec) * _NANO + int(message.header.stamp.nanosec)
+    stamp = int(message.header.stamp.sec) * NANO + int(message.header.stamp.nanosec)
     return stamp or receipt
 
 
-def _joint_state(message: Any, receipt: int) -> BagMessage:
+def _joint_state(message: Any, receipt: int) -> JointMessage:
     channels = {"position": message.position, "velocity": message.velocity, "torque": message.effort}
-    return BagMessage(_stamp(message, receipt), tuple(message.name), channels)
+    return JointMessage(_stamp(message, receipt), tuple(message.name), channels)
 
 
-def _controller_state(message: Any, receipt: int) -> BagMessage:
+def _controller_state(message: Any, receipt: int) -> JointMessage:
     measured = getattr(message, "feedback", None) or message.actual
     wanted = getattr(message, "reference", None) or message.desired
     channels = {
@@ -143,10 +112,10 @@ def _controller_state(message: Any, receipt: int) -> BagMessage:
         "torque": measured.effort,
         "position_command": wanted.positions,
     }
-    return BagMessage(_stamp(message, receipt), tuple(message.joint_names), channels)
+    return JointMessage(_stamp(message, receipt), tuple(message.joint_names), channels)
 
 
-def _dynamic_state(message: Any, receipt: int) -> BagMessage:
+def _dynamic_state(message: Any, receipt: int) -> JointMessage:
     kinds = {"position": "position", "velocity": "velocity", "torque": "effort"}
     rows = [dict(zip(v.interface_names, v.values, strict=False)) for v in message.interface_values]
     channels = {
@@ -154,14 +123,14 @@ def _dynamic_state(message: Any, receipt: int) -> BagMessage:
         for channel, kind in kinds.items()
         if any(kind in row for row in rows)
     }
-    return BagMessage(_stamp(message, receipt), tuple(message.joint_names), channels)
+    return JointMessage(_stamp(message, receipt), tuple(message.joint_names), channels)
 
 
 def _short(kind: str) -> str:
     return kind.rpartition("/")[2]
 
 
-_READERS: dict[str, Callable[[Any, int], BagMessage]] = {
+_READERS: dict[str, Callable[[Any, int], JointMessage]] = {
     "JointState": _joint_state,
     "JointTrajectoryControllerState": _controller_state,
     "DynamicJointState": _dynamic_state,

@@ -26,7 +26,7 @@ LITTLE_ENDIAN = b"\0\1\0\0"
 """Encapsulation of a message in this order of bytes."""
 _HEADER = 4  # encapsulation; alignment counts from its end
 _STAMPED = 12  # encapsulation and stamp
-_NANO = 1_000_000_000
+NANO = 1_000_000_000
 
 
 class JointState(NamedTuple):
@@ -50,7 +50,7 @@ def _decoded(data: bytes) -> tuple[JointState, str]:
         raise ValueError(f"not a JointState message: {error}") from None
     stamp = message.header.stamp
     lists = (tuple(values.tolist()) for values in (message.position, message.velocity, message.effort))
-    return JointState(stamp.sec * _NANO + stamp.nanosec, tuple(message.name), *lists), message.header.frame_id
+    return JointState(stamp.sec * NANO + stamp.nanosec, tuple(message.name), *lists), message.header.frame_id
 
 
 @cache
@@ -85,7 +85,7 @@ class JointStateDecoder:
                     lists.append(tuple(values[at + 1 : at + 1 + count]))
                     at += 1 + count
                 else:
-                    return JointState(seconds * _NANO + nanoseconds, names, *lists)
+                    return JointState(seconds * NANO + nanoseconds, names, *lists)
         state, frame = _decoded(data)
         self._learn(data, state, frame)
         return state
@@ -126,7 +126,7 @@ def joint_state_encoder(
             taken += count
         if taken != len(numbers):
             raise ValueError(f"{len(numbers)} numbers for {sum(counts)} of {n} joints")
-        return stamped.pack(LITTLE_ENDIAN, *divmod(stamp, _NANO)) + rest + body.pack(*values)
+        return stamped.pack(LITTLE_ENDIAN, *divmod(stamp, NANO)) + rest + body.pack(*values)
 
     return encode
 

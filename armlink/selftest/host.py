@@ -18,8 +18,8 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.bus.port import Frame
 from armlink.clock import Clock, MonotonicClock
-from armlink.drives.base import BasicDrives
-from armlink.drives.family import Ask, Family
+from armlink.drives.base import Ask, BasicDrives, DriveMemory
+from armlink.drives.family import Family
 from armlink.drives.orders import Limits, Mode, Order, Power, Reading, Setup
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
@@ -27,9 +27,9 @@ from armlink.errors import BusFault
 from armlink.link.cycle import Commander
 from armlink.link.cyclic_exchange import Loop
 from armlink.link.gate import start_from
-from armlink.link.gate_limits import drive_limits, gate_limits, joint_ranges, target_window
+from armlink.link.gate_limits import arm_limits, gate_limits, joint_ranges
 from armlink.link.joints.ask import LinkAsk
-from armlink.link.joints.groups import Group, Mounting
+from armlink.link.joints.groups import Group
 from armlink.link.joints.values import JointValues
 from armlink.link.lateness import Lateness
 from armlink.link.types import Command
@@ -68,7 +68,7 @@ class HostReport:
         return next((rate for rate in RATES if late <= HELD / rate and self.busy <= HELD / rate), 0.0)
 
 
-class EchoDrives(BasicDrives):
+class EchoDrives(BasicDrives[DriveMemory]):
     """Drives of no real family, which answer each command at once, standing still: what is measured is the host."""
 
     def routes(self) -> dict[int, int]:
@@ -84,17 +84,11 @@ class EchoDrives(BasicDrives):
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
         return [(1 + joint, _VALUES.pack(order.position, order.torque)) for joint, order in enumerate(orders) if order]
 
-    def sent(self, joint: int) -> Order | None:
-        return None
-
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         if can_id >= STOPPED:
             return self.note(Reading(can_id - STOPPED, power=Power.STOPPED))
         position, torque = _VALUES.unpack(data)
         return Reading(can_id - _ANSWER, position, 0.0, torque)
-
-    def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        return None
 
 
 class EchoPort:
@@ -160,11 +154,9 @@ def echo_commander(arm: ArmFile, port: EchoPort, clock: Clock) -> Commander:
     n, period = len(section.joints), 1.0 / section.rate
     drives = EchoDrives(section.joints, _TRAITS)
     groups = (Group(Family("echo", _TRAITS, DriveSettings, lambda arm, joints: drives), drives, tuple(range(n)), 0),)
-    values = JointValues(Mounting.of(arm), np.zeros(n, bool))
+    values = JointValues(arm, np.zeros(n, bool))
     loop = Loop(port, clock, groups, values, period, lock_step=False)
-    windows = [target_window(*limits) for limits in joint_ranges(arm)]
-    pairs = zip(section.joints, windows, strict=True)
-    limits = [drive_limits(joint, window, period, section.deadline) for joint, window in pairs]
+    limits = arm_limits(section, joint_ranges(arm))
     commander = Commander(loop, clock, arm.joint_names, period, np.inf, lock_step=False)
     setups = drives.set_up(LinkAsk(loop, clock, lambda done, timeout: False), limits)
     gates = [gate_limits(limit) for limit in limits]

@@ -1,12 +1,11 @@
 """Motion for the judgement of an arm's scales: readings while a hand, this host or another one moves the arm."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 
-from armlink.drives.family import TellsCurrent
 from armlink.drives.orders import Order, Power
 from armlink.errors import BusFault
 from armlink.link.faults import bus_fault
@@ -144,13 +143,9 @@ def _ways(source: Link | Listener) -> list[float]:
 
 
 def _currents(link: Link, joint: int) -> list[tuple[float, float]]:
-    """Torque as reported and by current, a few times; of a drive that tells its current."""
+    """Torque as reported and by current, a few times; nothing of a drive that does not tell its current."""
     group, number = by_joint(link.groups)[joint]
-    drives = group.drives
-    if not isinstance(drives, TellsCurrent):
-        return []
-    ask: Callable[..., object] = link.ask.on(group.tag)
-    found = [drives.torque_by_current(number, ask) for _ in range(ASKED)]  # type: ignore[arg-type]
+    found = [group.drives.torque_by_current(number, link.ask.on(group.tag)) for _ in range(ASKED)]
     return [each for each in found if each is not None]
 
 

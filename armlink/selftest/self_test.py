@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from armlink.drives.findings import Outcome, Result
+from armlink.drives.findings import ANSWER_CYCLES, ANSWERED, HELD, PATIENCE, Checks, Result
 from armlink.drives.orders import Power
 from armlink.drives.traits import Silence
 from armlink.errors import ArmlinkError, BusFault, Refused
@@ -19,19 +19,11 @@ from armlink.link.park import falling, park, speeds, straight
 from armlink.link.types import Command, Sample, Tell
 
 CHECKS = ("set-up", "position", "answers", "enables and holds", "silence", "park")
-CYCLES = 50
-"""Cycles without power, to see whether each is answered."""
-ANSWERED = 0.9
-"""Share of them whose answer must come in its cycle; a busy host misses some."""
 HOLD_SECONDS = 0.5
-HELD = 0.05
-"""A joint that moves further than this while it should hold ends the test [rad]."""
 FELL = 0.5
 """A joint whose drive falls free may move this far in the test of its silence [rad]."""
 LEAN = 0.2
 """So far a joint is led to where gravity pulls at it, if its drive does not tell its state [rad], and within 2 s."""
-PATIENCE = 3.0
-"""So many deadlines are waited for a reaction."""
 KEEPS_ON = "nothing stops this joint when its host dies: do not drive it"
 ASKED_CYCLES = 5
 """Cycles that a drive has to tell its state when it is asked."""
@@ -43,13 +35,12 @@ def self_test(link: Link, tell: Tell, power: bool) -> tuple[list[Result], str]:
 
 
 class SelfTest:
-    """Runs the checks on an arm's drives; the link must not be started. Results gather in `results`."""
+    """Runs the checks on an arm's drives; the link must not be started."""
 
     def __init__(self, link: Link, progress: Callable[[str], None] = lambda text: None) -> None:
         """`progress` is told what is being done."""
         self.link, self.progress = link, progress
-        self.results: list[Result] = []
-        self._reached: set[tuple[str, str]] = set()
+        self.checks = Checks()
         self._parked = False
 
     def run(self, power: bool) -> list[Result]:
@@ -61,7 +52,7 @@ class SelfTest:
         own = link.groups[0].family.self_test if len(link.groups) == 1 else None
         if own is not None:
             link.correct_turns()
-            limits = [link.values.limits(joint, limit) for joint, limit in enumerate(link.wanted_limits())]
+            limits = [link.values.limits(joint, limit) for joint, limit in enumerate(link.limits)]
             return own(link, link.groups[0].drives, limits, power, self.progress)
         reason = "not asked for"
         try:
@@ -73,22 +64,16 @@ class SelfTest:
                 reason = self._watched() or self._with_power()
         except ArmlinkError as error:
             reason = str(error)
-            if self.results and all(each.outcome != "failed" for each in self.results):
-                self._add(link.names[0], "answers", "failed", reason)
+            if self.checks.results and not self.checks.failed:
+                self.checks.add(link.names[0], "answers", "failed", reason)
         finally:
             if link.enabled:
                 link.stop()
             elif link.commander.passed and not self._parked:
                 link.commander.stop()
-        for check in CHECKS:
-            for name in link.names:
-                if (name, check) not in self._reached:
-                    self._add(name, check, "not run", reason)
-        return self.results
-
-    def _add(self, joint: str, check: str, outcome: Outcome, found: str, seconds: float | None = None) -> None:
-        self._reached.add((joint, check))
-        self.results.append(Result(joint, check, outcome, found, seconds))
+        for name, check in self.checks.missing(CHECKS, link.names):
+            self.checks.add(name, check, "not run", reason)
+        return self.checks.results
 
     def _identified(self) -> bool:
         """Each drive answers and is the one that the arm file states."""
@@ -97,12 +82,12 @@ class SelfTest:
         for each in self.link.scan():
             name = self.link.names[each.joint]
             if not each.present:
-                self._add(name, "answers", "failed", f"no answer of {each.address}")
+                self.checks.add(name, "answers", "failed", f"no answer of {each.address}")
             elif each.mismatch:
-                self._add(name, "identity", "failed", each.mismatch)
+                self.checks.add(name, "identity", "failed", each.mismatch)
             else:
                 told = " ".join(part for part in (each.name, each.serial, each.firmware) if part)
-                self._add(name, "identity", "passed", told or each.address)
+                self.checks.add(name, "identity", "passed", told or each.address)
                 continue
             good = False
         return good
@@ -115,7 +100,7 @@ class SelfTest:
             link.start()
         except BusFault as error:
             who = next((name for name in link.names if str(error).startswith(name)), link.names[0])
-            self._add(who, "set-up", "failed", str(error))
+            self.checks.add(who, "set-up", "failed", str(error))
             return False
         except Refused as error:
             if not link.setups or not self._places():
@@ -124,24 +109,23 @@ class SelfTest:
             return False
         for name, setup in zip(link.names, link.setups, strict=True):
             scales = ", ".join(f"{what} {value:.6g}" for what, value in setup.scales.items())
-            self._add(name, "set-up", "passed", "; ".join((*setup.notes, scales)) or "read back")
+            self.checks.add(name, "set-up", "passed", "; ".join((*setup.notes, scales)) or "read back")
             for lost in setup.lost:
-                self._add(name, f"lacks: {lost.partition(':')[0]}", "absent", lost)
+                self.checks.add(name, f"lacks: {lost.partition(':')[0]}", "absent", lost)
         self._places()
         self._calibrations()
         came = np.zeros(link.n, int)
-        for _ in range(CYCLES):
+        for _ in range(ANSWER_CYCLES):
             came += np.isfinite(link.commander.stand([Power.OFF] * link.n).position)
         for joint, name in enumerate(link.names):
-            good = bool(came[joint] >= ANSWERED * CYCLES)
-            self._add(name, "answers", "passed" if good else "failed", f"{came[joint]} of {CYCLES} cycles answered")
-        return bool((came >= ANSWERED * CYCLES).all())
+            good = bool(came[joint] >= ANSWERED * ANSWER_CYCLES)
+            self.checks.judge(name, "answers", good, f"{came[joint]} of {ANSWER_CYCLES} cycles answered")
+        return bool((came >= ANSWERED * ANSWER_CYCLES).all())
 
     def _places(self) -> bool:
         """Whether each joint can stand where it reads; returns whether one cannot."""
         results = self.link.turns.results(self.link.set_up_positions)
-        for each in results:
-            self._add(each.joint, each.check, each.outcome, each.found)
+        self.checks.results += results
         return any(each.outcome == "failed" for each in results)
 
     def _calibrations(self) -> None:
@@ -152,17 +136,17 @@ class SelfTest:
                 continue
             held = link.read_calibration(joint)
             if name in link.uncalibrated:
-                self._add(name, "calibration", "absent", "no record in force: torque is as the drive reports it")
+                self.checks.add(name, "calibration", "absent", "no record in force: torque is as the drive reports it")
             else:
                 told = f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
-                self._add(name, "calibration", "passed", told)
+                self.checks.add(name, "calibration", "passed", told)
 
     def _watched(self) -> str:
         """Why the joints are not driven: a drive that is known to keep on when its host falls silent; else empty."""
-        for name, traits in zip(self.link.names, traits_of(self.link.groups), strict=True):
-            if traits.silence == "keeps on":
-                self._add(name, "silence", "failed", KEEPS_ON)
-        keeping = [each.joint for each in self.results if each.check == "silence"]
+        pairs = zip(self.link.names, traits_of(self.link.groups), strict=True)
+        keeping = [name for name, traits in pairs if traits.silence == "keeps on"]
+        for name in keeping:
+            self.checks.add(name, "silence", "failed", KEEPS_ON)
         return f"{keeping[0]} is not driven: it would keep on after its host died" if keeping else ""
 
     def _with_power(self) -> str:
@@ -179,7 +163,7 @@ class SelfTest:
         moved = np.abs(sample.position - standing)
         for joint, name in enumerate(link.names):
             found = f"moved by {moved[joint]:.4f} rad in {HOLD_SECONDS} s"
-            self._add(name, "enables and holds", "passed", found, seconds)
+            self.checks.add(name, "enables and holds", "passed", found, seconds)
         for joint in range(link.n):
             self._silence(joint)
         return self._park()
@@ -190,18 +174,18 @@ class SelfTest:
         letting_go = falling(link)
         if link.section.park is None and letting_go:
             for name in letting_go:
-                self._add(name, "park", "absent", "link.park: the arm is let down slowly when the work ends")
+                self.checks.add(name, "park", "absent", "link.park: the arm is let down slowly when the work ends")
         if link.section.park is None or not letting_go:
             return "every drive holds on its own" if not letting_go else "no link.park"
         start = link.clock.now()
         try:
             park(link, self.progress)
         except Refused as error:
-            self._add(link.names[0], "park", "failed", str(error))
+            self.checks.add(link.names[0], "park", "failed", str(error))
             return str(error)
         self._parked, seconds = True, link.clock.now() - start
         for name in link.names:
-            self._add(name, "park", "passed", "stowed, power off", seconds)
+            self.checks.add(name, "park", "passed", "stowed, power off", seconds)
         return ""
 
     def _silence(self, joint: int) -> None:
@@ -216,19 +200,19 @@ class SelfTest:
             found = (
                 "its drive reports no state, and the joint carries no load here: repeat this where gravity pulls at it"
             )
-            self._add(name, "silence", "not run", found)
+            self.checks.add(name, "silence", "not run", found)
             return
         told = f"{does} within {seconds * 1e3:.0f} ms without a command, by its trait it {trait}"
         if does == "keeps on":
             told += f": {KEEPS_ON}"
         good = does == trait or (does, trait) == ("holds", "damps")
-        self._add(name, "silence", "passed" if good else "failed", told, seconds)
+        self.checks.judge(name, "silence", good, told, seconds)
 
     def _lean(self, joint: int) -> None:
         """Lead a joint away from where it hangs, towards the middle of its way."""
         link = self.link
         start = np.array(link.commander.loop.latest_position)
-        goal, middle = start.copy(), sum(link.windows[joint]) / 2
+        goal, middle = start.copy(), (link.limits[joint].lower + link.limits[joint].upper) / 2
         goal[joint] += LEAN if middle > start[joint] else -LEAN
         for target in straight(start, goal, speeds(link, LEAN), link.period):
             link.cycle(Command.hold(target))

@@ -27,7 +27,6 @@ WORDS = (
 
 
 def obey(line: str, injector: Injector) -> None:
-    """Execute one line. Raises BadInput."""
     arm, (word, _, text) = injector.arm, line.strip().partition(" ")
     text = text.strip()
     if word == "effect":
@@ -107,7 +106,6 @@ class ControlPipe:
         return wrong
 
     def close(self) -> None:
-        """Close the pipe; remove it if it was created here."""
         os.close(self._file)
         if self._made:
             self.path.unlink(missing_ok=True)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from armlink.bus.port import ERROR
 from armlink.errors import BadInput
 from sim_bus.bus.fault_kinds import CANOPEN_FAULTS, Fault
 from sim_bus.drives.drive_faults import DRIVE_KINDS, FALSE_READINGS, QUANTITIES, FalseReadings
@@ -15,9 +16,8 @@ from sim_bus.node.node import Node
 from sim_bus.node.pdo import Frame, layout
 from sim_bus.simulated_arm import SERVICE, SimulatedArm
 
-ERROR_FLAG = 0x20000000
-"""Flag of an error frame, as in SocketCAN; the lower bits are the error class."""
 PROTOCOL_ERROR, BUS_OFF, RESTARTED = 0x08, 0x40, 0x100
+"""Classes of an error frame, as in SocketCAN."""
 ABORT_CODE, STORM_CODE = 0x08000022, 0x7305
 BABBLE = (0x001, bytes(8))
 TPDO1, SDO_ANSWER, SDO_REQUEST = 0x180, 0x580, 0x600
@@ -98,7 +98,6 @@ class Injector:
         self._carry()
 
     def advance(self, duration: float) -> None:
-        """Advance simulated time [s]."""
         self._begin()
         self.arm.advance(duration)
         for (fault, place), rate in self._on.items():
@@ -191,7 +190,7 @@ class Injector:
             return ()
         is_reading = place in self.arm.drive_at or can_id & SERVICE == TPDO1
         if self._strikes("frame.corrupt", place):
-            return ((ERROR_FLAG | PROTOCOL_ERROR, bytes(8)),)
+            return ((ERROR | PROTOCOL_ERROR, bytes(8)),)
         if is_reading and self._strikes("frame.short", place):
             return ((can_id, data[:3]),)
         if ("node.duplicate", place) in self._on:
@@ -226,4 +225,4 @@ class Injector:
         return share is not None and self._random.random() < share
 
     def _error(self, kind: int) -> None:
-        self.outbox.append((ERROR_FLAG | kind, bytes(8)))
+        self.outbox.append((ERROR | kind, bytes(8)))

@@ -37,8 +37,6 @@ CANOPEN_FAULTS = frozenset(("emcy.storm", "sdo.abort", "sdo.timeout"))
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault to inject."""
-
     id: str
     joint: str = ""
     value: float = math.nan
@@ -52,7 +50,6 @@ class Fault:
 
     @property
     def amount(self) -> float:
-        """The value, or the default of the kind."""
         return self.kind.default if math.isnan(self.value) else self.value
 
 

@@ -11,10 +11,10 @@ import can
 from armlink.arm_file import load_arm
 from armlink.bus.in_process import InProcessBus
 from armlink.bus.message_port import as_frame, as_message
-from armlink.bus.port import CLASSICAL, Frame
+from armlink.bus.port import CLASSICAL, ERROR, Frame
 from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BusFault
-from sim_bus.bus.fault_injector import BUS_OFF, ERROR_FLAG, HOST_REFUSES, Injector
+from sim_bus.bus.fault_injector import BUS_OFF, HOST_REFUSES, Injector
 from sim_bus.bus.fault_kinds import Fault, parse_fault
 from sim_bus.bus.wire_timing import TimedArm, TimedWire
 from sim_bus.simulated_arm import SimulatedArm
@@ -35,7 +35,6 @@ class SimulatedClock:
         return self._arm.time
 
     def sleep_until(self, instant: float) -> None:
-        """Advance simulated time to `instant` [s]; returns immediately if it is past."""
         with self._lock:
             if instant > self._arm.time + 1e-9:
                 self._bus.line.advance(instant - self._arm.time)
@@ -80,7 +79,6 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
 
     @property
     def dropped(self) -> int:
-        """Frames lost because they were not taken in time."""
         return self._injector.dropped if self._injector else 0
 
     def inject(self, fault: Fault | str) -> None:
@@ -122,7 +120,7 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
         """As recv, without a message object; counts error frames. Raises BusFault for bus-off."""
         while True:
             frame = self._next(timeout)
-            if frame is None or not frame[0] & ERROR_FLAG:
+            if frame is None or not frame[0] & ERROR:
                 return frame
             self.errors += 1
             if frame[0] & BUS_OFF:

@@ -3,12 +3,12 @@
 import math
 from collections.abc import Callable
 
-from armlink.bus.port import EXTENDED, REMOTE
-from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, pack_reply
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.drives.cubemars.frames import CubeMarsReply, pack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
-from armlink.drives.mit_packing import Ranges, Special, special_of, unpack_command
+from armlink.drives.mit_packing import Grid, Special, grid_of, special_of, unpack_command
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, NO_COMMAND, WrappingDrive
 
 LOOP_RATE = 40_000.0
 """Cycles of the drive's loop a second: those of the open firmware that it descends from, bgkatz/motorcontrol."""
@@ -17,25 +17,31 @@ ZEROING = 1.0
 """After its zero was set a drive answers nothing for so long [s]."""
 
 
-class CubeMarsDrive(SimulatedDrive):
+class CubeMarsDrive(WrappingDrive):
     """One AK drive, with the CAN timeout that its arm file states."""
 
-    def __init__(self, motor: Motor, send: Callable[[int, bytes], None], settings: CubeMarsSettings) -> None:
+    def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         super().__init__(motor, send)
+        settings: CubeMarsSettings = joint.settings
         self.address, self.reply = settings.id, settings.reply
         self.can_timeout = settings.can_timeout
         self._ranges = settings.ranges
-        self.motor_mode, self.command, self.error = False, NO_COMMAND, 0
-        self._zero, self._deaf_until = 0.0, -math.inf
+        self.motor_mode, self.error = False, 0
+        self._deaf_until = -math.inf
 
     @property
-    def coding(self) -> Ranges:
-        """Ranges by which it really codes and decodes."""
-        return self.miscoded(self._ranges)
+    def coding(self) -> Grid:
+        return grid_of(self.miscoded(self._ranges))
 
     @property
     def patience(self) -> float:
         return self.can_timeout / LOOP_RATE
+
+    def takes(self, can_id: int) -> bool:
+        return can_id == self.address
+
+    def sends(self, can_id: int) -> bool:
+        return can_id == self.reply
 
     def receive(self, can_id: int, data: bytes) -> None:
         """A command; in another mode than MIT none is understood."""
@@ -47,34 +53,20 @@ class CubeMarsDrive(SimulatedDrive):
         elif special is Special.DISABLE:
             self.motor_mode = False
         elif special is Special.SET_ZERO:
-            self._zero, self._deaf_until = self.motor.position, self.now + ZEROING
+            self.zero, self._deaf_until = self.motor.position, self.now + ZEROING
             return
         elif special is None and self.motor_mode:
             self.command = unpack_command(data, self.coding)
         self.tell(self._answer)
         self.heard = self.now
-        self._follow()
-
-    def _follow(self) -> None:
-        """In motor mode the newest command, that of before it was left included; else free."""
-        if not self.motor_mode:
+        if self.motor_mode:
+            self.follow()  # the command of before the mode was left included
+        else:
             self.motor.free()
-            return
-        command, coding = self.command, self.coding
-        position = self.motor.position
-        target = command.position + position - self._shown(position)
-        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.torque)
-
-    def _shown(self, position: float) -> float:
-        """Position as the drive shows it, within its range."""
-        largest = self.coding.position
-        return (position - self._zero + largest) % (2 * largest) - largest
 
     def _answer(self) -> None:
-        told, coding = self.told(), self.coding
-        feedback = told._replace(position=self._shown(told.position))
-        temperature = int(MOTOR_TEMPERATURE + self.motor.heating)
-        self.answer(self.reply, pack_reply(CubeMarsReply(self.address, feedback, temperature, self.error), coding))
+        reply = CubeMarsReply(self.address, self.feedback(), int(MOTOR_TEMPERATURE + self.motor.heating), self.error)
+        self.answer(self.reply, pack_reply(reply, self.coding))
 
     def trip(self) -> None:
         """CAN timeout: its command becomes one of no torque; motor mode goes on."""
@@ -90,16 +82,3 @@ class CubeMarsDrive(SimulatedDrive):
         """Encoder fault: out of motor mode."""
         self.error, self.motor_mode = ENCODER_FAULT, False
         self.motor.free()
-
-
-class CubeMarsFront(AddressedFront[CubeMarsDrive]):
-    """All CubeMars drives on one bus: which of them a frame is for."""
-
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        if not can_id & (EXTENDED | REMOTE) and (drive := self._addressed.get(can_id)) is not None:
-            drive.on_frame(can_id, data)
-
-    def joint_of(self, can_id: int) -> int | None:
-        """See Front; None where several drives share a reply id."""
-        found = [drive.joint for drive in self.drives if drive.reply == can_id]
-        return found[0] if len(found) == 1 else None

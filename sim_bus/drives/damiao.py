@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable
 
-from armlink.bus.port import EXTENDED, REMOTE
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.damiao.frames import (
     INTEGER_REGISTERS,
     MIT_MODE,
@@ -20,9 +20,11 @@ from armlink.drives.damiao.frames import (
     unpack_value,
 )
 from armlink.drives.damiao.settings import MODELS
-from armlink.drives.mit_packing import MitCommand, Ranges, Special, special_of, unpack_command
+from armlink.drives.mit_packing import Grid, Ranges, Special, grid_of, special_of, unpack_command
+from armlink.errors import BadInput
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, STAGE_TEMPERATURE, SimulatedDrive
+from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, NO_COMMAND, STAGE_TEMPERATURE, WrappingDrive
+from sim_bus.sim_section import serial_of
 
 LEAST_RANGE = 1e-3
 """A range register of 0 counts as this."""
@@ -30,19 +32,21 @@ STORE = 0xAA
 STAGE = int(STAGE_TEMPERATURE)
 OTHER_MODES = 0x100, 0x200, 0x300
 """Offsets of the command ids of the position, velocity and force modes."""
-NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 WRITABLE = frozenset((0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35))
 
 
-class DamiaoDrive(SimulatedDrive):
-    """One DM-J drive with command id `drive` and reply id `reply`."""
-
-    def __init__(
-        self, motor: Motor, send: Callable[[int, bytes], None], drive: int, reply: int, model: str, serial: int
-    ) -> None:
+class DamiaoDrive(WrappingDrive):
+    def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """As the maker delivers it, but for the ids: the deadman is off, the mode is MIT."""
         super().__init__(motor, send)
-        position, velocity, torque, _, _ = MODELS[model]
+        settings = joint.settings
+        if settings.model not in MODELS:
+            raise BadInput(
+                f"{arm.path}: {joint.name}: drive.model is {settings.model!r}; simulated are {', '.join(MODELS)}"
+            )
+        position, velocity, torque, _, _ = MODELS[settings.model]
+        drive, reply, serial = settings.id, settings.reply, serial_of(arm, joint)
+        self._taken = frozenset(drive + offset for offset in (0, *OTHER_MODES)) | {REGISTERS_ID}
         self._stored: dict[int, float] = {
             0: 15.0, 1: 1.2, 2: 100.0, 3: 0.95, 4: 50.0, 5: -50.0, 6: 200.0, 7: reply, 8: drive, 9: 0, 10: MIT_MODE,
             11: 1e-4, 12: 1e-4, 13: 3, 14: 5016, 15: serial, 16: 14, 17: 0.6, 18: 4e-4, 19: 0.005, 20: 10.0,
@@ -53,25 +57,29 @@ class DamiaoDrive(SimulatedDrive):
         }  # fmt: skip
         self.registers = dict(self._stored)
         self.state = DamiaoStatus.DISABLED
-        self.command = NO_COMMAND
         self._coded: object = None
         """Source of `coding`."""
-        self._coding = Ranges(position, velocity, torque)
+        self._coding = grid_of(Ranges(position, velocity, torque))
 
     @property
-    def coding(self) -> Ranges:
-        """Ranges by which it really codes and decodes."""
+    def coding(self) -> Grid:
         registers, faults = self.registers, self.faults
         told = (registers[21], registers[22], registers[23])
         made_of = (told, tuple(faults.items()) if faults else ())
         if made_of != self._coded:
             self._coded = made_of
-            self._coding = self.miscoded(Ranges(*(max(each, LEAST_RANGE) for each in told)))
+            self._coding = grid_of(self.miscoded(Ranges(*(max(each, LEAST_RANGE) for each in told))))
         return self._coding
 
     @property
     def patience(self) -> float:
         return self.registers[DamiaoRegister.TIMEOUT] * TIMEOUT_UNIT
+
+    def takes(self, can_id: int) -> bool:
+        return can_id in self._taken
+
+    def sends(self, can_id: int) -> bool:
+        return can_id == self.registers[DamiaoRegister.REPLY_ID]
 
     def receive(self, can_id: int, data: bytes) -> None:
         """A command, or a register request that names this drive."""
@@ -87,7 +95,7 @@ class DamiaoDrive(SimulatedDrive):
             self.command = unpack_command(data, self.coding)
         self.heard = self.now
         if self.state is DamiaoStatus.ENABLED:
-            self._follow()
+            self.follow()
         self._reply()
 
     def _obey(self, special: Special) -> None:
@@ -97,12 +105,6 @@ class DamiaoDrive(SimulatedDrive):
             special is Special.CLEAR_ERROR and self.state is not DamiaoStatus.ENABLED and not self.latched
         ):
             self._stop(DamiaoStatus.DISABLED)
-
-    def _follow(self) -> None:
-        command, coding = self.command, self.coding
-        position = self.motor.position
-        target = command.position + position - _wrapped(position, coding.position)
-        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.torque)
 
     def _stop(self, state: DamiaoStatus) -> None:
         self.state, self.command = state, NO_COMMAND
@@ -114,12 +116,9 @@ class DamiaoDrive(SimulatedDrive):
         self.tell(self._feed_back)
 
     def _feed_back(self) -> None:
-        motor, coding = self.motor, self.coding
-        told = self.told()
-        feedback = told._replace(position=_wrapped(told.position, coding.position))
-        drive = int(self.registers[DamiaoRegister.COMMAND_ID])
-        reply = DamiaoReply(drive, self.state, feedback, STAGE, int(MOTOR_TEMPERATURE + motor.heating))
-        self.answer(int(self.registers[DamiaoRegister.REPLY_ID]), pack_reply(reply, coding))
+        drive, warm = int(self.registers[DamiaoRegister.COMMAND_ID]), int(MOTOR_TEMPERATURE + self.motor.heating)
+        reply = DamiaoReply(drive, self.state, self.feedback(), STAGE, warm)
+        self.answer(int(self.registers[DamiaoRegister.REPLY_ID]), pack_reply(reply, self.coding))
 
     def _register(self, data: bytes) -> None:
         drive, request, register = struct.unpack_from("<HBB", data)
@@ -145,7 +144,7 @@ class DamiaoDrive(SimulatedDrive):
                 return
             self.command = NO_COMMAND
             if self.state is DamiaoStatus.ENABLED:
-                self._follow()
+                self.follow()
         if register in (21, 22, 23) and not 0.0 < value < 1e6:
             return
         self.registers[register] = value
@@ -165,36 +164,3 @@ class DamiaoDrive(SimulatedDrive):
 
     def lose_feedback(self) -> None:
         """Replies stop; the drive itself goes on."""
-
-
-class DamiaoFront:
-    """All Damiao drives on one bus: which of them a frame is for."""
-
-    def __init__(self, drives: list[DamiaoDrive]) -> None:
-        """`drives` have different command ids."""
-        self.drives = drives
-        ids = [int(drive.registers[DamiaoRegister.COMMAND_ID]) for drive in drives]
-        self._commanded = {
-            drive_id + offset: drive
-            for drive_id, drive in zip(ids, drives, strict=True)
-            for offset in (0, *OTHER_MODES)
-        }
-
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        if can_id & (EXTENDED | REMOTE):
-            return
-        if can_id == REGISTERS_ID:
-            for drive in self.drives:
-                drive.on_frame(can_id, data)
-        elif (addressed := self._commanded.get(can_id)) is not None:
-            addressed.on_frame(can_id, data)
-
-    def joint_of(self, can_id: int) -> int | None:
-        """See Front; None where several drives share a reply id."""
-        found = [drive.joint for drive in self.drives if drive.registers[DamiaoRegister.REPLY_ID] == can_id]
-        return found[0] if len(found) == 1 else None
-
-
-def _wrapped(position: float, largest: float) -> float:
-    """Position as the drive shows it, within ±largest."""
-    return (position + largest) % (2 * largest) - largest

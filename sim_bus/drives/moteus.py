@@ -4,11 +4,13 @@ import contextlib
 import math
 from collections.abc import Callable
 
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.moteus.frames import (
     CYCLE_COMMAND,
     CYCLE_REPLY,
     FLOAT,
+    HOMED_AT_OUTPUT,
     INT32,
     READ,
     READ_ERROR,
@@ -20,7 +22,7 @@ from armlink.drives.moteus.frames import (
     MoteusRegister,
     Subframe,
     identifier,
-    pack_reply,
+    pack_subframes,
     unpack,
 )
 from sim_bus.drives.motor import Motor
@@ -28,9 +30,9 @@ from sim_bus.drives.simulated_drive import (
     BUS_VOLTAGE,
     MOTOR_TEMPERATURE,
     STAGE_TEMPERATURE,
-    AddressedFront,
     SimulatedDrive,
 )
+from sim_bus.sim_section import serial_of
 
 TURN = 2 * math.pi
 DEFAULT_TIMEOUT = 0.1
@@ -41,8 +43,6 @@ TORQUE_CONSTANT = 0.55
 """Of the motor at its output [N·m/A]."""
 ENCODER_FAULT = 35
 NO_REGISTER = 1
-HOME_OUTPUT = 2
-"""Home state: positions are those of the output."""
 COMMANDS = {
     MoteusRegister.COMMAND_POSITION: math.nan,
     MoteusRegister.COMMAND_VELOCITY: 0.0,
@@ -63,12 +63,10 @@ COMMANDS = {
 
 
 class MoteusDrive(SimulatedDrive):
-    """One controller with id `drive`."""
-
-    def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, serial: int) -> None:
+    def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """As configured for its joint: gains tuned, encoder at the output."""
         super().__init__(motor, send)
-        self.address, self.serial = drive, serial
+        self.address, self.serial = joint.settings.id, serial_of(arm, joint)
         self.mode, self.fault_code = MoteusMode.STOPPED, 0
         self.command: dict[int, float] = dict(COMMANDS)
         self._gains = motor.tuned
@@ -85,8 +83,15 @@ class MoteusDrive(SimulatedDrive):
     def watches(self) -> bool:
         return super().watches and self.mode is MoteusMode.POSITION
 
+    def takes(self, can_id: int) -> bool:
+        """The low seven bits are the destination, 7Fh is all; 29 bits with a prefix are for other devices."""
+        number, destination = can_id & 0x1FFFFFFF, can_id & 0x7F
+        return not can_id & REMOTE and (destination == 0x7F or (destination == self.address and number < 0x10000))
+
+    def sends(self, can_id: int) -> bool:
+        return can_id >> 8 & 0x7F == self.address and can_id & 0x1FFFFFFF < 0x10000
+
     def receive(self, can_id: int, data: bytes) -> None:
-        """A frame whose destination is this controller."""
         source, replies = can_id >> 8 & 0x7F, can_id >> 8 & REPLY_WANTED
         usual = CYCLE_COMMAND.unpack(data) if replies else None
         if usual is not None:
@@ -102,7 +107,7 @@ class MoteusDrive(SimulatedDrive):
 
         def reply() -> None:
             shown = self._shown_registers() if asked else {}
-            self._reply(source, pack_reply([*errors, *(_shown(each, shown) for each in asked)]))
+            self._reply(source, pack_subframes([*errors, *(_shown(each, shown) for each in asked)]))
 
         with contextlib.suppress(ValueError):  # more than a frame holds: the controller sends none
             self.tell(reply)
@@ -148,7 +153,7 @@ class MoteusDrive(SimulatedDrive):
                 0x007: 0.0,
                 MoteusRegister.MOTOR_TEMPERATURE: MOTOR_TEMPERATURE,
                 0x00B: 1,
-                MoteusRegister.HOME_STATE: HOME_OUTPUT,
+                MoteusRegister.HOME_STATE: HOMED_AT_OUTPUT,
                 MoteusRegister.VOLTAGE: BUS_VOLTAGE,
                 MoteusRegister.MODEL: 1,
                 MoteusRegister.FIRMWARE: 0x0104,
@@ -241,20 +246,3 @@ def _shown(asked: Subframe, shown: dict[int, float]) -> Subframe:
         return Subframe(READ_ERROR, asked.register, NO_REGISTER)
     whole = asked.register in (MoteusRegister.MODEL, MoteusRegister.FIRMWARE, MoteusRegister.SERIAL1)
     return Subframe(REPLY, asked.register, value, INT32 if whole and asked.resolution == FLOAT else asked.resolution)
-
-
-class MoteusFront(AddressedFront[MoteusDrive]):
-    """All moteus controllers on one bus: which of them a frame is for."""
-
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        if can_id & REMOTE:
-            return
-        number = can_id & 0x1FFFFFFF
-        if number & 0x7F == 0x7F:
-            for drive in self.drives:
-                drive.on_frame(number, data)
-        elif number >> 16 == 0 and (drive_at := self._addressed.get(number & 0x7F)) is not None:
-            drive_at.on_frame(number, data)
-
-    def joint_of(self, can_id: int) -> int | None:
-        return self.joint_at(can_id >> 8 & 0x7F) if can_id & 0x1FFFFFFF < 0x10000 else None

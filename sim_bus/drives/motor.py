@@ -18,7 +18,6 @@ class Readings:
     """Readings of all joints' motors at one time; arrays (n,), sampled once however many drives ask."""
 
     def __init__(self, plant: Plant, sensors: JointSensors) -> None:
-        """Nothing is sampled before the first at()."""
         self._plant, self._sensors = plant, sensors
         self._time = -1.0
         self.position, self.velocity, self.torque, self.heating = (np.zeros(plant.n) for _ in range(4))
@@ -51,7 +50,6 @@ class Motor:
     def __init__(
         self, joint: int, described: LinkJoint, loops: Loops, sensors: JointSensors, readings: Readings
     ) -> None:
-        """Motor of joint `joint` of the arm, as the arm file describes it."""
         settings = described.settings
         self.joint, self.rated_torque = joint, described.rated_torque
         self.ratio: float = settings.direction * settings.gear
@@ -62,7 +60,6 @@ class Motor:
         self.powered = False
 
     def pass_time(self, time: float) -> None:
-        """It is `time` [s] now."""
         self._time = time
 
     @property

@@ -4,7 +4,8 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from armlink.bus.port import EXTENDED, REMOTE
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.bus.port import REMOTE
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import AxisError, AxisState, Message, identifier, pack, unpack
 from sim_bus.drives.motor import Motor
@@ -12,9 +13,9 @@ from sim_bus.drives.simulated_drive import (
     BUS_VOLTAGE,
     MOTOR_TEMPERATURE,
     STAGE_TEMPERATURE,
-    AddressedFront,
     SimulatedDrive,
 )
+from sim_bus.sim_section import serial_of
 
 TURN = 2 * math.pi
 HEARTBEAT_PERIOD = 0.1
@@ -26,27 +27,13 @@ CARRIED = {Message.ESTIMATES: ("position", "velocity"), Message.TORQUES: ("torqu
 RATES = {Message.HEARTBEAT: HEARTBEAT_PERIOD, Message.TEMPERATURE: 0.5}
 
 
-def cyclic_periods(cycle: float) -> dict[Message, float]:
-    """Periods [s] as they are to be set for a host with this cycle: estimates and torques once a cycle, in whole ms."""
-    period = max(int(cycle * 1000 + 1e-9), 1) / 1000
-    return {Message.ESTIMATES: period, Message.TORQUES: period}
-
-
 class ODriveAxis(SimulatedDrive):
-    """One axis with node id `node`."""
-
-    def __init__(
-        self,
-        motor: Motor,
-        send: Callable[[int, bytes], None],
-        node: int,
-        serial: int,
-        watchdog: float,
-        rates: dict[Message, float],
-    ) -> None:
-        """Configured over USB: gains tuned, watchdog time [s] (0: off), period of each cyclic message [s]."""
+    def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
+        """As it was configured over USB: gains tuned, watchdog on, estimates and torques once a cycle in whole ms."""
         super().__init__(motor, send)
-        self.address, self.serial = node, serial
+        link = arm.require_link()
+        self.address: int = joint.settings.node
+        self.serial = serial_of(arm, joint)
         self.state, self.errors, self.reason = AxisState.IDLE, 0, 0
         self.control_mode = frames.POSITION_CONTROL
         stiffness, damping, integral = motor.tuned
@@ -57,8 +44,9 @@ class ODriveAxis(SimulatedDrive):
         self._velocity_limit, self._current_limit = 1e3, 3 * motor.rated_torque / abs(motor.ratio) / TORQUE_CONSTANT
         self._input = (0.0, 0.0, 0.0)
         """Position [rad], velocity [rad/s], torque [N·m]."""
-        self._watchdog = watchdog
-        self._periods = RATES | rates
+        self._watchdog = link.deadline
+        period = max(int(1000 / link.rate + 1e-9), 1) / 1000
+        self._periods = {**RATES, Message.ESTIMATES: period, Message.TORQUES: period}
         self._next = dict.fromkeys(self._periods, 0.0)
 
     @property
@@ -68,6 +56,12 @@ class ODriveAxis(SimulatedDrive):
     @property
     def due(self) -> float:
         return min(super().due, *self._next.values())
+
+    def takes(self, can_id: int) -> bool:
+        return (can_id & ~REMOTE) >> 5 == self.address
+
+    def sends(self, can_id: int) -> bool:
+        return can_id >> 5 == self.address
 
     def receive(self, can_id: int, data: bytes) -> None:
         command = can_id & 0x1F
@@ -157,7 +151,6 @@ class ODriveAxis(SimulatedDrive):
     # ---- messages
 
     def pass_time(self, now: float) -> None:
-        """See SimulatedDrive; cyclic messages."""
         super().pass_time(now)
         for message, instant in self._next.items():
             if instant <= now + 1e-9:
@@ -186,7 +179,6 @@ class ODriveAxis(SimulatedDrive):
     # ---- faults
 
     def trip(self) -> None:
-        """Watchdog: idle, free."""
         self._disarm(AxisError.WATCHDOG)
 
     def reboot(self) -> None:
@@ -200,19 +192,4 @@ class ODriveAxis(SimulatedDrive):
             self.control_mode = int(value)
 
     def lose_feedback(self) -> None:
-        """Missing estimate: idle, free."""
         self._disarm(AxisError.MISSING_ESTIMATE)
-
-
-class ODriveFront(AddressedFront[ODriveAxis]):
-    """All ODrive axes on one bus: which of them a frame is for."""
-
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        if can_id & EXTENDED:
-            return
-        drive = self._addressed.get((can_id & 0x7FF) >> 5)
-        if drive is not None:
-            drive.on_frame(can_id & (0x7FF | REMOTE), data)
-
-    def joint_of(self, can_id: int) -> int | None:
-        return self.joint_at(can_id >> 5) if can_id < 0x800 else None

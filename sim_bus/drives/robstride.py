@@ -3,9 +3,11 @@
 import math
 from collections.abc import Callable
 
+from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, REMOTE
-from armlink.drives.mit_packing import MitCommand, Ranges
+from armlink.drives.mit_packing import Grid, grid_of
 from armlink.drives.robstride.frames import (
+    MOTION_BITS,
     MOTION_MODE,
     NEVER_READ,
     RANGES,
@@ -23,9 +25,9 @@ from armlink.drives.robstride.frames import (
     unpack_value,
 )
 from sim_bus.drives.motor import Motor
-from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, AddressedFront, SimulatedDrive
+from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, NO_COMMAND, SimulatedDrive
+from sim_bus.sim_section import serial_of
 
-NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 HOST = 0xFD
 """Host id to which feedback goes before a host has shown its own."""
 ENCODER_FAULT = 1 << 3
@@ -43,13 +45,11 @@ READ_ONLY = frozenset(
 
 
 class RobStrideDrive(SimulatedDrive):
-    """One drive with id `drive`."""
-
-    def __init__(self, motor: Motor, send: Callable[[int, bytes], None], drive: int, model: str, serial: int) -> None:
+    def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         """As the maker delivers it: deadman off, motion mode."""
         super().__init__(motor, send)
-        self.address, self.serial = drive, serial
-        self._ranges = RANGES[model]
+        self.address, self.serial = joint.settings.id, serial_of(arm, joint)
+        self._ranges = RANGES[joint.settings.model]
         self._stored: dict[int, float] = {
             RobStrideParameter.RUN_MODE: MOTION_MODE,
             0x7006: 0.0,
@@ -74,9 +74,9 @@ class RobStrideDrive(SimulatedDrive):
         self._host, self._reports_at = HOST, math.inf
 
     @property
-    def coding(self) -> Ranges:
-        """Ranges by which it really codes and decodes."""
-        return self.miscoded(self._ranges)
+    def coding(self) -> Grid:
+        """By which it really codes and decodes."""
+        return grid_of(self.miscoded(self._ranges), MOTION_BITS)
 
     @property
     def patience(self) -> float:
@@ -85,6 +85,12 @@ class RobStrideDrive(SimulatedDrive):
     @property
     def due(self) -> float:
         return min(super().due, self._reports_at)
+
+    def takes(self, can_id: int) -> bool:
+        return bool(can_id & EXTENDED) and not can_id & REMOTE and can_id & 0xFF == self.address
+
+    def sends(self, can_id: int) -> bool:
+        return bool(can_id & EXTENDED) and can_id >> 8 & 0xFF == self.address
 
     def receive(self, can_id: int, data: bytes) -> None:
         kind = kind_of(can_id)
@@ -127,7 +133,7 @@ class RobStrideDrive(SimulatedDrive):
 
     def _follow(self) -> None:
         command = self.command
-        limit = min(self.coding.torque, max(self.parameters[RobStrideParameter.LIMIT_TORQUE], 0.0))
+        limit = min(self.coding.t, max(self.parameters[RobStrideParameter.LIMIT_TORQUE], 0.0))
         self.motor.impede(command.kp, command.kd, command.position, command.velocity, command.torque, limit)
 
     def _stop(self) -> None:
@@ -192,17 +198,3 @@ class RobStrideDrive(SimulatedDrive):
         """Encoder fault: free, with the bit set."""
         self.fault_bits |= ENCODER_FAULT
         self._stop()
-
-
-class RobStrideFront(AddressedFront[RobStrideDrive]):
-    """All RobStride drives on one bus: which of them a frame is for."""
-
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        if not can_id & EXTENDED or can_id & REMOTE:
-            return
-        drive = self._addressed.get(can_id & 0xFF)
-        if drive is not None:
-            drive.on_frame(can_id & 0x1FFFFFFF, data)
-
-    def joint_of(self, can_id: int) -> int | None:
-        return self.joint_at(can_id >> 8 & 0xFF) if can_id & EXTENDED else None

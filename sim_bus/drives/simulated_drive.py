@@ -2,10 +2,9 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Generic, Protocol, TypeVar
 
 from armlink.bus.port import CLASSICAL
-from armlink.drives.mit_packing import MitFeedback, Ranges
+from armlink.drives.mit_packing import Grid, MitCommand, MitFeedback, Ranges
 from sim_bus.drives.drive_faults import FALSE_READINGS, QUANTITIES, FalseReadings
 from sim_bus.drives.motor import Motor
 
@@ -15,13 +14,9 @@ BUS_VOLTAGE = 48.0
 
 
 class SimulatedDrive:
-    """One drive on one joint. A family's drive overrides receive(), control(), and what a fault does."""
-
-    address: int
-    """Its id on the bus, where its family has but one."""
+    """One drive on one joint. A family's drive overrides what is addressed to it, and what commands and faults do."""
 
     def __init__(self, motor: Motor, send: Callable[[int, bytes], None]) -> None:
-        """`send(can_id, data)` puts a frame on the drive's bus."""
         self.motor, self.joint = motor, motor.joint
         self.now = 0.0
         self.heard = 0.0
@@ -38,8 +33,16 @@ class SimulatedDrive:
 
     # ---- bus
 
+    def takes(self, can_id: int) -> bool:
+        """Whether a frame of this identifier, with its flags, is addressed to it; here any, and receive() sifts."""
+        return True
+
+    def sends(self, can_id: int) -> bool:
+        """Whether it sends frames of this identifier."""
+        raise NotImplementedError
+
     def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame that its family takes as addressed to it; lost where it is unplugged."""
+        """A frame that is addressed to it; lost where it is unplugged."""
         if not self.unplugged:
             self.receive(can_id, data)
 
@@ -119,7 +122,6 @@ class SimulatedDrive:
             self.lose_feedback()
 
     def lose_feedback(self) -> None:
-        """The encoder no longer answers the drive."""
         self.motor.free()
 
     def end_faults(self) -> None:
@@ -146,31 +148,48 @@ class SimulatedDrive:
         )
 
 
-D = TypeVar("D", bound=SimulatedDrive)
+NO_COMMAND = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class Front(Protocol):
-    """The drives of one family on one bus."""
+class WrappingDrive(SimulatedDrive):
+    """A drive with the MIT law whose position wraps within the range of its coding."""
+
+    command = NO_COMMAND
+    zero = 0.0
+    """Where its position is zero [rad]."""
 
     @property
-    def drives(self) -> Sequence[SimulatedDrive]: ...
+    def coding(self) -> Grid:
+        """By which it really codes and decodes."""
+        raise NotImplementedError
 
-    def on_frame(self, can_id: int, data: bytes) -> None: ...
+    def feedback(self) -> MitFeedback:
+        told = self.told()
+        return told._replace(position=self._wrapped(told.position))
+
+    def follow(self) -> None:
+        """Follow the newest command."""
+        command, coding, position = self.command, self.coding, self.motor.position
+        target = command.position + position - self._wrapped(position)
+        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.t)
+
+    def _wrapped(self, position: float) -> float:
+        largest = self.coding.q
+        return (position - self.zero + largest) % (2 * largest) - largest
+
+
+class Front:
+    """The drives of one family on one bus."""
+
+    def __init__(self, drives: Sequence[SimulatedDrive]) -> None:
+        self.drives = drives
+
+    def on_frame(self, can_id: int, data: bytes) -> None:
+        for drive in self.drives:
+            if drive.takes(can_id):
+                drive.on_frame(can_id, data)
 
     def joint_of(self, can_id: int) -> int | None:
-        """Joint whose drive sends frames of this identifier, or None."""
-        ...
-
-
-class AddressedFront(Generic[D]):
-    """All drives of a family on one bus: which of them a frame is for. A family says where the address stands."""
-
-    def __init__(self, drives: list[D]) -> None:
-        """`drives` in arm order, each with an address of its own."""
-        self.drives = drives
-        self._addressed = {drive.address: drive for drive in drives}
-
-    def joint_at(self, address: int) -> int | None:
-        """Joint of the drive with this address."""
-        drive = self._addressed.get(address)
-        return None if drive is None else drive.joint
+        """Joint whose drive sends frames of this identifier, or None; None too where several share it."""
+        found = [drive.joint for drive in self.drives if drive.sends(can_id)]
+        return found[0] if len(found) == 1 else None

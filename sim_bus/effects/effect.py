@@ -55,7 +55,6 @@ class SimulatedParameter:
 
     @property
     def joint(self) -> bool:
-        """Whether the value is a joint's name."""
         return self.unit == catalogue.JOINT
 
     @property
@@ -72,8 +71,6 @@ class SimulatedParameter:
 
 @dataclass(frozen=True)
 class SimulatedEffect:
-    """One effect on the simulated arm."""
-
     id: str
     parameters: tuple[SimulatedParameter, ...]
     apply: Apply

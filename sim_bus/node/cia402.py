@@ -75,5 +75,4 @@ def command(word: int, previous: int) -> ControlCommand:
 
 
 def next_state(state: PowerState, asked: ControlCommand) -> PowerState:
-    """The state that follows `state`."""
     return TRANSITIONS.get((state, asked), state)

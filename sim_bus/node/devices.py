@@ -1,4 +1,4 @@
-"""Stock CiA 402 devices as they are known from their data sheets: what they lack, and what they have differently.
+"""The joints' CiA 402 devices: their power-on values, and how stock devices differ by their data sheets.
 
 Sources: the makers' data sheets (EDS) and firmware specifications, in own words; docs/drives.md names them.
 """
@@ -6,18 +6,25 @@ Sources: the makers' data sheets (EDS) and firmware specifications, in own words
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from armlink.arm_file import LinkJoint
+from armlink.arm_file import ArmFile, LinkJoint
+from armlink.drives.canopen.eds_file import expected_identity, of_joints
 from armlink.drives.canopen.settings import TorqueObject
 from sim_bus.node.object_arrays import INPUT, Key
+from sim_bus.node.position_torque_loops import CSP, CST, CSV, FEED, PROFILE_POSITION, PROFILE_TORQUE, UNIT
+from sim_bus.sim_section import serial_of, sim_section
 
+SUPPORTED_MODES = sum(1 << (mode - 1) for mode in (PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST))
+"""Supported drive modes (6502h)."""
+IDENTITY = ("vendor", "product", "revision", "serial")
+"""Keys of a joint's identity in the arm file, in the order of 1018h's sub-indices."""
+TEMPERATURE = 310
+"""Temperature of every drive [0.1 °C]."""
 OURS = "ours"
 _ABSENT_IN_ALL = frozenset({0x2101})
 
 
 @dataclass(frozen=True)
 class Device:
-    """A kind of device."""
-
     absent: frozenset[int | Key] = frozenset()
     """Objects, whole or by sub-index, that it lacks."""
     values: Mapping[Key, int | str] = field(default_factory=dict)
@@ -78,3 +85,31 @@ def device_of(joint: LinkJoint, named: str | None) -> Device:
     if not (isinstance(settings.torque, TorqueObject) and settings.torque.index == INPUT):
         absent |= {INPUT}
     return Device(**{**vars(device), "absent": absent})
+
+
+def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int, device: Device) -> dict[Key, int | str]:
+    """Objects of one joint that differ from the EDS's defaults; `increments` of the encoder per joint revolution."""
+    link, servo = arm.require_link(), sim_section(arm).servo
+    stated = expected_identity(joint, of_joints(arm, [joint])[0]).model_dump(exclude_none=True)
+    deceleration = round(servo.quick_stop_deceleration / UNIT)
+    return {
+        (0x1018, 4): serial_of(arm, joint),
+        (0x2101, 0): TEMPERATURE,
+        (0x6072, 0): min(round(joint.max_torque * 1000 / joint.rated_torque), 0xFFFF),
+        (0x6076, 0): round(joint.rated_torque * 1000),
+        (0x6081, 0): round(joint.max_velocity / UNIT),
+        (0x6083, 0): deceleration,
+        (0x6085, 0): deceleration,
+        (0x6087, 0): round(joint.max_torque_rate * 1000 / joint.rated_torque),
+        (0x608F, 1): increments,
+        (0x6092, 1): FEED,
+        (0x60C2, 1): min(max(round(1000 / link.rate), 1), 255),
+        (0x6502, 0): _modes_shown(device),
+        **device.values,
+        **{(0x1018, sub): stated[key] for sub, key in enumerate(IDENTITY, start=1) if key in stated},
+    }
+
+
+def _modes_shown(device: Device) -> int:
+    has = SUPPORTED_MODES if device.modes is None else sum(1 << (mode - 1) for mode in device.modes)
+    return has & ~device.hidden_modes

@@ -8,24 +8,14 @@ from armlink.arm_file import ArmFile
 from armlink.drives.canopen.settings import TorqueObject
 from sim_bus.node.cia402 import STATUS, PowerState, command, next_state
 from sim_bus.node.devices import Device
+from sim_bus.node.node import Node
 from sim_bus.node.object_arrays import INPUT, ObjectArrays
-from sim_bus.node.position_torque_loops import (
-    CSP,
-    CST,
-    CSV,
-    FEED,
-    KINDS,
-    OFF,
-    POSITION,
-    PROFILE_POSITION,
-    PROFILE_TORQUE,
-    Loops,
-)
+from sim_bus.node.position_torque_loops import FEED, KINDS, OFF, POSITION, UNIT, Loops
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import JointSensors
 
-SUPPORTED_MODES = sum(1 << (mode - 1) for mode in (PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST))
-"""Supported drive modes (6502h)."""
+APPLIED = (0x6007, 0x605A, 0x6065, 0x607D, 0x6085, 0x60C2)
+"""Objects of the drive profile that take effect when written."""
 VELOCITY_FILTER = 0.008
 """Time constant of the low-pass filter of velocity readings [s]."""
 REMOTE, INTERNAL_LIMIT, FOLLOWS = 0x0210, 0x0800, 0x1000
@@ -76,12 +66,22 @@ class SimulatedDrives:
         self._last_elapsed, self._share = 0.0, 0.0
 
     def set_devices(self, devices: Sequence[Device], places: Sequence[int]) -> None:
-        """Differences of stock devices."""
         for place, device in zip(places, devices, strict=True):
             if device.modes is not None:
                 self.refused_modes[place] = set(KINDS) - device.modes
             if device.rpm:
                 self._velocity_per_count[place] = 60.0 / self._sensors.increments[place]
+
+    def bring_into_force(self, node: Node) -> None:
+        """Apply a node's calibration record and drive settings to its drive."""
+        joint, record, window = node.place, node.record.active, node.value(0x6065)
+        self.gain[joint], self.offset[joint] = record.gain, record.offset
+        self.quick_stop_option[joint] = node.value(0x605A)
+        self.following_window[joint] = np.inf if window == UNWATCHED else window * UNIT
+        loops = self.loops
+        loops.deceleration[joint] = max(node.value(0x6085), 1) * UNIT
+        loops.interpolate(joint, node.value(0x60C2, 1) * 10.0 ** node.value(0x60C2, 2))
+        loops.lowest[joint], loops.highest[joint] = node.value(0x607D, 1), node.value(0x607D, 2)
 
     def units(self, joint: int) -> tuple[float, float, float]:
         """One count of position [rad], velocity [rad/s] and torque of the motor [N·m], as its PDOs have them."""
@@ -181,7 +181,6 @@ class SimulatedDrives:
 
     @property
     def needs_watch(self) -> bool:
-        """Whether watch() has anything to do."""
         return bool(self.loops.stopping.any() or np.isfinite(self.following_window).any())
 
     def _select_mode(self, joint: int) -> None:

@@ -9,14 +9,15 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoServer
 from canopen.sdo.exceptions import SdoAbortedError
 
+from armlink.drives.canopen.pdo import INVALID
 from sim_bus.node.devices import Device
 from sim_bus.node.object_arrays import DTYPES, Key, ObjectArrays, data_sheet, variable
-from sim_bus.node.pdo import INVALID, Frame, PdoParameters, layout
-from sim_bus.node.torque_sensor_record import TorqueRecord
+from sim_bus.node.pdo import Frame, PdoParameters, layout
+from sim_bus.node.torque_sensor_record import WRONG_VALUE, TorqueRecord
 
 INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 NO_OBJECT, NO_SUB_INDEX, READ_ONLY, WRONG_LENGTH = 0x06020000, 0x06090011, 0x06010002, 0x06070010
-WRONG_VALUE, NOT_NOW, NOT_MAPPABLE, PDO_TOO_LONG = 0x06090030, 0x08000022, 0x06040041, 0x06040042
+NOT_NOW, NOT_MAPPABLE, PDO_TOO_LONG = 0x08000022, 0x06040041, 0x06040042
 SAVE, LOAD = b"save", b"load"
 
 
@@ -205,12 +206,10 @@ class Node:
         self._put((self.tag | can_id, data))
 
     def on_sdo(self, data: bytes) -> None:
-        """Pass a frame to the SDO server."""
         if len(data) == 8 and self.nmt in (PRE_OPERATIONAL, OPERATIONAL):
             self._server.on_request(0x600 + self.node_id, bytearray(data), None)
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send a response of the SDO server."""
         self.send(can_id, bytes(data))
 
     def emergency(self, code: int, register: int, manufacturer: bytes = b"") -> None:

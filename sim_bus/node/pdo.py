@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armlink.drives.canopen.pdo import INVALID
 from sim_bus.node.object_arrays import DTYPES, Key, ObjectArrays, variable
 
-INVALID = 0x80000000
 Frame = tuple[int, bytes]
 
 
@@ -109,7 +109,6 @@ class PdoTable:
         self._count = 0
 
     def send_sync(self) -> None:
-        """Send the synchronous TPDOs that are due at this SYNC."""
         self._count += 1
         for group in self._sync_send:
             if self._count % max(group.kind, 1) == 0:

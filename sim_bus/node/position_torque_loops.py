@@ -141,7 +141,6 @@ class Loops:
         self._select()
 
     def stopped(self, joint: int) -> bool:
-        """Whether a stopping joint's ramp has come to rest."""
         return bool(self.stopping[joint] and self._rate[joint] == 0.0)
 
     @property
@@ -165,7 +164,6 @@ class Loops:
         self._select()
 
     def _serve(self) -> None:
-        """Hand stiffness, damping and limits to the plant."""
         stiffness, damping, limit = self._given
         np.copyto(self.limit, limit, where=self.kind == IMPEDANCE)
         limits = np.where(self._powered, self.limit, 0.0)

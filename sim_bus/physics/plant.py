@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics.gravity import gravity_torque, inertia, tilt
 from sim_bus.physics.inertials import ModelFrames, ModelInertials
 from sim_bus.physics.joint_torques import Cables, LateMotors, dry_friction, unevenness
 from sim_bus.physics.mjcf import build_model
@@ -119,7 +118,7 @@ class Plant:
         self._has_rotors = bool(self._rotor_inertia.any())
         self._seat("armature", self._rotor_inertia)
         self._seat("damping", self._viscous)
-        self.model.opt.gravity[:] = tilt(imperfections.tilt).T @ self._gravity
+        self.model.opt.gravity[:] = _tilted(imperfections.tilt).T @ self._gravity
         self.model.jnt_stiffness[self._joints] = imperfections.spring[:, 0]
         self.model.qpos_spring[self._dof] = imperfections.spring[:, 1]
         self._frames.apply(imperfections)
@@ -153,11 +152,24 @@ class Plant:
 
     def gravity_torque(self, q: Array) -> Array:
         """True holding torque ∂V/∂q at the angles `q` (K, n) → (K, n), with the attached mass."""
-        return gravity_torque(self.model, self._dof, q)
+        scratch, q = mujoco.MjData(self.model), np.atleast_2d(np.asarray(q, float))
+        torque = np.empty_like(q)
+        for row, angles in enumerate(q):
+            scratch.qpos[self._dof] = angles
+            mujoco.mj_kinematics(self.model, scratch)
+            mujoco.mj_comPos(self.model, scratch)
+            mujoco.mj_rne(self.model, scratch, 0, scratch.qfrc_bias)
+            torque[row] = scratch.qfrc_bias[self._dof]
+        return torque
 
     def inertia(self, q: Array) -> Array:
         """Joint-space inertia matrix at the angles `q` (n,) → (n, n) [kg·m²]."""
-        return inertia(self.model, self._dof, q)
+        scratch, full = mujoco.MjData(self.model), np.empty((self.model.nv, self.model.nv))
+        scratch.qpos[self._dof] = q
+        mujoco.mj_forward(self.model, scratch)
+        mujoco.mj_fullM(self.model, scratch, full)
+        matrix: Array = full[self._dof][:, self._dof]
+        return matrix
 
     # ---- state and steps
 
@@ -179,7 +191,6 @@ class Plant:
 
     @property
     def motor_velocity(self) -> Array:
-        """Motor velocities referred to the joints."""
         return self.velocity if self._gears is None else self._gears.shown(self._velocities)
 
     @property
@@ -311,7 +322,6 @@ class Plant:
         self._seat("frictionloss", np.where(self._braked, self._brake_torque, np.maximum(level + self._uneven, 0.0)))
 
     def _seat(self, quantity: str, values: Array) -> None:
-        """Set friction, damping or inertia of the motors."""
         on_dofs = getattr(self.model, f"dof_{quantity}")
         if self._gears is None:
             on_dofs[self._dof] = values
@@ -324,3 +334,12 @@ class Plant:
         if data.nf == self.n:
             return slice(0, self.n)
         return self._place_of_dof[data.efc_id[data.ne : data.ne + data.nf]]
+
+
+def _tilted(angles: Array) -> Array:
+    """Rotation of the base: about its x axis, then about its y axis [rad] → (3, 3)."""
+    (cx, cy), (sx, sy) = np.cos(angles), np.sin(angles)
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    rotation: Array = about_x @ about_y
+    return rotation

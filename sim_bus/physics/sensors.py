@@ -122,7 +122,6 @@ class JointSensors:
         return reading
 
     def angle_of(self, reading: Array) -> Array:
-        """True angle θ for a reading φ."""
         angle = self.position_gain * reading + self.position_offset
         if self._eccentric:
             amplitude, phase = self._imperfections.eccentricity.T

@@ -42,17 +42,7 @@ def compare(
 
     if len(sim) < 2:
         raise BadInput("--sim: give two models or more")
-    stated = parse_corrections(
-        columns=columns or (),
-        header=header,
-        sign=sign or (),
-        units=units or (),
-        zero=zero or (),
-        clock=clock or (),
-        effort=effort_is,
-        joints=joints,
-        topic=topic,
-    )
+    stated = parse_corrections(columns, header, sign, units, zero, clock, effort_is, joints, topic)
     with PlainConsole().status("moving the models along the recordings"):
         judged = {name: each for path in heldout for name, each in load_recordings(path, stated.of_reading()).items()}
         found = compare_models(

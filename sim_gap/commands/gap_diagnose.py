@@ -130,17 +130,7 @@ def diagnose(
         require_extra("--report", "reports")
     if out_samples is not None and out_samples.suffix == ".parquet":
         require_extra("--out-samples", "parquet")
-    stated = parse_corrections(
-        columns=columns or (),
-        header=header,
-        sign=sign or (),
-        units=units or (),
-        zero=zero or (),
-        clock=clock or (),
-        effort=effort_is,
-        joints=joints,
-        topic=topic,
-    )
+    stated = parse_corrections(columns, header, sign, units, zero, clock, effort_is, joints, topic)
     reading = stated.of_reading()
     with console.status(f"reading {len(paths)} recordings"):
         fitted = {name: each for path in train for name, each in load_recordings(path, reading).items()}

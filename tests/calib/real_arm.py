@@ -61,7 +61,7 @@ class RealArm(RestArm):
         return torque if self.push is None else torque + self.push(q[None])[0]
 
     def _gravity_torque(self, angle: np.ndarray) -> np.ndarray:
-        """As `sim_bus.physics.gravity.gravity_torque`, (n,) [N·m] at link angles (n,) [rad]."""
+        """As `sim_bus.physics.plant.Plant.gravity_torque`, (n,) [N·m] at link angles (n,) [rad]."""
         model, data = self.plant.model, self._scratch
         data.qpos[: self.n] = angle
         mujoco.mj_kinematics(model, data)

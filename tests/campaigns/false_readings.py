@@ -187,7 +187,7 @@ class Run:
     def _positions(self, hold: Command):
         """To and fro between drawn poses, as fast as max_velocity allows."""
         start = hold.position
-        lower, upper = np.array(self.link.windows).T
+        lower, upper = np.array([(each.lower, each.upper) for each in self.link.limits]).T
         goal = self.random.uniform(lower + 0.1, upper - 0.1)
         seconds = float((np.abs(goal - start) * 1.875 / (0.9 * self.most)).max())
         time = np.arange(0.0, 2 * JOB_SECONDS, self.link.period)

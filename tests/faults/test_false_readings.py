@@ -156,7 +156,7 @@ def test_a_damiao_range_below_the_gates_limits_is_refused(register, value, says)
 
 def test_a_position_range_that_ends_before_the_gates_window_is_refused():
     link, sim = started("six-damiao")
-    window = link.values.limits(1, link.wanted_limits()[1])
+    window = link.values.limits(1, link.limits[1])
     sim.drive_at[1].registers[21] = max(-window.lower, window.upper) + 0.05
     with pytest.raises(Refused, match=r"register 21 \(PMAX\) ends position readings at .* correct zero and direction"):
         link.start()

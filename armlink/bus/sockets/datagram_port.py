@@ -86,7 +86,6 @@ class DatagramBatch:
                 message.header.name, message.header.name_length = name + i * NAME, NAME
 
     def put(self, place: int, datagram: bytes) -> None:
-        """Set the datagram at `place`."""
         size, start = len(datagram), place * self.size
         self.content[start : start + size] = datagram
         self._vectors[2 * place + 1] = size
@@ -181,7 +180,6 @@ class DatagramPort(ABC):
         return BusFault(f"bus {self._name}: transmit queue stays full: does any node acknowledge?")
 
     def receive(self, timeout: float) -> Frame | None:
-        """The next frame that is no error frame, or None after `timeout` seconds."""
         waiting = self._waiting
         if waiting:
             return waiting.pop()

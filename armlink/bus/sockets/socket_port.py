@@ -13,8 +13,6 @@ _FD_FLAGS = 0x05  # CANFD_BRS | CANFD_FDF: a CAN FD frame with bit-rate switch
 
 
 class SocketPort(DatagramPort):
-    """A raw CAN socket."""
-
     def __init__(self, raw: socket.socket, name: str, fd: bool = False, as_node: bool = False) -> None:
         """`name` of the bus for messages; `fd`: the socket accepts CAN FD frames, and CAN FD frames are sent.
 

@@ -34,7 +34,6 @@ class Stamping(DatagramPort):
         self._began = time.monotonic()
 
     def wait(self, timeout: float) -> None:
-        """Return when a frame is there, or after `timeout` seconds."""
         select.select([self._number], [], [], timeout)
 
     def take_all(self) -> list[Stamped]:

@@ -38,12 +38,23 @@ class Protection:
 
     host: int
     """Node id of the host, whose heartbeat the joints watch."""
-    deadline_ms: int
-    """A joint that hears no RPDO1 for this long goes to quick stop."""
-    heartbeat_ms: int
-    """A joint that hears no heartbeat of the host for this long goes to quick stop."""
-    producer_ms: int
-    """Period of the joint's own heartbeat."""
+    deadline: float
+    """`link.deadline` [s]."""
+
+    @property
+    def deadline_ms(self) -> int:
+        """A joint that hears no RPDO1 for this long goes to quick stop."""
+        return milliseconds(self.deadline)
+
+    @property
+    def heartbeat_ms(self) -> int:
+        """A joint that hears no heartbeat of the host for this long goes to quick stop."""
+        return milliseconds(2 * self.deadline)
+
+    @property
+    def producer_ms(self) -> int:
+        """Period of the joint's own heartbeat."""
+        return milliseconds(self.deadline / 2)
 
 
 @dataclass(frozen=True)
@@ -73,14 +84,8 @@ def milliseconds(seconds: float) -> int:
 
 
 def protection_of(section: LinkSection, nodes: Collection[int]) -> Protection:
-    """Host node (the highest that no joint has) and times from the arm file's deadline."""
-    host = next(node for node in range(127, 0, -1) if node not in nodes)
-    return Protection(
-        host,
-        deadline_ms=milliseconds(section.deadline),
-        heartbeat_ms=milliseconds(2 * section.deadline),
-        producer_ms=milliseconds(section.deadline / 2),
-    )
+    """With the highest node id that no joint has for the host."""
+    return Protection(next(node for node in range(127, 0, -1) if node not in nodes), section.deadline)
 
 
 def identify(services: NodeServices) -> Identity:
@@ -208,15 +213,8 @@ def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int, profile: 
     """
     is_command, stock = each.communication == pdo.RPDO1.communication, profile is not OURS
     deadline = deadline_ms if is_command and profile.has(objects.RPDO_DEADLINE) else None if stock else 0
-
-    def write(entry: Entry, value: int) -> None:
-        services.write(entry, value)
-
-    def read(entry: Entry) -> int:
-        return int(services.read(entry))
-
     try:
-        pdo.configure(each, services.node, write, read, deadline)
+        pdo.configure(each, services.node, services.write, services.read, deadline)
     except pdo.MappingRefused as error:
         raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
 
@@ -226,18 +224,11 @@ def disable_other_rpdos(services: NodeServices) -> None:
 
     Raises BusFault naming joint and object.
     """
-
-    def write(entry: Entry, value: int) -> None:
-        services.write(entry, value)
-
-    def read(entry: Entry) -> int:
-        return int(services.read(entry))
-
     for index in pdo.foreign_rpdos(services.remote.object_dictionary):
         if not services.has(Entry(index, 1, "I", "RPDO COB-ID")):
             continue
         try:
-            pdo.disable(index, write, read)
+            pdo.disable(index, services.write, services.read)
         except pdo.MappingRefused as error:
             raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
 

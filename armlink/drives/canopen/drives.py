@@ -8,6 +8,7 @@ from typing import Any
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import Frame
+from armlink.drives.base import Ask, BasicDrives, DriveMemory
 from armlink.drives.board import Board
 from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import faults, torque_sensor_record
@@ -18,19 +19,17 @@ from armlink.drives.canopen.cyclic.commands import SYNC, TARGETS, CommandFrames
 from armlink.drives.canopen.cyclic.readings import ReadingFrames
 from armlink.drives.canopen.cyclic.wire import Wire, check_fits
 from armlink.drives.canopen.eds_file import of_joints
-from armlink.drives.canopen.host_frames import HostFrames
-from armlink.drives.canopen.pdo import RPDO1, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
+from armlink.drives.canopen.pdo import RPDO1, RPDO_BASES, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
 from armlink.drives.canopen.profile import Profile, profile_of
 from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
+from armlink.drives.canopen.settings import TRAITS
 from armlink.drives.canopen.units import assumed_units, read_units, unit_doubt
-from armlink.drives.family import Ask
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
 from armlink.errors import ArmlinkError, BusFault
 from armlink.torque_calibration import Calibration
 
 log = logging.getLogger("armlink")
-SDO_RESPONSE_ID = 0x580
 _POWERS = {
     DriveState.ENABLED: Power.ON,
     DriveState.QUICK_STOP: Power.STOPPED,
@@ -41,21 +40,28 @@ _POWERS = {
     DriveState.READY: Power.READY,
     DriveState.SWITCHED_ON: Power.READY,
 }
+_DOWNLOADS = (1, 6)
+"""Command specifiers of SDO requests that write: initiate download, block download (CiA 301, 7.2.4.3)."""
+_HARMLESS_WRITES = (0x1010, 0x2100)
+"""Objects that another program may write: they store settings or hold the torque sensor's calibration."""
 
 
-class CanopenDrives:
-    """Implements `armlink.drives.family.Drives`, `FillsBoard` and `KeepsCalibration`."""
+class CanopenDrives(BasicDrives[DriveMemory]):
+    """The nodes of one bus, all with one SYNC."""
 
-    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint], traits: Traits) -> None:
-        """The drives of these joints; `traits` of one with our torque sensor record."""
+    def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
+        super().__init__(joints, TRAITS)
         section = arm.require_link()
-        self.arm, self.rows = arm, tuple(joints)
-        self.names = tuple(joint.name for joint in joints)
-        self.nodes = tuple(joint.settings.node for joint in joints)
-        self.m = len(self.rows)
+        self.arm, self.nodes = arm, tuple(settings.node for settings in self.settings)
         self.protection = device.protection_of(section, self.nodes)
-        self._host_frames = HostFrames(self.nodes, self.protection.host)
-        self._traits, self._deadline = traits, section.deadline
+        self._commands = {
+            objects.NMT_ID: "NMT command",
+            objects.SYNC_ID: "SYNC",
+            objects.LSS_ID: "LSS command",
+            objects.HEARTBEAT_ID + self.protection.host: "heartbeat of the host",
+            **{base + node: f"RPDO{k} of node {node}" for k, base in enumerate(RPDO_BASES, 1) for node in self.nodes},
+        }
+        self._deadline = section.deadline
         self._joint_of = {node: joint for joint, node in enumerate(self.nodes)}
         self.known = faults.JointStates(self.names)
         """Newest state of the joints."""
@@ -66,7 +72,8 @@ class CanopenDrives:
         self.cycle = CommandFrames(self.known, self.protection.host, self.beat_every, 1.0 / section.rate)
         self._readings = ReadingFrames(self.known)
         self.wires: list[Wire] = []
-        self._use([Wire(*row) for row in zip(self.nodes, map(_profile, joints), assumed_units(joints), strict=True)])
+        profiles = [profile_of(settings) for settings in self.settings]
+        self._use([Wire(*row) for row in zip(self.nodes, profiles, assumed_units(joints), strict=True)])
         self._network: PumpedNetwork | None = None
         self._services: tuple[NodeServices, ...] = ()
 
@@ -79,9 +86,9 @@ class CanopenDrives:
     # ---- what they are
 
     def traits(self, joint: int) -> Traits:
-        settings, profile = self.rows[joint].settings, self.wires[joint].profile
+        settings, profile = self.settings[joint], self.wires[joint].profile
         if settings.torque == "record" and settings.calibration is None:
-            return self._traits
+            return TRAITS
         watched = profile.has(objects.RPDO_DEADLINE) or profile.has(objects.HEARTBEAT_CONSUMER)
         bounds = [(objects.MAX_TORQUE, "torque"), (objects.POSITION_LOWER, "window")]
         return Traits(
@@ -101,19 +108,23 @@ class CanopenDrives:
             TPDO3.cob_base,
             objects.EMCY_ID,
             objects.HEARTBEAT_ID,
-            SDO_RESPONSE_ID,
+            objects.SDO_RESPONSE_ID,
         )
         return {base + node: joint for joint, node in enumerate(self.nodes) for base in services}
 
     def commands(self) -> Mapping[int, str]:
-        return self._host_frames.by_id
+        return self._commands
 
     def intrusion(self, can_id: int, data: bytes) -> str:
-        """See Drives: what only a host sends, and SDO requests that write, but of settings and calibration."""
-        return self._host_frames(can_id, data)
+        """Frames that only a host sends, and SDO requests that write, but of settings and calibration."""
+        node = can_id - objects.SDO_REQUEST_ID
+        if node not in self._joint_of or len(data) < 4 or data[0] >> 5 not in _DOWNLOADS:
+            return self._commands.get(can_id, "")
+        index = int.from_bytes(data[1:3], "little")
+        return "" if index in _HARMLESS_WRITES else f"SDO write of {index:04X}h to node {node}"
 
     def cycle_bits(self) -> float:
-        """See Drives: RPDO1 and TPDO1 in every cycle, TPDO2 in every fourth, SYNC."""
+        """RPDO1 and TPDO1 in every cycle, TPDO2 in every fourth, SYNC."""
         each = sum(longest_frame_bits(pdo.layout.size) for pdo in (RPDO1, TPDO1))
         slow = longest_frame_bits(TPDO2.layout.size) / STATUS_DECIMATION
         return self.m * (each + slow) + longest_frame_bits(0)
@@ -131,18 +142,14 @@ class CanopenDrives:
     def missing(self, ask: Ask) -> list[int]:
         return [joint for joint, services in enumerate(self.services(ask)) if not services.present()]
 
-    def identify(self, ask: Ask) -> list[DriveIdentity]:
-        found = []
-        for joint, services in enumerate(self.services(ask)):
-            address = self.rows[joint].settings.address
-            if not services.present():
-                found.append(DriveIdentity(joint, address, present=False))
-                continue
-            told = device.identify(services)
-            serial = f"{told.vendor:x}:{told.product:x}:{told.revision:x}:{told.serial}"
-            power = _POWERS.get(told.state, Power.UNKNOWN)
-            found.append(DriveIdentity(joint, address, True, told.name, serial, power=power))
-        return found
+    def identity(self, joint: int, ask: Ask) -> DriveIdentity:
+        services = self.services(ask)[joint]
+        if not services.present():
+            return self.absent(joint)
+        told = device.identify(services)
+        serial = f"{told.vendor:x}:{told.product:x}:{told.revision:x}:{told.serial}"
+        power = _POWERS.get(told.state, Power.UNKNOWN)
+        return DriveIdentity(joint, self.settings[joint].address, True, told.name, serial, power=power)
 
     def positions(self, ask: Ask) -> list[float]:
         found = []
@@ -159,21 +166,19 @@ class CanopenDrives:
     # ---- set-up
 
     def fits(self, limits: Sequence[Limits]) -> None:
-        """See Drives: data sheets are read, limits tried with the usual units."""
+        """Data sheets are read, limits tried with the usual units."""
         of_joints(self.arm, self.rows)
         for row, limit, unit in zip(self.rows, limits, assumed_units(self.rows), strict=True):
             check_fits(row, limit, unit)
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        """See Drives: nodes pre-operational, everything set and read back, nodes started (NMT)."""
+        """Nodes pre-operational, everything set and read back, nodes started (NMT)."""
         all_services = self.services(ask)
         for services, row in zip(all_services, self.rows, strict=True):
             device.check_identity(services, row)
         for node in self.nmt_targets():
             self.send_nmt(ask, objects.NMT_PRE_OPERATIONAL, node)
-        profiles = [
-            device.examined(services, row.settings) for services, row in zip(all_services, self.rows, strict=True)
-        ]
+        profiles = [device.examined(*each) for each in zip(all_services, self.settings, strict=True)]
         found = [self._set_up(*each) for each in zip(range(self.m), all_services, limits, profiles, strict=True)]
         self._use([wire for wire, _ in found])
         self.cycle.restart()
@@ -182,12 +187,12 @@ class CanopenDrives:
         return [setup for _, setup in found]
 
     def guard_rules(self, ask: Ask, limits: Sequence[Limits]) -> dict[str, Any]:
-        """See Guarded: scales and objects as the devices tell them."""
+        """Scales and objects as the devices tell them."""
         return guard_rules(self.rows, self.services(ask), limits, self.protection)
 
     def nmt_targets(self) -> tuple[int, ...]:
         """Whom NMT commands go to: all, or these nodes where others may be on the bus."""
-        return (0,) if all(row.settings.torque == "record" for row in self.rows) else self.nodes
+        return (0,) if all(settings.torque == "record" for settings in self.settings) else self.nodes
 
     def _set_up(self, joint: int, services: NodeServices, limits: Limits, profile: Profile) -> tuple[Wire, Setup]:
         row, known = self.rows[joint], self.known
@@ -211,11 +216,11 @@ class CanopenDrives:
             ranges=device.reading_ranges(services, row, unit, limits, profile),
             scales={"torque [N·m]": unit.torque, "position [rad]": unit.position, "velocity [rad/s]": unit.velocity},
         )
-        return Wire(row.settings.node, profile, unit, limits), setup
+        return Wire(self.nodes[joint], profile, unit, limits), setup
 
     def offered(self, services: NodeServices, joint: int) -> int:
         """Modes of a device as bits of 6502h; raises BusFault where one that the link needs is not among them."""
-        if self.rows[joint].settings.torque == "record":
+        if self.settings[joint].torque == "record":
             return device.check_modes(services)
         return device.offered_modes(services)
 
@@ -229,7 +234,7 @@ class CanopenDrives:
         self.cycle.beaten(ask.now())
 
     def recover(self, ask: Ask) -> None:
-        """See Drives: start the nodes that left operation."""
+        """Start the nodes that left operation."""
         self.beat(ask)  # their watches have run on
         for node in self.nodes:
             self.send_nmt(ask, objects.NMT_START, node)
@@ -237,7 +242,7 @@ class CanopenDrives:
     # ---- orders to frames
 
     def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        """See Drives: RPDO2 where a mode changes, RPDO1 of every joint, heartbeat when due, SYNC."""
+        """RPDO2 where a mode changes, RPDO1 of every joint, heartbeat when due, SYNC."""
         return self.cycle.frames(orders, now)
 
     def sent(self, joint: int) -> Order | None:
@@ -256,7 +261,7 @@ class CanopenDrives:
         return self._readings.fill(board, places)
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
-        """See Drives. The cyclic frames of a link take the way of `fill`; emergencies, heartbeats and SDO come here."""
+        """The cyclic frames of a link take the way of `fill`; emergencies, heartbeats and SDO come here."""
         joint, service = self._joint_of.get(can_id & 0x7F), can_id & ~0x7F
         if joint is None:
             return None
@@ -266,7 +271,7 @@ class CanopenDrives:
             self.known.node_states[joint] = state = data[0] & 0x7F if data else 0
             if state == 0:
                 self.known.restarted.add(joint)
-        elif service == SDO_RESPONSE_ID:
+        elif service == objects.SDO_RESPONSE_ID:
             if self._network is not None:
                 self._network.notify(can_id, bytearray(data), 0.0)
         elif service == TPDO1.cob_base:
@@ -276,22 +281,22 @@ class CanopenDrives:
         return None
 
     def details(self, joint: int, sends: bool) -> Mapping[str, Any]:
-        """See Drives: node id and NMT state; only operational nodes send TPDOs."""
+        """Node id and NMT state; only operational nodes send TPDOs."""
         nmt = objects.OPERATIONAL if sends else self.known.node_states.get(joint)
         told = None if nmt is None else objects.NMT_STATES.get(nmt, str(nmt))
         return {"node": self.nodes[joint], "nmt": told}
 
     def reading_ids(self) -> Mapping[int, int]:
-        """See Drives: TPDO1."""
+        """TPDO1."""
         return {TPDO1.cob_base + node: joint for joint, node in enumerate(self.nodes)}
 
     def poll(self, first: bool) -> list[Frame]:
-        """See Drives: SYNC, nodes started (NMT) before the first."""
+        """SYNC, nodes started (NMT) before the first."""
         start: list[Frame] = [(objects.NMT_ID, bytes([objects.NMT_START, 0]))]
         return start if first else [SYNC]
 
     def replayed(self, first: bool, readings: Sequence[Reading]) -> list[Frame]:
-        """See Replays: SYNC and TPDO1, TPDO2 if its values are there; the joints are enabled, in no mode."""
+        """SYNC and TPDO1, TPDO2 if its values are there; the joints are enabled, in no mode."""
         return self._readings.replayed(first, readings)
 
     # ---- states
@@ -299,17 +304,10 @@ class CanopenDrives:
     def power(self, joint: int) -> Power:
         return _POWERS.get(state_of(self.known.statuses[joint]), Power.UNKNOWN)
 
-    def state_request(self, joint: int) -> list[Frame]:
-        """See Drives: TPDO3 tells a change by itself."""
-        return []
-
-    def lets_go(self, joint: int) -> bool:
-        return self.power(joint) in (Power.OFF, Power.READY, Power.FAULT)
-
     def ready(self, joint: int) -> bool:
         displayed = self.wires[joint].entries.get(TPDO3.name, ())
         told = len(displayed) < 2 or self.known.displays[joint] == self.cycle.modes[joint]
-        return self.power(joint) is Power.ON and told
+        return told and super().ready(joint)
 
     def alarm(self) -> BusFault | None:
         return faults.alarm(self.known)
@@ -352,7 +350,3 @@ class CanopenDrives:
 
     def write_calibration(self, joint: int, ask: Ask, calibration: Calibration, store: bool = False) -> Calibration:
         return torque_sensor_record.write_record(self.services(ask)[joint], calibration, store)
-
-
-def _profile(joint: LinkJoint) -> Profile:
-    return profile_of(joint.settings)

@@ -48,7 +48,6 @@ def used_objects() -> Iterable[Entry]:
 
 
 def bundled_path() -> str:
-    """Path of the bundled data sheet."""
     return str(files("armlink.drives.canopen").joinpath("eds/joint.eds"))
 
 

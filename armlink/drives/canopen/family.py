@@ -1,52 +1,22 @@
-"""CANopen drives with the CiA 402 profile."""
+"""CANopen drives with the CiA 402 profile; the canopen package, which takes its time, is imported where it is used."""
 
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
-from armlink.arm_file import ArmFile, LinkJoint
-from armlink.bus.can_bus import CanBus
 from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen.cia402 import state_of
-from armlink.drives.canopen.settings import CanopenSettings
-from armlink.drives.family import Drives, Family
-from armlink.drives.findings import DriveFinding, FoundDrives, Result
-from armlink.drives.orders import Limits
-from armlink.drives.traits import Traits
-
-TRAITS = Traits(
-    torque="link",
-    calibration="controller",
-    silence="holds",
-    bounds=("torque", "window"),
-    cadence="sync",
-    frame="11",
-)
-"""Of a drive with our torque sensor record."""
+from armlink.drives.canopen.settings import TRAITS, CanopenSettings
+from armlink.drives.family import Family
 
 
-def build(arm: ArmFile, joints: Sequence[LinkJoint]) -> Drives:
-    from armlink.drives.canopen.drives import CanopenDrives  # imports the canopen package, which takes its time
+def _late(module: str, name: str) -> Callable[..., Any]:
+    """A function or class of a module of this folder, which is imported when it is called."""
 
-    return CanopenDrives(arm, joints, TRAITS)
+    def call(*args: Any) -> Any:
+        return getattr(import_module(f"armlink.drives.canopen.{module}"), name)(*args)
 
-
-def search(
-    arm: ArmFile | None, bus: str | None, json: Path | None, write: Callable[..., None], show: Callable[..., None]
-) -> int:
-    """All nodes of a bus; see `armlink.drives.canopen.check.scan_report`."""
-    from armlink.drives.canopen.check.scan_report import scan_report
-
-    return scan_report(arm, bus, json, write, show)
-
-
-def self_test(
-    link: Any, drives: Any, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
-) -> list[Result]:
-    """The self-test of CiA 402 controllers; see `armlink.drives.canopen.check.self_test`."""
-    from armlink.drives.canopen.check.self_test import CanopenSelfTest
-
-    return CanopenSelfTest(link, drives, limits, progress).run(power)
+    return call
 
 
 def state_name(code: int) -> str:
@@ -54,29 +24,15 @@ def state_name(code: int) -> str:
     return "unknown" if code == NO_STATUS else state_of(code).value
 
 
-def find(bus: CanBus) -> FoundDrives:
-    """Nodes on a bus with their ratings; see `armlink.drives.canopen.check.found_drives`."""
-    from armlink.drives.canopen.check.found_drives import FoundNodes
-
-    return FoundNodes(bus)
-
-
-def examine(arm: ArmFile, bus: CanBus, name: str) -> Iterator[DriveFinding]:
-    """Contradictions between nodes and arm file; see `armlink.drives.canopen.check.arm_findings`."""
-    from armlink.drives.canopen.check.arm_findings import arm_findings
-
-    return arm_findings(arm, bus, name)
-
-
 FAMILY = Family(
     "canopen",
     TRAITS,
     CanopenSettings,
-    build,
-    self_test=self_test,
-    search=search,
-    find=find,
-    examine=examine,
+    build=_late("drives", "CanopenDrives"),
+    self_test=_late("check.self_test", "self_test"),
+    search=_late("check.scan", "scan_report"),
+    find=_late("check.scan", "FoundNodes"),
+    examine=_late("check.scan", "arm_findings"),
     state_name=state_name,
     summary="CiA 402 (CANopen), with or without our torque sensor object 2100h",
 )

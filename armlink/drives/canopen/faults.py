@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-from armlink.drives.board import NO_STATUS
+from armlink.drives.board import EVENTS_KEPT, NO_STATUS
 from armlink.drives.canopen import emcy
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.cia402 import CYCLIC_VELOCITY, MODE_NAMES, DriveState, state_of
@@ -16,10 +16,6 @@ ENABLED_BITS = 0x27
 WATCHDOGS = frozenset({0x8130, 0x8250, 0x8700})
 """Emergencies of a node that does not hear its host: heartbeat, RPDO deadline, SYNC (CiA 301)."""
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
-
-
-EMERGENCIES_KEPT = 64
-"""So many emergencies are kept; a storm of them costs no memory."""
 NO_MODE = 0
 """Stands for the mode display of a joint that has sent none: no mode is active."""
 
@@ -38,7 +34,7 @@ class JointStates:
         """When each joint's mode was commanded, by the clock [s]."""
         self.positions = [math.nan] * m
         """Position readings [rad]."""
-        self.emergencies: deque[tuple[int, int, int]] = deque(maxlen=EMERGENCIES_KEPT)
+        self.emergencies: deque[tuple[int, int, int]] = deque(maxlen=EVENTS_KEPT)
         """(joint, code, error register) in the order of arrival; ends of errors (code 0) are not kept."""
         self.node_states: dict[int, int] = {}
         """NMT states by joint, of the newest heartbeat."""

@@ -87,7 +87,7 @@ SYNC_ID = 0x80
 NMT_ID = 0x000
 EMCY_ID = 0x80
 HEARTBEAT_ID = 0x700
-SDO_REQUEST_ID = 0x600
+SDO_REQUEST_ID, SDO_RESPONSE_ID = 0x600, 0x580
 LSS_ID = 0x7E5
 """Requests of a master that sets node ids and bit rates (CiA 305)."""
 NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET = 0x01, 0x80, 0x81

@@ -25,7 +25,7 @@ EVENT_TYPE = 255
 STATUS_DECIMATION = 4
 """TPDO2 is sent after every fourth SYNC."""
 
-_INVALID = 1 << 31
+INVALID = 1 << 31
 _NO_REMOTE = 1 << 30
 
 
@@ -35,8 +35,6 @@ class MappingRefused(Exception):
 
 @dataclass(frozen=True)
 class Pdo:
-    """One PDO of every joint."""
-
     name: str
     cob_base: int
     """COB-ID without the node id."""
@@ -114,7 +112,7 @@ def write_mapping(pdo: Pdo, node: int, write: Write, deadline_ms: int | None = 0
     settings += [
         (Entry(pdo.mapping, i, "I", f"{pdo.name} mapping {i}"), entry.mapping) for i, entry in enumerate(pdo.entries, 1)
     ]
-    write(cob_id, value | _INVALID)
+    write(cob_id, value | INVALID)
     write(count, 0)
     for entry, setting in settings:
         write(entry, setting)
@@ -125,7 +123,7 @@ def write_mapping(pdo: Pdo, node: int, write: Write, deadline_ms: int | None = 0
 
 def try_mapping(pdo: Pdo, node: int, write: Write) -> None:
     """Write the mapping of one PDO, which stays invalid; raises what `write` raises where the device refuses it."""
-    write(Entry(pdo.communication, 1, "I", f"{pdo.name} COB-ID"), pdo.cob_base + node | _INVALID)
+    write(Entry(pdo.communication, 1, "I", f"{pdo.name} COB-ID"), pdo.cob_base + node | INVALID)
     write(Entry(pdo.mapping, 0, "B", f"{pdo.name} number of mapped objects"), 0)
     for i, entry in enumerate(pdo.entries, 1):
         write(Entry(pdo.mapping, i, "I", f"{pdo.name} mapping {i}"), entry.mapping)
@@ -141,9 +139,9 @@ def disable(index: int, write: Write, read: Read) -> None:
     """Set the RPDO whose communication record is `index` invalid; raises MappingRefused if it stays valid."""
     cob_id = Entry(index, 1, "I", f"RPDO{index - _RPDOS.start + 1} COB-ID")
     held = read(cob_id)
-    if not held & _INVALID:
-        write(cob_id, held | _INVALID)
-        if not read(cob_id) & _INVALID:
+    if not held & INVALID:
+        write(cob_id, held | INVALID)
+        if not read(cob_id) & INVALID:
             raise MappingRefused(f"{cob_id}: stays valid, so another program could command this joint through it")
 
 

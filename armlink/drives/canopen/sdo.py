@@ -125,7 +125,6 @@ class NodeServices:
         return True
 
     def read(self, entry: Entry) -> Any:
-        """Value of an object; raises BusFault."""
         try:
             data = self._upload(entry)
         except SdoAbortedError as error:
@@ -146,7 +145,6 @@ class NodeServices:
             raise self.fault(entry, f"malformed SDO response: {error}") from None
 
     def write(self, entry: Entry, value: float) -> None:
-        """Set an object; raises BusFault."""
         try:
             self.remote.sdo.download(entry.index, entry.sub, struct.pack("<" + entry.code, value))
         except SdoAbortedError as error:

@@ -60,6 +60,17 @@ def units_from(
     )
 
 
+def told_units(services: NodeServices, rated_torque_mnm: int) -> Units:
+    """Scales by what a device tells of encoder, gear and feed; raises ValueError on a zero, BusFault."""
+    entries = (
+        (objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS),
+        (objects.GEAR_MOTOR, objects.GEAR_SHAFT),
+        (objects.FEED, objects.FEED_SHAFT),
+    )
+    encoder, gear, feed = ((int(services.read(one)), int(services.read(other))) for one, other in entries)
+    return units_from(rated_torque_mnm, encoder, gear, feed)
+
+
 def assumed_units(joints: Sequence[LinkJoint]) -> tuple[Units, ...]:
     """Scales from the arm file's rated torques and USER_UNITS per revolution, for listeners, which read no objects.
 
@@ -80,14 +91,10 @@ def read_units(services: NodeServices, joint: LinkJoint) -> Units:
     settings: CanopenSettings = joint.settings
     if settings.torque != "record":
         return _stock_units(services, joint, settings)
-    read = services.read
-    rated_mnm = int(read(objects.RATED_TORQUE))
+    rated_mnm = int(services.read(objects.RATED_TORQUE))
     _require_rated(joint, rated_mnm * 1e-3, joint.rated_torque)
-    encoder = int(read(objects.ENCODER_INCREMENTS)), int(read(objects.ENCODER_REVOLUTIONS))
-    gear = int(read(objects.GEAR_MOTOR)), int(read(objects.GEAR_SHAFT))
-    feed = int(read(objects.FEED)), int(read(objects.FEED_SHAFT))
     try:
-        return units_from(rated_mnm, encoder, gear, feed)
+        return told_units(services, rated_mnm)
     except ValueError as error:
         raise BusFault(f"{joint.name} (node {settings.node}): no units: {error}") from None
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
+from armlink.drives.base import Ask
 from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, error_text, unpack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
-from armlink.drives.family import Ask, Family
-from armlink.drives.mit_drives import MitDrives, MitKnown
-from armlink.drives.mit_packing import Special, pack_command, special, unwrap
-from armlink.drives.mit_setup import mit_setup, require_window
+from armlink.drives.family import Family
+from armlink.drives.mit_drives import MitDrives, MitMemory
+from armlink.drives.mit_packing import Special, grid_of, pack_command, special, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, law_torque
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
@@ -33,9 +33,7 @@ FOLLOWS = 0.5
 
 
 @dataclass
-class _CubeMarsState(MitKnown):
-    """Newest state of one drive."""
-
+class CubeMarsMemory(MitMemory):
     on: bool | None = None
     """In motor mode, by the newest switching that was answered."""
     switched: Special | None = None
@@ -52,124 +50,102 @@ class _CubeMarsState(MitKnown):
     """The next reply tells whether the newest order is still followed."""
 
 
-class CubeMarsDrives(MitDrives):
-    """The drives of one bus; see `Drives`."""
-
+class CubeMarsDrives(MitDrives[CubeMarsMemory]):
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent. Raises BadInput where one drive's replies have another's id."""
-        self._known: list[_CubeMarsState] = [_CubeMarsState() for _ in joints]
-        super().__init__(joints, TRAITS, self._known)
+        super().__init__(joints, TRAITS, CubeMarsMemory)
         self._traits = [
             replace(traits, silence="falls") if settings.can_timeout else traits
-            for traits, settings in zip(self._traits, self._settings, strict=True)
+            for traits, settings in zip(self._traits, self.settings, strict=True)
         ]
-        for joint, (known, settings) in enumerate(zip(self._known, self._settings, strict=True)):
-            known.use(settings.ranges)
+        for joint, (known, settings) in enumerate(zip(self.memory, self.settings, strict=True)):
+            known.grid = grid_of(settings.ranges)
             other = self._joint_of.get(settings.reply)
             if other is not None:
                 raise BadInput(
                     f"{arm.path}: {self.names[joint]}: drive.reply {settings.reply:#04x} is the id of "
                     f"{self.names[other]}'s commands: replies need an id that is no drive's (master id, usually 0)"
                 )
-        self._replies = {(each.reply, each.id): joint for joint, each in enumerate(self._settings)}
+        self._replies = {(each.reply, each.id): joint for joint, each in enumerate(self.settings)}
         self._spare_canopen(arm)
 
     def _spare_canopen(self, arm: ArmFile) -> None:
         """Raise BadInput where CANopen nodes share the bus and would take replies for NMT commands."""
-        buses = {row.bus for row, each in zip(self.rows, self._settings, strict=True) if each.reply == NMT_ID}
-        others = [each for each in arm.require_link().joints if each.settings.family == "canopen"]
-        for joint in others:
-            if joint.bus in buses:
+        buses = {row.bus for row in self.rows if row.settings.reply == NMT_ID}
+        for joint in arm.require_link().joints:
+            if joint.settings.family == "canopen" and joint.bus in buses:
                 raise BadInput(
                     f"{arm.path}: {joint.name}: a CANopen node takes CubeMars replies on id 0 for NMT commands: put "
                     "it on another bus, or set another master id in the drives (drive.reply)"
                 )
 
-    # ---- set-up
+    # ---- before the cycle
 
     def identify(self, ask: Ask) -> list[DriveIdentity]:
-        """See Drives: only a drive that nobody is heard to drive is asked, by what also leaves motor mode."""
-        for known in self._known:
+        """Only a drive that nobody is heard to drive is asked, by what also leaves motor mode."""
+        for known in self.memory:
             known.position = math.nan
-        ask.wait(lambda: all(math.isfinite(known.position) for known in self._known), LISTEN)
-        found = []
-        for joint, (known, settings) in enumerate(zip(self._known, self._settings, strict=True)):
-            there = math.isfinite(known.position) or self._exit(ask, joint) is not None
-            name = f"CubeMars {settings.model}".strip() if there else ""
-            found.append(DriveIdentity(joint, settings.address, there, name, power=self.power(joint)))
-        return found
+        ask.wait(lambda: all(math.isfinite(known.position) for known in self.memory), LISTEN)
+        return super().identify(ask)
+
+    def identity(self, joint: int, ask: Ask) -> DriveIdentity:
+        there = math.isfinite(self.memory[joint].position) or self._exit(ask, joint) is not None
+        return self.present(joint, f"CubeMars {self.settings[joint].model}".strip()) if there else self.absent(joint)
 
     def positions(self, ask: Ask) -> list[float]:
-        """See TellsPosition: asked as `identify` does."""
+        """Asked as `identify` does."""
         self.identify(ask)
-        return [known.position for known in self._known]
+        return [known.position for known in self.memory]
 
     def _exit(self, ask: Ask, joint: int) -> CubeMarsReply | None:
-        """Leave motor mode; the reply, None where there is none."""
-        return ask((self._settings[joint].id, special(Special.DISABLE)), self._reply_of(joint))
+        return ask((self.settings[joint].id, special(Special.DISABLE)), self._reply_of(joint))
 
     def _reply_of(self, joint: int) -> Callable[[int, bytes], CubeMarsReply | None]:
         def reply(can_id: int, data: bytes) -> CubeMarsReply | None:
-            known = self._known[joint]
-            assert known.ranges is not None
             mine = self._replies.get((can_id, data[0])) == joint if data else False
-            return unpack_reply(data, known.ranges) if mine else None
+            return unpack_reply(data, self.grid_of(joint)) if mine else None
 
         return reply
 
-    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        """See Drives: no torque, then out of motor mode; nothing in such a drive can be read or set over CAN."""
-        return [self._prepare(ask, joint, limit) for joint, limit in enumerate(limits)]
-
-    def _prepare(self, ask: Ask, joint: int, limit: Limits) -> Setup:
-        known, settings, name = self._known[joint], self._settings[joint], self.names[joint]
-        ranges = known.ranges
-        assert ranges is not None
-        require_window(name, limit, ranges)
-        ask((settings.id, pack_command(NO_COMMAND, ranges)), self._reply_of(joint))
+    def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
+        """No torque, then out of motor mode; nothing in such a drive can be read or set over CAN."""
+        settings, name, grid = self.settings[joint], self.names[joint], self.grid_of(joint)
+        self.require_window(joint, limits, grid)
+        ask(self._quiet(joint), self._reply_of(joint))
         reply = self._exit(ask, joint)
         if reply is None:
             raise BusFault(
                 f"{name}: no answer from {settings.address} on id {settings.reply:02X}h: is it powered, in MIT mode, "
                 "and are its CAN and master ids right?"
             )
-        self._known[joint] = known = _CubeMarsState(ranges, known.grid, limit, reply.feedback.position, on=False)
+        self.memory[joint] = CubeMarsMemory(on=False)
         self.powers[joint], self.faults[joint] = Power.OFF, error_text(reply.error)
         notes = (_watched(settings), "scales are the arm file's: the drive reports none")
         where = ("position_range", "velocity_range", "torque_range")
         remedy = "if that is the drive's own range, take a drive with more; else correct it or drive.model"
-        return mit_setup(reply.feedback.position, settings.kp, settings.kd, ranges, notes, where, remedy)
+        return self.mit_setup(joint, limits, reply.feedback.position, grid, notes, where, remedy)
 
     # ---- cycle
 
-    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        return [
-            frame
-            for joint, order in enumerate(orders)
-            if order is not None
-            for frame in self._frames(joint, order, now)
-        ]
+    def _quiet(self, joint: int) -> Frame:
+        return self.settings[joint].id, pack_command(NO_COMMAND, self.grid_of(joint))
 
-    def _frames(self, joint: int, order: Order, now: float) -> list[Frame]:
-        known, drive = self._known[joint], self._settings[joint].id
-        if known.limits is None:
-            raise BusFault(f"{self.names[joint]}: a command before the set-up")
-        if known.on and now - known.commanded > known.limits.deadline:
+    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+        known, drive, limits = self.memory[joint], self.settings[joint].id, self.limits_of(joint)
+        if known.on and now - known.commanded > limits.deadline:
             known.on, known.stopped, self.powers[joint] = None, True, Power.STOPPED
         known.damping = False
         if known.on and order.power is not Power.OFF:
             known.commanded = now
-            return [self._command(joint, order) if order.power is Power.ON else self._damp(joint)]
+            return [self.command(joint, order) if order.power is Power.ON else self.damp(joint)]
         known.sent, known.lacking = None, math.inf
-        assert known.ranges is not None
-        quiet = drive, pack_command(NO_COMMAND, known.ranges)
         if order.power is Power.ON and order.walk and known.on is False:
             # motor mode goes on with the command that was in force when it was left
             known.switched, known.skip, known.commanded, known.stopped = Special.ENABLE, True, now, False
-            return [(drive, special(Special.ENABLE)), quiet]
+            return [(drive, special(Special.ENABLE)), self._quiet(joint)]
         if known.on:
             known.on = None
-            return [quiet]
+            return [self._quiet(joint)]
         known.switched = Special.DISABLE
         return [(drive, special(Special.DISABLE))]
 
@@ -177,14 +153,13 @@ class CubeMarsDrives(MitDrives):
         joint = self._replies.get((can_id, data[0])) if data else None
         if joint is None:
             return None
-        known = self._known[joint]
-        assert known.ranges is not None
-        reply = unpack_reply(data, known.ranges)
+        known, grid = self.memory[joint], self.grid_of(joint)
+        reply = unpack_reply(data, grid)
         if reply is None:
             return None
         position, velocity, torque = reply.feedback
         if math.isfinite(known.position):
-            position = unwrap(position, known.position, 2 * known.ranges.position)
+            position = unwrap(position, known.position, grid.q_span)
         known.position, known.velocity = position, velocity
         if known.switched is not None:
             known.on, known.switched = known.switched is Special.ENABLE, None
@@ -199,11 +174,11 @@ class CubeMarsDrives(MitDrives):
 
     def _judge(self, joint: int, torque: float, now: float) -> None:
         """Whether the drive makes the torque of the newest command, by a reading of it [N·m]."""
-        known = self._known[joint]
-        if known.sent is None or known.ranges is None:
+        known = self.memory[joint]
+        if known.sent is None:
             return
         wanted = law_torque(known.sent, known.position, known.velocity)
-        shown = abs(wanted) > LOADED * known.ranges.torque
+        shown = abs(wanted) > LOADED * self.grid_of(joint).t
         follows = torque * math.copysign(1.0, wanted) > FOLLOWS * abs(wanted)
         known.lacking = min(known.lacking, now) if shown and not follows else math.inf
         if known.asked:
@@ -211,13 +186,13 @@ class CubeMarsDrives(MitDrives):
             known.on, known.stopped = (follows if shown else None), shown and not follows
 
     def _idle_text(self, joint: int, now: float) -> str:
-        known = self._known[joint]
+        known = self.memory[joint]
         if known.limits is None or not now - known.lacking > known.limits.deadline:
             return ""
         return "makes no torque although its commands ask for some: it has left motor mode, or restarted"
 
     @staticmethod
-    def _power(known: _CubeMarsState) -> Power:
+    def _power(known: CubeMarsMemory) -> Power:
         if known.stopped:
             return Power.STOPPED
         if known.on:
@@ -225,24 +200,24 @@ class CubeMarsDrives(MitDrives):
         return Power.UNKNOWN if known.on is None else Power.OFF
 
     def state_request(self, joint: int) -> list[Frame]:
-        """See Drives: a command of no torque, whose reply has the torque that the drive made until then."""
-        known = self._known[joint]
-        if known.limits is None or known.ranges is None:
+        """A command of no torque, whose reply has the torque that the drive made until then."""
+        known = self.memory[joint]
+        if known.limits is None:
             return []
         known.asked = True
-        return [(self._settings[joint].id, pack_command(NO_COMMAND, known.ranges))]
+        return [self._quiet(joint)]
 
     def lets_go(self, joint: int) -> bool:
-        return not self._known[joint].on
+        return not self.memory[joint].on
 
     def own_stop(self, joint: int) -> str:
-        if not self._known[joint].stopped:
+        if not self.memory[joint].stopped:
             return ""
         return f"{self.where(joint)}: without a command for its deadline: its CAN timeout has let it go"
 
     def forget(self, restarts: bool = False) -> None:
         super().forget(restarts)
-        for known in self._known:
+        for known in self.memory:
             known.stopped, known.lacking = False, math.inf
 
 

@@ -8,7 +8,7 @@ python-can.
 
 from typing import NamedTuple
 
-from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, pack_feedback, unpack_feedback
+from armlink.drives.mit_packing import Grid, MitCommand, MitFeedback, pack_feedback, unpack_feedback
 
 MODELS = {
     "AK10-9": (12.5, 50.0, 65.0),
@@ -45,18 +45,16 @@ class CubeMarsReply(NamedTuple):
     error: int | None
 
 
-def pack_reply(reply: CubeMarsReply, ranges: Ranges) -> bytes:
-    """The eight or six bytes of a reply."""
+def pack_reply(reply: CubeMarsReply, grid: Grid) -> bytes:
     tail = b"" if reply.temperature is None else bytes([max(0, min(255, reply.temperature)), reply.error or 0])
-    return bytes([reply.drive]) + pack_feedback(reply.feedback, ranges) + tail
+    return bytes([reply.drive]) + pack_feedback(reply.feedback, grid) + tail
 
 
-def unpack_reply(data: bytes, ranges: Ranges) -> CubeMarsReply | None:
-    """The reply in `data`, or None for another length."""
+def unpack_reply(data: bytes, grid: Grid) -> CubeMarsReply | None:
     if len(data) not in (6, 8):
         return None
     temperature, error = (data[6], data[7]) if len(data) == 8 else (None, None)
-    return CubeMarsReply(data[0], unpack_feedback(data[1:6], ranges), temperature, error)
+    return CubeMarsReply(data[0], unpack_feedback(data[1:6], grid), temperature, error)
 
 
 def error_text(error: int | None) -> str:

@@ -1,20 +1,21 @@
 """Damiao DM-J drives on one bus, in MIT mode: set-up by registers, one command and one reply a cycle."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
+from armlink.drives.base import Ask
 from armlink.drives.damiao import frames
-from armlink.drives.damiao.frames import READ, WRITE, DamiaoRegister, DamiaoStatus
-from armlink.drives.damiao.set_up import LARGEST_RANGE, prepare, read_position, read_registers
+from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, DamiaoRegister, DamiaoStatus
 from armlink.drives.damiao.settings import MODELS, DamiaoSettings
-from armlink.drives.family import Ask, Family
-from armlink.drives.mit_drives import MitDrives, MitKnown
-from armlink.drives.mit_packing import Ranges, Special, feedback_in, special, unwrap
+from armlink.drives.family import Family
+from armlink.drives.mit_drives import MitDrives, MitMemory
+from armlink.drives.mit_packing import Grid, Ranges, Special, grid_of, special, unpack_feedback, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
 from armlink.drives.traits import Traits
+from armlink.errors import BadInput, BusFault
 
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="11")
 OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
@@ -25,14 +26,22 @@ IDENTITY = (
     DamiaoRegister.SERIAL_NUMBER,
     DamiaoRegister.REPLY_ID,
 )
-REGISTER_KINDS = frozenset((READ, WRITE))
-ENABLED = int(DamiaoStatus.ENABLED)
-POWERS: dict[int | None, Power] = {DamiaoStatus.DISABLED: Power.OFF, DamiaoStatus.LOST_COMMUNICATION: Power.STOPPED}
 RANGE_FIELDS: dict[int, str] = {
     DamiaoRegister.POSITION_RANGE: "position",
     DamiaoRegister.VELOCITY_RANGE: "velocity",
     DamiaoRegister.TORQUE_RANGE: "torque",
 }
+NOTED = (
+    DamiaoRegister.TORQUE_CONSTANT,
+    DamiaoRegister.OVER_CURRENT,
+    DamiaoRegister.LARGEST_CURRENT,
+    DamiaoRegister.GEAR_RATIO,
+)
+LARGEST_RANGE = 1e4
+"""No range of a real drive is larger [rad, rad/s, N·m]."""
+REGISTER_KINDS = frozenset((READ, WRITE))
+ENABLED = int(DamiaoStatus.ENABLED)
+POWERS: dict[int | None, Power] = {DamiaoStatus.DISABLED: Power.OFF, DamiaoStatus.LOST_COMMUNICATION: Power.STOPPED}
 NO_FAULTS = frozenset((int(DamiaoStatus.DISABLED), int(DamiaoStatus.ENABLED), int(DamiaoStatus.LOST_COMMUNICATION)))
 UNKNOWN_RANGES = Ranges(math.nan, math.nan, math.nan)
 FAULTS = {
@@ -46,21 +55,18 @@ FAULTS = {
 
 
 @dataclass
-class _DamiaoState(MitKnown):
+class DamiaoMemory(MitMemory):
     """Its ranges are those that its model is delivered with, until its registers are known."""
 
     state: int | None = None
 
 
-class DamiaoDrives(MitDrives):
-    """The drives of one bus; see `Drives`."""
-
+class DamiaoDrives(MitDrives[DamiaoMemory]):
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
-        self._known: list[_DamiaoState] = [_DamiaoState() for _ in joints]
-        super().__init__(joints, TRAITS, self._known)
-        for known, settings in zip(self._known, self._settings, strict=True):
-            known.use(MODELS.get(settings.model))
-        self._replies = {(each.reply, each.id & 0xF): joint for joint, each in reversed([*enumerate(self._settings)])}
+        super().__init__(joints, TRAITS, DamiaoMemory)
+        for known, settings in zip(self.memory, self.settings, strict=True):
+            known.grid = grid_of(MODELS[settings.model]) if settings.model in MODELS else None
+        self._replies = {(each.reply, each.id & 0xF): joint for joint, each in reversed([*enumerate(self.settings)])}
         """Joint by reply id and by the id in a reply."""
         self._asked: tuple[int, int, int] | None = None
         """Joint, READ or WRITE and register of the newest register request of another host."""
@@ -73,90 +79,167 @@ class DamiaoDrives(MitDrives):
         }
         return {frames.REGISTERS_ID: "register request", **super().commands(), **others}
 
+    def _refresh(self, joint: int) -> Frame:
+        return frames.REGISTERS_ID, frames.refresh_request(self.settings[joint].id)
+
     def poll(self, first: bool) -> list[Frame]:
-        return [(frames.REGISTERS_ID, frames.refresh_request(settings.id)) for settings in self._settings]
+        return [self._refresh(joint) for joint in range(self.m)]
 
-    # ---- set-up
+    def state_request(self, joint: int) -> list[Frame]:
+        return [self._refresh(joint)]
 
-    def identify(self, ask: Ask) -> list[DriveIdentity]:
-        found = []
-        for joint, settings in enumerate(self._settings):
-            values = read_registers(ask, settings.id, IDENTITY)
-            if None in values.values():
-                found.append(DriveIdentity(joint, settings.address, present=False))
-                continue
-            hardware, software, serial, reply = (int(value or 0) for value in values.values())
-            wrong = (
-                "" if reply == settings.reply else f"replies on {reply:02X}h, the arm file says {settings.reply:02X}h"
-            )
-            found.append(
-                DriveIdentity(
-                    joint,
-                    settings.address,
-                    True,
-                    "Damiao DM-J",
-                    f"{serial:08X}",
-                    f"{software} (hardware {hardware})",
-                    self.power(joint),
-                    wrong,
-                )
-            )
+    # ---- registers
+
+    def _exchange(self, ask: Ask, joint: int, request: bytes) -> float | None:
+        """The value in the answer to a register request; None where the drive does not answer."""
+        kind, register = request[2:4]
+
+        def answer(can_id: int, data: bytes) -> float | None:
+            found = frames.register_answer(data, self.settings[joint].id)
+            good = found is not None and found[:2] == (kind, register) and math.isfinite(found[2])
+            return found[2] if good and found is not None else None
+
+        return ask((frames.REGISTERS_ID, request), answer)
+
+    def _read(self, ask: Ask, joint: int, registers: Iterable[int]) -> dict[int, float] | None:
+        """Values of registers; None where the drive does not answer."""
+        found: dict[int, float] = {}
+        for register in registers:
+            value = self._exchange(ask, joint, frames.read_request(self.settings[joint].id, register))
+            if value is None:
+                return None
+            found[register] = value
         return found
+
+    def _set(self, ask: Ask, joint: int, register: DamiaoRegister, value: int, otherwise: str) -> None:
+        """Write a register in RAM and read it back. Raises BusFault."""
+        self._exchange(ask, joint, frames.write_request(self.settings[joint].id, register, value))
+        found = (self._read(ask, joint, (register,)) or {}).get(register)
+        if found != value:
+            raise BusFault(
+                f"{self.names[joint]}: register {int(register)} ({register.name}) was set to {value} and reads back "
+                f"{found}: {otherwise}"
+            )
+
+    def _told_grid(self, joint: int, values: Mapping[int, float]) -> Grid:
+        """By which a drive codes, by its range registers; raises BusFault."""
+        for register in RANGE_FIELDS:
+            if not 0.0 < values[register] < LARGEST_RANGE:
+                name = DamiaoRegister(register).name
+                raise BusFault(
+                    f"{self.names[joint]}: register {register:d} ({name}) is {values[register]}: no usable scale"
+                )
+        return grid_of(Ranges(*(values[register] for register in RANGE_FIELDS)))
+
+    def _state(self, ask: Ask, joint: int, grid: Grid) -> frames.DamiaoReply | None:
+        settings = self.settings[joint]
+
+        def state_of(can_id: int, data: bytes) -> frames.DamiaoReply | None:
+            if can_id != settings.reply or frames.register_answer(data, settings.id) is not None:
+                return None
+            reply = frames.unpack_reply(data, grid)
+            return reply if reply is not None and reply.drive == settings.id & 0xF else None
+
+        return ask(self._refresh(joint), state_of)
+
+    # ---- before the cycle
+
+    def identity(self, joint: int, ask: Ask) -> DriveIdentity:
+        values = self._read(ask, joint, IDENTITY)
+        if values is None:
+            return self.absent(joint)
+        hardware, software, serial, reply = map(int, values.values())
+        own = self.settings[joint].reply
+        wrong = "" if reply == own else f"replies on {reply:02X}h, the arm file says {own:02X}h"
+        return self.present(joint, "Damiao DM-J", f"{serial:08X}", f"{software} (hardware {hardware})", wrong)
 
     def positions(self, ask: Ask) -> list[float]:
-        """See TellsPosition: by the scales that each drive has at present."""
-        return [read_position(ask, self.names[joint], each) for joint, each in enumerate(self._settings)]
+        """By the scales that each drive has at present."""
+        return [self._position(ask, joint) for joint in range(self.m)]
 
-    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        found = []
-        for joint, (known, settings, limit) in enumerate(zip(self._known, self._settings, limits, strict=True)):
-            ranges, result = prepare(ask, self.names[joint], settings, limit)
-            known.use(ranges)
-            known.limits, known.state = limit, None
-            found.append(result)
-            known.position = result.position
-        return found
+    def _position(self, ask: Ask, joint: int) -> float:
+        values = self._read(ask, joint, RANGE_FIELDS)
+        if values is None:
+            return math.nan
+        try:
+            reply = self._state(ask, joint, self._told_grid(joint, values))
+        except BusFault:
+            return math.nan
+        return math.nan if reply is None else reply.feedback.position
+
+    def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
+        """Off, MIT mode, deadman, both read back."""
+        settings, name = self.settings[joint], self.names[joint]
+        ask.send(settings.id, special(Special.DISABLE))
+        values = self._read(ask, joint, (*RANGE_FIELDS, DamiaoRegister.REPLY_ID, *NOTED))
+        if values is None:
+            raise BusFault(f"{name}: no answer from {settings.address}: is it powered, and its id right?")
+        reply_id = values[DamiaoRegister.REPLY_ID]
+        if reply_id != settings.reply:
+            raise BadInput(
+                f"{name}: its drive replies on id {int(reply_id):02X}h (register 7), "
+                f"the arm file says reply: {settings.reply:#04x}"
+            )
+        grid = self._told_grid(joint, values)
+        self.require_window(joint, limits, grid, " (register 21)")
+        self._set(ask, joint, DamiaoRegister.CONTROL_MODE, frames.MIT_MODE, "the drive is not in MIT mode")
+        deadman = round(limits.deadline / TIMEOUT_UNIT)
+        self._set(ask, joint, DamiaoRegister.TIMEOUT, deadman, "it would keep on after its host died")
+        reply = self._state(ask, joint, grid)
+        if reply is None:
+            raise BusFault(f"{name}: {settings.address} answers registers, but sends no feedback")
+        if reply.state == DamiaoStatus.ENABLED:
+            raise BusFault(f"{name}: {settings.address} stays enabled although it was commanded to disable")
+        constant = values[DamiaoRegister.TORQUE_CONSTANT]
+        notes = (
+            f"torque constant {constant:g} N·m/A"
+            if constant
+            else "torque constant register reads 0: its meaning is unknown",
+            f"gear {values[DamiaoRegister.GEAR_RATIO]:g}",
+            f"current limit {values[DamiaoRegister.OVER_CURRENT] * values[DamiaoRegister.LARGEST_CURRENT]:g} A",
+        )
+        where = ("register 21 (PMAX)", "register 22 (VMAX)", "register 23 (TMAX)")
+        remedy = "write it with the maker's tool and store it"
+        self.memory[joint].state = None
+        return self.mit_setup(joint, limits, reply.feedback.position, grid, notes, where, remedy)
 
     # ---- cycle
 
-    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        return [self._frame(joint, order) for joint, order in enumerate(orders) if order is not None]
-
-    def _frame(self, joint: int, order: Order) -> Frame:
-        known, drive = self._known[joint], self._settings[joint].id
+    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+        known, drive = self.memory[joint], self.settings[joint].id
         known.damping = False
         if known.limits is None:
             known.sent = None
-            return frames.REGISTERS_ID, frames.refresh_request(drive)
+            return (self._refresh(joint),)
         on = known.state == ENABLED
         if order.power is Power.ON and on:
-            return self._command(joint, order)
+            return (self.command(joint, order),)
         if order.power is Power.STOPPED and on:
-            return self._damp(joint)
+            return (self.damp(joint),)
         known.sent = None
         if order.power is Power.OFF and on:
-            return drive, special(Special.DISABLE)
+            return ((drive, special(Special.DISABLE)),)
         if order.power is Power.ON and order.walk:
             if known.state == DamiaoStatus.DISABLED:
-                return drive, special(Special.ENABLE)
+                return ((drive, special(Special.ENABLE)),)
             if known.state is not None:
-                return drive, special(Special.CLEAR_ERROR)
-        return frames.REGISTERS_ID, frames.refresh_request(drive)
+                return ((drive, special(Special.CLEAR_ERROR)),)
+        return (self._refresh(joint),)
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         joint = self._replies.get((can_id, data[0] & 0xF)) if len(data) == 8 else None
         if joint is None:
             return None
-        known = self._known[joint]
+        known = self.memory[joint]
         if data[2] in REGISTER_KINDS:
-            told = frames.register_answer(data, self._settings[joint].id)
+            told = frames.register_answer(data, self.settings[joint].id)
             if told is not None:
                 self._overhear(joint, *told)
                 return None
         grid = known.grid
         if grid is None:
             return None
-        position, velocity, torque = feedback_in(data[1:6], grid)
+        position, velocity, torque = unpack_feedback(data[1:6], grid)
         known.state = state = data[0] >> 4
         if abs(known.position - position) > grid.q:
             position = unwrap(position, known.position, grid.q_span)
@@ -171,36 +254,33 @@ class DamiaoDrives(MitDrives):
 
         Without the request before it the bytes may as well be a reading near the lower end of the range.
         """
-        known, asked = self._known[joint], self._asked
+        known, asked = self.memory[joint], self._asked
         field = RANGE_FIELDS.get(register)
         if asked != (joint, kind, register) or field is None or not 0.0 < value < LARGEST_RANGE:
             return
         self._asked = None
-        known.use((known.ranges or UNKNOWN_RANGES)._replace(**{field: value}))
+        ranges = known.grid.ranges if known.grid else UNKNOWN_RANGES
+        known.grid = grid_of(ranges._replace(**{field: value}))
 
     @staticmethod
-    def _power(known: _DamiaoState) -> Power:
+    def _power(known: DamiaoMemory) -> Power:
         if known.state == ENABLED:
             return Power.STOPPED if known.damping else Power.ON
         return POWERS.get(known.state, Power.FAULT)
 
-    def state_request(self, joint: int) -> list[Frame]:
-        return [(frames.REGISTERS_ID, frames.refresh_request(self._settings[joint].id))]
-
     def lets_go(self, joint: int) -> bool:
-        """See Drives: in every state but enabled."""
-        return self._known[joint].state != ENABLED
+        return self.memory[joint].state != ENABLED
 
     def own_stop(self, joint: int) -> str:
-        if self._known[joint].state != DamiaoStatus.LOST_COMMUNICATION:
+        if self.memory[joint].state != DamiaoStatus.LOST_COMMUNICATION:
             return ""
         return f"{self.where(joint)}: lost communication (state Dh): its TIMEOUT ran out, the torque is off"
 
     # ---- listening
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        """See Drives; of register requests it is noted which register was asked for, so that the answer is known."""
-        if can_id == frames.REGISTERS_ID and len(data) == 8 and data[2] in (READ, WRITE):
+        """Of register requests it is noted which register was asked for, so that the answer is known."""
+        if can_id == frames.REGISTERS_ID and len(data) == 8 and data[2] in REGISTER_KINDS:
             asked = self._joint_of.get(data[0] | data[1] << 8)
             self._asked = None if asked is None else (asked, data[2], data[3])
             return None

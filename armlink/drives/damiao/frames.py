@@ -7,7 +7,7 @@ import struct
 from enum import IntEnum
 from typing import NamedTuple
 
-from armlink.drives.mit_packing import MitFeedback, Ranges, pack_feedback, unpack_feedback
+from armlink.drives.mit_packing import Grid, MitFeedback, pack_feedback, unpack_feedback
 
 REGISTERS_ID = 0x7FF
 """Identifier of register requests to any drive."""
@@ -81,17 +81,14 @@ def write_request(drive: int, register: int, value: float) -> bytes:
 
 
 def refresh_request(drive: int) -> bytes:
-    """Ask for a reply without a command."""
     return struct.pack("<HB5x", drive, REFRESH)
 
 
 def pack_value(register: int, value: float) -> bytes:
-    """Four bytes of a register's value."""
     return VALUES[0].pack(int(value)) if register in INTEGER_REGISTERS else VALUES[1].pack(value)
 
 
 def unpack_value(register: int, data: bytes) -> float:
-    """Value of a register from its four bytes."""
     value: float = VALUES[register not in INTEGER_REGISTERS].unpack(data)[0]
     return value
 
@@ -107,15 +104,13 @@ def register_answer(data: bytes, drive: int) -> tuple[int, int, float] | None:
     return data[2], data[3], unpack_value(data[3], data[4:8])
 
 
-def pack_reply(reply: DamiaoReply, ranges: Ranges) -> bytes:
-    """The eight bytes of a reply."""
+def pack_reply(reply: DamiaoReply, grid: Grid) -> bytes:
     head = reply.state << 4 | reply.drive & 0xF
     tail = (max(0, min(255, reply.stage_temperature)), max(0, min(255, reply.rotor_temperature)))
-    return bytes([head]) + pack_feedback(reply.feedback, ranges) + bytes(tail)
+    return bytes([head]) + pack_feedback(reply.feedback, grid) + bytes(tail)
 
 
-def unpack_reply(data: bytes, ranges: Ranges) -> DamiaoReply | None:
-    """The reply in `data`, or None for another length."""
+def unpack_reply(data: bytes, grid: Grid) -> DamiaoReply | None:
     if len(data) != 8:
         return None
-    return DamiaoReply(data[0] & 0xF, data[0] >> 4, unpack_feedback(data[1:6], ranges), data[6], data[7])
+    return DamiaoReply(data[0] & 0xF, data[0] >> 4, unpack_feedback(data[1:6], grid), data[6], data[7])

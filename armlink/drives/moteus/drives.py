@@ -9,20 +9,31 @@ from pydantic import Field
 
 from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import EXTENDED, Frame
-from armlink.drives.base import BasicDrives, no_order
-from armlink.drives.family import Ask, Family
+from armlink.drives.base import Ask, BasicDrives, DriveMemory, no_order
+from armlink.drives.family import Family
 from armlink.drives.moteus import frames
 from armlink.drives.moteus.frames import (
     COMMAND,
     CYCLE_COMMAND,
     CYCLE_REPLY,
+    HOMED_AT_OUTPUT,
     QUERY,
     READ_ERROR,
     REPLY,
     WRITE,
     MoteusRegister,
 )
-from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.orders import (
+    DriveIdentity,
+    Limits,
+    Mode,
+    Order,
+    Power,
+    Reading,
+    Setup,
+    real32_step,
+    real32_within,
+)
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
@@ -47,7 +58,6 @@ class MoteusSettings(DriveSettings):
 
 TURN = 2 * math.pi
 TRAITS = Traits(torque="current", calibration="host", silence="damps", bounds=("torque",), cadence="reply", frame="fd")
-HOMED_AT_OUTPUT = 2
 NOMINAL_BITS, FAST_BITS, FASTER = 60, 40, 5
 """Bits of a CAN FD frame at the nominal rate (29-bit identifier, end) and besides the payload at the fast one, and how
 many times faster that is."""
@@ -84,24 +94,16 @@ STOPPED_MODES = (frames.MoteusMode.TIMEOUT, frames.MoteusMode.ZERO_VELOCITY, fra
 
 
 @dataclass
-class _MoteusState:
-    """Newest state of one controller."""
-
-    limits: Limits | None = None
+class MoteusMemory(DriveMemory):
     mode: int | None = None
     fault: int = 0
-    sent: Order | None = None
 
 
-class MoteusDrives(BasicDrives):
-    """The controllers of one bus; see `Drives`."""
-
+class MoteusDrives(BasicDrives[MoteusMemory]):
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
         """Nothing is sent. Raises BadInput for a bus without CAN FD."""
-        super().__init__(joints, TRAITS)
-        self._settings = [joint.settings for joint in joints]
-        self._known = [_MoteusState() for _ in joints]
-        self._joint_of = {_reply_id(settings): joint for joint, settings in enumerate(self._settings)}
+        super().__init__(joints, TRAITS, MoteusMemory)
+        self._joint_of = {_reply_id(settings): joint for joint, settings in enumerate(self.settings)}
         section = arm.require_link()
         bus = section.buses[joints[0].bus] if joints[0].bus else section.bus
         if not bus.fd:
@@ -114,24 +116,25 @@ class MoteusDrives(BasicDrives):
         """Frames to our controllers, from any source, with or without a wish for a reply."""
         return {
             _flagged(head << 8 | settings.id): f"command to {name}"
-            for settings, name in zip(self._settings, self.names, strict=True)
+            for settings, name in zip(self.settings, self.names, strict=True)
             for head in range(0x100)
         }
 
     def cycle_bits(self) -> float:
-        """See Drives: identifiers at the nominal rate, the rest five times as fast."""
+        """Identifiers at the nominal rate, the rest five times as fast."""
         payload = CYCLE_COMMAND.size + CYCLE_REPLY.size
         return self.m * (2 * NOMINAL_BITS + (8 * payload + 2 * FAST_BITS) * 1.25 / FASTER)
 
+    def _frame(self, joint: int, data: bytes) -> Frame:
+        settings = self.settings[joint]
+        return _flagged(frames.identifier(settings.source, settings.id, True)), data
+
     def poll(self, first: bool) -> list[Frame]:
-        return [
-            (_flagged(frames.identifier(settings.source, settings.id, True)), frames.pack({}, QUERY))
-            for settings in self._settings
-        ]
+        return [self._frame(joint, frames.pack({}, QUERY)) for joint in range(self.m)]
 
     # ---- set-up
 
-    def identify(self, ask: Ask) -> list[DriveIdentity]:
+    def identity(self, joint: int, ask: Ask) -> DriveIdentity:
         asked = (
             MoteusRegister.MODEL,
             MoteusRegister.FIRMWARE,
@@ -139,22 +142,15 @@ class MoteusDrives(BasicDrives):
             MoteusRegister.SERIAL2,
             MoteusRegister.SERIAL3,
         )
-        found = []
-        for joint, settings in enumerate(self._settings):
-            values = self._ask(ask, joint, {}, asked)
-            if values is None:
-                found.append(DriveIdentity(joint, settings.address, present=False))
-                continue
-            model, firmware, *serial = (int(values.get(register, 0)) for register in asked)
-            text = "".join(f"{part & 0xFFFFFFFF:08X}" for part in reversed(serial))
-            version = f"{firmware >> 8 & 0xFF}.{firmware & 0xFF}"
-            found.append(
-                DriveIdentity(joint, settings.address, True, f"moteus model {model}", text, version, self.power(joint))
-            )
-        return found
+        values = self._ask(ask, joint, {}, asked)
+        if values is None:
+            return self.absent(joint)
+        model, firmware, *serial = (int(values.get(register, 0)) for register in asked)
+        text = "".join(f"{part & 0xFFFFFFFF:08X}" for part in reversed(serial))
+        return self.present(joint, f"moteus model {model}", text, f"{firmware >> 8 & 0xFF}.{firmware & 0xFF}")
 
     def positions(self, ask: Ask) -> list[float]:
-        """See TellsPosition: only those of the output count."""
+        """Only those of the output count."""
         found = []
         for joint in range(self.m):
             values = self._ask(ask, joint, {}, (*QUERY, MoteusRegister.HOME_STATE)) or {}
@@ -162,40 +158,34 @@ class MoteusDrives(BasicDrives):
             found.append(values.get(MoteusRegister.POSITION, math.nan) * TURN if at_output else math.nan)
         return found
 
-    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        """See Drives: stopped, and referenced to its output; torque and watchdog go with every command."""
-        found = []
-        for joint, (known, limit) in enumerate(zip(self._known, limits, strict=True)):
-            name, asked = self.names[joint], (*QUERY, MoteusRegister.HOME_STATE)
-            values = self._ask(ask, joint, {MoteusRegister.MODE: frames.MoteusMode.STOPPED}, asked)
-            if values is None:
-                address = self._settings[joint].address
-                raise BusFault(f"{name}: no answer from {address}: is it powered, its id right, the bus CAN FD?")
-            if values.get(MoteusRegister.HOME_STATE) != HOMED_AT_OUTPUT:
-                raise BusFault(
-                    f"{name}: its position is not that of the output (home state "
-                    f"{values.get(MoteusRegister.HOME_STATE, math.nan):.0f}, expected 2): set it (register 130h) or "
-                    "use an encoder at the output"
-                )
-            position = values.get(MoteusRegister.POSITION, math.nan) * TURN
-            if not math.isfinite(position):
-                raise BusFault(f"{name}: reports no position")
-            known.limits, known.mode = limit, None
-            found.append(
-                Setup(
-                    position=position,
-                    torque=0.0,
-                    position_step=TURN * 2.0**-23 * max(1.0, abs(position) / TURN),
-                    modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
-                    notes=("largest torque and watchdog are part of every command",),
-                )
+    def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
+        """Stopped, and referenced to its output; torque and watchdog go with every command."""
+        known, name, asked = self.memory[joint], self.names[joint], (*QUERY, MoteusRegister.HOME_STATE)
+        values = self._ask(ask, joint, {MoteusRegister.MODE: frames.MoteusMode.STOPPED}, asked)
+        if values is None:
+            address = self.settings[joint].address
+            raise BusFault(f"{name}: no answer from {address}: is it powered, its id right, the bus CAN FD?")
+        if values.get(MoteusRegister.HOME_STATE) != HOMED_AT_OUTPUT:
+            raise BusFault(
+                f"{name}: its position is not that of the output (home state "
+                f"{values.get(MoteusRegister.HOME_STATE, math.nan):.0f}, expected 2): set it (register 130h) or "
+                "use an encoder at the output"
             )
-        return found
+        position = values.get(MoteusRegister.POSITION, math.nan) * TURN
+        if not math.isfinite(position):
+            raise BusFault(f"{name}: reports no position")
+        known.limits, known.mode = limits, None
+        return Setup(
+            position=position,
+            torque=0.0,
+            position_step=real32_step(position / TURN) * TURN,
+            modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
+            notes=("largest torque and watchdog are part of every command",),
+        )
 
     def _ask(self, ask: Ask, joint: int, writes: Mapping[int, float], asked: Sequence[int]) -> dict[int, float] | None:
         """Values of the registers that came, or None without an answer."""
-        settings = self._settings[joint]
-        reply_id = _reply_id(settings)
+        reply_id = _reply_id(self.settings[joint])
 
         def answer(can_id: int, data: bytes) -> dict[int, float] | None:
             if can_id != reply_id:
@@ -205,27 +195,19 @@ class MoteusDrives(BasicDrives):
                 return None
             return {each.register: each.value for each in subframes if each.kind == REPLY}
 
-        return ask(
-            (_flagged(frames.identifier(settings.source, settings.id, True)), frames.pack(writes, asked)), answer
-        )
+        return ask(self._frame(joint, frames.pack(writes, asked)), answer)
 
     # ---- cycle
 
-    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        found = []
-        for joint, order in enumerate(orders):
-            if order is None:
-                continue
-            settings = self._settings[joint]
-            writes = self._writes(joint, order)
-            data = CYCLE_COMMAND.pack(writes) if len(writes) == len(COMMAND) else frames.pack(writes, QUERY)
-            told = _order_of(data)
-            self._known[joint].sent = told if told is not None and told.power is Power.ON else None
-            found.append((_flagged(frames.identifier(settings.source, settings.id, True)), data))
-        return found
+    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+        writes = self._writes(joint, order)
+        data = CYCLE_COMMAND.pack(writes) if len(writes) == len(COMMAND) else frames.pack(writes, QUERY)
+        told = _order_of(data)
+        self.memory[joint].sent = told if told is not None and told.power is Power.ON else None
+        return (self._frame(joint, data),)
 
     def _writes(self, joint: int, order: Order) -> dict[int, float]:
-        known = self._known[joint]
+        known = self.memory[joint]
         on = known.mode == frames.MoteusMode.POSITION
         if order.power is Power.STOPPED and known.mode in (frames.MoteusMode.POSITION, *STOPPED_MODES):
             damps = known.mode == frames.MoteusMode.TIMEOUT
@@ -239,37 +221,31 @@ class MoteusDrives(BasicDrives):
         return {MoteusRegister.MODE: frames.MoteusMode.STOPPED} if order.power is Power.OFF else {}
 
     def _command(self, joint: int, order: Order) -> dict[int, float]:
-        limits = self._known[joint].limits
-        if limits is None:
-            raise BusFault(f"{self.names[joint]}: a command before the set-up")
+        limits = self.limits_of(joint)
         if not all(math.isfinite(value) for value in (order.position, order.velocity, order.torque)):
             raise ValueError(f"{self.names[joint]}: an order that is not finite: {order}")
         stiff = float(order.mode == Mode.POSITION)
-        most = limits.max_torque
         return {
             MoteusRegister.MODE: frames.MoteusMode.POSITION,
             MoteusRegister.COMMAND_POSITION: order.position / TURN if stiff else math.nan,
             MoteusRegister.COMMAND_VELOCITY: order.velocity / TURN if stiff else 0.0,
-            MoteusRegister.COMMAND_TORQUE: 0.0 if stiff else _float_within(order.torque, most),
+            MoteusRegister.COMMAND_TORQUE: 0.0 if stiff else real32_within(order.torque, limits.max_torque),
             MoteusRegister.COMMAND_KP_SCALE: stiff,
             MoteusRegister.COMMAND_KD_SCALE: stiff,
-            MoteusRegister.COMMAND_MAX_TORQUE: _float_within(most, most),
+            MoteusRegister.COMMAND_MAX_TORQUE: real32_within(math.inf, limits.max_torque),
             MoteusRegister.COMMAND_STOP_POSITION: math.nan,
             MoteusRegister.COMMAND_WATCHDOG: limits.deadline,
             MoteusRegister.COMMAND_ILIMIT_SCALE: stiff,
         }
 
     def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
-        constant = self._settings[joint].torque_constant
-        values = (
-            None if constant is None else self._ask(ask, joint, {}, (MoteusRegister.TORQUE, MoteusRegister.Q_CURRENT))
-        )
-        if values is None or constant is None:
+        constant = self.settings[joint].torque_constant
+        if constant is None:
+            return None
+        values = self._ask(ask, joint, {}, (MoteusRegister.TORQUE, MoteusRegister.Q_CURRENT))
+        if values is None:
             return None
         return values.get(MoteusRegister.TORQUE, math.nan), constant * values.get(MoteusRegister.Q_CURRENT, math.nan)
-
-    def sent(self, joint: int) -> Order | None:
-        return self._known[joint].sent
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         joint = self._joint_of.get(can_id)
@@ -281,7 +257,7 @@ class MoteusDrives(BasicDrives):
         mode, fault = values.get(MoteusRegister.MODE, math.nan), values.get(MoteusRegister.FAULT, math.nan)
         if not math.isfinite(mode):
             return None
-        known = self._known[joint]
+        known = self.memory[joint]
         known.mode = int(mode)
         if math.isfinite(fault):
             known.fault = int(fault)
@@ -301,31 +277,30 @@ class MoteusDrives(BasicDrives):
         )
 
     def state_request(self, joint: int) -> list[Frame]:
-        """See Drives: a query."""
         return [self.poll(first=False)[joint]]
 
     def own_stop(self, joint: int) -> str:
-        if self._known[joint].mode != frames.MoteusMode.TIMEOUT:
+        if self.memory[joint].mode != frames.MoteusMode.TIMEOUT:
             return ""
         return f"{self.where(joint)}: its watchdog ran out: it damps until it is stopped (mode 11)"
 
     # ---- listening
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        for joint, settings in enumerate(self._settings):
+        for joint, settings in enumerate(self.settings):
             if can_id & 0xFF == settings.id and can_id & 0x1FFFFFFF < 0x10000 and _flagged(can_id & 0xFFFF) == can_id:
                 order = _order_of(data)
                 return None if order is None else (joint, order)
         return None
 
 
-def _power(known: _MoteusState) -> Power:
+def _power(known: MoteusMemory) -> Power:
     if known.mode in STOPPED_MODES:
         return Power.STOPPED
     return STOPS[frames.MoteusMode(known.mode)] if known.mode in STOPS else Power.READY
 
 
-def _fault_text(known: _MoteusState) -> str:
+def _fault_text(known: MoteusMemory) -> str:
     if known.mode == frames.MoteusMode.FAULT:
         return f"{FAULTS.get(known.fault, 'unknown fault')} (fault {known.fault})"
     return ""
@@ -356,12 +331,6 @@ def _order_of(data: bytes) -> Order | None:
     velocity = values.get(MoteusRegister.COMMAND_VELOCITY, 0.0) * TURN
     torque = values.get(MoteusRegister.COMMAND_TORQUE, 0.0)
     return Order(Power.ON, False, Mode.POSITION if stiff else Mode.TORQUE, position, velocity, torque, 0.0, 0.0)
-
-
-def _float_within(value: float, most: float) -> float:
-    """A value within ±most that stays within after rounding to a 32-bit float."""
-    shrunk = most * (1 - 2.0**-23)
-    return max(-shrunk, min(shrunk, value))
 
 
 def _finite(value: float) -> float:

@@ -8,7 +8,7 @@ docs/protocol/can.md and registers.md. Positions are revolutions of the output.
 
 import math
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -50,6 +50,10 @@ class MoteusRegister(IntEnum):
     SERIAL1 = 0x120
     SERIAL2 = 0x121
     SERIAL3 = 0x122
+
+
+HOMED_AT_OUTPUT = 2
+"""Home state: positions are those of the output."""
 
 
 class MoteusMode(IntEnum):
@@ -100,14 +104,13 @@ class FixedPayload:
         layout, self.heads = "<", []
         self.registers: tuple[int, ...] = ()
         for kind, registers in kinds:
-            for run in _runs(sorted(registers), FLOAT):
-                form = _form(run[0], FLOAT)
-                head = _head(kind, form, run)
+            for run in _runs(Subframe(kind, each, math.nan, _form(each, FLOAT)) for each in sorted(registers)):
+                head = _head(run)
                 self.heads.append(head)
                 layout += f"{len(head)}s"
                 if kind != READ:
-                    layout += LAYOUTS[form].format[1:] * len(run)
-                    self.registers += tuple(run)
+                    layout += LAYOUTS[run[0].resolution].format[1:] * len(run)
+                    self.registers += tuple(each.register for each in run)
         self._struct = struct.Struct(layout)
         self.size = next(length for length in LENGTHS if length >= self._struct.size)
         self._fill = bytes([NOP]) * (self.size - self._struct.size)
@@ -140,47 +143,28 @@ def identifier(source: int, destination: int, reply_wanted: bool = False) -> int
 
 
 def pack(writes: Mapping[int, float], reads: Sequence[int], resolution: int = FLOAT) -> bytes:
-    """Write registers, then read others, consecutive ones together, padded with NOP to a length of CAN FD.
+    """Write registers, then read others; raises ValueError for more than 64 bytes."""
+    frames = [Subframe(WRITE, each, writes[each], _form(each, resolution)) for each in sorted(writes)]
+    return pack_subframes(frames + [Subframe(READ, each, math.nan, _form(each, resolution)) for each in sorted(reads)])
+
+
+def pack_subframes(frames: Sequence[Subframe]) -> bytes:
+    """Subframes, consecutive registers together, padded with NOP to a length of CAN FD.
 
     Raises ValueError for more than 64 bytes.
     """
-    data = b"".join(
-        _head(WRITE, _form(run[0], resolution), run)
-        + b"".join(pack_value(r, writes[r], _form(r, resolution)) for r in run)
-        for run in _runs(sorted(writes), resolution)
-    )
-    data += b"".join(_head(READ, _form(run[0], resolution), run) for run in _runs(sorted(reads), resolution))
-    return pad(data)
-
-
-def pack_reply(values: Sequence[Subframe]) -> bytes:
-    """A reply: each subframe's register in its own resolution, runs of them together. Raises ValueError if too long."""
-    data, row = b"", 0
-    while row < len(values):
-        first = values[row]
-        end = row + 1
-        while (
-            end < len(values)
-            and values[end].kind == first.kind == REPLY
-            and values[end].resolution == first.resolution
-            and values[end].register == first.register + end - row
-        ):
-            end += 1
-        run = values[row:end]
-        if first.kind == REPLY:
-            data += _head(REPLY, first.resolution, [each.register for each in run])
-            data += b"".join(pack_value(each.register, each.value, each.resolution) for each in run)
-        else:
+    data = b""
+    for run in _runs(frames):
+        first = run[0]
+        if first.kind in (WRITE_ERROR, READ_ERROR):
             data += bytes([first.kind]) + _varuint(first.register) + _varuint(int(first.value))
-        row = end
-    return pad(data)
-
-
-def pad(data: bytes) -> bytes:
-    """Pad with NOP to the next length of a CAN FD frame. Raises ValueError beyond 64 bytes."""
+            continue
+        data += _head(run)
+        if first.kind != READ:
+            data += b"".join(pack_value(each.register, each.value, each.resolution) for each in run)
     if len(data) > LENGTHS[-1]:
         raise ValueError(f"{len(data)} bytes do not fit a CAN FD frame")
-    return data.ljust(next(length for length in LENGTHS if length >= len(data)), bytes([NOP]))
+    return data.ljust(next(length for length in LENGTHS if length >= len(data)), _NOPS)
 
 
 def unpack(data: bytes) -> Iterator[Subframe]:
@@ -230,7 +214,6 @@ def pack_value(register: int, value: float, resolution: int) -> bytes:
 
 
 def unpack_value(register: int, data: bytes, place: int, resolution: int) -> float:
-    """A register's value from `data` at `place`."""
     value: float = LAYOUTS[resolution].unpack_from(data, place)[0]
     if resolution == FLOAT or register not in SCALES:
         return value
@@ -242,22 +225,33 @@ def _form(register: int, resolution: int) -> int:
     return INT8 if register in SMALL else resolution if register in SCALES else INT32
 
 
-def _runs(registers: Sequence[int], resolution: int) -> Iterator[list[int]]:
-    """Groups of consecutive registers of one form."""
-    run: list[int] = []
-    for register in registers:
-        if run and (register != run[-1] + 1 or _form(register, resolution) != _form(run[0], resolution)):
+def _runs(frames: Iterable[Subframe]) -> Iterator[list[Subframe]]:
+    """Groups of consecutive registers of one kind and resolution; errors stand alone."""
+    run: list[Subframe] = []
+    for each in frames:
+        if run and (each.kind, each.register, each.resolution) != (
+            run[0].kind,
+            run[-1].register + 1,
+            run[0].resolution,
+        ):
             yield run
             run = []
-        run.append(register)
+        run.append(each)
+        if each.kind in (WRITE_ERROR, READ_ERROR):
+            yield run
+            run = []
     if run:
         yield run
 
 
-def _head(kind: int, resolution: int, run: Sequence[int]) -> bytes:
-    count = len(run)
+def _head(run: Sequence[Subframe]) -> bytes:
+    count, first = len(run), run[0]
     short = count if count <= 3 else 0
-    return bytes([kind | resolution << 2 | short]) + (b"" if short else _varuint(count)) + _varuint(run[0])
+    return (
+        bytes([first.kind | first.resolution << 2 | short])
+        + (b"" if short else _varuint(count))
+        + _varuint(first.register)
+    )
 
 
 def _varuint(value: int) -> bytes:

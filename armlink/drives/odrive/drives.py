@@ -13,8 +13,8 @@ from pydantic import Field
 from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import REMOTE, Frame
-from armlink.drives.base import BasicDrives, no_order
-from armlink.drives.family import Ask, Family
+from armlink.drives.base import Ask, BasicDrives, DriveMemory, no_order
+from armlink.drives.family import Family
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import (
     INPUT_FEED_FORWARD,
@@ -30,7 +30,17 @@ from armlink.drives.odrive.frames import (
     pack,
     unpack,
 )
-from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.orders import (
+    DriveIdentity,
+    Limits,
+    Mode,
+    Order,
+    Power,
+    Reading,
+    Setup,
+    real32_step,
+    real32_within,
+)
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
@@ -73,13 +83,8 @@ LARGEST_POSITION = 1e5
 
 
 @dataclass
-class _ODriveState:
-    """Newest state of one axis."""
-
-    limits: Limits | None = None
+class ODriveMemory(DriveMemory):
     heartbeat: frames.Heartbeat | None = None
-    position: float = math.nan
-    """[rad]."""
     requested: int = 0
     """Torques that were asked for, and come besides the cyclic ones."""
     came: set[int] = field(default_factory=set)
@@ -90,19 +95,14 @@ class _ODriveState:
     """How often it is still to be told."""
     asked: tuple[int, float] = (0, -math.inf)
     """Message or state that was last asked for, and when [s]."""
-    sent: Order | None = None
     stopping: bool = False
     """The newest input holds it where it stood, whatever was ordered."""
 
 
-class ODriveDrives(BasicDrives):
-    """The axes of one bus; see `Drives`."""
-
+class ODriveDrives(BasicDrives[ODriveMemory]):
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
-        super().__init__(joints, TRAITS)
-        self._settings = [joint.settings for joint in joints]
-        self._known = [_ODriveState() for _ in joints]
-        self._joint_of = {settings.node: joint for joint, settings in enumerate(self._settings)}
+        super().__init__(joints, TRAITS, ODriveMemory)
+        self._joint_of = {settings.node: joint for joint, settings in enumerate(self.settings)}
 
     def routes(self) -> Mapping[int, int]:
         return {identifier(node, message): joint for node, joint in self._joint_of.items() for message in FROM_DRIVE}
@@ -115,7 +115,7 @@ class ODriveDrives(BasicDrives):
         }
 
     def cycle_bits(self) -> float:
-        """See Drives: the input, and estimates and torques as often."""
+        """The input, and estimates and torques as often."""
         return 3 * self.m * longest_frame_bits(8)
 
     def reading_ids(self) -> Mapping[int, int]:
@@ -123,27 +123,22 @@ class ODriveDrives(BasicDrives):
 
     # ---- set-up
 
-    def identify(self, ask: Ask) -> list[DriveIdentity]:
-        """See Drives: by a remote frame for the version, else by the cyclic heartbeat."""
-        found = []
-        for joint, settings in enumerate(self._settings):
-            version = self._request(ask, joint, Message.VERSION)
-            if version is None:
-                known = self._known[joint]
-                known.came.discard(Message.HEARTBEAT)
-                there = ask.wait(lambda known=known: Message.HEARTBEAT in known.came, PATIENCE)  # type: ignore[misc]
-                found.append(DriveIdentity(joint, settings.address, there, "ODrive" if there else ""))
-                continue
-            _, product, major, minor, *firmware, _ = (int(value) for value in version)
-            name = f"ODrive {product}.{major}.{minor}"
-            text = ".".join(str(part) for part in firmware)
-            wrong = "" if firmware[:2] >= [0, 6] else f"firmware {text}, expected 0.6 or newer"
-            found.append(DriveIdentity(joint, settings.address, True, name, "", text, self.power(joint), wrong))
-        return found
+    def identity(self, joint: int, ask: Ask) -> DriveIdentity:
+        """By a remote frame for the version, else by the cyclic heartbeat."""
+        version = self._request(ask, joint, Message.VERSION)
+        if version is None:
+            came = self.memory[joint].came
+            came.discard(Message.HEARTBEAT)
+            there = ask.wait(lambda: Message.HEARTBEAT in came, PATIENCE)
+            return DriveIdentity(joint, self.settings[joint].address, there, "ODrive" if there else "")
+        _, product, major, minor, *firmware, _ = (int(value) for value in version)
+        text = ".".join(str(part) for part in firmware)
+        wrong = "" if firmware[:2] >= [0, 6] else f"firmware {text}, expected 0.6 or newer"
+        return self.present(joint, f"ODrive {product}.{major}.{minor}", "", text, wrong)
 
     def _request(self, ask: Ask, joint: int, message: Message) -> tuple[float, ...] | None:
         """Values of a message that is asked for by a remote frame; None where nothing answers."""
-        can_id = identifier(self._settings[joint].node, message)
+        can_id = identifier(self.settings[joint].node, message)
 
         def answer(came: int, data: bytes) -> tuple[float, ...] | None:
             return unpack(message, data) if came == can_id else None
@@ -151,24 +146,24 @@ class ODriveDrives(BasicDrives):
         return ask((can_id | REMOTE, bytes(8)), answer)
 
     def positions(self, ask: Ask) -> list[float]:
-        """See TellsPosition: by the estimates that come by themselves."""
-        for known in self._known:
+        """By the estimates that come by themselves."""
+        for known in self.memory:
             known.came.discard(Message.ESTIMATES)
-        ask.wait(lambda: all(Message.ESTIMATES in known.came for known in self._known), PATIENCE)
-        return [known.position if Message.ESTIMATES in known.came else math.nan for known in self._known]
+        ask.wait(lambda: all(Message.ESTIMATES in known.came for known in self.memory), PATIENCE)
+        return [known.position if Message.ESTIMATES in known.came else math.nan for known in self.memory]
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        """See Drives: idle, and its cyclic messages come."""
-        for settings in self._settings:
-            ask.send(identifier(settings.node, Message.AXIS_STATE), pack(Message.AXIS_STATE, AxisState.IDLE))
+        """Idle, and its cyclic messages come."""
+        for joint in range(self.m):
+            ask.send(*self._message(joint, Message.AXIS_STATE, AxisState.IDLE))
         wanted = {Message.HEARTBEAT, Message.ESTIMATES, Message.TORQUES}
-        for known in self._known:
+        for known in self.memory:
             known.came.clear()
-        ask.wait(lambda: all(wanted <= known.came for known in self._known), PATIENCE)
-        return [self._result(joint, limit) for joint, limit in enumerate(limits)]
+        ask.wait(lambda: all(wanted <= known.came for known in self.memory), PATIENCE)
+        return super().set_up(ask, limits)
 
-    def _result(self, joint: int, limit: Limits) -> Setup:
-        known, name, address = self._known[joint], self.names[joint], self._settings[joint].address
+    def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
+        known, name, address = self.memory[joint], self.names[joint], self.settings[joint].address
         if Message.HEARTBEAT not in known.came:
             raise BusFault(f"{name}: no heartbeat from {address}: is it powered, its node id and bit rate right?")
         if Message.ESTIMATES not in known.came or not math.isfinite(known.position):
@@ -180,11 +175,11 @@ class ODriveDrives(BasicDrives):
         if Message.TORQUES not in known.came:
             lost = ("torques (1Ch) do not come: no torque reading; set axis0.config.can.torques_msg_rate_ms",)
             modes.discard(int(Mode.TORQUE))
-        known.limits, known.mode = limit, 0
+        known.limits, known.mode = limits, 0
         return Setup(
             position=known.position,
             torque=0.0,
-            position_step=TURN * 2.0**-23 * max(1.0, abs(known.position) / TURN),
+            position_step=real32_step(known.position / TURN) * TURN,
             modes=frozenset(modes),
             lost=lost,
             notes=("watchdog, current limit and torque constant are set over USB and cannot be read over CAN",),
@@ -192,16 +187,8 @@ class ODriveDrives(BasicDrives):
 
     # ---- cycle
 
-    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        return [
-            frame
-            for joint, order in enumerate(orders)
-            if order is not None
-            for frame in self._frames(joint, order, now)
-        ]
-
-    def _frames(self, joint: int, order: Order, now: float) -> list[Frame]:
-        known = self._known[joint]
+    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+        known = self.memory[joint]
         state = known.heartbeat.state if known.heartbeat else AxisState.UNDEFINED
         on = state == AxisState.CLOSED_LOOP
         known.sent, known.stopping = None, False
@@ -223,12 +210,10 @@ class ODriveDrives(BasicDrives):
         return []
 
     def _towards_on(self, joint: int, order: Order, now: float) -> list[Frame]:
-        known = self._known[joint]
-        found: list[Frame] = []
+        known = self.memory[joint]
         if known.heartbeat is not None and known.heartbeat.error:
-            if _may_ask(known, -Message.CLEAR_ERRORS, now):
-                found = [self._message(joint, Message.CLEAR_ERRORS, 0)]
-            return found
+            may_clear = _may_ask(known, -Message.CLEAR_ERRORS, now)
+            return [self._message(joint, Message.CLEAR_ERRORS, 0)] if may_clear else []
         known.mode = 0
         fed = self._input(joint, order)
         known.sent = None
@@ -238,24 +223,21 @@ class ODriveDrives(BasicDrives):
 
     def _input(self, joint: int, order: Order) -> list[Frame]:
         """Control mode where it changes, and the input."""
-        known = self._known[joint]
-        if known.limits is None:
-            raise BusFault(f"{self.names[joint]}: a command before the set-up")
+        limits = self.limits_of(joint)
         if order.mode == Mode.TORQUE:
-            most = known.limits.max_torque * (1 - 2.0**-23)
             control, message = TORQUE_CONTROL, Message.INPUT_TORQUE
-            data = pack(message, max(-most, min(most, _checked(order.torque))))
+            data = pack(message, real32_within(_checked(order.torque), limits.max_torque))
         else:
             control, message = POSITION_CONTROL, Message.INPUT_POSITION
             data = frames.input_position(_checked(order.position) / TURN, _checked(order.velocity) / TURN, 0.0)
-        told = _order_of(identifier(self._settings[joint].node, message), data)
+        told = _order_of(message, data)
         assert told is not None
-        known.sent = told._replace(power=order.power)
+        self.memory[joint].sent = told._replace(power=order.power)
         return self._controlled(joint, control, message, data)
 
     def _controlled(self, joint: int, control: int, message: Message, data: bytes) -> list[Frame]:
         """An input, after its control mode where that changes."""
-        known, frame = self._known[joint], (identifier(self._settings[joint].node, message), data)
+        known, frame = self.memory[joint], (identifier(self.settings[joint].node, message), data)
         if known.mode != control:
             known.mode, known.mode_frames = control, MODE_FRAMES
         if not known.mode_frames:
@@ -264,18 +246,15 @@ class ODriveDrives(BasicDrives):
         return [self._message(joint, Message.CONTROLLER_MODE, control, PASSTHROUGH), frame]
 
     def _message(self, joint: int, message: Message, *values: int) -> Frame:
-        return identifier(self._settings[joint].node, message), pack(message, *values)
+        return identifier(self.settings[joint].node, message), pack(message, *values)
 
     def torque_by_current(self, joint: int, ask: Ask) -> tuple[float, float] | None:
-        constant = self._settings[joint].torque_constant
+        constant = self.settings[joint].torque_constant
         if constant is None:
             return None
-        self._known[joint].requested += 1
+        self.memory[joint].requested += 1
         torques, currents = self._request(ask, joint, Message.TORQUES), self._request(ask, joint, Message.CURRENT)
         return None if torques is None or currents is None else (torques[1], constant * currents[1])
-
-    def sent(self, joint: int) -> Order | None:
-        return self._known[joint].sent
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         joint = self._joint_of.get(can_id >> 5)
@@ -283,7 +262,7 @@ class ODriveDrives(BasicDrives):
         values = unpack(message, data)
         if joint is None or values is None or message not in FROM_DRIVE:
             return None
-        known = self._known[joint]
+        known = self.memory[joint]
         known.came.add(message)
         if message == Message.HEARTBEAT:
             known.heartbeat = frames.heartbeat(data)
@@ -303,33 +282,29 @@ class ODriveDrives(BasicDrives):
         return None
 
     def lets_go(self, joint: int) -> bool:
-        """See Drives: in every state but closed loop."""
-        beat = self._known[joint].heartbeat
+        beat = self.memory[joint].heartbeat
         return beat is not None and beat.state != AxisState.CLOSED_LOOP
 
     def own_stop(self, joint: int) -> str:
-        beat = self._known[joint].heartbeat
+        beat = self.memory[joint].heartbeat
         if beat is None or beat.state == AxisState.CLOSED_LOOP or not beat.error & AxisError.WATCHDOG:
             return ""
         return f"{self.where(joint)}: its watchdog ran out: idle, the torque is off"
 
     def forget(self, restarts: bool = False) -> None:
-        """See Drives; the next request goes out at once."""
+        """The next request goes out at once."""
         super().forget(restarts)
-        for known in self._known:
+        for known in self.memory:
             known.asked = (0, -math.inf)
 
     # ---- listening
 
     def command_of(self, can_id: int, data: bytes) -> tuple[int, Order] | None:
-        joint = self._joint_of.get(can_id >> 5)
-        if joint is None:
-            return None
-        order = _order_of(can_id, data)
-        return None if order is None else (joint, order)
+        joint, order = self._joint_of.get(can_id >> 5), _order_of(can_id & 0x1F, data)
+        return None if joint is None or order is None else (joint, order)
 
 
-def _may_ask(known: _ODriveState, what: int, now: float) -> bool:
+def _may_ask(known: ODriveMemory, what: int, now: float) -> bool:
     """Whether something may be asked for: not again before the last request for it has had time to show."""
     if known.asked[0] == what and now - known.asked[1] < ASK_AGAIN:
         return False
@@ -337,7 +312,7 @@ def _may_ask(known: _ODriveState, what: int, now: float) -> bool:
     return True
 
 
-def _power(known: _ODriveState) -> Power:
+def _power(known: ODriveMemory) -> Power:
     """The state counts, not the error: that can be 0 after a disarm."""
     beat = known.heartbeat
     if beat is None:
@@ -351,14 +326,12 @@ def _power(known: _ODriveState) -> Power:
     return Power.OFF if beat.state == AxisState.IDLE else Power.READY
 
 
-def _fault_text(known: _ODriveState) -> str:
+def _fault_text(known: ODriveMemory) -> str:
     error = known.heartbeat.error & ~AxisError.WATCHDOG if known.heartbeat else 0
     return f"{error_names(error)} (axis error {error:#x})" if error else ""
 
 
-def _order_of(can_id: int, data: bytes) -> Order | None:
-    """The order that a host's message gives, or None."""
-    message = can_id & 0x1F
+def _order_of(message: int, data: bytes) -> Order | None:
     values = unpack(message, data)
     if message == Message.ESTOP:
         return no_order()._replace(power=Power.OFF)

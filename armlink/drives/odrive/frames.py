@@ -50,8 +50,6 @@ INPUT_FEED_FORWARD = 0.001
 
 
 class AxisError(IntFlag):
-    """Errors of an axis."""
-
     INITIALIZING = 1 << 0
     SYSTEM_LEVEL = 1 << 1
     TIMING = 1 << 2

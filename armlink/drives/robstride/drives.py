@@ -3,50 +3,79 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field, FiniteFloat, model_validator
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, Frame
-from armlink.drives.base import BasicDrives, no_order
-from armlink.drives.family import ANY, BROADCAST, Ask, Family
-from armlink.drives.mit_leash import damping, order_of, round_within
-from armlink.drives.mit_packing import MitCommand, Ranges, grid_of
-from armlink.drives.orders import DriveIdentity, Limits, Mode, Order, Power, Reading, Setup
+from armlink.drives.base import ANY, BROADCAST, Ask, no_order
+from armlink.drives.family import Family
+from armlink.drives.mit_drives import MitDrives, MitMemory, Steps, order_of
+from armlink.drives.mit_packing import Grid, MitCommand
+from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
 from armlink.drives.robstride import frames
-from armlink.drives.robstride.frames import RANGES, RobStrideParameter, Type, fault_names
-from armlink.drives.robstride.set_up import identify, prepare, read_parameter
-from armlink.drives.robstride.settings import RobStrideSettings
+from armlink.drives.robstride.frames import (
+    GRIDS,
+    MOTION_MODE,
+    RANGES,
+    TIMEOUT_UNIT,
+    RobStrideParameter,
+    RunMode,
+    Type,
+    fault_names,
+)
+from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
 
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="29")
 HOST_TYPES = frozenset((Type.MOTION, Type.ENABLE, Type.STOP, Type.SET_ZERO, Type.SET_ID, Type.WRITE, Type.SAVE))
 """Frames that change something, which one host alone may send."""
+TOLERANCE = 1e-3
+"""Relative difference between a float that was written and its reading."""
+
+
+class RobStrideSettings(DriveSettings):
+    """A RobStride drive in the private protocol (29-bit identifiers)."""
+
+    family: Literal["robstride"] = "robstride"
+    id: Annotated[int, Field(ge=1, le=0x7F)]
+    """Motor id."""
+    host: Annotated[int, Field(ge=0, le=0xFF)] = 0xFD
+    """Our id, to which it replies."""
+    model: Literal["RS00", "RS01", "RS02", "RS03", "RS04", "RS05", "RS06"]
+    """Model as on its label: its frames are scaled by it, and the drive has no register that tells it."""
+    kp: Annotated[FiniteFloat, Field(ge=0)]
+    """Stiffness under position control, at the drive's output [N·m/rad]."""
+    kd: Annotated[FiniteFloat, Field(ge=0)]
+    """Damping under position control [N·m·s/rad]."""
+
+    @model_validator(mode="after")
+    def _gains_fit_the_model(self) -> "RobStrideSettings":
+        ranges = RANGES[self.model]
+        if self.kp > ranges.kp or self.kd > ranges.kd:
+            raise ValueError(f"kp {self.kp} and kd {self.kd}: {self.model} takes kp to {ranges.kp}, kd to {ranges.kd}")
+        return self
+
+    @property
+    def address(self) -> str:
+        return f"motor {self.id}"
 
 
 @dataclass
-class _RobStrideState:
-    """Newest state of one drive."""
-
-    ranges: Ranges
-    limits: Limits | None = None
+class RobStrideMemory(MitMemory):
     mode: int | None = None
     faults: int = 0
-    position: float = math.nan
-    velocity: float = math.nan
-    damping: bool = False
     was_on: bool = False
     """It has been on since forget()."""
-    sent: Order | None = None
 
 
-class RobStrideDrives(BasicDrives):
-    """The drives of one bus; see `Drives`."""
-
+class RobStrideDrives(MitDrives[RobStrideMemory]):
     def __init__(self, arm: ArmFile, joints: Sequence[LinkJoint]) -> None:
-        super().__init__(joints, TRAITS)
-        self._settings = [joint.settings for joint in joints]
-        self._known = [_RobStrideState(RANGES[settings.model]) for settings in self._settings]
-        self._joint_of = {settings.id: joint for joint, settings in enumerate(self._settings)}
+        super().__init__(joints, TRAITS, RobStrideMemory)
+        for known, settings in zip(self.memory, self.settings, strict=True):
+            known.grid = GRIDS[settings.model]
         self._intruder = ""
 
     def routes(self) -> Mapping[int, int]:
@@ -68,87 +97,109 @@ class RobStrideDrives(BasicDrives):
         """Feedback and reports, with all modes and faults that their identifiers may tell."""
         return {
             frames.identifier(kind, head << 8 | settings.id, settings.host) | EXTENDED: joint
-            for joint, settings in enumerate(self._settings)
+            for joint, settings in enumerate(self.settings)
             for kind in (Type.FEEDBACK, Type.REPORT)
             for head in range(0x100)
         }
 
-    # ---- set-up
+    # ---- parameters
 
-    def identify(self, ask: Ask) -> list[DriveIdentity]:
-        found = []
-        for joint, settings in enumerate(self._settings):
-            serial = identify(ask, settings)
-            there = serial is not None
-            found.append(
-                DriveIdentity(
-                    joint,
-                    settings.address,
-                    there,
-                    f"RobStride {settings.model}" if there else "",
-                    serial or "",
-                    power=self.power(joint),
-                )
+    def read_parameter(self, ask: Ask, joint: int, parameter: int) -> float | None:
+        """Value of a parameter; None where the drive does not answer or does not have it."""
+        settings = self.settings[joint]
+
+        def value(can_id: int, data: bytes) -> tuple[float | None] | None:
+            found = frames.parameter_answer(can_id, data) if can_id & EXTENDED else None
+            return (found[2],) if found is not None and found[:2] == (settings.id, parameter) else None
+
+        answer = ask(_extended(frames.read_frame(settings.id, settings.host, parameter)), value)
+        return None if answer is None else answer[0]
+
+    def _fed_back(self, ask: Ask, joint: int, frame: Frame) -> frames.Feedback | None:
+        def feedback(can_id: int, data: bytes) -> frames.Feedback | None:
+            found = frames.unpack_feedback(can_id, data, self.grid_of(joint)) if can_id & EXTENDED else None
+            return found if found is not None and found.drive == self.settings[joint].id else None
+
+        return ask(_extended(frame), feedback)
+
+    def _set(self, ask: Ask, joint: int, parameter: RobStrideParameter, value: float, otherwise: str) -> None:
+        """Write a parameter in RAM and read it back. Raises BusFault."""
+        settings, name = self.settings[joint], self.names[joint]
+        self._fed_back(ask, joint, frames.write_frame(settings.id, settings.host, parameter, value))
+        found = self.read_parameter(ask, joint, parameter)
+        if found is None:
+            raise BusFault(
+                f"{name}: its firmware has no parameter {int(parameter):04X}h ({parameter.name}): {otherwise}; "
+                "update it"
             )
-        return found
+        if abs(found - value) > TOLERANCE * abs(value):
+            raise BusFault(
+                f"{name}: parameter {int(parameter):04X}h ({parameter.name}) was set to {value:g} and reads back "
+                f"{found:g}: {otherwise}"
+            )
+
+    # ---- before the cycle
+
+    def identity(self, joint: int, ask: Ask) -> DriveIdentity:
+        """By its 64-bit unique id."""
+        settings = self.settings[joint]
+
+        def unique_id(can_id: int, data: bytes) -> str | None:
+            known = can_id & EXTENDED and frames.kind_of(can_id) == Type.IDENTITY and len(data) == 8
+            return data[::-1].hex().upper() if known and frames.data_of(can_id) & 0xFF == settings.id else None
+
+        serial = ask(_extended(frames.identity_frame(settings.id, settings.host)), unique_id)
+        return self.absent(joint) if serial is None else self.present(joint, f"RobStride {settings.model}", serial)
 
     def positions(self, ask: Ask) -> list[float]:
-        found = [read_parameter(ask, settings, RobStrideParameter.POSITION) for settings in self._settings]
+        found = [self.read_parameter(ask, joint, RobStrideParameter.POSITION) for joint in range(self.m)]
         return [math.nan if position is None else position for position in found]
 
-    def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        found = []
-        for joint, (known, settings, limit) in enumerate(zip(self._known, self._settings, limits, strict=True)):
-            result = prepare(ask, self.names[joint], settings, limit, known.ranges)
-            known.limits, known.mode, known.position, known.was_on = limit, None, result.position, False
-            found.append(result)
-        return found
+    def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
+        """Stopped, motion mode, torque limit, deadman, each read back."""
+        settings, known, grid = self.settings[joint], self.memory[joint], self.grid_of(joint)
+        self.require_window(joint, limits, grid)
+        feedback = self._fed_back(ask, joint, frames.stop_frame(settings.id, settings.host))
+        if feedback is None:
+            raise BusFault(
+                f"{self.names[joint]}: no answer from {settings.address}: is it powered, its id right, its protocol "
+                "private?"
+            )
+        most = min(limits.max_torque, grid.t)
+        self._set(ask, joint, RobStrideParameter.RUN_MODE, MOTION_MODE, "the drive is not in motion mode")
+        self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "its own torque limit is not in force")
+        deadman = round(limits.deadline / TIMEOUT_UNIT)
+        self._set(ask, joint, RobStrideParameter.TIMEOUT, deadman, "it would keep on after its host died")
+        known.mode, known.was_on = None, False
+        notes = (f"scales of {settings.model} by its manual: the drive has no register for them",)
+        where = (f"the range of an {settings.model}",) * 3
+        remedy = "the drive has no register for it: correct drive.model, or take a drive with more"
+        return self.mit_setup(joint, limits, feedback.motion.position, grid, notes, where, remedy)
 
     # ---- cycle
 
-    def frames(self, orders: Sequence[Order | None], now: float) -> list[Frame]:
-        found = [self._frame(joint, order) for joint, order in enumerate(orders) if order is not None]
-        return [(can_id | EXTENDED, data) for can_id, data in found]
+    def coded(self, joint: int, steps: Steps) -> Frame:
+        return _extended(frames.motion_frame(self.settings[joint].id, *steps))
 
-    def _frame(self, joint: int, order: Order) -> Frame:
-        known, settings = self._known[joint], self._settings[joint]
+    def decoded(self, can_id: int, data: bytes, grid: Grid) -> MitCommand:
+        return frames.unpack_motion(can_id, data, grid)
+
+    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+        known, settings = self.memory[joint], self.settings[joint]
         known.damping = False
-        on = known.mode == frames.RunMode.RUN and not known.faults
+        on = known.mode == RunMode.RUN and not known.faults
         if on and order.power is Power.ON:
             known.was_on = True
-            return self._command(joint, order)
+            return (self.command(joint, order),)
         if on and order.power is Power.STOPPED:
-            known.damping = True
-            assert known.limits is not None
-            quiet = damping(settings.kd, known.position, known.velocity, known.limits.max_torque)
-            return self._motion(joint, frames.motion_frame(settings.id, quiet, known.ranges), Power.STOPPED)
+            return (self.damp(joint),)
         known.sent = None
         known.was_on = known.was_on and order.power is Power.ON
         if order.power is Power.ON and order.walk and known.mode is not None and not known.faults:
-            if known.limits is None:
-                raise BusFault(f"{self.names[joint]}: a command before the set-up")
-            return frames.enable_frame(settings.id, settings.host)
-        return frames.stop_frame(settings.id, settings.host, clear_fault=order.walk and bool(known.faults))
-
-    def _command(self, joint: int, order: Order) -> Frame:
-        known = self._known[joint]
-        if known.limits is None:
-            raise BusFault(f"{self.names[joint]}: a command before the set-up")
-        stiff = order.mode == Mode.POSITION
-        asked = MitCommand(
-            order.position, order.velocity, order.kp if stiff else 0.0, order.kd if stiff else 0.0, order.torque
-        )
-        ranges, drive = known.ranges, self._settings[joint].id
-        steps = round_within(asked, grid_of(ranges, frames.MOTION_BITS), known.limits, known.position, known.velocity)
-        return self._motion(joint, frames.motion_of_steps(drive, *steps), Power.ON)
-
-    def _motion(self, joint: int, frame: Frame, power: Power) -> Frame:
-        known = self._known[joint]
-        known.sent = order_of(frames.unpack_motion(*frame, known.ranges))._replace(power=power)
-        return frame
-
-    def sent(self, joint: int) -> Order | None:
-        return self._known[joint].sent
+            self.limits_of(joint)
+            return (_extended(frames.enable_frame(settings.id, settings.host)),)
+        clear = order.walk and bool(known.faults)
+        return (_extended(frames.stop_frame(settings.id, settings.host, clear_fault=clear)),)
 
     def take(self, can_id: int, data: bytes, now: float) -> Reading | None:
         if not can_id & EXTENDED:
@@ -158,54 +209,44 @@ class RobStrideDrives(BasicDrives):
         joint = self._joint_of.get(frames.data_of(can_id) & 0xFF)
         if joint is None:
             return None
-        known = self._known[joint]
-        if known.limits is not None and can_id & 0xFF != self._settings[joint].host:
+        known = self.memory[joint]
+        if known.limits is not None and can_id & 0xFF != self.settings[joint].host:
             return None  # a listener, who has set nothing up, takes what is said to any host
-        feedback = frames.unpack_feedback(can_id, data, known.ranges)
+        feedback = frames.unpack_feedback(can_id, data, self.grid_of(joint))
         if feedback is None:
             return None
         known.mode, known.faults = feedback.mode, feedback.faults
-        known.position, known.velocity = feedback.motion.position, feedback.motion.velocity
-        return self.note(
-            Reading(
-                joint,
-                feedback.motion.position,
-                feedback.motion.velocity,
-                feedback.motion.torque,
-                temperature=feedback.temperature,
-                power=_power(known),
-                fault=_fault_text(feedback.faults),
-            )
-        )
+        known.position, known.velocity, torque = feedback.motion
+        fault = f"{fault_names(known.faults)} (fault bits {known.faults:02X}h)" if known.faults else ""
+        heat, power = feedback.temperature, _power(known)
+        return self.note(Reading(joint, known.position, known.velocity, torque, math.nan, heat, power, fault))
 
     def alarm(self) -> BusFault | None:
-        """See Drives: another host."""
+        """Another host."""
         return BusFault(self._intruder) if self._intruder else None
 
     def state_request(self, joint: int) -> list[Frame]:
-        """See Drives: the torque limit, written as it is, since a reading is answered without the mode."""
-        known, settings = self._known[joint], self._settings[joint]
-        if known.limits is None:
+        """The torque limit, written as it is, since a reading is answered without the mode."""
+        settings, limits = self.settings[joint], self.memory[joint].limits
+        if limits is None:
             return []
-        most = min(known.limits.max_torque, known.ranges.torque)
-        can_id, data = frames.write_frame(settings.id, settings.host, frames.RobStrideParameter.LIMIT_TORQUE, most)
-        return [(can_id | EXTENDED, data)]
+        most = min(limits.max_torque, self.grid_of(joint).t)
+        return [_extended(frames.write_frame(settings.id, settings.host, RobStrideParameter.LIMIT_TORQUE, most))]
 
     def lets_go(self, joint: int) -> bool:
-        """See Drives: in every mode but run."""
-        return self._known[joint].mode != frames.RunMode.RUN
+        return self.memory[joint].mode != RunMode.RUN
 
     def own_stop(self, joint: int) -> str:
-        """See Drives: a watchdog that ran out shows as mode reset alone."""
-        known = self._known[joint]
-        if not known.was_on or known.mode != frames.RunMode.RESET or known.faults:
+        """A watchdog that ran out shows as mode reset alone."""
+        known = self.memory[joint]
+        if not known.was_on or known.mode != RunMode.RESET or known.faults:
             return ""
         return f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off"
 
     def forget(self, restarts: bool = False) -> None:
         super().forget(restarts)
         self._intruder = ""
-        for known in self._known:
+        for known in self.memory:
             known.damping = known.was_on = False
 
     # ---- listening
@@ -216,22 +257,22 @@ class RobStrideDrives(BasicDrives):
             return None
         kind = frames.kind_of(can_id)
         if kind == Type.MOTION:
-            return joint, order_of(frames.unpack_motion(can_id, data, self._known[joint].ranges))
+            return joint, order_of(self.decoded(can_id, data, self.grid_of(joint)))
         powers: dict[int, Power] = {Type.ENABLE: Power.ON, Type.STOP: Power.OFF}
         power = powers.get(kind)
         return None if power is None else (joint, no_order()._replace(power=power))
 
 
-def _power(known: _RobStrideState) -> Power:
+def _power(known: RobStrideMemory) -> Power:
     if known.faults:
         return Power.FAULT
-    if known.mode == frames.RunMode.RUN:
+    if known.mode == RunMode.RUN:
         return Power.STOPPED if known.damping else Power.ON
-    return Power.OFF if known.mode == frames.RunMode.RESET else Power.READY
+    return Power.OFF if known.mode == RunMode.RESET else Power.READY
 
 
-def _fault_text(bits: int) -> str:
-    return f"{fault_names(bits)} (fault bits {bits:02X}h)" if bits else ""
+def _extended(frame: Frame) -> Frame:
+    return frame[0] | EXTENDED, frame[1]
 
 
 FAMILY = Family(

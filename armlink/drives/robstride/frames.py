@@ -8,7 +8,7 @@ import struct
 from enum import IntEnum
 from typing import NamedTuple
 
-from armlink.drives.mit_packing import MitCommand, MitFeedback, Ranges, grid_of
+from armlink.drives.mit_packing import Grid, MitCommand, MitFeedback, Ranges, grid_of
 
 RANGES = {
     "RS00": Ranges(12.57, 33.0, 14.0),
@@ -23,13 +23,13 @@ RANGES = {
 MOTION_BITS = (16, 16, 16, 16, 16)
 """Bits of q, dq, kp, kd and τ in the private protocol."""
 MOTION = struct.Struct(">4H")
+GRIDS = {model: grid_of(ranges, MOTION_BITS) for model, ranges in RANGES.items()}
+"""Steps that the frames of each model can carry."""
 NEVER_READ = 0x01
 """Bits 16 to 23 of the identifier that answers the reading of an unknown parameter."""
 
 
 class Type(IntEnum):
-    """Type of a frame."""
-
     IDENTITY = 0
     MOTION = 1
     FEEDBACK = 2
@@ -45,8 +45,6 @@ class Type(IntEnum):
 
 
 class RobStrideParameter(IntEnum):
-    """Parameters by index."""
-
     RUN_MODE = 0x7005
     LIMIT_TORQUE = 0x700B
     LIMIT_CURRENT = 0x7018
@@ -95,33 +93,25 @@ def identifier(kind: int, data: int, target: int) -> int:
 
 
 def kind_of(can_id: int) -> int:
-    """Type of a frame by its identifier."""
     return can_id >> 24 & 0x1F
 
 
 def data_of(can_id: int) -> int:
-    """The 16 bits of data in an identifier."""
     return can_id >> 8 & 0xFFFF
 
 
-def motion_frame(drive: int, command: MitCommand, ranges: Ranges) -> tuple[int, bytes]:
-    """Motion command (type 1): the torque is in the identifier. Raises ValueError for numbers that are not finite."""
-    return motion_of_steps(drive, *grid_of(ranges, MOTION_BITS).steps(command))
-
-
-def motion_of_steps(drive: int, q: int, dq: int, kp: int, kd: int, torque: int) -> tuple[int, bytes]:
-    """Motion command of packed steps."""
+def motion_frame(drive: int, q: int, dq: int, kp: int, kd: int, torque: int) -> tuple[int, bytes]:
+    """Motion command (type 1) of packed steps: the torque is in the identifier."""
     return identifier(Type.MOTION, torque, drive), MOTION.pack(q, dq, kp, kd)
 
 
-def unpack_motion(can_id: int, data: bytes, ranges: Ranges) -> MitCommand:
+def unpack_motion(can_id: int, data: bytes, grid: Grid) -> MitCommand:
     """A motion command as the drive understands it; `data` has eight bytes."""
     q, dq, kp, kd = MOTION.unpack(data)
-    return grid_of(ranges, MOTION_BITS).command(q, dq, kp, kd, data_of(can_id))
+    return grid.command(q, dq, kp, kd, data_of(can_id))
 
 
 def enable_frame(drive: int, host: int) -> tuple[int, bytes]:
-    """Enable (type 3)."""
     return identifier(Type.ENABLE, host, drive), bytes(8)
 
 
@@ -131,12 +121,10 @@ def stop_frame(drive: int, host: int, clear_fault: bool = False) -> tuple[int, b
 
 
 def identity_frame(drive: int, host: int) -> tuple[int, bytes]:
-    """Ask for the 64-bit unique id (type 0)."""
     return identifier(Type.IDENTITY, host, drive), bytes(8)
 
 
 def read_frame(drive: int, host: int, parameter: int) -> tuple[int, bytes]:
-    """Read a parameter (type 17)."""
     return identifier(Type.READ, host, drive), struct.pack("<H6x", parameter)
 
 
@@ -146,13 +134,11 @@ def write_frame(drive: int, host: int, parameter: int, value: float) -> tuple[in
 
 
 def pack_value(parameter: int, value: float) -> bytes:
-    """Four bytes of a parameter's value."""
     layout = INTEGERS.get(parameter)
     return struct.pack("<f", value) if layout is None else struct.pack(layout, int(value))
 
 
 def unpack_value(parameter: int, data: bytes) -> float:
-    """Value of a parameter from its four bytes."""
     value: float = struct.unpack(INTEGERS.get(parameter, "<f"), data)[0]
     return value
 
@@ -169,23 +155,19 @@ def parameter_answer(can_id: int, data: bytes) -> tuple[int, int, float | None] 
     return can_id >> 8 & 0xFF, parameter, None if unknown else unpack_value(parameter, data[4:8])
 
 
-def pack_feedback(feedback: Feedback, host: int, ranges: Ranges, kind: int = Type.FEEDBACK) -> tuple[int, bytes]:
-    """Feedback to `host`."""
+def pack_feedback(feedback: Feedback, host: int, grid: Grid, kind: int = Type.FEEDBACK) -> tuple[int, bytes]:
     head = feedback.drive | feedback.faults << 8 | feedback.mode << 14
-    motion = feedback.motion
-    steps = grid_of(ranges, MOTION_BITS).feedback_steps(motion)
-    data = MOTION.pack(*steps, round(feedback.temperature * 10) & 0xFFFF)
+    data = MOTION.pack(*grid.feedback_steps(feedback.motion), round(feedback.temperature * 10) & 0xFFFF)
     return identifier(kind, head, host), data
 
 
-def unpack_feedback(can_id: int, data: bytes, ranges: Ranges) -> Feedback | None:
+def unpack_feedback(can_id: int, data: bytes, grid: Grid) -> Feedback | None:
     """Feedback or report in a frame, or None for another type or length."""
     if kind_of(can_id) not in (Type.FEEDBACK, Type.REPORT) or len(data) != 8:
         return None
     q, dq, torque, temperature = MOTION.unpack(data)
     head = data_of(can_id)
-    motion = grid_of(ranges, MOTION_BITS).feedback(q, dq, torque)
-    return Feedback(head & 0xFF, head >> 8 & 0x3F, head >> 14, motion, temperature / 10)
+    return Feedback(head & 0xFF, head >> 8 & 0x3F, head >> 14, grid.feedback(q, dq, torque), temperature / 10)
 
 
 def fault_names(bits: int) -> str:

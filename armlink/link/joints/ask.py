@@ -5,7 +5,7 @@ from typing import TypeVar
 
 from armlink.bus.port import BUS_SHIFT, Frame
 from armlink.clock import Clock
-from armlink.drives.family import ANSWER, TRIES
+from armlink.drives.base import ANSWER, TRIES
 from armlink.link.cyclic_exchange import Loop
 
 T = TypeVar("T")
@@ -14,7 +14,7 @@ Pump = Callable[[Callable[[], bool], float], bool]
 
 
 class LinkAsk:
-    """Implements `armlink.drives.family.Ask` for the drives of one bus."""
+    """Implements `armlink.drives.base.Ask` for the drives of one bus."""
 
     def __init__(self, loop: Loop, clock: Clock, pump: Pump, tag: int = 0) -> None:
         """`tag` marks identifiers of the bus."""

@@ -12,7 +12,6 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.contributed import contributed
-from armlink.drives.family import KeepsCalibration, TellsSerialNumber
 from armlink.errors import BadInput
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.groups import Group, by_joint, traits_of
@@ -88,7 +87,7 @@ class Calibrations:
         """Temperatures (n,) [°C] that the drives tell with their readings; NaN for one that must be asked."""
         told = np.full(self.n, np.nan)
         for group in self.groups:
-            told[list(group.places)] = getattr(group.drives, "temperatures", np.nan)
+            told[list(group.places)] = group.drives.temperatures
         return told
 
     def read_temperatures(self) -> Array:
@@ -103,14 +102,13 @@ class Calibrations:
         if joint in self._in_host:
             return self._in_host[joint]
         group, number = by_joint(self.groups)[joint]
-        assert isinstance(group.drives, KeepsCalibration)
         return group.drives.read_calibration(number, self._ask(group))
 
     def drive_serial(self, joint: int) -> DriveSerial:
         """Serial number of the drive of joint 0 … n−1, if it keeps its calibration itself; raises BusFault."""
-        group, number = by_joint(self.groups)[joint]
-        if joint in self._in_host or not isinstance(group.drives, TellsSerialNumber):
+        if joint in self._in_host:
             return DriveSerial(simulated=self._simulated)
+        group, number = by_joint(self.groups)[joint]
         return DriveSerial(group.drives.serial_number(number, self._ask(group)), self._simulated)
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
@@ -132,7 +130,6 @@ class Calibrations:
             self.calibration_changed(joint)
             return calibration
         group, number = by_joint(self.groups)[joint]
-        assert isinstance(group.drives, KeepsCalibration)
         return group.drives.write_calibration(number, self._ask(group), calibration, store)
 
     def calibration_changed(self, joint: int) -> None:

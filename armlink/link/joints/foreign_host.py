@@ -6,7 +6,7 @@ import numpy as np
 
 from armlink.arrays import Array
 from armlink.bus.port import BUS_SHIFT, Frame
-from armlink.drives.family import ANY
+from armlink.drives.base import ANY
 from armlink.drives.orders import Order, law_torque
 from armlink.link.joints.groups import Group
 from armlink.link.joints.values import JointValues

@@ -2,14 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-
-import numpy as np
+from typing import Any
 
 from armlink.arm_file import ArmFile
-from armlink.arrays import Array
 from armlink.bus.can_bus import CanBus
-from armlink.drives.family import Drives, Family
+from armlink.drives.base import BasicDrives
+from armlink.drives.family import Family
 from armlink.drives.registry import family
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput
@@ -20,40 +18,11 @@ class Group:
     """Drives of one family on one bus."""
 
     family: Family
-    drives: Drives
+    drives: BasicDrives[Any]
     places: tuple[int, ...]
     """Joints of the arm, in order."""
     tag: int
     """Marks identifiers of its bus where there are several, else 0."""
-
-
-@dataclass(frozen=True, eq=False)
-class Mounting:
-    """How each joint's drive is built in (n,): q = direction (p − zero) / gear, τ = direction · gear · τ_drive."""
-
-    direction: Array
-    zero: Array
-    """Drive's reading at joint position 0 [rad]."""
-    gear: Array
-
-    @cached_property
-    def plain(self) -> bool:
-        """Whether every drive's output is the joint."""
-        return bool((self.direction == 1).all() and (self.zero == 0).all() and (self.gear == 1).all())
-
-    def with_zero(self, joint: int, zero: float) -> "Mounting":
-        """The same with another zero of one joint [rad]."""
-        zeros = self.zero.copy()
-        zeros[joint] = zero
-        return Mounting(self.direction, zeros, self.gear)
-
-    @classmethod
-    def of(cls, arm: ArmFile) -> "Mounting":
-        settings = [joint.settings for joint in arm.require_link().joints]
-        direction, zero, gear = (
-            np.array([float(getattr(each, key)) for each in settings]) for key in ("direction", "zero", "gear")
-        )
-        return cls(direction, zero, gear)
 
 
 def make_groups(arm: ArmFile, bus: CanBus | None = None) -> tuple[Group, ...]:

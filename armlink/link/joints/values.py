@@ -8,39 +8,48 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.drives.orders import Gains, Limits, Order, Power
-from armlink.link.gate_limits import drive_limits, joint_ranges, target_window
-from armlink.link.joints.groups import Group, Mounting, make_groups, traits_of
+from armlink.link.gate_limits import arm_limits, joint_ranges
+from armlink.link.joints.groups import Group, make_groups, traits_of
 from armlink.torque_calibration import TorqueCalibration
 
 
 class JointValues:
     """Conversions of n joints. Drive: what the drive reads and is told; joint: what the arm does.
 
+    A drive is built in by direction, zero and gear: q = direction (p − zero) / gear, τ = direction · gear · τ_drive.
     With v the drive's torque at the joint (direction and gear applied), the host's calibration v = gain · τ + offset
     corrects the reading and, where the torque is from current, also the command.
     """
 
-    def __init__(self, mounting: Mounting, from_current: Array) -> None:
+    def __init__(self, arm: ArmFile, from_current: Array) -> None:
         """`from_current` (n,) bool: joints whose torque reading is the motor's."""
-        self._mounting, self._current = mounting, from_current.astype(bool)
+        self._current = from_current.astype(bool)
         self._all_sensors = not self._current.any()
         n = from_current.size
+        settings = [joint.settings for joint in arm.require_link().joints]
+        self._signs, self._zeros, self._gears = (
+            [float(getattr(each, key)) for each in settings] for key in ("direction", "zero", "gear")
+        )
+        self.direction, self.gear = np.array(self._signs), np.array(self._gears)
+        """1 or −1; turns of the drive's output for one of the joint (n,)."""
+        self._place_zeros()
         self.calibration = TorqueCalibration(np.ones(n), np.zeros(n))
         """In force in the host; 1 and 0 for joints without."""
         self._calibrated = False
-        self._signs: list[float] = mounting.direction.tolist()
-        self._zeros: list[float] = mounting.zero.tolist()
-        self._gears: list[float] = mounting.gear.tolist()
         self._corrections = [(1.0, 0.0)] * n
         """Gain and offset of each joint's command; 1 and 0 where the torque is not from current."""
 
+    def _place_zeros(self) -> None:
+        self._zero = np.array(self._zeros)
+        """Reading of each drive at joint position 0 (n,) [rad]."""
+        self._direct = bool((self.direction == 1).all() and (self._zero == 0).all() and (self.gear == 1).all())
+        """Whether every drive's output is the joint."""
+
     @property
     def plain(self) -> bool:
-        """Whether orders need no conversion."""
-        return self._mounting.plain and (self._all_sensors or not self._calibrated)
+        return self._direct and (self._all_sensors or not self._calibrated)
 
     def calibrate(self, calibration: TorqueCalibration[Array]) -> None:
-        """Put gains and offsets (n,) into force."""
         self.calibration = calibration
         self._calibrated = bool((calibration.gain != 1).any() or (calibration.offset != 0).any())
         pairs = zip(self._current, calibration.gain.tolist(), calibration.offset.tolist(), strict=True)
@@ -48,26 +57,21 @@ class JointValues:
 
     def position(self, values: Array) -> Array:
         """Joint positions [rad] of drive positions (n,)."""
-        mount = self._mounting
-        return values if mount.plain else mount.direction * (values - mount.zero) / mount.gear
+        return values if self._direct else self.direction * (values - self._zero) / self.gear
 
     def position_of(self, joint: int, value: float) -> float:
-        """Position of one joint [rad]."""
-        mount = self._mounting
-        if mount.plain:
+        if self._direct:
             return value
         return float(self._signs[joint] * (value - self._zeros[joint]) / self._gears[joint])
 
     def velocity(self, values: Array) -> Array:
         """Joint velocities [rad/s] of drive velocities (n,)."""
-        mount = self._mounting
-        return values if mount.plain else mount.direction * values / mount.gear
+        return values if self._direct else self.direction * values / self.gear
 
     def motor(self, values: Array) -> Array:
         """Motor torques at the joint [N·m] (n,); of joints whose torque is from current as the calibration has them."""
-        mount = self._mounting
-        if not mount.plain:
-            values = mount.direction * mount.gear * values
+        if not self._direct:
+            values = self.direction * self.gear * values
         if self._calibrated and not self._all_sensors:
             values = np.where(self._current, self.calibration.invert(values), values)
         return values
@@ -80,17 +84,15 @@ class JointValues:
 
     def torque(self, sensor: Array, motor: Array) -> Array:
         """Joint torques [N·m] (n,): of the sensor, or the motor's (as `motor` gives it) where there is none."""
-        mount = self._mounting
-        if not mount.plain:
-            sensor = mount.direction * sensor
+        if not self._direct:
+            sensor = self.direction * sensor
         if self._calibrated:
             sensor = self.calibration.invert(sensor)
         return sensor if self._all_sensors else np.where(self._current, motor, sensor)
 
     def limits(self, joint: int, limits: Limits) -> Limits:
         """Limits of a joint, at the output of its drive."""
-        mount = self._mounting
-        gear = float(mount.gear[joint])
+        gear = self._gears[joint]
         ends = sorted(self._drive_position(joint, end) for end in (limits.lower, limits.upper))
         return replace(
             limits,
@@ -101,28 +103,18 @@ class JointValues:
             upper=ends[1],
         )
 
-    @property
-    def gear(self) -> Array:
-        """(n,)."""
-        return self._mounting.gear
-
-    @property
-    def direction(self) -> Array:
-        """1 or −1 (n,)."""
-        return self._mounting.direction
-
     def zero_of(self, joint: int) -> float:
         """Reading of one joint's drive at joint position 0 [rad], as it is in force."""
         return self._zeros[joint]
 
     def turn_zero(self, joint: int, turns: int) -> None:
         """Change the zero of one joint's drive by whole turns of the drive's output."""
-        self._mounting = self._mounting.with_zero(joint, self._zeros[joint] + 2 * math.pi * turns)
-        self._zeros = self._mounting.zero.tolist()
+        self._zeros[joint] += 2 * math.pi * turns
+        self._place_zeros()
 
     def gains(self, joint: int, gains: Gains | None) -> Gains | None:
         """Gains at the joint, of those at the output of its drive."""
-        square = float(self._mounting.gear[joint]) ** 2
+        square = self._gears[joint] ** 2
         return gains and Gains(*(square * value for value in (gains.kp, gains.kd, gains.max_kp, gains.max_kd)))
 
     def torque_of(self, joint: int, motor: float) -> float:
@@ -156,8 +148,7 @@ class JointValues:
 
     def ordered(self, joint: int, sent: Order) -> Order:
         """A drive's order at the joint; torque as the drive makes it, not corrected."""
-        mount = self._mounting
-        if mount.plain:
+        if self._direct:
             return sent
         gear, sign = self._gears[joint], self._signs[joint]
         power, walk, mode, position, velocity, torque, kp, kd, refused = sent
@@ -180,15 +171,13 @@ class JointValues:
 def values_of(arm: ArmFile, groups: tuple[Group, ...]) -> JointValues:
     """Conversions between the values of an arm's joints and of their drives."""
     traits = traits_of(groups)
-    return JointValues(Mounting.of(arm), np.array([each.torque == "current" for each in traits]))
+    return JointValues(arm, np.array([each.torque == "current" for each in traits]))
 
 
 def try_limits(arm: ArmFile) -> None:
     """Raise BadInput where an arm file fits no drives; asks none."""
-    link = arm.require_link()
     groups = make_groups(arm)
-    rows = zip(link.joints, joint_ranges(arm), strict=True)
-    limits = [drive_limits(row, target_window(*ends), 1.0 / link.rate, link.deadline) for row, ends in rows]
+    limits = arm_limits(arm.require_link(), joint_ranges(arm))
     values = values_of(arm, groups)
     for group in groups:
         group.drives.fits([values.limits(place, limits[place]) for place in group.places])

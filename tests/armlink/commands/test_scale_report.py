@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from armlink.commands.scale_report import SCHEMA
+from armlink.commands.check import SCALES_SCHEMA as SCHEMA
 
 
 def test_the_schema_is_documented():

@@ -7,7 +7,6 @@ import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.drives.board import Board
-from armlink.drives.family import FillsBoard
 from armlink.drives.orders import Limits, Mode, Order, Power, Reading
 from armlink.drives.registry import family
 from sim_bus.simulated_arm import SimulatedArm
@@ -32,7 +31,7 @@ class Bench:
         ]
         self.routes, self.latest = self.drives.routes(), [Reading(joint) for joint in range(self.arm.n)]
         self.board = Board(self.arm.n)
-        self.fast = self.drives.fill(self.board, range(self.arm.n)) if isinstance(self.drives, FillsBoard) else {}
+        self.fast = self.drives.fill(self.board, range(self.arm.n))
         self.log: list[tuple[int, bytes]] = []
         """Frames that the host sent."""
         self.heard: list[tuple[int, bytes]] = []

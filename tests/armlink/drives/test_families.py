@@ -173,7 +173,7 @@ def test_damiao_scales_come_from_the_registers():
     bench.simulated[2].registers[22] = 8.0
     assert bench.set_up()[2].scales["velocity range, rad/s"] == 8.0
     bench.walk()
-    assert bench.drives._known[2].ranges.velocity == 8.0
+    assert bench.drives.memory[2].grid.ranges.velocity == 8.0
 
 
 @pytest.mark.parametrize(
@@ -274,7 +274,9 @@ def told(name, bench, joint, frames):
     for can_id, data in frames:
         if name in PACKED_ALIKE and can_id == row.id and data[:7] != b"\xff" * 7:
             device = bench.simulated[joint]
-            p, v, t = device.coding[:3] if name == "six-cubemars" else (device.registers[r] for r in (21, 22, 23))
+            p, v, t = (
+                device.coding.ranges[:3] if name == "six-cubemars" else (device.registers[r] for r in (21, 22, 23))
+            )
             bits = int.from_bytes(data, "big")
             q, dq = bits >> 48, bits >> 36 & 0xFFF
             kp, kd, torque = bits >> 24 & 0xFFF, bits >> 12 & 0xFFF, bits & 0xFFF
@@ -304,7 +306,7 @@ def told(name, bench, joint, frames):
 
 
 def check(name, bench, joint, order, frames):
-    limits, reading = bench.limits[joint], bench.drives._known[joint]
+    limits, reading = bench.limits[joint], bench.drives.memory[joint]
     for torque, position, kp, kd, velocity, largest in told(name, bench, joint, frames):
         assert abs(torque) <= limits.max_torque
         assert largest == math.inf or largest <= limits.max_torque
@@ -473,7 +475,7 @@ def test_a_frame_log_keeps_frames_of_every_kind(bench, suffix, tmp_path):
 def test_a_listener_takes_what_a_robstride_drive_replies_to_a_host_of_any_id():
     listener, host = Bench("six-robstride"), 0xAA
     motion = MitFeedback(0.5, -1.0, 2.0)
-    frame = robstride.pack_feedback(robstride.Feedback(2, 0, 2, motion, 30.0), host, listener.drives._known[1].ranges)
+    frame = robstride.pack_feedback(robstride.Feedback(2, 0, 2, motion, 30.0), host, listener.drives.memory[1].grid)
     reading = listener.drives.take(frame[0] | EXTENDED, frame[1], 0.0)
     assert reading.joint == 1
     assert tuple(reading[1:4]) == pytest.approx(tuple(motion), abs=1e-2)
@@ -529,10 +531,10 @@ def test_settings_are_checked_by_key(tmp_path):
 
 def test_a_register_answer_is_no_reading():
     bench = prepared("six-damiao")
-    before = bench.drives._known[0].position
+    before = bench.drives.memory[0].position
     assert bench.drives.take(0x11, struct.pack("<HBBf", 1, 0x33, 21, 12.5), 0.0) is None
     assert bench.drives.take(0x11, damiao.read_request(1, 9), 0.0) is None
-    assert bench.drives._known[0].position == before
+    assert bench.drives.memory[0].position == before
 
 
 # ---- keys of CubeMars drives

@@ -36,7 +36,7 @@ from armlink.drives.moteus import frames as moteus
 from armlink.drives.odrive import frames as odrive
 from armlink.drives.robstride import frames as robstride
 
-DM4340 = Ranges(12.5, 10.0, 28.0)
+DM4340 = grid_of(Ranges(12.5, 10.0, 28.0))
 
 
 # ---- MIT packing
@@ -52,7 +52,7 @@ def test_mit_command_by_hand():
 def test_zero_is_sent_as_the_nearest_step():
     """Truncation sends 7FFh for 0 N·m; 2047.5 lies between two steps, and half a step is as near as it goes."""
     sent = unpack_command(pack_command(MitCommand(0.0, 0.0, 0.0, 0.0, 0.0), DM4340), DM4340)
-    assert abs(sent.torque) <= DM4340.torque / 0xFFF * 1.0001  # half a step
+    assert abs(sent.torque) <= DM4340.t / 0xFFF * 1.0001  # half a step
     small = pack_command(MitCommand(0.0, 0.0, 0.0, 0.0, -0.0001), DM4340)
     large = pack_command(MitCommand(0.0, 0.0, 0.0, 0.0, 0.0001), DM4340)
     assert (small[-2] & 0xF) << 8 | small[-1] == 0x7FF
@@ -138,7 +138,7 @@ def test_no_request_of_ours_stores_to_flash():
 
 # ---- CubeMars
 
-AK80_9 = Ranges(12.5, 50.0, 18.0)
+AK80_9 = grid_of(Ranges(12.5, 50.0, 18.0))
 
 
 def test_cubemars_reply_by_hand_and_by_the_stock_client():
@@ -185,9 +185,9 @@ def test_cubemars_commands_beside_the_stock_client(values):
 
 def test_robstride_motion_command_by_hand():
     """Type 1 to motor 7Fh: torque 8.5 of ±17 is C000h (rounded), q, dq, kp and kd big endian."""
-    can_id, data = robstride.motion_frame(0x7F, MitCommand(12.57, 0.0, 500.0, 0.0, 8.5), robstride.RANGES["RS01"])
+    can_id, data = robstride.motion_frame(0x7F, *robstride.GRIDS["RS01"].steps(MitCommand(12.57, 0.0, 500.0, 0.0, 8.5)))
     assert (can_id, data.hex()) == (0x01BFFF7F, "ffff8000ffff0000")
-    back = robstride.unpack_motion(can_id, data, robstride.RANGES["RS01"])
+    back = robstride.unpack_motion(can_id, data, robstride.GRIDS["RS01"])
     assert back == pytest.approx((12.57, 0.0, 500.0, 0.0, 8.5), abs=1e-3)
 
 
@@ -204,14 +204,14 @@ def test_robstride_frames_by_hand():
 def test_robstride_feedback_beside_the_stock_client():
     """Motor 7Fh in run mode with undervoltage and encoder faults, to host FDh; the client has ±4π for ±12.57."""
     can_id, data = 0x02 << 24 | 2 << 22 | 0b001001 << 16 | 0x7F << 8 | 0xFD, bytes.fromhex("c00060003fff014a")
-    found = robstride.unpack_feedback(can_id, data, robstride.RANGES["RS01"])
+    found = robstride.unpack_feedback(can_id, data, robstride.GRIDS["RS01"])
     message = can.Message(arbitration_id=can_id, data=data, is_extended_id=True)
     theirs = Client(None, host_can_id=0xFD)._parse_feedback_resp(message, 0x7F, 1)
     assert (found.drive, found.mode, found.temperature) == (0x7F, 2, 33.0)
     assert robstride.fault_names(found.faults) == "undervoltage, encoder"
     assert found.motion == pytest.approx((theirs.angle, theirs.velocity, theirs.torque), abs=3e-3)
     assert [error.value for error in theirs.errors] == [1, 8]
-    assert robstride.pack_feedback(found, 0xFD, robstride.RANGES["RS01"]) == (can_id, data)
+    assert robstride.pack_feedback(found, 0xFD, robstride.GRIDS["RS01"]) == (can_id, data)
 
 
 def test_ranges_of_the_models_that_other_tables_have_wrong():
@@ -242,7 +242,7 @@ def test_moteus_identifiers():
     st.sampled_from([moteus.INT16, moteus.INT32, moteus.FLOAT]),
 )
 def test_moteus_replies_are_what_mjbots_reads(values, resolution):
-    data = moteus.pack_reply([moteus.Subframe(moteus.REPLY, r, v, resolution) for r, v in sorted(values.items())])
+    data = moteus.pack_subframes([moteus.Subframe(moteus.REPLY, r, v, resolution) for r, v in sorted(values.items())])
     theirs = protocol.parse_reply(data)
     assert theirs.keys() == values.keys()
     for register, value in values.items():
@@ -269,7 +269,7 @@ def test_any_bytes_are_read_as_mjbots_reads_them(data):
 
 
 def test_nan_in_integers():
-    data = moteus.pack_reply([moteus.Subframe(moteus.REPLY, 0x001, math.nan, moteus.INT16)])
+    data = moteus.pack_subframes([moteus.Subframe(moteus.REPLY, 0x001, math.nan, moteus.INT16)])
     assert data[2:4].hex() == "0080"
     assert math.isnan(next(moteus.unpack(data)).value)
 
@@ -343,7 +343,7 @@ def test_the_cycles_payload_is_what_the_general_way_packs():
     assert CYCLE_COMMAND.unpack(data) == values
     assert CYCLE_COMMAND.unpack(data[:-1] + b"\1") is None
     assert CYCLE_REPLY.unpack(data) is None
-    reply = moteus.pack_reply(
+    reply = moteus.pack_subframes(
         [moteus.Subframe(moteus.REPLY, r, 1.0, moteus.INT8 if r in moteus.SMALL else moteus.FLOAT) for r in QUERY]
     )
     assert CYCLE_REPLY.unpack(reply) == dict.fromkeys(sorted(QUERY), 1.0)

@@ -26,20 +26,20 @@ def answer(drive: int, kind: int, register: int, value: float) -> bytes:
 
 def test_a_range_that_another_host_asked_for_holds_from_its_answer_on():
     drives = damiao_drives()
-    before = drives._known[0].ranges.position
+    before = drives.memory[0].grid.ranges.position
     assert before != 20.0
     drives.take(0x11, answer(1, READ, PMAX, 20.0), 0.0)  # nobody has asked
-    assert drives._known[0].ranges.position == before
+    assert drives.memory[0].grid.ranges.position == before
     assert drives.command_of(frames.REGISTERS_ID, frames.read_request(1, PMAX)) is None
     drives.take(0x11, answer(1, READ, PMAX, 20.0), 0.0)
-    assert drives._known[0].ranges.position == 20.0
+    assert drives.memory[0].grid.ranges.position == 20.0
     assert drives.command_of(frames.REGISTERS_ID, frames.write_request(1, PMAX, 16.0)) is None
     drives.take(0x11, answer(1, WRITE, PMAX, 16.0), 0.0)
-    assert drives._known[0].ranges.position == 16.0
+    assert drives.memory[0].grid.ranges.position == 16.0
 
 
 @pytest.mark.parametrize(("state", "free"), [(None, False), (AxisState.IDLE, True), (AxisState.CLOSED_LOOP, False)])
 def test_an_odrive_lets_go_in_every_state_but_closed_loop(state, free):
     beat = None if state is None else SimpleNamespace(state=state)
-    drives = SimpleNamespace(_known=[SimpleNamespace(heartbeat=beat)])
+    drives = SimpleNamespace(memory=[SimpleNamespace(heartbeat=beat)])
     assert ODriveDrives.lets_go(drives, 0) is free

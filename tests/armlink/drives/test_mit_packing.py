@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from armlink.drives.mit_leash import round_within
+from armlink.drives.mit_drives import round_within
 from armlink.drives.mit_packing import MitCommand, Ranges, grid_of, pack_steps, unpack_command
 from armlink.drives.orders import Limits
 
-RANGES = Ranges(12.5, 10.0, 28.0)
+GRID = grid_of(Ranges(12.5, 10.0, 28.0))
 LIMITS = Limits(10.8, 100.0, 1.0, -2.5, 2.5, 0.1, 0.004)
 
 
 def left(asked: MitCommand, position: float, velocity: float) -> MitCommand:
-    steps = round_within(asked, grid_of(RANGES), LIMITS, position, velocity)
-    return unpack_command(pack_steps(*steps), RANGES)
+    steps = round_within(asked, GRID, LIMITS, position, velocity)
+    return unpack_command(pack_steps(*steps), GRID)
 
 
 def law(told: MitCommand, position: float, velocity: float) -> float:

@@ -1,11 +1,11 @@
 """Reading a parameter of a RobStride drive among the frames of others."""
 
 import struct
+from types import SimpleNamespace
 
 from armlink.bus.port import EXTENDED
+from armlink.drives.robstride.drives import RobStrideDrives, RobStrideSettings
 from armlink.drives.robstride.frames import Type, identifier
-from armlink.drives.robstride.set_up import read_parameter
-from armlink.drives.robstride.settings import RobStrideSettings
 
 SETTINGS = RobStrideSettings(id=5, model="RS02", kp=20.0, kd=1.0)
 
@@ -15,6 +15,7 @@ def answer(drive: int, parameter: int, value: float, kind: int = Type.READ) -> t
 
 
 def test_the_answer_is_that_of_the_drive_to_the_parameter():
+    drives = RobStrideDrives(None, [SimpleNamespace(name="elbow", settings=SETTINGS)])
     frames = [
         answer(5, 0x7019, 9.0, Type.FEEDBACK),
         answer(6, 0x7019, 1.0),
@@ -27,6 +28,6 @@ def test_the_answer_is_that_of_the_drive_to_the_parameter():
     def ask(frame, match):
         return next((found for each in frames if (found := match(*each)) is not None), None)
 
-    assert read_parameter(ask, SETTINGS, 0x7019) == 3.0
+    assert drives.read_parameter(ask, 0, 0x7019) == 3.0
     del frames[-2:]
-    assert read_parameter(ask, SETTINGS, 0x7019) is None
+    assert drives.read_parameter(ask, 0, 0x7019) is None

@@ -143,7 +143,7 @@ def test_turns_auto_corrects_zero_limits_and_readings(name):
                 sample = link.cycle(Command.hold(standing))
             assert np.abs(sample.position - bus.arm.plant.position).max() < 0.01
             assert np.abs(link.position_sent - standing).max() < 0.01
-            limits = link.values.limits(joint, link.wanted_limits()[joint])
+            limits = link.values.limits(joint, link.limits[joint])
             assert limits.lower < settings.zero + settings.direction * standing[joint] < limits.upper
 
 

@@ -10,7 +10,7 @@ from websockets.asyncio.client import connect
 
 from armlink.errors import BadInput
 from armlink.link.types import Sample
-from armlink.monitor.foxglove_stream import FoxgloveStream
+from armlink.monitor.streams import FoxgloveStream
 from armlink.recording.ros_joint_state import JointStateDecoder
 
 NAMES = ("shoulder", "elbow")

@@ -18,7 +18,7 @@ import pytest
 
 from armlink.errors import BadInput
 from armlink.link.types import Sample
-from armlink.monitor.rerun_stream import RerunStream
+from armlink.monitor.streams import RerunStream
 
 NAMES = ("shoulder", "elbow")
 T = TypeVar("T")

@@ -12,6 +12,7 @@ from armlink.arm_file import bundled_arms, parse_arm
 from armlink.cli import run
 from armlink.commands.check import _outcomes
 from armlink.drives.canopen.check.power_test import PowerTest
+from armlink.drives.findings import Result
 from armlink.link.link import Link
 from armlink.selftest.self_test import SelfTest
 from sim_bus.bus.lock_step import LockStepBus
@@ -226,10 +227,16 @@ def test_a_drive_that_lost_a_turn_fails_without_power(tmp_path, capsys, drive, p
 @pytest.mark.parametrize(
     ("found", "shown"),
     [
-        ({"a": "ok", "b": "ok"}, "ok"),
-        ({"a": "8 ms", "b": "12 ms", "c": "8 ms"}, "8 to 12 ms"),
-        ({"a": "ok", "b": "FAILED", "c": "ok", "d": "–"}, "ok: a, c; FAILED: b; –: d"),
+        ({"a": "passed", "b": "passed"}, "ok"),
+        ({"a": 0.008, "b": 0.012, "c": 0.0081}, "8 to 12 ms"),
+        ({"a": 0.008, "b": 0.0081}, "8 ms"),
+        ({"a": 0.008, "b": "passed"}, "8 ms: a; ok: b"),
+        ({"a": "passed", "b": "failed", "c": "passed", "d": "not run"}, "ok: a, c; FAILED: b; –: d"),
     ],
 )
 def test_the_table_names_joints_where_they_differ(found, shown):
-    assert _outcomes(found).plain == shown
+    results = {
+        joint: [Result(joint, "silence", "passed", "", it) if isinstance(it, float) else Result(joint, "x", it, "")]
+        for joint, it in found.items()
+    }
+    assert _outcomes(results).plain == shown

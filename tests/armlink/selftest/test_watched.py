@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from armlink.drives.findings import Checks
 from armlink.selftest import self_test
 from armlink.selftest.self_test import SelfTest
 
@@ -19,11 +20,10 @@ from armlink.selftest.self_test import SelfTest
 def test_no_joint_is_driven_where_one_would_keep_on(silence, says, monkeypatch):
     traits = [SimpleNamespace(silence=each) for each in silence]
     monkeypatch.setattr(self_test, "traits_of", lambda groups: traits)
-    results = [SimpleNamespace(joint="other", check="calibration")]
-    test = SimpleNamespace(
-        link=SimpleNamespace(names=("a", "b"), groups=(), n=2),
-        results=results,
-        _add=lambda name, check, outcome, found: results.append(SimpleNamespace(joint=name, check=check)),
-    )
+    checks = Checks()
+    test = SimpleNamespace(link=SimpleNamespace(names=("a", "b"), groups=(), n=2), checks=checks)
     assert SelfTest._watched(test) == says
-    assert [each.joint for each in results[1:]] == [n for n, each in zip("ab", silence, strict=True) if "keeps" in each]
+    keeping = [name for name, each in zip("ab", silence, strict=True) if "keeps" in each]
+    assert [(each.joint, each.check, each.outcome) for each in checks.results] == [
+        (name, "silence", "failed") for name in keeping
+    ]

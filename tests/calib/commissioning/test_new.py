@@ -12,7 +12,7 @@ import yaml
 
 from armlink import cli
 from armlink.arm_file import bundled_arms, load_arm, parse_arm
-from armlink.drives.canopen.check.found_drives import FoundNodes
+from armlink.drives.canopen.check.scan import FoundNodes
 from armlink.errors import BadInput, BusFault
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.bus_arm import arm_of_bus

@@ -14,7 +14,7 @@ from serving import pendulum
 from armlink.arm_file import parse_arm
 from armlink.bus.port import CLASSICAL
 from armlink.drives.damiao import frames as damiao
-from armlink.drives.mit_packing import MitCommand, Ranges, Special, pack_command, special
+from armlink.drives.mit_packing import MitCommand, Ranges, Special, grid_of, pack_command, special
 from armlink.errors import BadInput
 from sim_bus.bus.fault_injector import Injector
 from sim_bus.bus.fault_kinds import parse_fault
@@ -24,7 +24,7 @@ from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
 DAMIAO = {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM4340", "kp": 40, "kd": 1.0}
-DM4340 = Ranges(12.5, 10.0, 28.0)
+DM4340 = grid_of(Ranges(12.5, 10.0, 28.0))
 FAMILIES = [
     DAMIAO,
     {"family": "cubemars", "id": 6, "model": "AK80-9", "can_timeout": 4000, "kp": 40, "kd": 1.0},

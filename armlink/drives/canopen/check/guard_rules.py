@@ -26,7 +26,7 @@ READING_AGE = 5.0
 """A reading stands for where a joint is for this long [s]; its set-up takes some seconds before the first cycle."""
 MOST_OFFSET = 1e4
 """[N·m]."""
-_INVALID, _UINT32 = 1 << 31, (1 << 32) - 1
+_UINT32 = (1 << 32) - 1
 _NMT_COMMANDS = (1, 2, 128, 129, 130)
 _ACKNOWLEDGED = 0x60
 _UPLOADED = {1: 0x4F, 2: 0x4B, 4: 0x43}
@@ -110,7 +110,7 @@ class NodeRules:
 
     @property
     def _answers(self) -> int:
-        return 0x580 + self.node
+        return objects.SDO_RESPONSE_ID + self.node
 
     def frames(self) -> dict[str, Any]:
         """RPDO1, RPDO2 and SDO requests."""
@@ -176,7 +176,7 @@ class NodeRules:
         """Objects that may be written, with the values that the set-up gives them."""
         allowed: dict[Entry, dict[str, Any]] = {}
         for index in pdo.foreign_rpdos(self._described):
-            allowed[Entry(index, 1, "I", "COB-ID of an RPDO that is off")] = {"least": _INVALID, "most": _UINT32}
+            allowed[Entry(index, 1, "I", "COB-ID of an RPDO that is off")] = {"least": pdo.INVALID, "most": _UINT32}
         for each in self.profile.pdos:
 
             def write(entry: Entry, value: int) -> None:

@@ -12,21 +12,14 @@ from armlink.drives.canopen.drives import CanopenDrives
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import RPDO2
 from armlink.drives.canopen.profile import LOST
+from armlink.drives.findings import ANSWER_CYCLES, ANSWERED, HELD, PATIENCE, Checks
 from armlink.drives.orders import Mode, Power
 from armlink.errors import ArmlinkError, BusFault, Refused
 
-CYCLES = 50
-"""SYNCs that are sent to see whether each is answered."""
-ANSWERED = 0.9
-"""Share of them whose answer must come in its cycle; a busy host misses some."""
 HOLD_SECONDS = 0.3
 """A stopped joint is watched for this long: does it stay in quick stop, holding?"""
-MOVED = 0.05
-"""A joint that moves further than this while it should hold ends the test [rad]."""
 LATE_SHARE, LATE_SECONDS = 0.5, 0.03
 """A device may take half its deadline and 30 ms longer than it was told, and two cycles."""
-PATIENCE = 3.0
-"""So many deadlines are waited for a reaction."""
 
 
 class PowerTest:
@@ -42,16 +35,13 @@ class PowerTest:
         "heartbeat of the host",
     )
 
-    def __init__(
-        self, link: Any, drives: CanopenDrives, add: Callable[..., None], progress: Callable[[str], None]
-    ) -> None:
-        """`link`: the Link of an arm with these joints; `add(joint, check, outcome, found, seconds)` takes results."""
+    def __init__(self, link: Any, drives: CanopenDrives, checks: Checks, progress: Callable[[str], None]) -> None:
+        """`link`: the Link of an arm with these joints; results are added to `checks`."""
         self.link, self.drives, self.commander, self.loop = link, drives, link.commander, link.commander.loop
-        self._add, self._progress = add, progress
+        self._checks, self._progress = checks, progress
         self._harmed = ""
         self._refused = False
         """Whether the joints are not driven because of a drive that is told already."""
-        self._reached: dict[str, set[str]] = {check: set() for check in self.CHECKS}
         self._standing = np.full(link.n, np.nan)
         self._last = 0.0
         """Time of the last SYNC [s]."""
@@ -77,37 +67,31 @@ class PowerTest:
             if self.commander.passed:
                 self.commander.stop()
         told = self._refused
-        for check, joints in self._reached.items():
-            for name in self.link.names:
-                if name not in joints:
-                    self._add(name, check, "not run" if told or not reason else "failed", reason or self._harmed)
-                    told = True
+        for name, check in self._checks.missing(self.CHECKS, self.link.names):
+            self._checks.add(name, check, "not run" if told or not reason else "failed", reason or self._harmed)
+            told = True
 
     def _require_watch(self) -> None:
         """Raise Refused for a device that does not watch its host at all: its joint is not driven."""
-        for joint in range(self.link.n):
-            if self.drives.traits(joint).silence == "keeps on":
-                found = "watches neither commands (1400h:05) nor heartbeat (1016h) of its host: do not drive it"
-                self._tell(joint, "heartbeat of the host", False, found)
-        keeping = [name for name in self.link.names if name in self._reached["heartbeat of the host"]]
+        keeping = [
+            name for joint, name in enumerate(self.link.names) if self.drives.traits(joint).silence == "keeps on"
+        ]
+        for name in keeping:
+            found = "watches neither commands (1400h:05) nor heartbeat (1016h) of its host: do not drive it"
+            self._checks.add(name, "heartbeat of the host", "failed", found)
         if keeping:
             self._refused = True
             raise Refused(f"{keeping[0]} is not driven: it would keep on after its host died")
 
     def _has(self, joint: int, entry: Entry, check: str) -> bool:
         """Whether a device has the object that a check is about; if not, the check is told to be absent."""
-        profile = self.drives.wires[joint].profile
-        if profile.has(entry):
+        if self.drives.wires[joint].profile.has(entry):
             return True
-        name = self.link.names[joint]
-        self._reached[check].add(name)
-        self._add(name, check, "absent", f"{entry}: {LOST[entry]}")
+        self._checks.add(self.link.names[joint], check, "absent", f"{entry}: {LOST[entry]}")
         return False
 
     def _tell(self, joint: int, check: str, passed: bool, found: str, seconds: float | None = None) -> None:
-        name = self.link.names[joint]
-        self._reached[check].add(name)
-        self._add(name, check, "passed" if passed else "failed", found, seconds)
+        self._checks.judge(self.link.names[joint], check, passed, found, seconds)
 
     def _cycle(self, power: list[Power], tested: int | None = None) -> Any:
         """One cycle; raises BusFault where a joint that is not being tested has a fault, or one moves."""
@@ -122,7 +106,7 @@ class PowerTest:
                 else f"{where}: its controller has restarted"
             )
         moved = np.abs(sample.position - self._standing)
-        if (moved > MOVED).any():
+        if (moved > HELD).any():
             joint = int(np.nanargmax(moved))
             raise BusFault(f"{names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: test ended")
         if tested is not None:
@@ -138,16 +122,12 @@ class PowerTest:
         off, came = [Power.OFF] * link.n, np.zeros(link.n, int)
         self.drives.known.node_states.clear()
         beat = 2 * self.drives.protection.producer_ms * 1e-3
-        cycles = max(CYCLES, int(np.ceil(beat / link.period)) + 1)
+        cycles = max(ANSWER_CYCLES, int(np.ceil(beat / link.period)) + 1)
         for _ in range(cycles):
             came += np.isfinite(self._cycle(off).position)
         for joint in range(link.n):
-            self._tell(
-                joint,
-                "answers SYNC",
-                bool(came[joint] >= ANSWERED * cycles),
-                f"{came[joint]} of {cycles} SYNCs answered",
-            )
+            answered = bool(came[joint] >= ANSWERED * cycles)
+            self._tell(joint, "answers SYNC", answered, f"{came[joint]} of {cycles} SYNCs answered")
             heard = joint in self.drives.known.node_states
             found = (
                 f"heard, period {self.drives.protection.producer_ms} ms"
@@ -194,9 +174,8 @@ class PowerTest:
             sample = self._cycle([Power.ON] * link.n, tested=-1)
         moved = np.abs(sample.position - self._standing)
         for joint in range(link.n):
-            self._tell(
-                joint, "enables and holds", True, f"moved by {moved[joint]:.4f} rad in {HOLD_SECONDS} s", seconds
-            )
+            found = f"moved by {moved[joint]:.4f} rad in {HOLD_SECONDS} s"
+            self._tell(joint, "enables and holds", True, found, seconds)
 
     def _again(self) -> None:
         drives = self.drives

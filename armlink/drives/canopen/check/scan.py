@@ -1,16 +1,30 @@
-"""Scan of a bus: which nodes are present, their identity and state; reads only."""
+"""Nodes on a CANopen bus: a search, `armlink scan`, and how they differ from an arm file; reads only."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
-from armlink.bus.port import Port
-from armlink.clock import Clock
-from armlink.drives.canopen.controller_setup import Identity, identify
-from armlink.drives.canopen.eds_file import bundled
-from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID
+from rich.box import SIMPLE
+from rich.table import Table
+from rich.text import Text
+
+from armlink.arm_file import ArmFile, Bus
+from armlink.bus.bus_group import BusGroup, GroupPort
+from armlink.bus.can_bus import CanBus
+from armlink.bus.open import open_bus, open_link_bus
+from armlink.bus.port import BUS_SHIFT, Port
+from armlink.clock import Clock, MonotonicClock
+from armlink.drives.canopen import object_dictionary as objects
+from armlink.drives.canopen.controller_setup import Identity, identify, identity_mismatches, refused_identity
+from armlink.drives.canopen.eds_file import bundled, expected_identity, of_joints
+from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID, SDO_RESPONSE_ID
 from armlink.drives.canopen.profile import Profile, lacking
 from armlink.drives.canopen.sdo import NodeServices, Pump, PumpedNetwork
+from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE, told_units
+from armlink.drives.findings import DriveFinding, FoundDrive
+from armlink.errors import BusFault
 
 SEARCH_SECONDS = 0.3
 """Wait for responses after the last request of the search [s]."""
@@ -61,15 +75,15 @@ def _search(port: Port, pump: Pump, network: PumpedNetwork) -> Counter[int]:
     found: Counter[int] = Counter()
 
     def answered(can_id: int, data: bytearray, timestamp: float) -> None:
-        found[can_id - 0x580] += bytes(data[1:4]) == _READ_DEVICE_TYPE[1:4]
+        found[can_id - SDO_RESPONSE_ID] += bytes(data[1:4]) == _READ_DEVICE_TYPE[1:4]
 
     for node in range(1, 128):
-        network.subscribe(0x580 + node, answered)
+        network.subscribe(SDO_RESPONSE_ID + node, answered)
         port.send(SDO_REQUEST_ID + node, _READ_DEVICE_TYPE)
         pump(lambda: False, 0.0)
     pump(lambda: False, SEARCH_SECONDS)
     for node in range(1, 128):
-        network.unsubscribe(0x580 + node, answered)
+        network.unsubscribe(SDO_RESPONSE_ID + node, answered)
     return found
 
 
@@ -78,3 +92,140 @@ def describe_type(device_type: int) -> str:
     profile = device_type & 0xFFFF
     kind = {0x0001: "frequency converter", 0x0002: "servo drive", 0x0004: "stepper"}.get(device_type >> 16 & 0xFF, "")
     return f"CiA {profile} {kind}".strip() if profile else "no profile"
+
+
+def _require_own_ids(found: Collection[Identity], channel: str) -> None:
+    twins = [str(each.node) for each in found if each.answers > 1]
+    if twins:
+        raise BusFault(f"{channel}: node id {', '.join(twins)} answers twice: give every node an id of its own")
+
+
+class FoundNodes:
+    """The drives of an open bus, by node id."""
+
+    def __init__(self, bus: CanBus) -> None:
+        """Search the bus and read every drive; raises BusFault naming the node."""
+        port, clock = bus.open_port(), bus.clock or MonotonicClock()
+        identities = scan_bus(port, clock, {})
+        _require_own_ids(identities, bus.channel_info)
+        network, pump = reading_network(port, clock)
+        self._services = {
+            each.node: NodeServices(network, f"node {each.node}", each.node, bundled(), pump) for each in identities
+        }
+        self.identities = {each.node: each for each in identities}
+        """By node id."""
+        self.found = [self._read(each) for each in identities]
+
+    def positions(self) -> dict[int, float]:
+        """Position reading (6064h) of every drive by node id [rad]; raises BusFault."""
+        return {each.node: int(self._services[each.node].read(objects.POSITION)) * each.unit for each in self.found}
+
+    def _read(self, identity: Identity) -> FoundDrive:
+        services = self._services[identity.node]
+        rated = int(services.read(objects.RATED_TORQUE))
+        try:
+            units = told_units(services, rated)
+        except ValueError as error:
+            raise BusFault(f"node {identity.node}: no units: {error}: set up the drive first") from None
+        most = int(services.read(objects.MAX_TORQUE)) * units.torque
+        own = services.has(objects.TORQUE_READING)
+        keys = {"family": "canopen", "node": identity.node, "torque": "motor", "calibration": "host"}
+        ratings = rated * 1e-3, most, units.position
+        return FoundDrive(identity.node, identity.vendor, identity.product, *ratings, None if own else keys)
+
+
+def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[DriveFinding]:
+    """Findings about the drives of an arm on an open bus of this name; raises BusFault."""
+    link, drives = arm_file.require_link(), FoundNodes(opened)
+    by_node, ours = {each.node: each for each in drives.found}, {joint.settings.node for joint in link.joints}
+    spare = [each.node for each in drives.found if each.node not in ours]
+    unknown = f"; nodes {', '.join(map(str, spare))} answer and are in no joint" if spare else ""
+    for joint, sheet in zip(link.joints, of_joints(arm_file, link.joints), strict=True):
+        node = joint.settings.node
+        where, drive = f"{joint.name} (node {node})", by_node.get(node)
+        if drive is None:
+            find = f"armlink new {arm_file.argument} --bus {bus} --out found.yaml"
+            remedy = f"check its power, wiring and node id{unknown}; the drives are found by {find}"
+            yield DriveFinding("error", f"no answer on {bus}", where, remedy)
+            continue
+        for differs in identity_mismatches(expected_identity(joint, sheet), vars(drives.identities[node])):
+            remedy = "connect the right arm, or correct identity under link.joints"
+            yield DriveFinding("error", f"another controller: {differs}", where, remedy)
+        if abs(drive.rated_torque - joint.rated_torque) > RATED_TORQUE_TOLERANCE * joint.rated_torque:
+            what = f"its rated torque (6076h) is {drive.rated_torque:g} N·m, the arm file has {joint.rated_torque:g}"
+            yield DriveFinding(
+                "error", what, where, f"set rated_torque: {drive.rated_torque:g}, or connect its own drive"
+            )
+        if drive.max_torque < joint.max_torque * (1 - RATED_TORQUE_TOLERANCE):
+            what = f"the drive allows {drive.max_torque:g} N·m (6072h), max_torque is {joint.max_torque:g}"
+            yield DriveFinding("warning", what, where, f"lower max_torque to {drive.max_torque:g}, or raise 6072h")
+    if spare and len(drives.found) - len(spare) == len(link.joints):
+        what = f"nodes {', '.join(map(str, spare))} answer and belong to no joint"
+        yield DriveFinding("hint", what, bus, "a gripper or another arm: nothing is sent to them")
+
+
+def scan_report(
+    arm: ArmFile | None,
+    bus: str | None,
+    json: Path | None,
+    write: Callable[[Path | None, Any], None],
+    show: Callable[..., None],
+) -> int:
+    """Find every node of a bus and those of an arm, `show` them, `write` them as JSON; exit status.
+
+    Raises BusFault for a joint that does not answer, Refused for another controller than the arm file states.
+    """
+    if arm is None:
+        joints, stated = {}, {}
+        opened = open_bus(bus, Bus())
+    else:
+        link = arm.require_link()
+        sheets = of_joints(arm, link.joints)
+        joints = {joint.settings.node: joint.name for joint in link.joints}
+        stated = {
+            each.settings.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)
+        }
+        opened = open_link_bus(bus, link)
+    try:
+        clock = opened.clock or MonotonicClock()
+        port = opened.open_port()
+        found = []
+        for place, member in enumerate(port.members if isinstance(port, GroupPort) else (port,)):
+            named = [] if arm is None else arm.require_link().joints
+            if isinstance(opened, BusGroup):
+                named = [joint for joint in named if opened.tags[joint.bus] >> BUS_SHIFT == place]
+            stock = {joint.settings.node for joint in named if joint.settings.torque != "record"}
+            found += scan_bus(member, clock, {joint.settings.node: joint.name for joint in named}, stock)
+        channel = str(opened.channel_info)
+    finally:
+        opened.shutdown()
+    wrong = {
+        each.node: differs
+        for each in found
+        if each.present and each.node in stated and (differs := identity_mismatches(stated[each.node], vars(each)))
+    }
+    table = Table("node", "joint", "state", "device", "identity", "serial", box=SIMPLE, title=channel)
+    for each in found:
+        if each.present:
+            told = (each.state.value, each.name or describe_type(each.device_type))
+            identity = f"{each.vendor:x}:{each.product:x}:{each.revision:x}"
+            style = "red" if each.node in wrong or each.answers > 1 else ""
+            table.add_row(str(each.node), each.joint, *told, identity, str(each.serial), style=style)
+        else:
+            table.add_row(str(each.node), each.joint, Text("no answer", style="red"))
+    show(table if found else f"{channel}: no node answers")
+    for lost in dict.fromkeys(lost for each in found for lost in each.lost):
+        lacking = [each.joint for each in found if lost in each.lost]
+        show(f"{', '.join(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} {lost}")
+    nodes = [{**vars(each), "state": each.state.value, "mismatches": wrong.get(each.node, [])} for each in found]
+    write(json, {"bus": channel, "nodes": nodes})
+    missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]
+    if missing:
+        raise BusFault(f"no answer from {', '.join(missing)} on {channel}")
+    _require_own_ids(found, channel)
+    if wrong:
+        node, differs = next(iter(wrong.items()))
+        raise refused_identity(joints[node], node, differs)
+    if found:
+        show(f"{len(found)} nodes answer")
+    return 0

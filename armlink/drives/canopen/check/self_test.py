@@ -6,6 +6,7 @@ device does, and how long it takes, is measured, not believed.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from armlink.arm_file import LinkJoint
@@ -22,7 +23,7 @@ from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.profile import OURS, Profile
 from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.units import read_units
-from armlink.drives.findings import Outcome, Result
+from armlink.drives.findings import Checks, Result
 from armlink.drives.orders import Limits, Mode
 from armlink.errors import ArmlinkError
 
@@ -31,7 +32,7 @@ NEEDED = (objects.CONTROL_WORD, objects.STATUS_WORD, objects.MODE, objects.POSIT
 
 
 class CanopenSelfTest:
-    """Runs the checks on an arm's controllers; the link must not be started. Results gather in `results`."""
+    """Runs the checks on an arm's controllers; the link must not be started."""
 
     def __init__(
         self, link: Any, drives: CanopenDrives, limits: Sequence[Limits], progress: Callable[[str], None]
@@ -40,7 +41,7 @@ class CanopenSelfTest:
         self.link, self.drives, self.limits, self.progress = link, drives, limits, progress
         self.services = drives.services(link.ask)
         self.profiles = [OURS] * drives.m
-        self.results: list[Result] = []
+        self.checks = Checks()
 
     def run(self, power: bool) -> list[Result]:
         """All checks; those with power only where `power`, and where all before them passed.
@@ -53,22 +54,23 @@ class CanopenSelfTest:
         for services, row in zip(self.services, self.drives.rows, strict=True):
             self.progress(f"{services.joint}: identity, objects, settings")
             if services.joint in missing:
-                self._add(services.joint, "answers", "failed", f"no answer at node {services.node}")
-            elif self._identity(services, row):
+                self.checks.add(services.joint, "answers", "failed", f"no answer at node {services.node}")
+                continue
+            try:
+                self.checks.add(services.joint, "identity", "passed", self._identity(services, row))
+            except ArmlinkError as error:
+                self.checks.add(services.joint, "identity", "failed", str(error))
+            else:
                 self._look_at(services, row)
-        self._places(missing)
-        if all(each.outcome != "failed" for each in self.results):
+        if not missing:
+            self.checks.results += link.turns.results(link.read_positions())
+        if not self.checks.failed:
             for node in self.drives.nmt_targets():
                 self.drives.send_nmt(link.ask, objects.NMT_PRE_OPERATIONAL, node)
             for joint, services in enumerate(self.services):
                 self._settings(services, joint)
         self._with_power(power)
-        return self.results
-
-    def _places(self, missing: Sequence[str]) -> None:
-        """Whether each joint can stand where it reads."""
-        if not missing:
-            self.results += self.link.turns.results(self.link.read_positions())
+        return self.checks.results
 
     def _look_at(self, services: NodeServices, row: LinkJoint) -> None:
         """Objects, modes and calibration of a device; of a stock one what it lacks, and what is lost by that."""
@@ -81,46 +83,30 @@ class CanopenSelfTest:
         profile = device.examined(services, row.settings)
         self.profiles[self.drives.rows.index(row)] = profile
         for lost in profile.lost:
-            self._add(services.joint, f"objects: {lost.partition(' ')[0]}", "absent", lost)
+            self.checks.add(services.joint, f"objects: {lost.partition(' ')[0]}", "absent", lost)
         needed = [entry for entry in NEEDED if not services.has(entry)]
         found = ", ".join(f"{entry}: the device lacks it" for entry in needed)
-        self._add(services.joint, "objects", "failed" if needed else "passed", found or "what the link needs is there")
+        self.checks.judge(services.joint, "objects", not needed, found or "what the link needs is there")
         self._modes(services)
         if row.name in self.link.uncalibrated:
             found = "no calibration record in the host: torque is as the device reports it"
-            self._add(services.joint, "calibration", "absent", found)
+            self.checks.add(services.joint, "calibration", "absent", found)
 
     def _with_power(self, power: bool) -> None:
-        failed = [each for each in self.results if each.outcome == "failed"]
+        failed = self.checks.failed
         if failed or not power:
             reason = f"not run: {failed[0].joint} failed: {failed[0].check}" if failed else "not run: not asked for"
-            for check in PowerTest.CHECKS:
-                for name in self.link.names:
-                    self._add(name, check, "not run", reason)
+            for name, check in self.checks.missing(PowerTest.CHECKS, self.link.names):
+                self.checks.add(name, check, "not run", reason)
             return
-        PowerTest(self.link, self.drives, self._add, self.progress).run()
+        PowerTest(self.link, self.drives, self.checks, self.progress).run()
 
-    def _add(self, joint: str, check: str, outcome: Outcome, found: str, seconds: float | None = None) -> None:
-        self.results.append(Result(joint, check, outcome, found, seconds))
-
-    def _try(self, joint: str, check: str, work: Callable[[], str]) -> bool:
-        """Add what `work` found, or what it raised; whether it passed."""
-        try:
-            self._add(joint, check, "passed", work())
-        except ArmlinkError as error:
-            self._add(joint, check, "failed", str(error))
-            return False
-        return True
-
-    def _identity(self, services: NodeServices, row: LinkJoint) -> bool:
-        def work() -> str:
-            device.check_identity(services, row)
-            stated = expected_identity(row, services.remote.object_dictionary)
-            told = [f"{int(services.read(entry)):#x}" for entry in device.IDENTITY_OBJECTS.values()]
-            known = "as stated" if stated.model_dump(exclude_none=True) else "not stated in the arm file"
-            return f"{':'.join(told)}, {known}"
-
-        return self._try(services.joint, "identity", work)
+    def _identity(self, services: NodeServices, row: LinkJoint) -> str:
+        device.check_identity(services, row)
+        stated = expected_identity(row, services.remote.object_dictionary)
+        told = [f"{int(services.read(entry)):#x}" for entry in device.IDENTITY_OBJECTS.values()]
+        known = "as stated" if stated.model_dump(exclude_none=True) else "not stated in the arm file"
+        return f"{':'.join(told)}, {known}"
 
     def _objects(self, services: NodeServices) -> None:
         """Every object that the link uses is there, with the length that the data sheet has."""
@@ -133,21 +119,22 @@ class CanopenSelfTest:
                 except ArmlinkError as error:
                     wrong.append(str(error))
             elif entry in OPTIONAL:
-                self._add(services.joint, f"data sheet: {entry}", "absent", OPTIONAL[entry] or "the device lacks it")
+                lost = OPTIONAL[entry] or "the device lacks it"
+                self.checks.add(services.joint, f"data sheet: {entry}", "absent", lost)
             else:
                 wrong.append(f"{entry}: the device lacks it")
         found = "; ".join(wrong) or f"{count} objects as the data sheet has them"
-        self._add(services.joint, "data sheet", "failed" if wrong else "passed", found)
+        self.checks.judge(services.joint, "data sheet", not wrong, found)
 
     def _modes(self, services: NodeServices) -> None:
         def work() -> str:
             supported = self.drives.offered(services, self.drives.names.index(services.joint))
             for mode in (Mode.PROFILE_POSITION, Mode.PROFILE_TORQUE):
                 if not supports(supported, mode):
-                    self._add(services.joint, f"modes: {int(mode)}", "absent", f"no {MODE_NAMES[mode]} mode")
+                    self.checks.add(services.joint, f"modes: {int(mode)}", "absent", f"no {MODE_NAMES[mode]} mode")
             return ", ".join(str(int(mode)) for mode in MODE_NAMES if mode and supports(supported, mode))
 
-        self._try(services.joint, "modes", work)
+        self.checks.attempt(services.joint, "modes", work)
 
     def _calibration(self, services: NodeServices) -> None:
         def work() -> str:
@@ -158,35 +145,28 @@ class CanopenSelfTest:
                 raise services.fault(objects.RECORD_CRC, f"is {held.crc:#x}, but what it holds gives {crc:#x}")
             return f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
 
-        self._try(services.joint, "calibration", work)
+        self.checks.attempt(services.joint, "calibration", work)
 
     def _settings(self, services: NodeServices, joint: int) -> None:
         """Configure as start() does, but go on where something is refused."""
         row, profile, limits = self.drives.rows[joint], self.profiles[joint], self.limits[joint]
-        self._try(services.joint, "settings: other RPDOs", lambda: self._others(services))
+        attempt = self.checks.attempt
+        attempt(services.joint, "settings: other RPDOs", partial(_others_off, services))
         for each in profile.pdos:
-            self._try(
-                services.joint,
-                f"PDO mapping: {each.name}",
-                lambda each=each: self._mapping(services, each, profile),  # type: ignore[misc]
-            )
+            attempt(services.joint, f"PDO mapping: {each.name}", partial(self._mapping, services, each, profile))
         try:
             unit = read_units(services, row)
             check_fits(row, limits, unit)
             supported = self.drives.offered(services, joint)
             settings = device.settings(unit, limits, self.drives.protection, supported, profile)
         except ArmlinkError as error:
-            self._add(services.joint, "units", "failed", str(error))
+            self.checks.add(services.joint, "units", "failed", str(error))
             return
-        self._add(services.joint, "units", "passed", f"rated torque {unit.torque * 1e3:.6g} N·m")
+        self.checks.add(services.joint, "units", "passed", f"rated torque {unit.torque * 1e3:.6g} N·m")
         if services.has(objects.TORQUE_OFFSET):
             settings = [(objects.TORQUE_OFFSET, 0), *settings]
         for entry, value in settings:
-            self._try(services.joint, f"settings: {entry}", lambda e=entry, v=value: _written(services, e, v))  # type: ignore[misc]
-
-    def _others(self, services: NodeServices) -> str:
-        device.disable_other_rpdos(services)
-        return "off: no other program can command the joint through them"
+            attempt(services.joint, f"settings: {entry}", partial(_written, services, entry, value))
 
     def _mapping(self, services: NodeServices, each: pdo.Pdo, profile: Profile) -> str:
         milliseconds = self.drives.protection.deadline_ms
@@ -196,6 +176,18 @@ class CanopenSelfTest:
         return f"{len(each.entries)} objects, read back{deadline}"
 
 
+def _others_off(services: NodeServices) -> str:
+    device.disable_other_rpdos(services)
+    return "off: no other program can command the joint through them"
+
+
 def _written(services: NodeServices, entry: Entry, value: int) -> str:
     services.write_checked(entry, value)
     return f"{value}, read back"
+
+
+def self_test(
+    link: Any, drives: CanopenDrives, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
+) -> list[Result]:
+    """The self-test of an arm with these drives alone."""
+    return CanopenSelfTest(link, drives, limits, progress).run(power)

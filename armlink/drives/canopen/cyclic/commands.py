@@ -137,7 +137,6 @@ class CommandFrames:
         return wire.layouts[RPDO1.name].pack(word, max(-INT32_MAX, min(INT32_MAX, counts)))
 
     def own_modes(self, modes: Sequence[int]) -> Sequence[int]:
-        """The devices' modes for those of orders."""
         return [self.own_mode(joint, mode) for joint, mode in enumerate(modes)] if self._any_own else modes
 
     def own_mode(self, joint: int, mode: int) -> int:

@@ -8,6 +8,7 @@ from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen.check.power_test import PowerTest
 from armlink.drives.canopen.check.self_test import CanopenSelfTest
 from armlink.drives.canopen.cia402 import DriveState
+from armlink.drives.findings import Checks
 from armlink.errors import BusFault
 
 
@@ -15,7 +16,7 @@ class Bench:
     """A test of two joints that drives none; the second one has no deadline for commands."""
 
     def __init__(self, start=lambda: None):
-        self.told, self.silenced = [], []
+        self.checks, self.silenced = Checks(), []
         loop = SimpleNamespace(withheld=None)
         link = SimpleNamespace(n=2, names=("a", "b"), period=0.004, start=start)
         link.commander = SimpleNamespace(loop=loop, passed=())
@@ -26,11 +27,15 @@ class Bench:
             wires=[SimpleNamespace(profile=each) for each in has],
             known=self.known,
         )
-        self.test = PowerTest(link, drives, lambda *told: self.told.append(told), lambda text: None)
+        self.test = PowerTest(link, drives, self.checks, lambda text: None)
         for name in ("_without_torque", "_require_watch", "_enable", "_no_heartbeat"):
             setattr(self.test, name, lambda: None)
         self.test._quick_stop = lambda joint: None
         self.test._silence = self.silenced.append
+
+    @property
+    def told(self):
+        return [(each.joint, each.check, each.outcome, each.found, each.seconds) for each in self.checks.results]
 
 
 def test_what_a_fault_kept_from_being_reached_is_told_with_the_fault_once_as_failed():
@@ -39,8 +44,8 @@ def test_what_a_fault_kept_from_being_reached_is_told_with_the_fault_once_as_fai
 
     bench = Bench(start)
     bench.test.run()
-    assert bench.told[0] == ("a", PowerTest.CHECKS[0], "failed", "a: no answer")
-    assert [each[2:] for each in bench.told[1:]] == [("not run", "a: no answer")] * (2 * len(PowerTest.CHECKS) - 1)
+    assert bench.told[0][:4] == ("a", PowerTest.CHECKS[0], "failed", "a: no answer")
+    assert [each[2:4] for each in bench.told[1:]] == [("not run", "a: no answer")] * (2 * len(PowerTest.CHECKS) - 1)
 
 
 def test_a_joint_without_a_deadline_is_not_left_without_commands():
@@ -86,17 +91,14 @@ def test_a_joint_that_loses_its_power_is_told_with_its_emergency():
     ],
 )
 def test_no_joint_is_driven_unless_asked_for_and_all_before_has_passed(outcome, power, says, monkeypatch):
-    ran, told = [], []
+    ran, checks = [], Checks()
+    checks.add("a", "units", outcome, "")
     monkeypatch.setattr(PowerTest, "run", lambda test: ran.append(test))
     monkeypatch.setattr(PowerTest, "__init__", lambda *given: None)
-    test = SimpleNamespace(
-        results=[SimpleNamespace(joint="a", check="units", outcome=outcome)],
-        link=SimpleNamespace(names=("a", "b")),
-        drives=None,
-        progress=None,
-        _add=lambda *each: told.append(each),
-    )
+    link = SimpleNamespace(names=("a", "b"))
+    test = SimpleNamespace(checks=checks, link=link, drives=None, progress=None)
     CanopenSelfTest._with_power(test, power)
+    told = checks.results[1:]
     assert len(ran) == (says is None)
-    assert {each[2:] for each in told} == ({("not run", says)} if says else set())
+    assert {(each.outcome, each.found) for each in told} == ({("not run", says)} if says else set())
     assert len(told) == (2 * len(PowerTest.CHECKS) if says else 0)
