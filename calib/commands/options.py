@@ -8,7 +8,7 @@ import typer
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
-    from calib.sweep.dataset import SweepData
+    from calib.dataset import SweepData
 
 Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweep, without and with load.")]
 SweepsArm = Annotated[str | None, typer.Option("--arm", help="Arm file, if it is no longer where sweep found it.")]
@@ -63,7 +63,7 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the answer 
 def load_sweeps(command: str, directories: list[Path], arm: str | None) -> "tuple[list[SweepData], ArmFile]":
     """Data sets and the arm file that they were made with, or `arm`; raises BadInput."""
     from armlink.errors import BadInput
-    from calib.sweep.dataset import data_sets
+    from calib.dataset import data_sets
 
     if not directories:
         raise BadInput(f"{command}: give the directories that sweep wrote")

@@ -19,7 +19,7 @@ from calib.creep.ripple import ripple_cycles
 from calib.creep.rows import CreepRows
 from calib.creep.scatter import Scatter, scatter
 from calib.creep.solve import CreepSolution, solve
-from calib.sweep.dataset import SweepData, digests
+from calib.dataset import SweepData, digests
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.fit.sweep_readings import SweepReadings
-from calib.sweep.run import APPROACH
+from calib.plan.types import APPROACH
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.identify.parameters import Parameters

@@ -11,11 +11,11 @@ from armlink.arm_file import ArmFile
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
+from calib.dataset import SweepData, digests
 from calib.fit.examination import Goodness, examine
 from calib.fit.findings import FitFinding
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
-from calib.sweep.dataset import SweepData, digests
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Parameters, Prior

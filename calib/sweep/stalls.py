@@ -5,8 +5,8 @@ from typing import TypeVar
 
 from armlink.errors import HostLate, Stall
 from armlink.loop.driver import ArmDriver
+from calib.dataset import StallLine
 from calib.motion.mover import Mover
-from calib.sweep.dataset import StallLine
 
 OnStall = Callable[[Stall], bool]
 """Told why the joints were stopped; whether to enable them again and go on."""
