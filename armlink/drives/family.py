@@ -26,7 +26,7 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.can_bus import CanBus
 from armlink.bus.port import Frame
 from armlink.drives.board import Board
-from armlink.drives.findings import DriveFinding, FoundDrives, Result
+from armlink.drives.findings import FoundDrives, Result, SetupFinding
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
@@ -297,7 +297,7 @@ class Family:
     """`search(arm or None, bus or None, json, write)`: `armlink scan` of a whole bus; None: each drive is asked."""
     find: Callable[[CanBus], FoundDrives] | None = None
     """`find(bus)`: the drives on an open bus, asked without an arm file; None: they are found by their ids alone."""
-    examine: Callable[[ArmFile, CanBus, str], Iterator[DriveFinding]] | None = None
+    examine: Callable[[ArmFile, CanBus, str], Iterator[SetupFinding]] | None = None
     """`examine(arm, bus, name)`: what the drives of an arm with this family alone say against its file, on an open bus
     of this name; they are only read. None: each drive is asked who it is."""
     state_name: Callable[[int], str] = power_name

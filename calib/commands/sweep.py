@@ -134,22 +134,22 @@ def _plan(
     from calib.plan.rough_gravity import guess_of_file
     from calib.plan.sweep_plan import plan_sweep
 
+    answer: dict[str, Any] = {"picture": None if picture is None else str(picture)}
+    drawn = "" if picture is None else f"; drawn in {picture}"
     if sweep_motion(arm_file) == "creep":
         planned = plan_creep(arm_file, seed=seed)
-        print_plan(arm_file, planned, console)
-        took = creep_seconds(planned)
-        console.print(f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass")
-        return {**planned.model_dump(mode="json"), "seconds": took, "picture": None}
-    planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
+        took = answer["seconds"] = creep_seconds(planned)
+        told = f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass{drawn}"
+    else:
+        planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
+        took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
+        answer |= {"seconds": took, "collisions": checked}
+        before = f"{_minutes(stops_seconds(arm_file))} more for its stops before the first"
+        told = f"about {_minutes(took)} a pass, {before}; {checked}{drawn}"
     print_plan(arm_file, planned, console)
-    drawn = ""
     if picture is not None:
         draw_plan(arm_file, planned, picture)
-        drawn = f"; drawn in {picture}"
-    took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
-    before = f"{_minutes(stops_seconds(arm_file))} more for its stops before the first"
-    console.print(f"about {_minutes(took)} a pass, {before}; {checked}{drawn}")
-    answer = {"seconds": took, "collisions": checked, "picture": None if picture is None else str(picture)}
+    console.print(told)
     return {**planned.model_dump(mode="json"), **answer}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.observer.discrepancy.kernel import Kernel
 from calib.observer.discrepancy.level import DiscrepancyLevel
-from calib.observer.discrepancy.posterior import Data, Posterior
+from calib.observer.discrepancy.posterior import Posterior
 from calib.observer.discrepancy.reference import Reference, Rows
 from calib.observer.saved_values import restored
 from gcomp.arm.arm import Arm
@@ -207,10 +207,9 @@ class GravityBelief:
         warmer = np.nan_to_num(rows.temperature - self._reference.temperature)
         points = self.kernel.points(rows.position, rows.side, warmer)
         columns = self._columns(rows.position, gravity_regressor(self.arm, rows.position))
-        data = Data(points, rows.residual, columns, rows.epoch)
         free = 0.1 * self.kernel.typical + 20 * self._noise
-        thermal, shared = np.minimum(THERMAL * self.level.total, self._wander), self._factor.shape[1] + self.arm.n
-        return Posterior(self.kernel, self.level, self._noise, free, thermal, data, shared)
+        thermal = np.minimum(THERMAL * self.level.total, self._wander)
+        return Posterior(self.kernel, self.level, self._noise, free, thermal, rows, points, columns)
 
     def _columns(self, q: Array, regressor: Array) -> Array:
         """Columns (K, n, P) of the model's stated uncertainty: of β and of the position sensors' zeros."""

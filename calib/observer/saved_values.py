@@ -33,14 +33,11 @@ def restored(part: Part, values: dict[str, Any]) -> Part:
 
 def save_rows(rows: list[StaticReading]) -> list[list[Any]]:
     """Rows as JSON values: time, position, torque, side of approach, and temperature if a drive tells it."""
+    told = ([known(row.temperature)] if np.isfinite(row.temperature).any() else [] for row in rows)
     return [
-        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *_known_values(row.temperature)]
-        for row in rows
+        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *warm]
+        for row, warm in zip(rows, told, strict=True)
     ]
-
-
-def _known_values(temperature: Array) -> list[Any]:
-    return [known(temperature)] if np.isfinite(temperature).any() else []
 
 
 def read_rows(values: Any, n: int) -> list[StaticReading]:

@@ -5,11 +5,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
 from armlink.arm_file import ArmFile
-from armlink.errors import Stall
-from calib.dataset import DataWriter, PlanLine, SweepData
+from armlink.errors import HostLate, Stall
+from calib.dataset import DataWriter, PlanLine, StallLine, SweepData
 from calib.motion.mover import Mover
 from calib.plan.types import Sweep, SweepPlan
-from calib.sweep.stalls import OnStall, resume_after, stall_line
+from calib.sweep.stalls import OnStall, repeat_work, restart
 
 Progress = Callable[[int, int, float, str], None]
 """Called with (readings or sweeps done, how many in all, seconds left, what is being done)."""
@@ -57,9 +57,11 @@ class SweepPass(ABC):
         """Note a stall, enable the joints again and hold them where they stand; raises it if that is not wanted."""
 
         def note(stall: Stall) -> None:
-            self.writer.append(stall_line(stall, self.mover.seen_at, reading))
+            late = stall.late * 1e3 if isinstance(stall, HostLate) else None
+            self.writer.append(StallLine(t=self.mover.seen_at, late_ms=late, reading=reading, reason=str(stall)))
 
-        resume_after(self.mover, self._on_stall, stall, note)
+        restart(self.mover.link, self._on_stall, stall, note)
+        repeat_work(self.mover.link, self._on_stall, self.mover.resume)
 
     def tell(self, done: int, total: int, before: int, name: str, curve: Sequence[float]) -> None:
         """Report what is done, `before` of it by an earlier run; with a plot of the torques of the sweep under way."""

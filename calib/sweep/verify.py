@@ -23,7 +23,7 @@ from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
 from calib.plan.poses import nearest_first, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.stalls import OnStall, give_up, repeat_motion
+from calib.sweep.stalls import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
@@ -123,7 +123,7 @@ def run_verify(
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
     for number, pose in enumerate(held_out, start=1):
-        found = repeat_motion(mover, on_stall, partial(read_at, mover, pose))
+        found = repeat_work(link, on_stall, partial(read_at, mover, pose), mover.resume)
         if found is None:
             continue
         position, torque = found

@@ -10,7 +10,7 @@ from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen.cia402 import state_of
 from armlink.drives.canopen.settings import CanopenSettings
 from armlink.drives.family import Drives, Family
-from armlink.drives.findings import DriveFinding, FoundDrives, Result
+from armlink.drives.findings import FoundDrives, Result, SetupFinding
 from armlink.drives.orders import Limits
 from armlink.drives.traits import Traits
 
@@ -61,7 +61,7 @@ def find(bus: CanBus) -> FoundDrives:
     return FoundNodes(bus)
 
 
-def examine(arm: ArmFile, bus: CanBus, name: str) -> Iterator[DriveFinding]:
+def examine(arm: ArmFile, bus: CanBus, name: str) -> Iterator[SetupFinding]:
     """Contradictions between nodes and arm file; see `armlink.drives.canopen.check.arm_findings`."""
     from armlink.drives.canopen.check.arm_findings import arm_findings
 

@@ -10,8 +10,8 @@ import yaml
 
 from armlink import cli
 from armlink.arm_file import bundled_arms
+from armlink.drives.findings import ORDER
 from calib.commissioning.doctor import examine
-from calib.commissioning.finding import ORDER
 
 MODELS = Path(__file__).parents[2] / "models"
 PLANAR = {
