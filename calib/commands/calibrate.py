@@ -109,6 +109,7 @@ def _answer(fit: "Calibrated", data: "list[SweepData]", record: "CalibrationReco
     else:
         own = {"schema": "armlink.creep/1", **_of_creeps(fit, data)}
     return {
+        **own,
         "record": record.id,
         "joints": list(fit.names),
         "not_identifiable": [
@@ -116,7 +117,6 @@ def _answer(fit: "Calibrated", data: "list[SweepData]", record: "CalibrationReco
             for (joint, parameter), reason in fit.reasons.items()
         ],
         "residual_rms": fit.residual_rms.tolist(),
-        **own,
     }
 
 
