@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.observer.config import ObserverConfig
-from calib.observer.saved_values import UNREADABLE
+from calib.observer.saved_values import UNREADABLE, restored
 from calib.observer.tracking.pose_memory import PoseMemory
 
 CONFIG = ObserverConfig()
@@ -73,5 +73,5 @@ def test_what_is_saved_is_known_after_a_restart():
         {"places": [[["a", "b"]], [[1, 2]], [1]]},
     ):
         with pytest.raises(UNREADABLE):
-            after.restore(wrong)
+            restored(after, wrong)
     assert after.seen(HERE) == 2
