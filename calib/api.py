@@ -17,20 +17,19 @@ from armlink.loop.open import open_arm
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
+from calib.arm.sweep_section import sweep_motion
 from calib.commissioning.model_judgement import refuse_impossible_sweep
-from calib.creep.choice import all_creep, sweep_motion
 from calib.creep.fit import fit_creep
-from calib.creep.record import CreepCalibration, gravity_fit
-from calib.creep.run import run_creep
-from calib.creep.verify import verify_creeping
+from calib.creep.record import CreepCalibration
+from calib.dataset import SweepData, all_creep, data_sets
 from calib.fit.gravity_fit import GravityFit, identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
 from calib.observer.observer import observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.dataset import SweepData, data_sets
-from calib.sweep.run import Progress, run_sweep
+from calib.sweep.run import run_sweep
+from calib.sweep.sweep_pass import Progress
 from calib.sweep.verify import Verification, run_verify
 from gcomp.arrays import Array
 
@@ -113,9 +112,8 @@ def sweep(
     """
     arm_file = arm.arm if _is_link(arm) else _arm(arm)
     refuse_impossible_sweep(arm_file, reference_mass)
-    run = run_creep if sweep_motion(arm_file) == "creep" else run_sweep
     with _enabled(arm, bus, simulated, reference_mass if simulated else 0.0) as link:
-        return run(
+        return run_sweep(
             link, arm_file, Path(out), reference_mass=reference_mass, resume=resume, seed=seed, progress=progress
         )
 
@@ -134,7 +132,7 @@ def calibrate(*sweeps: SweepLike, arm: ArmLike | None = None) -> Calibrated:
     writes one. Raises BadInput, Refused.
     """
     data = _sweeps("calibrate", sweeps)
-    return _calibrated(_arm_of(data, arm), data)
+    return calibrated(_arm_of(data, arm), data)
 
 
 def identify(*sweeps: SweepLike, arm: ArmLike | None = None, sensors: Calibrated | None = None) -> GravityFit:
@@ -149,12 +147,7 @@ def identify(*sweeps: SweepLike, arm: ArmLike | None = None, sensors: Calibrated
     """
     data = _sweeps("identify", sweeps)
     arm_file = _arm_of(data, arm)
-    found = sensors or _calibrated(arm_file, data)
-    if isinstance(found, CreepCalibration) != all_creep(data):
-        raise BadInput(
-            "identify: sensors: these were found in sweeps of the other kind (creep or steps): leave the argument out"
-        )
-    return gravity_fit(found.fit) if isinstance(found, CreepCalibration) else identify_gravity(arm_file, data, found)
+    return identified(arm_file, data, sensors or calibrated(arm_file, data))
 
 
 def verify(
@@ -186,12 +179,9 @@ def verify(
     arm_file = arm.arm if _is_link(arm) else _arm(arm)
     calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepCalibration) else sensors
     model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity
-    creeping = sweep_motion(arm_file) == "creep"
-    if creeping and calibration is None:
+    if calibration is None and sweep_motion(arm_file) == "creep":
         raise BadInput("verify: sensors: the drives of this arm keep no calibration: give what calibrate found")
     with _enabled(arm, bus, simulated) as link:
-        if creeping and calibration is not None:
-            return verify_creeping(link, arm_file, model, calibration, poses=poses, seed=seed, progress=progress)
         return run_verify(link, arm_file, model, calibration, poses=poses, seed=seed, progress=progress)
 
 
@@ -276,10 +266,20 @@ def _sweeps(function: str, sweeps: tuple[object, ...]) -> list[SweepData]:
     return data_sets(given)
 
 
-def _calibrated(arm_file: ArmFile, data: list[SweepData]) -> Calibrated:
+def calibrated(arm_file: ArmFile, data: list[SweepData]) -> Calibrated:
+    """The fit of data sets, by their motion; raises BadInput, Refused."""
     if all_creep(data):
         return CreepCalibration(fit_creep(arm_file, [each.require(arm_file) for each in data]))
     return fit_sensors(arm_file, data)
+
+
+def identified(arm_file: ArmFile, data: list[SweepData], sensors: Calibrated | CalibrationRecord) -> GravityFit:
+    """Mass moments from data sets and their sensors, by their motion; raises BadInput, Refused."""
+    if isinstance(sensors, CreepCalibration if not all_creep(data) else SensorFit):
+        raise BadInput(
+            "identify: sensors: these were found in sweeps of the other kind (creep or steps): leave the argument out"
+        )
+    return sensors.gravity if isinstance(sensors, CreepCalibration) else identify_gravity(arm_file, data, sensors)
 
 
 def _arm_of(data: list[SweepData], arm: ArmLike | None) -> ArmFile:

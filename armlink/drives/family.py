@@ -13,7 +13,7 @@ from typing import Any
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.can_bus import CanBus
 from armlink.drives.base import BasicDrives
-from armlink.drives.findings import DriveFinding, FoundDrives, Result
+from armlink.drives.findings import SetupFinding, FoundDrives, Result
 from armlink.drives.orders import power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
@@ -35,7 +35,7 @@ class Family:
     """`search(arm or None, bus or None, json, write, show)`: `armlink scan` of a bus; None: each drive is asked."""
     find: Callable[[CanBus], FoundDrives] | None = None
     """`find(bus)`: the drives on an open bus, asked without an arm file; None: they are found by their ids alone."""
-    examine: Callable[[ArmFile, CanBus, str], Iterator[DriveFinding]] | None = None
+    examine: Callable[[ArmFile, CanBus, str], Iterator[SetupFinding]] | None = None
     """`examine(arm, bus, name)`: what the drives of an arm with this family alone say against its file, on an open bus
     of this name; they are only read. None: each drive is asked who it is."""
     state_name: Callable[[int], str] = power_name

@@ -40,14 +40,20 @@ class FoundDrives(Protocol):
         """Position reading of every drive by its id [rad]; raises BusFault."""
 
 
-@dataclass(frozen=True)
-class DriveFinding:
-    """A lack or doubt about a drive, its place, and its remedy."""
+Level = Literal["error", "warning", "hint"]
 
-    level: Literal["error", "warning", "hint"]
+
+@dataclass(frozen=True)
+class SetupFinding:
+    """A lack or doubt about a drive or an arm's set-up, its place, and its remedy."""
+
+    level: Level
     what: str
     where: str
     remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.what}: {self.remedy}"
 
 
 Outcome = Literal["passed", "failed", "absent", "not run"]

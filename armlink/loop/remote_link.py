@@ -172,7 +172,8 @@ class RemoteLink:
         for begin in range(0, len(setpoints), CHUNK):
             self._put(Play(number, setpoints[begin : begin + CHUNK]))
         yield from self._take(number, len(setpoints))
-        self._in_force = _copy(setpoints.command(len(setpoints) - 1))
+        last = setpoints.command(len(setpoints) - 1)
+        self._in_force = Command(last.mode.copy(), last.torque.copy(), last.position.copy(), guard=last.guard)
 
     def run(self, controller: Controller) -> Samples:
         number = next(self._numbers)
@@ -281,10 +282,6 @@ class RemoteLink:
             if not see_out(self._channel, lambda: self._process.poll() is None, cause, tell):
                 self._process.kill()
             self._process.wait()
-
-
-def _copy(command: Command) -> Command:
-    return Command(command.mode.copy(), command.torque.copy(), command.position.copy(), guard=command.guard)
 
 
 def _same(one: Command, other: Command) -> bool:

@@ -120,7 +120,8 @@ def _content(path: Path, stated: tuple[str, ...]) -> tuple[bytearray, str, CsvLa
             content = bytearray(packed)
         del packed
     except (OSError, zlib.error) as error:
-        raise BadInput(f"{path}: not a readable CSV file: {_first_line(error)}") from None
+        first_line = str(error).partition("\n")[0]
+        raise BadInput(f"{path}: not a readable CSV file: {first_line}") from None
     layout = layout_of(content, str(path), stated)
     if content.endswith((b"\n", b"\r")) or not content:
         return content, cut, layout
@@ -184,7 +185,3 @@ def require_each_once(header: Sequence[str], path: Path, where: str = " in the h
     twins = sorted(column for column in set(header) if column and header.count(column) > 1)
     if twins:
         raise BadInput(f"{path}: column {twins[0]!r} occurs twice{where}")
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0]

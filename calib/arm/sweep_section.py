@@ -7,9 +7,11 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from armlink.arm_file import ArmFile, Positive, Section
+from armlink.drives.registry import family
 from armlink.errors import BadInput
 from gcomp.identify.parameters import Prior
 
+Motion = Literal["creep", "steps"]
 Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
 
@@ -51,7 +53,7 @@ class ParkedArm(Section):
 class SweepSection(Section):
     """Steps, poses, settle rule, averaging and how resting joints are held."""
 
-    motion: Literal["creep", "steps"] | None = None
+    motion: Motion | None = None
     """Creep at constant speed, or steps at rest; by default creep where every drive's torque is a motor current."""
     creep: CreepSection = CreepSection()
     """How joints creep."""
@@ -133,6 +135,19 @@ def sweep_section(arm_file: ArmFile) -> SweepSection:
             f"{arm_file.path}: key sweep.beside: collisions need geometry: give a URDF or MJCF as kinematics.model"
         )
     return section
+
+
+def sweep_motion(arm_file: ArmFile) -> Motion:
+    """`sweep.motion` of the arm file; without it creep where the torque of every drive is a motor current.
+
+    At rest friction holds a joint at any torque within its band, and a motor current cannot tell friction from gravity;
+    a torque sensor behind the friction can.
+    """
+    stated = sweep_section(arm_file).motion
+    if stated is not None:
+        return stated
+    joints = arm_file.require_link().joints
+    return "creep" if all(family(each.settings.family).traits.torque == "current" for each in joints) else "steps"
 
 
 def with_hold(arm_file: ArmFile, hold: str | None) -> ArmFile:

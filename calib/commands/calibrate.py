@@ -1,6 +1,7 @@
 """Fits gains and offsets of torque and position sensors to sweeps; keeps a calibration record."""
 
 import getpass
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,8 +11,11 @@ from calib.commands.options import APPLY, Bus, Check, Flash, JsonFile, Replaced,
 
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
+    from calib.api import Calibrated
+    from calib.creep.record import CreepCalibration
+    from calib.dataset import SweepData
     from calib.fit.sensor_fit import SensorFit
-    from calib.records.records import CalibrationRecord, Parameter
+    from calib.records.records import CalibrationRecord
 
 
 def calibrate(
@@ -42,47 +46,43 @@ def calibrate(
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput, Refused
     from armlink.extras import require_extra
+    from calib.api import calibrated
     from calib.arm.kinematics import gcomp_arm
-    from calib.commands.creep_fits import calibrate_creep
     from calib.commands.options import load_sweeps
-    from calib.creep.choice import all_creep
+    from calib.dataset import all_creep, drives_of
     from calib.fit.felt_mass import felt_mass
-    from calib.fit.sensor_fit import fit_sensors
+    from calib.fit.sensor_fit import SensorFit
     from calib.install.apply import Apply, apply_calibration
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore
-    from calib.sweep.dataset import drives_of
 
     if report is not None:
         require_extra("--report", "reports")
     data, arm_file = load_sweeps("calibrate", directories, arm)
-    if all_creep(data):
-        if apply:
-            raise BadInput("--apply: the host keeps the calibration of these drives: the record is in force without it")
-        calibrate_creep(data, arm_file, store, json_file, report)
-        suggest(command_line("identify", *map(str, directories), arm=arm, store=store))
-        return
-    drives = drives_of(data)
-    fit = fit_sensors(arm_file, data)
+    if apply and all_creep(data):
+        raise BadInput("--apply: the host keeps the calibration of these drives: the record is in force without it")
+    fit = calibrated(arm_file, data)
     records = RecordStore(store)
     current = records.current(CalibrationRecord, arm_file)
-    parent = None if current is None else current.id
-    record = fit.record(arm_file).model_copy(update={"parent": parent, "drives": drives})
-    felt = felt_mass(gcomp_arm(arm_file), fit.rows.readings)
-    if felt is not None and felt.contradicts:
-        records.add(record.model_copy(update={"note": f"not made current: {felt}"}))
-        write_json(json_file, _answer(fit, record, False))
-        raise Refused(f"{felt} Record {record.id} is kept, and not made current")
+    record = fit.record(arm_file).model_copy(update={"parent": None if current is None else current.id})
+    if isinstance(fit, SensorFit):
+        record = record.model_copy(update={"drives": drives_of(data)})
+        felt = felt_mass(gcomp_arm(arm_file), fit.rows.readings)
+        if felt is not None and felt.contradicts:
+            records.add(record.model_copy(update={"note": f"not made current: {felt}"}))
+            write_json(json_file, _answer(fit, data, record, False))
+            raise Refused(f"{felt} Record {record.id} is kept, and not made current")
     out = results(json_file)
-    _show(fit, out)
+    _show(fit, data, out)
+    user = getpass.getuser()
     if apply:
-        user = getpass.getuser()
         record = record.model_copy(update={"confirmed_by": user})
     if report is not None:
         from calib.report.calibration import Calibrated, write_report
 
         write_report(Calibrated(arm_file, data, fit, record, current), report)
     if apply:
+        assert isinstance(fit, SensorFit)
         how = Apply(
             by=user, bus=bus, replaced=tuple(replaced or ()), accepted=tuple(accept or ()), check=check, flash=flash
         )
@@ -92,29 +92,42 @@ def calibrate(
             written = apply_calibration(record, arm_file, records, data, fit, how)
         out.print(f"record {record.id} is current, written to {len(written)} controllers and read back")
     else:
-        records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
-        out.print(f"record {record.id} is current; the controllers keep what they hold until --apply writes it to them")
+        of_host = not isinstance(fit, SensorFit)
+        records.put(record, arm_file, by="armlink calibrate", reason="creep sweeps" if of_host else "sweeps")
+        kept = "the controllers keep what they hold until --apply writes it to them"
+        in_host = f"record {record.id} is current: it corrects readings and commands when the arm is opened next"
+        out.print(in_host if of_host else f"record {record.id} is current; {kept}")
     suggest(command_line("identify", *map(str, directories), arm=arm, store=store))
-    write_json(json_file, _answer(fit, record, apply))
+    write_json(json_file, _answer(fit, data, record, apply))
 
 
-def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dict[str, Any]:
-    from calib.records.records import PARAMETERS
+def _answer(fit: "Calibrated", data: "list[SweepData]", record: "CalibrationRecord", applied: bool) -> dict[str, Any]:
+    from calib.fit.sensor_fit import SensorFit
 
+    if isinstance(fit, SensorFit):
+        own: dict[str, Any] = {"schema": "armlink.calibration/1", "applied": applied, **_of_steps(fit)}
+    else:
+        own = {"schema": "armlink.creep/1", **_of_creeps(fit, data)}
     return {
-        "schema": "armlink.calibration/1",
+        **own,
         "record": record.id,
-        "applied": applied,
         "joints": list(fit.names),
-        **{name: {"estimated": fit.value(name).tolist(), "ci95": fit.ci95(name).tolist()} for name in PARAMETERS},
         "not_identifiable": [
             {"joint": joint, "parameter": parameter, "reason": reason}
             for (joint, parameter), reason in fit.reasons.items()
         ],
+        "residual_rms": fit.residual_rms.tolist(),
+    }
+
+
+def _of_steps(fit: "SensorFit") -> dict[str, Any]:
+    from calib.records.records import PARAMETERS
+
+    return {
+        **{name: {"estimated": fit.value(name).tolist(), "ci95": fit.ci95(name).tolist()} for name in PARAMETERS},
         "imprecise": list(fit.imprecise),
         "attachment": _attachment(fit),
         "gain_ratio": None if fit.gain_ratio is None else fit.gain_ratio.tolist(),
-        "residual_rms": fit.residual_rms.tolist(),
         "hysteresis": fit.hysteresis.tolist(),
         "friction": fit.friction.tolist(),
         "findings": [
@@ -134,6 +147,23 @@ def _answer(fit: "SensorFit", record: "CalibrationRecord", applied: bool) -> dic
     }
 
 
+def _of_creeps(fit: "CreepCalibration", data: "list[SweepData]") -> dict[str, Any]:
+    from calib.creep.record import VALUES, family_of
+
+    values = {
+        family_of(name): {
+            "estimated": fit.value(name).tolist(),
+            "ci95": [None if math.isnan(low) else [low, high] for low, high in fit.ci95(name).tolist()],
+        }
+        for name in VALUES
+    }
+    return {
+        **values,
+        "disturbed": [*(each.reason for one in data for each in one.contacts), *fit.findings],
+        "temperature": [None if math.isnan(each) else each for each in fit.fit.rows.warmest.tolist()],
+    }
+
+
 def _attachment(fit: "SensorFit") -> dict[str, list[Any]] | None:
     """Position of the reference mass [m]; None if it is not identifiable."""
     if fit.attachment is None:
@@ -145,16 +175,23 @@ def _attachment(fit: "SensorFit") -> dict[str, list[Any]] | None:
     }
 
 
-def _show(fit: "SensorFit", console: "PlainConsole") -> None:
+def _show(fit: "Calibrated", data: "list[SweepData]", console: "PlainConsole") -> None:
     from calib.commands.screen import print_intervals, print_lines
+    from calib.fit.sensor_fit import SensorFit
+    from calib.report.tables import CREEP_HEADINGS, SENSOR_HEADINGS
 
-    headings: dict[Parameter, str] = {"gain": "gain", "offset": "offset [N·m]", "position_gain": "position gain"}
-    columns = {heading: (fit.value(name), fit.half95(name)) for name, heading in headings.items()}
+    reasons = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
+    if not isinstance(fit, SensorFit):
+        drives = {heading: (fit.value(name), fit.half95(name)) for name, heading in CREEP_HEADINGS.items()}
+        print_intervals("Drives, ± half of the 95 % interval", fit.names, drives, console)
+        print_lines(reasons, console=console)
+        print_lines([*(each.reason for one in data for each in one.contacts), *fit.findings], "yellow", console)
+        return
+    columns = {heading: (fit.value(name), fit.half95(name)) for name, heading in SENSOR_HEADINGS.items()}
     columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
     print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns, console)
-    lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
     doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
-    lines.append(f"at new poses, sensors and gravity model still disagree by [N·m]: {', '.join(doubts)}")
+    lines = [*reasons, f"at new poses, sensors and gravity model still disagree by [N·m]: {', '.join(doubts)}"]
     lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
     if fit.gain_ratio is not None:
         ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))

@@ -1,21 +1,11 @@
 """Runs the service that watches the arm, keeps its torque sensors true, and serves a page and an API."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from calib.commands.options import Store
-
-
-class Policies(StrEnum):
-    """Treatment of a drift that was found."""
-
-    observe = "observe"
-    propose = "propose"
-    apply = "apply"
-
 
 TAKE_OVER_SECONDS = 3.0
 """Time that the bus process of a daemon that was killed may take to leave the joints safe and end [s]."""
@@ -46,7 +36,8 @@ def daemon(
         typer.Option(help="File with the token that TCP clients must send.", rich_help_panel="Page and API"),
     ] = None,
     policy: Annotated[
-        Policies | None, typer.Option(help="What to do about a drift, instead of the arm file's daemon.policy.")
+        Literal["observe", "propose", "apply"] | None,
+        typer.Option(help="What to do about a drift, instead of the arm file's daemon.policy."),
     ] = None,
     state: Annotated[
         Path | None, typer.Option(help="Directory of journal and recordings; default the user's state directory.")
@@ -86,7 +77,7 @@ def daemon(
         socket=socket or directory / "api.sock",
         tcp=address,
         token=token,
-        policy=None if policy is None else policy.value,
+        policy=policy,
         store=store,
         work=work,
     )

@@ -76,22 +76,17 @@ def hold_afloat(
 
 def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple[Array, CalibrationRecord | None, str]":
     """Mass moments (2n,) [kg·m], the calibration record if any, and where the moments come from; raises Refused."""
-    import numpy as np
-
-    from armlink.errors import BadInput
     from calib.arm.kinematics import model_arm
+    from calib.commands.options import gravity_model
     from calib.commissioning.model_judgement import refuse_impossible_model
-    from calib.records.records import CalibrationRecord, GravityRecord
+    from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore, no_record
 
     records = RecordStore(store)
-    calibration = records.current(CalibrationRecord, arm_file)
-    kept = records.current(GravityRecord, arm_file) if record is None else records.usable(record, arm_file)
-    if kept is None and arm_file.model_path is not None:
-        refuse_impossible_model(arm_file)
-        return model_arm(arm_file).beta, calibration, f"the inertials of {arm_file.model_path.name}"
-    if kept is None:
+    calibration, found = records.current(CalibrationRecord, arm_file), gravity_model(arm_file, record, records)
+    if found is not None:
+        return found[0], calibration, found[1]
+    if arm_file.model_path is None:
         raise no_record(arm_file, "gravity")
-    if not isinstance(kept, GravityRecord):
-        raise BadInput(f"--record {record}: that is a {kept.kind} record, expected a gravity record")
-    return np.array(kept.beta), calibration, f"gravity record {kept.id}"
+    refuse_impossible_model(arm_file)
+    return model_arm(arm_file).beta, calibration, f"the inertials of {arm_file.model_path.name}"

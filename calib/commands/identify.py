@@ -27,34 +27,30 @@ def identify(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.errors import BadInput
-    from calib.commands.creep_fits import identify_creep
+    from calib.api import Calibrated, calibrated, identified
     from calib.commands.options import load_sweeps
-    from calib.creep.choice import all_creep
-    from calib.fit.gravity_fit import identify_gravity
-    from calib.fit.sensor_fit import SensorFit, fit_sensors
+    from calib.dataset import all_creep
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore
 
     data, arm_file = load_sweeps("identify", directories, arm)
-    if all_creep(data):
-        identify_creep(data, arm_file, store, json_file)
-        suggest(command_line("verify", arm_file.argument, store=store))
-        return
     records = RecordStore(store)
-    sensors: SensorFit | CalibrationRecord
+    sensors: Calibrated | CalibrationRecord
     used: CalibrationRecord | None
     if calibration is None:
-        sensors = fit_sensors(arm_file, data)
+        sensors = calibrated(arm_file, data)
         current = records.current(CalibrationRecord, arm_file)
         used = current if current is not None and current.sources == sensors.sources else None
     else:
+        if all_creep(data):
+            raise BadInput("--calibration: creep sweeps tell drives and gravity in one fit: leave the option out")
         kept = records.usable(calibration, arm_file)
         if not isinstance(kept, CalibrationRecord):
             raise BadInput(f"--calibration {calibration}: that is a {kept.kind} record, expected a calibration record")
         sensors = used = kept
-    fit = identify_gravity(arm_file, data, sensors)
+    fit = identified(arm_file, data, sensors)
     record = fit.record(arm_file, used)
-    records.put(record, arm_file, by="armlink identify", reason="sweeps")
+    records.put(record, arm_file, by="armlink identify", reason="creep sweeps" if all_creep(data) else "sweeps")
     out = results(json_file)
     _show(fit, out)
     out.print(f"record {record.id} is current: {fit.identifiable.sum()} of {len(fit.beta)} mass moments are determined")
@@ -80,17 +76,11 @@ def _show(fit: "GravityFit", console: "PlainConsole") -> None:
 
     from calib.commands.screen import print_intervals
 
-    recursive = np.full(len(fit.beta), np.nan) if fit.recursive is None else fit.recursive.beta
     beta, half = np.where(fit.identifiable, fit.beta, np.nan), 1.96 * fit.std
-    print_intervals(
-        "Mass moments [kg·m], ± half of the 95 % interval",
-        fit.names,
-        {
-            "x": (beta[0::2], half[0::2]),
-            "y": (beta[1::2], half[1::2]),
-            "x, recursive": (recursive[0::2], 0 * half[0::2]),
-            "y, recursive": (recursive[1::2], 0 * half[1::2]),
-            "residual [N·m]": (fit.residual_rms, 0 * fit.residual_rms),
-        },
-        console,
-    )
+    columns = {"x": (beta[0::2], half[0::2]), "y": (beta[1::2], half[1::2])}
+    if fit.recursive is not None:
+        recursive = fit.recursive.beta
+        columns["x, recursive"] = recursive[0::2], 0 * half[0::2]
+        columns["y, recursive"] = recursive[1::2], 0 * half[1::2]
+    columns["residual [N·m]"] = fit.residual_rms, 0 * fit.residual_rms
+    print_intervals("Mass moments [kg·m], ± half of the 95 % interval", fit.names, columns, console)

@@ -8,7 +8,9 @@ import typer
 
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
-    from calib.sweep.dataset import SweepData
+    from calib.dataset import SweepData
+    from calib.records.store import RecordStore
+    from gcomp.arrays import Array
 
 Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweep, without and with load.")]
 SweepsArm = Annotated[str | None, typer.Option("--arm", help="Arm file, if it is no longer where sweep found it.")]
@@ -60,10 +62,28 @@ WithoutAsking = Annotated[bool, typer.Option("--yes", help="Do not ask before th
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")]
 
 
+def gravity_model(arm_file: "ArmFile", record: str | None, records: "RecordStore") -> "tuple[Array, str] | None":
+    """Mass moments (2n,) [kg·m] of the record named, else of the current one, and their origin; None without one.
+
+    Raises BadInput where it is no gravity record, Refused where it is of another arm.
+    """
+    import numpy as np
+
+    from armlink.errors import BadInput
+    from calib.records.records import GravityRecord
+
+    kept = records.current(GravityRecord, arm_file) if record is None else records.usable(record, arm_file)
+    if kept is None:
+        return None
+    if not isinstance(kept, GravityRecord):
+        raise BadInput(f"--record {record}: that is a {kept.kind} record, expected a gravity record")
+    return np.array(kept.beta), f"gravity record {kept.id}"
+
+
 def load_sweeps(command: str, directories: list[Path], arm: str | None) -> "tuple[list[SweepData], ArmFile]":
     """Data sets and the arm file that they were made with, or `arm`; raises BadInput."""
     from armlink.errors import BadInput
-    from calib.sweep.dataset import data_sets
+    from calib.dataset import data_sets
 
     if not directories:
         raise BadInput(f"{command}: give the directories that sweep wrote")

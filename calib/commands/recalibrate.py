@@ -88,8 +88,8 @@ def _rows(
     from armlink.errors import BadInput
     from armlink.recording.files import load_recording
     from armlink.torque_calibration import UNCALIBRATED, per_joint
+    from calib.dataset import labels, load_data
     from calib.field.rows import rows_of_recording, rows_of_sweeps
-    from calib.sweep.dataset import labels, load_data
 
     n = len(arm_file.joint_names)
     blank = per_joint([UNCALIBRATED] * n)

@@ -20,7 +20,7 @@ from calib.plan.types import SweepPlan
 from calib.report.tables import interval_table
 
 if TYPE_CHECKING:
-    from calib.sweep.dataset import SweepData
+    from calib.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
 _CONSOLE = PlainConsole()

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
     from armlink.loop.driver import ArmDriver
     from calib.commands.screen import SweepScreen
-    from calib.sweep.dataset import SweepData
+    from calib.dataset import SweepData
     from calib.sweep.preflight import Preflight
 
 
@@ -69,7 +69,7 @@ def sweep(
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, warn_late
     from calib.commissioning.model_judgement import refuse_impossible_sweep
-    from calib.sweep.dataset import MANIFEST, require_vacant
+    from calib.dataset import MANIFEST, require_vacant
 
     if picture is not None:
         require_extra("--picture", "reports")
@@ -126,30 +126,30 @@ def _plan(
     arm_file: "ArmFile", seed: int, reference_mass: float, picture: Path | None, console: "PlainConsole"
 ) -> dict[str, Any]:
     """Print and check the plan, and draw it if asked to; the answer for machines."""
+    from calib.arm.sweep_section import sweep_motion
     from calib.commands.screen import print_plan
-    from calib.creep.choice import sweep_motion
     from calib.creep.plan import creep_seconds, plan_creep
     from calib.plan.collisions import check_plan
     from calib.plan.drawing import draw_plan, pass_seconds, stops_seconds
     from calib.plan.rough_gravity import guess_of_file
     from calib.plan.sweep_plan import plan_sweep
 
+    answer: dict[str, Any] = {"picture": None if picture is None else str(picture)}
+    drawn = "" if picture is None else f"; drawn in {picture}"
     if sweep_motion(arm_file) == "creep":
         planned = plan_creep(arm_file, seed=seed)
-        print_plan(arm_file, planned, console)
-        took = creep_seconds(planned)
-        console.print(f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass")
-        return {**planned.model_dump(mode="json"), "seconds": took, "picture": None}
-    planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
+        took = answer["seconds"] = creep_seconds(planned)
+        told = f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass{drawn}"
+    else:
+        planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
+        took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
+        answer |= {"seconds": took, "collisions": checked}
+        before = f"{_minutes(stops_seconds(arm_file))} more for its stops before the first"
+        told = f"about {_minutes(took)} a pass, {before}; {checked}{drawn}"
     print_plan(arm_file, planned, console)
-    drawn = ""
     if picture is not None:
         draw_plan(arm_file, planned, picture)
-        drawn = f"; drawn in {picture}"
-    took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
-    before = f"{_minutes(stops_seconds(arm_file))} more for its stops before the first"
-    console.print(f"about {_minutes(took)} a pass, {before}; {checked}{drawn}")
-    answer = {"seconds": took, "collisions": checked, "picture": None if picture is None else str(picture)}
+    console.print(told)
     return {**planned.model_dump(mode="json"), **answer}
 
 
@@ -168,8 +168,7 @@ def _run(
     seed: int,
     check_stops: bool,
 ) -> "tuple[Preflight, SweepData]":
-    from calib.creep.choice import sweep_motion
-    from calib.creep.run import run_creep
+    from calib.arm.sweep_section import sweep_motion
     from calib.sweep.preflight import find_stops, listen
     from calib.sweep.run import run_sweep
     from calib.sweep.stalls import repeat_work
@@ -177,11 +176,10 @@ def _run(
     link.enable()
     on_stall = screen.on_stall(keep_going)
     heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
-    found, creeping = heard, sweep_motion(arm_file) == "creep"
-    if check_stops and not creeping:
+    found = heard
+    if check_stops and sweep_motion(arm_file) == "steps":
         found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
-    run = run_creep if creeping else run_sweep
-    data = run(
+    data = run_sweep(
         link,
         arm_file,
         out,
@@ -217,7 +215,7 @@ def _show(
         loaded = data.path.with_name(f"{data.path.name}-loaded")
         console.print(f"{complete}; now attach {mass:g} kg and sweep again")
         suggest(command_line(*again, reference_mass=f"{mass:g}", out=loaded))
-    elif data.plan.sweeps[0].speed is not None:
+    elif data.creeps:
         bare = data.path.with_name(f"{data.path.name}-again")
         console.print(f"{complete}; now take the mass off and sweep once more without it")
         suggest(command_line(*again, out=bare))

@@ -59,13 +59,11 @@ def _model(
     arm: str, base: str | None, tip: str | None, record: str | None, store: str | None
 ) -> "tuple[Arm, Array, str]":
     """The arm, its mass moments (2n,) [kg·m], and their origin in words; raises BadInput, Refused."""
-    import numpy as np
-
     from armlink.arm_file import MODEL_SUFFIXES, load_arm
     from armlink.content.model_sizes import model_budget
     from armlink.errors import BadInput, Refused
     from calib.arm.kinematics import gcomp_arm, model_arm
-    from calib.records.records import GravityRecord
+    from calib.commands.options import gravity_model
     from calib.records.store import RecordStore, way_to
     from gcomp.arm.load import load_model
 
@@ -83,13 +81,10 @@ def _model(
     if record is None and arm_file.model_path is not None:
         model = model_arm(arm_file)
         return model.arm, model.beta, f"inertials of {arm_file.model_path.name}"
-    records = RecordStore(store)
-    kept = records.current(GravityRecord, arm_file) if record is None else records.usable(record, arm_file)
-    if kept is None:
+    found = gravity_model(arm_file, record, RecordStore(store))
+    if found is None:
         raise Refused(
             f"{arm_file.name} {arm_file.serial}: its description has no inertials, and there is no gravity record yet:"
             f" {way_to(arm_file, 'gravity')}"
         )
-    if not isinstance(kept, GravityRecord):
-        raise BadInput(f"--record {record}: that is a {kept.kind} record, expected a gravity record")
-    return gcomp_arm(arm_file), np.array(kept.beta), f"gravity record {kept.id}"
+    return gcomp_arm(arm_file), *found

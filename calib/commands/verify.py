@@ -38,9 +38,8 @@ def verify(
     from armlink.commands.plain_console import command_line, results, suggest
     from armlink.extras import require_extra
     from armlink.loop.open import open_arm
+    from calib.arm.sweep_section import sweep_motion
     from calib.commands.screen import SweepScreen, confirm
-    from calib.creep.choice import sweep_motion
-    from calib.creep.verify import verify_creeping
     from calib.records.store import RecordStore, no_record
     from calib.sweep.verify import run_verify
 
@@ -54,22 +53,16 @@ def verify(
         open_arm(arm_file, bus) as link,
     ):
         gravity, calibration = _records(RecordStore(store), arm_file, record or [])
-        creeping = sweep_motion(arm_file) == "creep"
-        if creeping and calibration is None:
+        if calibration is None and sweep_motion(arm_file) == "creep":
             raise no_record(arm_file, "calibration")
         link.start()
         work.enabled = True
         with SweepScreen(f"{arm_file.name}: verify") as screen:
             link.enable()
             watch, bridge = screen.count, screen.on_stall(keep_going)
-            if creeping and calibration is not None:
-                result = verify_creeping(
-                    link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
-                )
-            else:
-                result = run_verify(
-                    link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
-                )
+            result = run_verify(
+                link, arm_file, gravity, calibration, poses=poses, seed=seed, progress=watch, on_stall=bridge
+            )
     _show(result, results(json_file))
     if result.passed:
         suggest(command_line("daemon", arm, bus=bus, store=store))

@@ -49,8 +49,9 @@ def arm_text(draft: Draft, out: Path) -> str:
         "sim:  # the simulated arm, for the command demo: masses are the model's",
         f"  effects:  # assumed: friction of {FRICTION:.0%} of the torque that its drives need, and a rotor",
     ]
-    lines += [yaml_item(_friction(joint), 4) for joint in draft.joints]
-    lines += [yaml_item(_rotor(joint), 4) for joint in draft.joints if joint.rotor]
+    effects = [("friction.coulomb", joint.name, "torque", joint.friction) for joint in draft.joints]
+    effects += [("actuator.rotor_inertia", joint.name, "inertia", joint.rotor) for joint in draft.joints if joint.rotor]
+    lines += [yaml_item({"effect": effect, "joint": joint, key: value}, 4) for effect, joint, key, value in effects]
     lines += [yaml_comment(note) for note in draft.notes]
     return "\n".join(lines) + "\n"
 
@@ -74,11 +75,3 @@ def _joint(joint: JointDraft) -> dict[str, Any]:
         "max_velocity": joint.max_velocity,
     }
     return row if joint.identity is None else {**row, "identity": joint.identity}
-
-
-def _rotor(joint: JointDraft) -> dict[str, Any]:
-    return {"effect": "actuator.rotor_inertia", "joint": joint.name, "inertia": joint.rotor}
-
-
-def _friction(joint: JointDraft) -> dict[str, Any]:
-    return {"effect": "friction.coulomb", "joint": joint.name, "torque": joint.friction}

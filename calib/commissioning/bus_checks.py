@@ -6,6 +6,7 @@ from pathlib import Path
 from armlink.arm_file import SIMULATED, ArmFile, Bus
 from armlink.bus.can_bus import CanBus
 from armlink.bus.open import open_link_bus, resolve_bus
+from armlink.drives.findings import Level, SetupFinding
 from armlink.errors import ArmlinkError
 from armlink.link.bus_load import HIGH_LOAD, bus_loads
 from armlink.link.gate_limits import joint_ranges
@@ -13,7 +14,6 @@ from armlink.link.joints.groups import make_groups
 from armlink.link.joints.values import values_of
 from armlink.link.joints.whole_turns import WholeTurns
 from armlink.link.link import Link
-from calib.commissioning.finding import Level, SetupFinding
 
 INTERFACES = Path("/sys/class/net")
 """Where Linux lists its network interfaces."""
@@ -106,9 +106,7 @@ def _drives(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFindin
     groups = make_groups(arm_file, opened)
     kind = groups[0].family
     if len(groups) == 1 and kind.examine is not None:
-        found = [
-            SetupFinding(each.level, each.what, each.where, each.remedy) for each in kind.examine(arm_file, opened, bus)
-        ]
+        found = list(kind.examine(arm_file, opened, bus))
         yield from found
         if all(each.level != "error" for each in found):
             yield from _places(Link(arm_file, opened))

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 from armlink.arm_file import ArmFile, BadKeys, bundled_arms, load_arm
+from armlink.drives.findings import Level, SetupFinding
 from armlink.errors import ArmlinkError
 from calib.commissioning.arm_text import assumed_lines
 from calib.commissioning.bus_checks import bus_findings, turn_findings
-from calib.commissioning.finding import ORDER, SetupFinding
 from calib.commissioning.model_checks import model_findings
 from calib.commissioning.model_judgement import arm_errors
 from calib.commissioning.motion_checks import motion_findings
@@ -21,7 +22,7 @@ def examine(arm: str, bus: str | None = None, offline: bool = False) -> list[Set
 
     `bus` replaces the arm file's; `offline` leaves the bus alone. The drives are only read.
     """
-    return sorted(_all(arm, bus, offline), key=lambda found: ORDER[found.level])
+    return sorted(_all(arm, bus, offline), key=lambda found: get_args(Level).index(found.level))
 
 
 def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:

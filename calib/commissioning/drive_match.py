@@ -3,10 +3,9 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from armlink.drives.findings import FoundDrive, FoundDrives
+from armlink.drives.findings import FoundDrive, FoundDrives, SetupFinding
 from armlink.drives.registry import not_looked_for
 from armlink.errors import BadInput, BusFault
-from calib.commissioning.finding import SetupFinding
 
 LEAST_TURN = 0.1
 """A joint counts as turned by hand from here on [rad]; a choice, far above the play of a gear."""

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.drives.findings import SetupFinding
 from armlink.model_file import NOT_FOUND, UNFETCHED, read_model
 from calib.arm.kinematics import gcomp_arm, model_arm
-from calib.commissioning.finding import SetupFinding
 from calib.commissioning.model_judgement import NO_MASS, largest_levers
 from calib.plan.sweep_plan import DEAD_LEVER
 

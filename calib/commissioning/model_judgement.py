@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.drives.findings import SetupFinding
 from armlink.errors import BadInput
 from armlink.link.joints.values import try_limits
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
-from calib.commissioning.finding import SetupFinding
-from calib.creep.choice import sweep_motion
+from calib.arm.sweep_section import sweep_motion
 from calib.creep.plan import refuse_unbearable_creeps
 from calib.plan.rough_gravity import HAND, guess_of_file, reach
 from calib.plan.sweep_plan import DEAD_LEVER, refuse_unbearable_mass

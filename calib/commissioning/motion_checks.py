@@ -6,11 +6,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.drives.findings import SetupFinding
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm, model_chain
-from calib.arm.sweep_section import sweep_section
-from calib.commissioning.finding import SetupFinding
+from calib.arm.sweep_section import sweep_motion, sweep_section
 from calib.commissioning.model_judgement import gravity_need
-from calib.creep.choice import sweep_motion
 from calib.creep.plan import plan_creep
 from calib.plan.bias_torque import pressable_joints
 from calib.plan.collisions import check_plan

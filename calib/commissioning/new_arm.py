@@ -10,7 +10,7 @@ from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
 from armlink.content.atomic_file import write_whole
 from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
 from armlink.content.yaml_text import EditedYaml
-from armlink.drives.findings import FoundDrives
+from armlink.drives.findings import FoundDrives, SetupFinding
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
@@ -18,7 +18,6 @@ from calib.commissioning.chain import Chain, find_chains
 from calib.commissioning.clear_range import clear_ranges, sweep_problem
 from calib.commissioning.draft import Draft, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
-from calib.commissioning.finding import SetupFinding
 from calib.commissioning.model_checks import file_findings
 from calib.commissioning.model_joints import model_joints
 from calib.commissioning.model_judgement import model_errors

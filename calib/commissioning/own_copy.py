@@ -8,11 +8,11 @@ from typing import Any
 from armlink.arm_file import ArmFile, Bus, parse_arm, read_yaml
 from armlink.bus.can_bus import CanBus
 from armlink.content.yaml_text import yaml_comment, yaml_document, yaml_entry
+from armlink.drives.findings import SetupFinding
 from armlink.drives.registry import family
 from armlink.errors import BusFault
 from armlink.link.link import Link
 from calib.commissioning.bus_checks import another_drive
-from calib.commissioning.finding import SetupFinding
 
 
 @dataclass(frozen=True)

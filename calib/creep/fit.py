@@ -19,7 +19,7 @@ from calib.creep.ripple import ripple_cycles
 from calib.creep.rows import CreepRows
 from calib.creep.scatter import Scatter, scatter
 from calib.creep.solve import CreepSolution, solve
-from calib.sweep.dataset import SweepData, digests
+from calib.dataset import SweepData, digests
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 
@@ -89,11 +89,6 @@ class CreepFit:
             value = self.value(family)
             seen = seen & (self.std(family) < LOOSEST * np.abs(value)) & (low <= value) & (value <= high)
         return np.asarray(seen, dtype=bool)
-
-    def ci95(self, family: str) -> Array:
-        """(…, 2) 95 % intervals."""
-        half = QUANTILE * self.std(family)
-        return np.stack([self.value(family) - half, self.value(family) + half], axis=-1)
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -166,7 +161,8 @@ def _fit(
         coulomb = np.maximum(np.abs(x[slices["coulomb"]]), LEAST_COULOMB * rated)
         uneven = _unevenness(found, std, coulomb, doubt)
         mean, std = prior(arm, rated, doubt, rows.by_temperature, coulomb, uneven)
-        freedom = 1 - _determined_parameters(found, std) / len(rows)
+        determined = float(np.sum(1 - np.diag(found.covariance) / std**2))  # by the data, and not the prior
+        freedom = 1 - determined / len(rows)
         by_degree = _temperature_std(rows) * x[slices["warming"]][rows.joint] * rows.reading
         scattered = scatter(rows, found.residual, rated, freedom, by_degree, ripple)
         if ripple and not model.ripple.any():
@@ -191,8 +187,3 @@ def _temperature_std(rows: CreepRows) -> float:
     """Standard deviation that the rounding of the temperatures leaves [K]; 0 where none are told."""
     steps = np.diff(np.unique(rows.warmth.round(6))) if rows.by_temperature else np.empty(0)
     return float(steps.min(initial=1.0)) / np.sqrt(12) if steps.size else 0.0
-
-
-def _determined_parameters(found: CreepSolution, std: Array) -> float:
-    """Parameters that the data, and not the prior, determine."""
-    return float(np.sum(1 - np.diag(found.covariance) / std**2))

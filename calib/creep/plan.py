@@ -9,8 +9,8 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.creep.choice import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.creep.design import CreepCandidate, choose
+from calib.creep.levers import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.creep.parameters import Doubt
 from calib.plan.collisions import POINTS, Geometry
 from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armlink.link.types import Sample
+from calib.dataset import SweepData
 from calib.motion.static_reading import StaticReading, stack
-from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array, Mask
 
 LEAST_SAMPLES = 5

@@ -8,7 +8,8 @@ from typing import Any
 
 from armlink.arm_file import ArmFile
 from calib.daemon.loop.loop_messages import LoopOptions
-from calib.daemon.settings import DaemonSection, Policy, daemon_section
+from calib.daemon.settings import DaemonSection, daemon_section
+from calib.observer.config import Policy
 
 
 @dataclass(frozen=True)

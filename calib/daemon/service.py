@@ -22,11 +22,9 @@ from armlink.arm_file import ArmFile
 from armlink.loop.messages import LoopAnswer
 from calib.daemon.environment import BusJobs, Environment
 from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
-from calib.daemon.observation.active_observation import ActiveObservation
 from calib.daemon.observation.active_records import ActiveRecords
 from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
-from calib.daemon.observation.observer_feed import ObserverFeed
-from calib.daemon.observation.observer_storage import ObserverStorage
+from calib.daemon.observation.observation import ActiveObservation, ObserverFeed, ObserverStorage
 from calib.daemon.observation.pose_tours import PoseTours
 from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration, DaemonSection

@@ -12,7 +12,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
 from calib.arm.skeleton import skeleton
-from calib.daemon.observation.active_observation import ActiveObservation
+from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.service import Service
 from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.view import api_models

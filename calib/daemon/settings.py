@@ -2,15 +2,14 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, FiniteFloat, field_validator
 
 from armlink.arm_file import ArmFile, Positive, Section
-from calib.observer.config import ObserverConfig
+from calib.observer.config import ObserverConfig, Policy
 
 _WHOLE = frozenset(field.name for field in fields(ObserverConfig) if field.type == "int" or field.type is int)
-Policy = Literal["observe", "propose", "apply"]
 
 
 class RecordingSettings(Section):

@@ -57,7 +57,7 @@ def _joint(name: str, j: int, fit: FieldFit, before: CalibrationRecord | None) -
         position_gain=values["position_gain"],
         position_offset=values["position_offset"],
         not_identifiable=reasons,
-        residual_std=_rms(residual) if len(residual) else None,
+        residual_std=float(np.sqrt(np.mean(residual**2))) if len(residual) else None,
         discrepancy=None if old is None else old.discrepancy,
     )
 
@@ -77,7 +77,3 @@ def _covariance(fit: FieldFit, before: CalibrationRecord | None) -> tuple[tuple[
         at = [before.covariance_of.index(name) for name in old]
         covariance[len(new) :, len(new) :] = np.array(before.covariance)[np.ix_(at, at)]
     return names, covariance
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))

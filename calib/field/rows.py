@@ -7,8 +7,8 @@ import numpy as np
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from armlink.torque_calibration import TorqueCalibration
+from calib.dataset import SweepData
 from calib.fit.sweep_readings import sweep_readings
-from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.identify.readings import StaticReadings
 

@@ -9,10 +9,10 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
+from calib.dataset import SweepData, digests
 from calib.fit.sensor_fit import SensorFit
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
-from calib.sweep.dataset import SweepData, digests
 from gcomp.arrays import Array, Mask
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import GlobalFit, identify_global

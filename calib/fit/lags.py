@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.fit.sweep_readings import SweepReadings
-from calib.sweep.run import APPROACH
+from calib.plan.types import APPROACH
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.identify.parameters import Parameters
@@ -45,18 +45,18 @@ class Lags:
         position, load = rows.readings.position, rows.readings.load
         approach = position - APPROACH * rows.readings.direction * rows.own
         way = np.stack([approach, position], axis=1).reshape(-1, arm.n)
-        cable = np.array([_play(way, np.full(arm.n, width))[1::2] for width in TURNS])
+        cable = np.array([play(way, np.full(arm.n, width))[1::2] for width in TURNS])
         before = np.vstack([way[:1], way[:-1]])
         shares = np.arange(1, STEPS + 1) / STEPS
         finer = (before[:, None] + shares[:, None] * (way - before)[:, None]).reshape(-1, arm.n)
         nothing = np.zeros((len(finer), arm.n))
         loads = np.repeat(load, 2 * STEPS)
         torque = predict(arm, parameters, StaticReadings.of(finer, nothing, 1.0, loads)) - parameters.offset
-        sensor = _play(torque / np.where(parameters.gain == 0, 1.0, parameters.gain), TORQUE * rated)
+        sensor = play(torque / np.where(parameters.gain == 0, 1.0, parameters.gain), TORQUE * rated)
         return cls(cable, -sensor[2 * STEPS - 1 :: 2 * STEPS])
 
 
-def _play(values: Array, half: Array) -> Array:
+def play(values: Array, half: Array) -> Array:
     """How far values (K, n), one after the other, are ahead of a play of half widths (n,), in these (K, n)."""
     held, ahead = values[0].copy(), np.empty_like(values)
     for row, value in enumerate(values):

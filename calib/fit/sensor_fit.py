@@ -11,11 +11,11 @@ from armlink.arm_file import ArmFile
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
+from calib.dataset import SweepData, digests
 from calib.fit.examination import Goodness, examine
 from calib.fit.findings import FitFinding
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
 from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
-from calib.sweep.dataset import SweepData, digests
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Parameters, Prior
@@ -175,24 +175,20 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
         good = _fit(arm_file, rows)
         gain_ratio = None if loaded else _gain_ratio(arm_file, rows)
     fit = good.refined.fit
+    left = rows.readings.torque - predict(gcomp_arm(arm_file), fit.complete, rows.readings)
     return SensorFit(
         names=arm_file.joint_names,
         fit=fit,
         rows=rows,
         noise_factor=good.refined.factor,
-        hysteresis=_half_difference(rows.readings.torque - _model_readings(arm_file, fit, rows), rows),
+        hysteresis=_half_difference(left, rows),
         friction=_friction(fit, rows),
         goodness=good,
-        quantile=_quantiles(good.refined.certainty),
+        quantile=Parameters.from_vector(stdtrit(good.refined.certainty.vector, 0.975), len(arm_file.joint_names)),
         reasons=missing_values(fit, rows),
         gain_ratio=gain_ratio,
         sources=digests(data),
     )
-
-
-def _quantiles(freedom: Parameters) -> Parameters:
-    """Student quantiles of 95 % intervals at degrees of freedom."""
-    return Parameters.from_vector(stdtrit(freedom.vector, 0.975), len(freedom.gain))
 
 
 def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
@@ -208,11 +204,6 @@ def _fit(arm_file: ArmFile, rows: SweepReadings, **extra: Prior) -> Goodness:
             priors["rho"] = section.known_point
     fit = identify_global(kinematics, rows.readings, unknown=unknown, priors=priors, position_sigma=rows.position_sigma)
     return examine(kinematics, rows, fit, priors, arm_file.require_link().rated_torques)
-
-
-def _model_readings(arm_file: ArmFile, fit: GlobalFit, rows: SweepReadings) -> Array:
-    """Torque readings (K, n) by the fitted sensors and moments alone [N·m]."""
-    return predict(gcomp_arm(arm_file), fit.complete, rows.readings)
 
 
 def _friction(fit: GlobalFit, rows: SweepReadings) -> Array:

@@ -90,7 +90,8 @@ def troubles(setting: Setting, rows: SweepReadings, parameters: Parameters, keep
     `keep` chooses columns; default: those that change some reading.
     """
     counted = rows.readings.counted
-    found = [_one_column(counted, *each) for each in _dense(setting, rows, parameters)]
+    dense = _dense(setting, rows, parameters)
+    found = [(family, joint, values[counted] * UNITS[family][0]) for family, joint, values in dense]
     for joint, field in enumerate(setting.fields):
         here = counted[:, joint]
         values = np.zeros((*counted.shape, field.root.shape[0]))
@@ -105,10 +106,6 @@ def troubles(setting: Setting, rows: SweepReadings, parameters: Parameters, keep
         np.array([each[1] for each in kept], dtype=np.int64),
         keep,
     )
-
-
-def _one_column(counted: Mask, family: str, joint: int, values: Array) -> tuple[str, int, Array]:
-    return family, joint, values[counted] * UNITS[family][0]
 
 
 def _dense(setting: Setting, rows: SweepReadings, parameters: Parameters) -> Iterator[tuple[str, int, Array]]:

@@ -8,8 +8,8 @@ import numpy.typing as npt
 
 from armlink.errors import BadInput
 from armlink.torque_calibration import TorqueCalibration
+from calib.dataset import SweepData, labels
 from calib.motion.static_reading import StaticReading, batch, stack
-from calib.sweep.dataset import SweepData, labels
 from gcomp.arrays import Array, Mask
 from gcomp.identify.readings import StaticReadings
 

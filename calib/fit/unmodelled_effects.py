@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc
 
+from calib.fit.lags import play
 from calib.fit.refinement import Extra, Refined
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arm.arm import Arm
@@ -171,12 +172,7 @@ def lag(kinematics: Arm, rows: SweepReadings, refined: Refined, joint: int) -> A
     flat = StaticReadings.of(
         way.reshape(-1, kinematics.n), np.zeros((len(position) * PATH, kinematics.n)), 1.0, np.repeat(load, PATH)
     )
-    torque = predict(kinematics, refined.fit.complete, flat)[:, joint].reshape(-1, PATH)
+    torque = predict(kinematics, refined.fit.complete, flat)[:, joint]
     residual = refined.fit.residual[:, joint]
     width = max(float(np.nanmedian(np.abs(residual))) * 1.5, 1e-9)
-    held, place = float(torque[0, 0]), np.zeros(len(position))
-    for row, values in enumerate(torque):
-        for value in values:
-            held = min(max(held, value - width), value + width)
-        place[row] = (held - torque[row, -1]) / width
-    return place
+    return -play(torque.reshape(-1, 1), np.array([width]))[PATH - 1 :: PATH, 0]

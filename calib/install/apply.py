@@ -9,6 +9,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from armlink.loop.driver import ArmDriver
 from armlink.loop.open import open_arm
+from calib.dataset import SweepData
 from calib.field.field_fit import FieldFit, heldout_errors
 from calib.fit.findings import FitFinding
 from calib.fit.heldout import heldout_scores, worse_joint
@@ -19,7 +20,6 @@ from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, GateRefused, Refusal, admit, admit_rollback
 from calib.records.records import ArmRecord, CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
-from calib.sweep.dataset import SweepData
 from gcomp.arrays import Array
 from gcomp.identify.readings import StaticReadings
 

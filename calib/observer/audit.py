@@ -1,9 +1,10 @@
 """Audits while no alarm is open: the last rows tested for effects too small or too slow for an alarm, or learned."""
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.cause_test import CauseTest, Verdict
+from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Agreeing
+from calib.observer.evidence import Verdict
 from calib.observer.investigation import Investigation
 from calib.observer.tracking.tracking import Tracking
 

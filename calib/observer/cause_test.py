@@ -1,17 +1,18 @@
 """The cause test: which single effect explains a window's torque residual, if any (docs/theory.md, section 6)."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
-from functools import cached_property
-from itertools import combinations, pairwise, product
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations, product
 
 import numpy as np
 
 from calib.observer.config import ObserverConfig
-from calib.observer.effect_dictionary import DRIFT, DictionaryEffect, class_of, dictionary, kin
+from calib.observer.evidence import DRIFT, ChangeFit, ChangeHypothesis, ResidualTest, Verdict
 from calib.observer.gravity_belief import GravityBelief
+from gcomp.arm.arm import Arm
+from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
-from gcomp.gravity.torque import gravity_levers
+from gcomp.gravity.torque import gravity_levers, gravity_regressor, gravity_stiffness
 from gcomp.identify.readings import StaticReadings
 
 OF_AN_ARM = ("friction", "spring", "slip", "tilt", "scale")
@@ -24,101 +25,61 @@ MOST_GAIN_LIMIT = 1.0
 """A gain whose limit is above this is not observed: gravity hardly loads the joint."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """Result of one test. `values` and `covariance` are the parameters of the winning entry."""
-
-    cause: str
-    """none, unknown, ambiguous, temperature (several zeros at once) or the winning entry's cause."""
-    joint: int | None
-    """Index of the joint, None if it concerns the whole arm."""
-    confidence: float
-    """Weight exp(−BIC/2) of the winner among all classes; for unknown and ambiguous that of the best entry."""
-    values: Array
-    covariance: Array
-    evidence: dict[str, float] = field(default_factory=dict)
-    """BIC of the best entry of each class above the best one; `misfit` of the winner in standard deviations."""
-    rivals: tuple[str, ...] = ()
-    """Classes that fit as well, if ambiguous."""
-    beside: int | None = None
-    """Another joint whose sensor drifts at the same time."""
-
-    @property
-    def is_drift(self) -> bool:
-        """Whether it is a drift of torque sensors, the only verdict that may lead to a new record."""
-        return self.cause in DRIFT
-
-    @property
-    def joints(self) -> tuple[int, ...]:
-        """The joints concerned, the one with more evidence first."""
-        return tuple(joint for joint in (self.joint, self.beside) if joint is not None)
-
-    def other(self, joint: int) -> int | None:
-        """The joint that drifts beside this one, if any."""
-        return next((other for other in self.joints if other != joint), None)
+CAUSES = {
+    "gain": ("torque.gain",),
+    "offset": ("torque.offset",),
+    "drift": ("torque.gain", "torque.offset"),
+    "friction": ("friction.coulomb",),
+    "spring": ("transmission.spring", "torque.offset"),
+    "slip": ("position.offset",),
+    "payload": ("link.payload",),
+    "tilt": ("base.tilt",),
+    "scale": ("torque.gain",),
+}
+"""Effects (`armlink.effect_catalogue`) that a cause consists of; a spring's rest angle acts as an offset."""
 
 
-@dataclass(frozen=True)
-class _CauseFit:
-    entry: DictionaryEffect
-    bic: float
-    chi2: float
-    values: Array
-    covariance: Array
+def dictionary(arm: Arm, beta: Array, window: StaticReadings) -> Iterator[ChangeHypothesis]:
+    """Every entry of the dictionary for the true angles of a window; beta (2n,) [kg·m] is the present gravity model."""
+    q, n = window.position, arm.n
+    regressor = gravity_regressor(arm, q)
+    torque = regressor @ beta
+    middle = np.where(np.isfinite(arm.lower + arm.upper), (arm.lower + arm.upper) / 2, 0.0)
+    one = np.ones(len(q))
+
+    def row_of(joint: int, *columns: Array) -> Array:
+        full = np.zeros((len(q), n, len(columns)))
+        full[:, joint] = np.stack(columns, axis=1)
+        return full.reshape(len(q) * n, len(columns))
+
+    for j in range(n):
+        yield ChangeHypothesis("gain", j, row_of(j, torque[:, j]))
+        yield ChangeHypothesis("offset", j, row_of(j, one))
+        yield ChangeHypothesis("drift", j, row_of(j, torque[:, j], one))
+        yield ChangeHypothesis("friction", j, row_of(j, window.direction[:, j]))
+        yield ChangeHypothesis("spring", j, row_of(j, q[:, j] - middle[j], one))
+    stiffness = gravity_stiffness(arm, beta, q)
+    for j in range(n):
+        yield ChangeHypothesis("slip", j, stiffness[:, :, j].reshape(-1, 1))
+    at_origin, by_point = payload_columns(arm)
+    yield ChangeHypothesis("payload", None, (regressor @ np.column_stack([at_origin, by_point])).reshape(-1, 4))
+    across = np.linalg.svd(arm.gravity[None])[2][1:] * np.linalg.norm(arm.gravity)
+    tilted = [gravity_regressor(replace(arm, gravity=direction), q) @ beta for direction in across]
+    yield ChangeHypothesis("tilt", None, np.stack(tilted, axis=-1).reshape(-1, 2))
+    # a payload explains nine tenths of a common scale and is far more frequent: at the same price it wins
+    yield ChangeHypothesis("scale", None, torque.reshape(-1, 1), price=4)
 
 
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """A least-squares fit of whitened columns."""
-
-    values: Array
-    """Parameters (p,)."""
-    covariance: Array
-    """(p, p); 0 for parameters that the rows do not show."""
-    chi2: float
-    """Of what the columns leave."""
-    shown: int
-    """Number of independent parameters that the rows show."""
+def class_of(entry: ChangeHypothesis) -> str:
+    """Class of an entry in the comparison of verdicts: gain, offset and both of one joint are one class."""
+    cause = "drift" if entry.cause in DRIFT else entry.cause
+    return cause if entry.joint is None else f"{cause}_{entry.joint + 1}"
 
 
-def solve_whitened(columns: Array, target: Array) -> Solved:
-    """The fit of whitened columns (K, p) to a whitened target (K,)."""
-    u, s, vt, size = _decomposed(columns)
-    kept = s > 0
-    back = (vt[kept].T / s[kept]) / size[:, None]
-    explained = u[:, kept].T @ target
-    covariance = back @ back.T
-    hidden = (np.abs(vt[~kept]) > 1e-3).any(axis=0)
-    covariance[hidden] = covariance[:, hidden] = 0.0
-    chi2 = float(target @ target) - float(explained @ explained)
-    return Solved(back @ explained, covariance, chi2, int(kept.sum()))
-
-
-def span(columns: Array) -> Array:
-    """An orthonormal basis (K, r) of whitened columns (K, p), of which r are independent."""
-    u, s, _, _ = _decomposed(columns)
-    return u[:, s > 0]
-
-
-def _decomposed(columns: Array) -> tuple[Array, Array, Array, Array]:
-    """u, s, vt of columns (K, p) in units of their lengths, and these; s is 0 where columns depend on others."""
-    size = np.linalg.norm(columns, axis=0)
-    size[size <= 1e-9] = 1.0
-    u, s, vt = np.linalg.svd(columns / size, full_matrices=False)
-    return u, np.where(s > max(1e-6 * s[0], 1e-12), s, 0.0), vt, size
-
-
-def smallest_noticed_change(own: Array, rivals: Iterable[tuple[Array, int]], evidence: float) -> float:
-    """Size of a change with whitened column (K,) that wins in one case of two: over "none", and over every rival.
-
-    Of each rival an orthonormal basis (K, p) and the parameters charged in its BIC.
-    """
-    size, once = float(own @ own), float(np.log(len(own)))
-    needed = evidence + once
-    for basis, price in rivals if size > 0 else ():
-        alike = float(((basis.T @ own) ** 2).sum()) / size
-        needed = max(needed, (evidence - (price - 1) * once) / max(1 - alike, 1e-9))
-    return float(np.sqrt(needed / max(size, 1e-30)))
+def kin(entry: ChangeHypothesis, winner: ChangeHypothesis) -> bool:
+    """Whether an entry is not a rival: it is of the same class, or the winner is a special case of it."""
+    special = entry.joint == winner.joint and set(CAUSES[winner.cause]) < set(CAUSES[entry.cause])
+    return class_of(entry) == class_of(winner) or special
 
 
 class CauseTest:
@@ -139,23 +100,17 @@ class CauseTest:
         covariance[np.diag_indices_from(covariance)] += window.sigma.ravel() ** 2
         noise = (window.sigma**2).mean(axis=0)
         self._of_model: list[float] = (1 - noise / (noise + expected.variance.mean(axis=0))).tolist()
-        self.entries = list(dictionary(belief.arm, belief.beta, window))
-        stacked = np.column_stack([residual.ravel(), *(entry.columns for entry in self.entries)])
-        white: Array = np.linalg.solve(np.linalg.cholesky(covariance), stacked)  # scipy takes longer to load
-        self._white: Array = white[:, 0]
-        ends = np.cumsum([1, *(entry.columns.shape[1] for entry in self.entries)])
-        self._columns: list[Array] = [white[:, start:end] for start, end in pairwise(ends)]
-        self.chi2_none = float(self._white @ self._white)
+        self.found = ResidualTest(residual.ravel(), covariance, list(dictionary(belief.arm, belief.beta, window)))
         discrepancy = float(np.median(belief.level.total / belief.kernel.typical)) if belief.level.total.any() else 0.0
         self._inexact = min(discrepancy, INEXACT)
 
     def verdict(self) -> Verdict:
         """The winning class, or why none wins."""
-        fits = sorted(map(self._fit, range(len(self.entries))), key=lambda fit: fit.bic)
+        fits = sorted(map(self._fit, range(len(self.found.hypotheses))), key=lambda fit: fit.bic)
         best, config = fits[0], self._config
-        classes = {"none": self.chi2_none}
+        classes = {"none": self.found.chi2}
         for fit in reversed(fits):
-            classes[class_of(fit.entry)] = fit.bic
+            classes[class_of(fit.hypothesis)] = fit.bic
         top = min(classes.values())
         weights = {name: np.exp(-(bic - top) / 2) for name, bic in classes.items()}
         total = sum(weights.values())
@@ -163,21 +118,21 @@ class CauseTest:
             name: round(float(bic - top), 1) for name, bic in sorted(classes.items(), key=lambda item: item[1])[:6]
         }
 
-        def answer(cause: str, fit: _CauseFit | None, of: str, rivals: tuple[str, ...] = ()) -> Verdict:
+        def answer(cause: str, fit: ChangeFit | None, of: str, rivals: tuple[str, ...] = ()) -> Verdict:
             known = (fit.values, fit.covariance) if fit else (np.empty(0), np.empty((0, 0)))
-            joint = fit.entry.joint if fit else None
+            joint = fit.hypothesis.joint if fit else None
             return Verdict(cause, joint, float(weights[of] / total), *known, evidence, rivals)
 
-        if self.chi2_none - best.bic < config.evidence:
-            misfit = self._misfit(self.chi2_none, 0)
+        if self.found.chi2 - best.bic < config.evidence:
+            misfit = self._misfit(self.found.chi2, 0)
             evidence["misfit"] = misfit
             return answer("unknown" if misfit > config.misfit else "none", None, "none")
-        winner, name = best.entry, class_of(best.entry)
-        inexact = self._inexact**2 * (self.chi2_none - best.chi2)
+        winner, name = best.hypothesis, class_of(best.hypothesis)
+        inexact = self._inexact**2 * (self.found.chi2 - best.chi2)
         evidence["misfit"] = self._misfit(best.chi2 - inexact, winner.columns.shape[1])
         if evidence["misfit"] > config.misfit or (winner.cause == "payload" and not self._weighs(best)):
             return self._two_drifts() or self._all_zeros() or answer("unknown", None, name)
-        near = [fit.entry for fit in fits[1:] if fit.bic - best.bic < config.evidence]
+        near = [fit.hypothesis for fit in fits[1:] if fit.bic - best.bic < config.evidence]
         rivals = tuple(dict.fromkeys(class_of(entry) for entry in near if not kin(entry, winner)))
         sensor_or_load = any(entry.cause in (*DRIFT, "payload") for entry in near)
         if winner.cause in OF_AN_ARM and not sensor_or_load and self._is_small(best):
@@ -186,39 +141,33 @@ class CauseTest:
             return answer("ambiguous", best, name, rivals)
         return answer(winner.cause, best, name)
 
-    def _is_small(self, fit: _CauseFit) -> bool:
+    def _is_small(self, fit: ChangeFit) -> bool:
         """Whether an effect is no larger than the arm's discrepancy anyway: twice its level at each joint."""
-        size = (fit.entry.columns @ fit.values).reshape(-1, self.belief.arm.n)
+        size = (fit.hypothesis.columns @ fit.values).reshape(-1, self.belief.arm.n)
         return bool((np.sqrt((size**2).mean(axis=0)) <= 2 * self.belief.level.total).all())
 
-    def _fit(self, *indices: int) -> _CauseFit:
+    def _fit(self, *indices: int) -> ChangeFit:
         """Generalised least squares of entries together; columns that are collinear at these poses never win.
 
         But for a payload: of an arm with parallel axes no lever may show its mass, or where it is along them. These
         parameters come with variance 0.
         """
-        columns = np.hstack([self._columns[index] for index in indices])
-        entries = [self.entries[index] for index in indices]
-        count = columns.shape[1]
-        nothing = _CauseFit(entries[0], np.inf, np.inf, np.full(count, np.nan), np.full((count, count), np.nan))
-        found = solve_whitened(columns, self._white)
-        hidden_by_arm = [entry.cause for entry in entries] == [
-            "payload"
-        ] and found.shown == self.belief.kernel.payload_rank
-        if not found.shown or not (found.shown == count or hidden_by_arm):
-            return nothing
-        price = sum(entry.columns.shape[1] if entry.price is None else entry.price for entry in entries)
-        price -= count - found.shown
-        bic = found.chi2 + price * np.log(len(self._white))
-        return _CauseFit(entries[0], bic, found.chi2, found.values, found.covariance)
+        fit, entries = self.found.fit(*indices), [self.found.hypotheses[index] for index in indices]
+        count = len(fit.values)
+        payload = [entry.cause for entry in entries] == ["payload"]
+        if fit.shown and (fit.shown == count or (payload and fit.shown == self.belief.kernel.payload_rank)):
+            return fit
+        unknown = np.full((count, count), np.nan)
+        return ChangeFit(entries[0], np.inf, np.inf, unknown[0], unknown, fit.shown)
 
     def _two_drifts(self) -> Verdict | None:
         """Two joints that drift at once, if that alone explains the window; else None.
 
         Competes with the drift of one joint together with an effect on the whole arm, such as a payload picked up.
         """
-        whole = [index for index, entry in enumerate(self.entries) if entry.joint is None]
-        drifts = [index for index, entry in enumerate(self.entries) if entry.cause == "drift"]
+        entries = self.found.hypotheses
+        whole = [index for index, entry in enumerate(entries) if entry.joint is None]
+        drifts = [index for index, entry in enumerate(entries) if entry.cause == "drift"]
         drifts.sort(key=lambda index: self._fit(index).chi2)
         pairs = [*combinations(drifts, 2), *product(drifts, whole)]
         fits = {pair: self._fit(*pair) for pair in pairs}
@@ -231,17 +180,17 @@ class CauseTest:
             return None
         confidence = float(1 / (1 + np.exp(-above / 2).sum()))
         evidence = {"next": round(float(above.min()), 1), "misfit": self._misfit(fit.chi2, 4)}
-        first, second = (self.entries[index].joint for index in best)
+        first, second = (entries[index].joint for index in best)
         return Verdict("drift", first, confidence, fit.values, fit.covariance, evidence, beside=second)
 
-    def _weighs(self, payload: _CauseFit) -> bool:
+    def _weighs(self, payload: ChangeFit) -> bool:
         """Whether a payload's mass is possible: positive, or no more taken off than the model carries as a tool; or no
         lever shows it."""
         return bool(payload.values[0] > min(0.0, -1.2 * self.belief.mass)) or payload.covariance[0, 0] == 0
 
     def _all_zeros(self) -> Verdict | None:
         """The zeros of several sensors moved together, as temperature moves them, if that alone explains the window."""
-        zeros = [self._index("offset", joint) for joint in range(self.belief.arm.n)]
+        zeros = [self.found.index("offset", joint) for joint in range(self.belief.arm.n)]
         fit = self._fit(*zeros)
         misfit = self._misfit(fit.chi2, len(zeros))
         if not np.isfinite(fit.bic) or misfit > self._config.misfit:
@@ -253,8 +202,8 @@ class CauseTest:
 
         If the joint `beside` drifts too, both are fitted together.
         """
-        also = [] if beside is None else [self._index("drift", beside)]
-        fit = self._fit(self._index(cause, joint), *also)
+        also = [] if beside is None else [self.found.index("drift", beside)]
+        fit = self._fit(self.found.index(cause, joint), *also)
         at = [index for index, name in enumerate(("gain", "offset")) if cause in (name, "drift")]
         values, covariance = np.zeros(2), np.zeros((2, 2))
         values[at] = fit.values[: len(at)]
@@ -263,19 +212,9 @@ class CauseTest:
 
     def noticed(self, cause: str, joint: int) -> float:
         """Size of a gain's or offset's change that wins in one case of two: over "none", and over every rival."""
-        index = self._index(cause, joint)
-        winner, own = self.entries[index], self._columns[index][:, 0]
-        rivals = (
-            (basis, entry.columns.shape[1] if entry.price is None else entry.price)
-            for entry, basis in zip(self.entries, self._bases, strict=True)
-            if basis.size and not kin(entry, winner)
-        )
-        return smallest_noticed_change(own, rivals, self._config.evidence)
-
-    @cached_property
-    def _bases(self) -> list[Array]:
-        """An orthonormal basis of each entry's columns."""
-        return [span(columns) for columns in self._columns]
+        index, entries = self.found.index(cause, joint), self.found.hypotheses
+        rivals = [k for k, entry in enumerate(entries) if not kin(entry, entries[index])]
+        return self.found.noticed(index, rivals, self._config.evidence)
 
     def of_model(self, joint: int) -> float:
         """Share of the model's own error in the variance of a joint's residuals."""
@@ -283,22 +222,19 @@ class CauseTest:
 
     def loss(self, joint: int, simple: str, full: str, beside: int | None = None) -> float:
         """BIC of a joint's drift `simple` above that of `full` (each gain, offset or drift)."""
-        also = [] if beside is None else [self._index("drift", beside)]
-        return self._fit(self._index(simple, joint), *also).bic - self._fit(self._index(full, joint), *also).bic
+        also = [] if beside is None else [self.found.index("drift", beside)]
+        less, more = (self._fit(self.found.index(cause, joint), *also).bic for cause in (simple, full))
+        return less - more
 
     def lever_share(self, joint: int) -> float:
         """Largest Γ_j/g in the window: gravity's lever on the joint as a share of g."""
         levers = gravity_levers(self.belief.arm, self.window.position)[:, joint]
         return float(levers.max() / np.linalg.norm(self.belief.arm.gravity))
 
-    def _index(self, cause: str, joint: int) -> int:
-        return [(entry.cause, entry.joint) for entry in self.entries].index((cause, joint))
-
     def _misfit(self, chi2: float, parameters: int) -> float:
-        """χ² above its degrees of freedom in standard deviations, those of the level's own uncertainty included."""
-        dof, level = len(self._white) - parameters, self.belief.level
-        known = np.inf if not level.total.any() else level.rows + LEVEL_ROWS
-        return round(float((chi2 - dof) / np.sqrt(2 * dof * (1 + len(self.window.position) / known))), 2)
+        level = self.belief.level
+        doubt = len(self.window.position) / (level.rows + LEVEL_ROWS) if level.total.any() else 0.0
+        return self.found.misfit(chi2, parameters, doubt)
 
 
 @dataclass(frozen=True)

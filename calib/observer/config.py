@@ -6,6 +6,10 @@ payloads recognised, no write in quiet work.
 """
 
 from dataclasses import dataclass
+from typing import Literal
+
+Policy = Literal["observe", "propose", "apply"]
+"""Treatment of a drift: an event only, a proposal, or a new record written to the controller."""
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ import numpy as np
 
 from armlink.torque_calibration import TorqueCalibration
 from calib.motion.static_reading import StaticReading
-from calib.observer.cause_test import CauseTest, Verdict
+from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
+from calib.observer.evidence import Verdict
 from gcomp.arrays import Array
 
 WIDER = 1.5

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.cause_test import Verdict
 from calib.observer.decision import DriftFinding
+from calib.observer.evidence import Verdict
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 
 from calib.observer.discrepancy.kernel import Kernel
 from calib.observer.discrepancy.level import DiscrepancyLevel
-from calib.observer.discrepancy.posterior import Data, Posterior
+from calib.observer.discrepancy.posterior import Posterior
 from calib.observer.discrepancy.reference import Reference, Rows
-from calib.observer.saved_values import UNREADABLE
+from calib.observer.saved_values import restored
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, as_array
@@ -207,10 +207,9 @@ class GravityBelief:
         warmer = np.nan_to_num(rows.temperature - self._reference.temperature)
         points = self.kernel.points(rows.position, rows.side, warmer)
         columns = self._columns(rows.position, gravity_regressor(self.arm, rows.position))
-        data = Data(points, rows.residual, columns, rows.epoch)
         free = 0.1 * self.kernel.typical + 20 * self._noise
-        thermal, shared = np.minimum(THERMAL * self.level.total, self._wander), self._factor.shape[1] + self.arm.n
-        return Posterior(self.kernel, self.level, self._noise, free, thermal, data, shared)
+        thermal = np.minimum(THERMAL * self.level.total, self._wander)
+        return Posterior(self.kernel, self.level, self._noise, free, thermal, rows, points, columns)
 
     def _columns(self, q: Array, regressor: Array) -> Array:
         """Columns (K, n, P) of the model's stated uncertainty: of β and of the position sensors' zeros."""
@@ -229,25 +228,15 @@ class GravityBelief:
             "level": {**level, "rows": self.level.rows},
         } | self._reference.save()
 
-    def restore(self, values: dict[str, Any]) -> bool:
-        """Continue from saved values; False, and nothing changed, if they do not fit.
-
-        States of before the discrepancy have no level and no reference rows: those begin again.
-        """
-        size, n, reference = self.beta.size, self.arm.n, copy(self._reference)
-        try:
-            beta, factor = as_array("beta", values["beta"], (size,)), as_array("factor", values["factor"], (size, None))
-            tool = as_array("tool", np.reshape(values.get("tool", []), (size, -1)), (size, None))
-            noise = as_array("noise", values.get("noise", np.zeros(n)), (n,))
-            mass, level, saved = float(values["mass"]), self.level, values.get("level")
-            if saved is not None:
-                stds = {name: as_array(name, saved[name], np.shape(getattr(level, name))) for name in LEVEL_ARRAYS}
-                level = DiscrepancyLevel(**stds, rows=int(saved["rows"]))
-        except UNREADABLE:
-            return False
-        if not reference.restore(values):
-            return False
-        self.beta, self._factor, self._tool, self.mass = beta, factor, tool, mass
-        self._noise, self.level, self._reference = noise, level, reference
+    def restore(self, values: dict[str, Any]) -> None:
+        """States of before the discrepancy have no level and no reference rows: those begin again."""
+        size, n, saved = self.beta.size, self.arm.n, values.get("level")
+        self.beta = as_array("beta", values["beta"], (size,))
+        self._factor = as_array("factor", values["factor"], (size, None))
+        self._tool = as_array("tool", np.reshape(values.get("tool", []), (size, -1)), (size, None))
+        self._noise, self.mass = as_array("noise", values.get("noise", np.zeros(n)), (n,)), float(values["mass"])
+        if saved is not None:
+            stds = {name: as_array(name, saved[name], np.shape(getattr(self.level, name))) for name in LEVEL_ARRAYS}
+            self.level = DiscrepancyLevel(**stds, rows=int(saved["rows"]))
+        self._reference = restored(self._reference, values)
         self._kernel = self._posterior = None
-        return True

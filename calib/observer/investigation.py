@@ -9,7 +9,7 @@ from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Agreeing
-from calib.observer.saved_values import UNREADABLE, read_rows, save_rows
+from calib.observer.saved_values import read_rows, save_rows
 
 
 class Investigation:
@@ -97,28 +97,16 @@ class Investigation:
             "reasons": list(self.reasons),
         }
 
-    def restore(self, values: dict[str, Any], cause_test: Callable[[list[StaticReading]], CauseTest]) -> bool:
-        """Continue from saved values; False, and nothing changed, if they do not fit.
-
-        `cause_test` makes the test of the rows to be confirmed, by the restored belief.
-        """
-        try:
-            window, first, said = read_rows(values["window"], self._n), values["first"], values["said"]
-            if first is not None:
-                rows = read_rows(first["rows"], self._n)
-                first = Agreeing(rows, cause_test(rows), frozenset(map(int, first["joints"])))
-            if said is not None:
-                said = (str(said[0]), tuple(said[1]))
-            suspected = values.get("suspected")
-            if suspected is not None:
-                suspected = (str(suspected[0]), tuple(suspected[1]))
-            fresh, repeated, carrying = (int(values[name]) for name in ("fresh", "repeated", "carrying"))
-            held, doubtful, reasons = bool(values["held"]), int(values["doubtful"]), tuple(values["reasons"])
-            learned, silent = int(values.get("learned", 0)), bool(values.get("silent", False))
-        except UNREADABLE:
-            return False
-        self.window, self.first, self.reported, self.reasons = window, first, said, reasons
-        self.fresh, self.repeated, self.carrying = fresh, repeated, carrying
-        self.suspected = suspected
-        self.held, self.silent, self.doubtful, self.learned = held, silent, doubtful, learned
-        return True
+    def restore(self, values: dict[str, Any], cause_test: Callable[[list[StaticReading]], CauseTest]) -> None:
+        """`cause_test` makes the test of the rows to be confirmed, by the restored belief."""
+        self.window, first, said = read_rows(values["window"], self._n), values["first"], values["said"]
+        self.first = None
+        if first is not None:
+            rows = read_rows(first["rows"], self._n)
+            self.first = Agreeing(rows, cause_test(rows), frozenset(map(int, first["joints"])))
+        self.reported = None if said is None else (str(said[0]), tuple(said[1]))
+        suspected = values.get("suspected")
+        self.suspected = None if suspected is None else (str(suspected[0]), tuple(suspected[1]))
+        self.fresh, self.repeated, self.carrying = (int(values[name]) for name in ("fresh", "repeated", "carrying"))
+        self.held, self.doubtful, self.reasons = bool(values["held"]), int(values["doubtful"]), tuple(values["reasons"])
+        self.learned, self.silent = int(values.get("learned", 0)), bool(values.get("silent", False))

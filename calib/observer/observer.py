@@ -12,15 +12,17 @@ import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.audit import DOUBTED, audit, is_confirmed, may_adapt
-from calib.observer.cause_test import CauseTest, DetectionLimits, Verdict
+from calib.observer.cause_test import CauseTest, DetectionLimits
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import Agreeing, DriftFinding, decide, windows_agree
 from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.events import Event, verdict_evidence
+from calib.observer.evidence import Verdict
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.investigation import Investigation
 from calib.observer.motion.observer import MovingObserver
 from calib.observer.rest_detector import RestDetector
+from calib.observer.saved_values import UNREADABLE, restored
 from calib.observer.tracking.sensor_filter import Estimate
 from calib.observer.tracking.tracking import Tracking
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -158,12 +160,13 @@ class Observer:
 
     def restore(self, values: dict[str, Any]) -> bool:
         """Continue from saved values of the same arm and records; False, and nothing changed, if they do not fit."""
-        tracking, rest, investigation = copy(self._tracking), copy(self._rest), copy(self._investigation)
-        if not isinstance(values, dict) or values.get("schema") != SCHEMA:
-            return False
-        if not (tracking.restore(values) and rest.restore(values)):
-            return False
-        if not investigation.restore(values, tracking.cause_test):
+        investigation = copy(self._investigation)
+        try:
+            if values["schema"] != SCHEMA:
+                return False
+            tracking, rest = restored(self._tracking, values), restored(self._rest, values)
+            investigation.restore(values, tracking.cause_test)
+        except UNREADABLE:
             return False
         self._tracking, self._rest, self._investigation = tracking, rest, investigation
         return True

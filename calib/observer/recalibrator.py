@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -13,12 +12,12 @@ from armlink.torque_calibration import TorqueCalibration, same_real32
 from calib.install.journaled_write import Controllers, install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
 from calib.observer.check_at_rests import AfterWrite, Checked
+from calib.observer.config import Policy
 from calib.observer.decision import DriftFinding
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.records.store import RecordStore, no_record
 from gcomp.arrays import Array
 
-Policy = Literal["observe", "propose", "apply"]
 APPLIED_BY = "observer, policy apply"
 CHECKED_BY = "check after recalibration"
 RESTORED_BY = "daemon, policy apply"

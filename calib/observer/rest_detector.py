@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
-from calib.observer.saved_values import UNREADABLE
+from calib.observer.saved_values import known
 from gcomp.arrays import Array, as_array
 
 
@@ -43,19 +43,12 @@ class RestDetector:
 
     def save(self) -> dict[str, Any]:
         """Directions of the last motion and the last stop, as JSON values."""
-        stop = [None if np.isnan(q) else float(q) for q in self._last_stop]
-        return {"direction": self._direction.tolist(), "left": stop}
+        return {"direction": self._direction.tolist(), "left": known(self._last_stop)}
 
-    def restore(self, values: dict[str, Any]) -> bool:
-        """Continue from saved values; False, and nothing changed, if they do not fit."""
-        shape = self._direction.shape
-        try:
-            direction = as_array("direction", values["direction"], shape)
-            last_stop = as_array("left", [np.nan if q is None else q for q in values["left"]], shape, finite=False)
-        except UNREADABLE:
-            return False
-        self._direction, self._last_stop = direction, last_stop
-        return True
+    def restore(self, values: dict[str, Any]) -> None:
+        shape, stop = self._direction.shape, [np.nan if q is None else q for q in values["left"]]
+        self._direction = as_array("direction", values["direction"], shape)
+        self._last_stop = as_array("left", stop, shape, finite=False)
 
     def _restart(self, t: float, position: Array, moved: bool) -> None:
         if moved:

@@ -1,10 +1,12 @@
 """The rule by which the parts of the observer are saved: JSON values, read back whole or not at all.
 
-Every part has `save() -> dict` and `restore(values) -> bool`; `restore` returns False and changes nothing if the values
-do not fit. Times are not saved, because clocks restart with the machine.
+Every part has `save() -> dict` and `restore(values)`, which raises one of UNREADABLE where the values do not fit: the
+observer restores copies of its parts, and keeps them if all fit. Times are not saved, because clocks restart with the
+machine.
 """
 
-from typing import Any
+from copy import copy
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -15,16 +17,27 @@ UNREADABLE = (LookupError, TypeError, ValueError, OverflowError)
 """Raised while values are read that are missing, of another type or of another shape (BadArray is a ValueError)."""
 
 
+class _Saved(Protocol):
+    def restore(self, values: dict[str, Any]) -> None: ...
+
+
+Part = TypeVar("Part", bound=_Saved)
+
+
+def restored(part: Part, values: dict[str, Any]) -> Part:
+    """A copy of a part that continues from saved values; raises one of UNREADABLE."""
+    made = copy(part)
+    made.restore(values)
+    return made
+
+
 def save_rows(rows: list[StaticReading]) -> list[list[Any]]:
     """Rows as JSON values: time, position, torque, side of approach, and temperature if a drive tells it."""
+    told = ([known(row.temperature)] if np.isfinite(row.temperature).any() else [] for row in rows)
     return [
-        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *_known_values(row.temperature)]
-        for row in rows
+        [row.t, row.position.tolist(), row.torque.tolist(), row.direction.tolist(), *warm]
+        for row, warm in zip(rows, told, strict=True)
     ]
-
-
-def _known_values(temperature: Array) -> list[Any]:
-    return [known(temperature)] if np.isfinite(temperature).any() else []
 
 
 def read_rows(values: Any, n: int) -> list[StaticReading]:

@@ -2,22 +2,14 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from armlink.errors import Refused
 from armlink.link.types import Command, Sample
+from armlink.loop.driver import ArmDriver
 from calib.observer.events import Event
 from calib.observer.observer import Observer
 from calib.observer.recalibrator import Recalibration, Recalibrator
 from gcomp.arrays import Array
-
-
-class Cycling(Protocol):
-    """The part of the link (`armlink.link.link.Link`) that watching needs."""
-
-    def cycle(self, command: Command) -> Sample:
-        """One cycle; raises BusFault."""
-        ...
 
 
 @dataclass
@@ -41,7 +33,7 @@ class WatchHistory:
 
 
 def watch(
-    link: Cycling,
+    link: ArmDriver,
     observer: Observer,
     targets: Iterable[Array],
     seconds: float,

@@ -52,7 +52,8 @@ class Geometry:
         kinematics = gcomp_arm(arm_file)  # checks the chain, with errors in terms of the arm file
         self.left_out = read_model(arm_file.model_path).left_out
         parked = sweep_section(arm_file).beside
-        beside = [_attached(arm_file, each) for each in parked if each.model]
+        folder = arm_file.path.parent
+        beside = [Beside(folder / each.model, each.at, each.turned, PARKED) for each in parked if each.model]
         self.model = compile_model(arm_file.model_path, beside, arm_file.kinematics.locked)
         self.data = mujoco.MjData(self.model)
         for each in parked:
@@ -147,11 +148,6 @@ def _require_free(arm_file: ArmFile, geometry: Geometry, place: str, pose: Array
             f" {' '.join(f'{angle:.3f}' for angle in pose)} rad: narrow lower and upper of these joints in the arm"
             " file, or clear the workspace"
         )
-
-
-def _attached(arm_file: ArmFile, parked: ParkedArm) -> Beside:
-    assert parked.model is not None
-    return Beside(arm_file.path.parent / parked.model, parked.at, parked.turned, PARKED)
 
 
 def poses_along(plan: SweepPlan) -> Iterator[tuple[str, Array]]:

@@ -87,7 +87,10 @@ def guess_gravity(
     sensor_rows[:, :, 2 * n :] = -regressor
     motor_rows[:, :, 2 * n :] = regressor
     sensor_sigma, motor_sigma = 0.005 * rated, friction * rated
-    spread = np.concatenate([np.full(n, GAIN_STD), 0.3 * rated, np.full(2 * n, _largest_moment(kinematics, rated))])
+    largest_moment = (
+        2 * float(rated.max()) / max(float(np.linalg.norm(kinematics.gravity)), 1.0)
+    )  # that drives can hold
+    spread = np.concatenate([np.full(n, GAIN_STD), 0.3 * rated, np.full(2 * n, largest_moment)])
     expected = np.concatenate([np.ones(n), np.zeros(3 * n)])
     counted = np.isfinite(motor_torque)
     design = np.concatenate(
@@ -103,8 +106,3 @@ def guess_gravity(
     residual = design @ solution - target
     excess = max(float(residual @ residual) / max(len(target) - 4 * n, 1), 1.0)
     return GravityGuess(kinematics, solution[2 * n :], covariance[2 * n :, 2 * n :] * excess)
-
-
-def _largest_moment(kinematics: Arm, rated: Array) -> float:
-    """Upper bound of the mass moments [kg·m] that these drives can hold."""
-    return 2 * float(rated.max()) / max(float(np.linalg.norm(kinematics.gravity)), 1.0)

@@ -15,7 +15,6 @@ from calib.plan.poses import require_range, sweep_range
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates, stop_combinations, with_lever
 from gcomp.arm.arm import Arm
-from gcomp.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +66,10 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
     if pressed.sum() >= min(section.poses, everything.count):
         return with_lever(everything.kept(pressed)), []
     if not (pressed | holdable).any():
+        needed = " ".join(f"{torque:.1f}" for torque in strongest.min(axis=0))
         raise BadInput(
             f"joint {name}: no combination of stops can be held within max_torque: gravity needs up to"
-            f" {_torques(strongest.min(axis=0))} N·m; sweep a lighter arm, or allow more torque"
+            f" {needed} N·m; sweep a lighter arm, or allow more torque"
         )
     note = f"{name}: too few stop combinations can be pressed within max_torque: some joints are servo-held instead"
     return with_lever(everything.kept(pressed | holdable)), [note]
@@ -88,7 +88,3 @@ def _without_collision(candidates: Candidates, geometry: Geometry, name: str) ->
         f"joint {name}: in every combination of stops something touches, for example {first} and {second}:"
         " narrow lower and upper in the arm file"
     )
-
-
-def _torques(values: Array) -> str:
-    return " ".join(f"{value:.1f}" for value in values)

@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 Side = Literal[-1, 0, 1]
+APPROACH = 0.03
+"""Each step is approached over at least this way [rad]."""
 
 
 class _PlanPart(BaseModel):

@@ -11,33 +11,26 @@ from markupsafe import Markup
 from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.fit import QUANTILE, CreepFit
-from calib.creep.record import HEADINGS, determined_values, missing
+from calib.creep.record import CreepCalibration
+from calib.dataset import SweepData
 from calib.fit.heldout import heldout_scores
 from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
-from calib.records.records import CalibrationRecord, Parameter
+from calib.records.records import CalibrationRecord
 from calib.report.figures import before_after_figure, creep_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
 from calib.report.page import ReportSection, bullets, html_of, paragraph, paragraphs, render, verdict_line
-from calib.report.tables import ReportTable, interval_table
-from calib.sweep.dataset import SweepData
+from calib.report.tables import CREEP_HEADINGS, SENSOR_HEADINGS, ReportTable, interval_table
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
-
-PARAMETERS: tuple[tuple[Parameter, str, str], ...] = (
-    ("gain", "gain", "1"),
-    ("offset", "offset", "N·m"),
-    ("position_gain", "position gain", "1"),
-)
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """Data, fit and records of one calibration."""
+    """Data, fit and records of one calibration, from steps at rest or from creeps."""
 
     arm: ArmFile
     data: Sequence[SweepData]
-    fit: SensorFit
+    fit: SensorFit | CreepCalibration
     record: CalibrationRecord
     before: CalibrationRecord | None
     """The current record until now; None if this is the first."""
@@ -52,25 +45,28 @@ def write_report(done: Calibrated, path: Path) -> None:
 
 def sections(done: Calibrated) -> list[ReportSection]:
     """The results, for a part of another report."""
-    return [_comparison(done), _sensors(done), *_sweeps(done), _left_out(done)]
+    if isinstance(done.fit, CreepCalibration):
+        return [_drives(done.fit, done.data), _creeps(done.fit)]
+    return [_comparison(done, done.fit), _sensors(done.fit), *_sweeps(done, done.fit), _left_out(done, done.fit)]
 
 
 def _identity(done: Calibrated) -> ReportSection:
-    record, findings = done.record, done.fit.goodness.findings
-    broken = sorted({each.joint for each in findings if each.breaks_model})
-    verdict = f"the model does not hold: {', '.join(broken)}" if broken else "the model holds"
-    html = verdict_line(verdict) + _advice(done, broken)
-    html += paragraphs(each.text for each in findings)
+    record, fit, html = done.record, done.fit, Markup()
     rows = [
         ["arm", f"{record.arm}, serial {record.serial}"],
         ["description (SHA-256)", html_of("<small>{}</small>", record.description_hash)],
         ["record", record.id + (f", replaces {record.parent}" if record.parent else ", the first of this arm")],
-        ["confirmed by", record.confirmed_by or "not confirmed: kept, not written to controllers"],
-        [
-            "readings",
-            f"{len(done.fit.rows.swept)}, χ² {done.fit.fit.chi2:.0f} at {done.fit.fit.dof} degrees of freedom",
-        ],
     ]
+    if isinstance(fit, SensorFit):
+        broken = sorted(fit.doubtful)
+        verdict = f"the model does not hold: {', '.join(broken)}" if broken else "the model holds"
+        html = verdict_line(verdict) + _advice(done, fit, broken)
+        html += paragraphs(each.text for each in fit.findings)
+        chi2 = f"χ² {fit.fit.chi2:.0f} at {fit.fit.dof} degrees of freedom"
+        rows += [
+            ["confirmed by", record.confirmed_by or "not confirmed: kept, not written to controllers"],
+            ["readings", f"{len(fit.rows.swept)}, {chi2}"],
+        ]
     for data in done.data:
         load = f"{data.manifest.reference_mass:g} kg attached" if data.manifest.reference_mass else "no mass"
         when = f"{data.manifest.created:%Y-%m-%d %H:%M} UTC"
@@ -80,9 +76,8 @@ def _identity(done: Calibrated) -> ReportSection:
     return ReportSection("Calibration", html, (), [ReportTable((), rows, texts=2)])
 
 
-def _advice(done: Calibrated, broken: list[str]) -> Markup:
+def _advice(done: Calibrated, fit: SensorFit, broken: list[str]) -> Markup:
     """Advice on what to do with this calibration, in a few sentences and a command, as HTML."""
-    fit = done.fit
     half = fit.half95("gain")
     known, unknown = (
         half[np.isfinite(half)],
@@ -104,9 +99,8 @@ def _advice(done: Calibrated, broken: list[str]) -> Markup:
     return paragraph(f"{exactly}{without}. {next_step}") + html_of("<p><code>{}</code></p>", command)
 
 
-def _sensors(done: Calibrated) -> ReportSection:
-    fit = done.fit
-    columns = {f"{title} [{unit}]": (fit.value(key), fit.half95(key)) for key, title, unit in PARAMETERS}
+def _sensors(fit: SensorFit) -> ReportSection:
+    columns = {heading: (fit.value(key), fit.half95(key)) for key, heading in SENSOR_HEADINGS.items()}
     columns |= {"residual RMS [N·m]": (fit.residual_rms, 0 * fit.residual_rms)}
     columns |= {"hysteresis [N·m]": (fit.hysteresis, 0 * fit.hysteresis)}
     table = interval_table(
@@ -119,16 +113,16 @@ def _sensors(done: Calibrated) -> ReportSection:
     return ReportSection("Sensors", paragraphs(reasons), (), [table])
 
 
-def _comparison(done: Calibrated) -> ReportSection:
+def _comparison(done: Calibrated, fit: SensorFit) -> ReportSection:
     """The calibration in use until now against the new one, on the same readings."""
-    before, record, names = done.before, done.record, done.fit.names
+    before, record, names = done.before, done.record, fit.names
     n = len(names)
     if before is None:
         manifest = done.data[0].manifest
         old, label = manifest.installed, "the controllers' values"
     else:
         old, label = before.torque_calibration(UNCALIBRATED), f"record {before.id}"
-    rms = [_rms_of_pair(done, pair) for pair in (old, record.torque_calibration(old))]
+    rms = [_rms_of_pair(done, fit, pair) for pair in (old, record.torque_calibration(old))]
     shown = np.isfinite(rms[0]) & np.isfinite(rms[1])
     text = (
         "Calibrated torque minus model torque over all readings without load, with the calibration in use until now and"
@@ -164,9 +158,9 @@ def _changes(before: CalibrationRecord, record: CalibrationRecord) -> ReportTabl
     return ReportTable(header, rows, f"Against record {before.id} of {before.created:%Y-%m-%d %H:%M} UTC.", texts=2)
 
 
-def _rms_of_pair(done: Calibrated, pair: TorqueCalibration[Array]) -> Array:
+def _rms_of_pair(done: Calibrated, fit: SensorFit, pair: TorqueCalibration[Array]) -> Array:
     """RMS (n,) [N·m] of calibrated minus model torque over own readings without load; NaN without any."""
-    fit, rows = done.fit, done.fit.rows
+    rows = fit.rows
     complete = fit.fit.complete
     counted = np.isfinite(rows.readings.torque) & (rows.readings.load == 0)[:, None]
     q = rows.readings.position * complete.position_gain + complete.position_offset
@@ -177,8 +171,8 @@ def _rms_of_pair(done: Calibrated, pair: TorqueCalibration[Array]) -> Array:
     return np.where(counted.any(axis=0), rms, np.nan)
 
 
-def _sweeps(done: Calibrated) -> list[ReportSection]:
-    arm, fit = gcomp_arm(done.arm), done.fit
+def _sweeps(done: Calibrated, fit: SensorFit) -> list[ReportSection]:
+    arm = gcomp_arm(done.arm)
     text = (
         "Upward (▸) and downward (◂) readings, one colour per sweep. Lines: the fit to all sweeps of all joints. Bars:"
         " the 95 % interval of one reading."
@@ -223,9 +217,9 @@ def _sweeps(done: Calibrated) -> list[ReportSection]:
     return made
 
 
-def _left_out(done: Calibrated) -> ReportSection:
+def _left_out(done: Calibrated, fit: SensorFit) -> ReportSection:
     """The paper's Figure 6 on held-out steps."""
-    rows, fit = done.fit.rows, done.fit
+    rows = fit.rows
     score = heldout_scores(done.record, done.arm, rows, refit=True)
     own = rows.own & (rows.readings.load == 0)[:, None]
     complete = fit.fit.complete
@@ -246,17 +240,14 @@ def _number(value: float | None, form: str) -> str:
     return "–" if value is None or not np.isfinite(value) else format(value, form)
 
 
-def creep_sections(fit: CreepFit) -> list[ReportSection]:
-    """Creep sweeps, for a part of another report."""
-    text = "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
-    return [ReportSection("Creep sweeps", paragraph(text) + paragraphs(fit.findings), [creep_figure(fit)])]
-
-
-def write_creep_report(fit: CreepFit, record: CalibrationRecord, contacts: Sequence[str], path: Path) -> None:
-    """Write one self-contained HTML file; raises OSError."""
-    columns = {title: (determined_values(fit, key), QUANTILE * fit.std(key)) for key, title in HEADINGS.items()}
+def _drives(fit: CreepCalibration, data: Sequence[SweepData]) -> ReportSection:
+    columns = {title: (fit.value(key), fit.half95(key)) for key, title in CREEP_HEADINGS.items()}
     values = interval_table(fit.names, columns, "Estimates ± half of the 95 % interval.")
-    unknown = (f"{joint} {parameter}: {reason}" for (joint, parameter), reason in missing(fit).items())
-    drives = ReportSection("Drives", bullets([*unknown, *contacts]), (), [values])
-    title = f"Calibration {record.id}: {record.arm} {record.serial}"
-    render(path, title, [drives, *creep_sections(fit)], f"{record.created:%Y-%m-%d %H:%M} UTC, {record.software}")
+    unknown = (f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items())
+    contacts = (each.reason for one in data for each in one.contacts)
+    return ReportSection("Drives", bullets([*unknown, *contacts]), (), [values])
+
+
+def _creeps(fit: CreepCalibration) -> ReportSection:
+    text = "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
+    return ReportSection("Creep sweeps", paragraph(text) + paragraphs(fit.findings), [creep_figure(fit.fit)])

@@ -6,6 +6,25 @@ from typing import Any
 
 import numpy as np
 
+from calib.creep.record import Value
+from calib.records.records import Parameter
+
+SENSOR_HEADINGS: dict[Parameter, str] = {
+    "gain": "gain",
+    "offset": "offset [N·m]",
+    "position_gain": "position gain",
+}
+"""Parameters of torque and position sensors, as people read them."""
+CREEP_HEADINGS: dict[Value, str] = {
+    "gain": "reading per N·m (1/k)",
+    "offset": "offset [N·m]",
+    "position_offset": "zero [rad]",
+    "coulomb": "Coulomb friction [N·m]",
+    "load": "friction per load",
+    "viscous": "viscous [N·m·s/rad]",
+}
+"""The same of drives whose torque is a motor current."""
+
 
 @dataclass(frozen=True)
 class ReportTable:

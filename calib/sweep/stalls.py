@@ -3,10 +3,8 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from armlink.errors import HostLate, Stall
+from armlink.errors import Stall
 from armlink.loop.driver import ArmDriver
-from calib.motion.mover import Mover
-from calib.sweep.dataset import StallLine
 
 OnStall = Callable[[Stall], bool]
 """Told why the joints were stopped; whether to enable them again and go on."""
@@ -34,33 +32,17 @@ def restart(
             return
 
 
-def repeat_work(link: ArmDriver, on_stall: OnStall, work: Callable[[], T]) -> T:
-    """Return the result of `work`; it is repeated from its beginning after each Stall that `on_stall` accepts."""
+def repeat_work(
+    link: ArmDriver, on_stall: OnStall, work: Callable[[], T], resume: Callable[[], object] | None = None
+) -> T:
+    """Return the result of `work`; it is repeated from its beginning after each Stall that `on_stall` accepts.
+
+    Work that moves the arm gives its mover's `resume`: the arm then holds where it stands first.
+    """
     while True:
         try:
             return work()
         except Stall as stall:
             restart(link, on_stall, stall)
-
-
-def resume_after(
-    mover: Mover, on_stall: OnStall, stall: Stall, note: Callable[[Stall], None] = lambda stall: None
-) -> None:
-    """As `restart`; then the arm holds where it stands."""
-    restart(mover.link, on_stall, stall, note)
-    repeat_work(mover.link, on_stall, mover.resume)
-
-
-def repeat_motion(mover: Mover, on_stall: OnStall, work: Callable[[], T]) -> T:
-    """As `repeat_work`, for work that moves the arm: after a Stall it holds where it stands first."""
-    while True:
-        try:
-            return work()
-        except Stall as stall:
-            resume_after(mover, on_stall, stall)
-
-
-def stall_line(stall: Stall, t: float, reading: str) -> StallLine:
-    """How a stall at link time `t` [s] is noted in the data set."""
-    late = stall.late * 1e3 if isinstance(stall, HostLate) else None
-    return StallLine(t=t, late_ms=late, reading=reading, reason=str(stall))
+            if resume is not None:
+                repeat_work(link, on_stall, resume)

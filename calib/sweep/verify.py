@@ -1,4 +1,8 @@
-"""Verification: model against sensor torque at held-out poses, as Figure 6 of [MH97] (docs/theory.md, section 3)."""
+"""Verification: model against sensor torque at held-out poses, as Figure 6 of [MH97] (docs/theory.md, section 3).
+
+A torque sensor is read at rest. Of a drive whose torque is a motor current, the half sum of two short creeps, there and
+back, is read, which is without friction.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,17 +11,20 @@ from functools import partial
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.errors import Refused
+from armlink.errors import BadInput, Refused
+from armlink.link.guard import ReadingBounds
+from armlink.link.types import Sample
 from armlink.loop.driver import ArmDriver
-from armlink.torque_calibration import TorqueCalibration, per_joint
+from armlink.torque_calibration import per_joint
 from calib.arm.kinematics import DriveLimits, gcomp_arm
-from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.motion.mover import Mover, Stalled
-from calib.motion.static_reading import StaticReading
+from calib.arm.sweep_section import SweepSection, sweep_motion, sweep_section
+from calib.creep.plan import CreepGround
+from calib.motion.mover import STALL, Mover, Stalled
+from calib.motion.static_reading import stack
 from calib.plan.poses import nearest_first, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.stalls import OnStall, give_up, repeat_motion
-from gcomp.arrays import Array, Mask
+from calib.sweep.stalls import OnStall, give_up, repeat_work
+from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 
 ACCELERATION = 2.0
@@ -30,6 +37,18 @@ EXPECTED = 2.5
 only a few times by the poses, and a mean of two squares exceeds this one time in five hundred."""
 NOISE_FLOOR = 0.003
 """RMS that always passes, as a share of rated torque: the error of an offset that tests/calib/drawn_arms.py allows."""
+CREEP_SPEED = 0.12
+"""Of the creeps [rad/s]."""
+CREEP_WAY = 0.15
+"""Of all joints together, once each way [rad]."""
+CREEP_LEAD = 0.05
+"""Way at the start of each that does not count: friction turns round [rad]."""
+CREEP_TOLERANCE = 0.02
+"""TOLERANCE of creeps."""
+CREEP_FLOOR = 0.008
+"""NOISE_FLOOR of creeps: friction that differs between the directions."""
+ReadAt = Callable[[Mover, Array], tuple[Array, Array] | None]
+"""Position [rad] and torque [N·m] readings (n,) at a pose (n,); back again, and None, where a joint stalls."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,39 +98,63 @@ def run_verify(
     progress: Callable[[int, int], None] | None = None,
     on_stall: OnStall = give_up,
 ) -> Verification:
-    """Drive, servo-held, to random poses within the joint range and read every torque sensor there.
+    """Drive, servo-held, to random poses within the joint range and read every torque there.
 
-    The link must have been enabled. Without a calibration record the controllers' own calibration is used. A pose whose
-    reading a Stall interrupts is repeated where `on_stall` accepts it. Raises Refused on records of another arm, or if
-    no pose can be reached; BusFault.
+    The link must have been enabled. Without a calibration record the controllers' own calibration is used; an arm that
+    creeps needs one. A pose whose reading a Stall interrupts is repeated where `on_stall` accepts it. Raises Refused on
+    records of another arm, or if no pose can be reached; BadInput, BusFault.
     """
-    n, section, limits = link.n, sweep_section(arm_file), DriveLimits.of(arm_file)
-    kinematics = gcomp_arm(arm_file)
-    sensors = _SensorConversion.of(link, None if calibration is None else calibration.require(arm_file))
+    section, limits, kinematics = sweep_section(arm_file), DriveLimits.of(arm_file), gcomp_arm(arm_file)
+    creeping = sweep_motion(arm_file) == "creep"
+    if calibration is not None:
+        calibration.require(arm_file)
+    elif creeping:
+        raise BadInput(f"{arm_file.name}: its drives keep no calibration: verify needs a calibration record")
     beta = np.array(gravity.require(arm_file).beta)
     mover = Mover(link, section, limits)
     mover.hold_all()
-    everything, angles, torques, skipped = np.ones(n, dtype=bool), [], [], 0
-    for number, pose in enumerate(verify_poses(limits, section, poses, seed, mover.position), start=1):
-        rest = repeat_motion(mover, on_stall, partial(_rest_at, mover, pose, everything))
-        if rest is None:
-            skipped += 1
+    read_at: ReadAt
+    if creeping:
+        read_at, held_out = _half_sum_at, _creep_poses(CreepGround.of(arm_file), poses, seed, mover.position)
+    else:
+        read_at, held_out = _rest_at, verify_poses(limits, section, poses, seed, mover.position)
+    installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
+    wanted = installed if calibration is None else calibration.torque_calibration(installed)
+    as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
+    angles, torques = list[Array](), list[Array]()
+    for number, pose in enumerate(held_out, start=1):
+        found = repeat_work(link, on_stall, partial(read_at, mover, pose), mover.resume)
+        if found is None:
             continue
-        angles.append(sensors.angle(rest.position))
-        torques.append(sensors.torque(rest.torque))
+        position, torque = found
+        angles.append(position if calibration is None else calibration.angle(position))
+        torques.append(np.where(as_sent, torque, wanted.invert(installed.apply(torque))))
         if progress is not None:
-            progress(number, poses)
+            progress(number, len(held_out))
     if not angles:
         raise Refused("no pose was reached: the drives stalled at every one; is the arm free to move?")
     q = np.array(angles)
     model = gravity_torque(kinematics, beta, q)
     variance = np.diagonal(torque_covariance(kinematics, np.array(gravity.covariance), q), axis1=-2, axis2=-1)
-    tolerance = _tolerance(calibration, model, variance, limits.rated)
-    return Verification(link.names, q, np.array(torques), model, np.sqrt(np.maximum(variance, 0.0)), skipped, tolerance)
+    share, floor = (CREEP_TOLERANCE, CREEP_FLOOR) if creeping else (TOLERANCE, NOISE_FLOOR)
+    tolerance = np.maximum(share * np.abs(model).max(axis=0), floor * limits.rated)
+    if calibration is not None and not creeping:
+        tolerance = _expected_rms(calibration, model, variance, tolerance, floor * limits.rated)
+    std, skipped = np.sqrt(np.maximum(variance, 0.0)), len(held_out) - len(angles)
+    return Verification(link.names, q, np.array(torques), model, std, skipped, tolerance)
 
 
-def _rest_at(mover: Mover, pose: Array, everything: Mask) -> StaticReading | None:
-    """Travel to a pose (n,) [rad] and rest there; back again, and None, where the drives do not reach it."""
+def _expected_rms(calibration: CalibrationRecord, model: Array, variance: Array, fixed: Array, floor: Array) -> Array:
+    """RMS that passes (n,) [N·m]: what records with a discrepancy expect of themselves, else fixed bounds."""
+    level, level_std = calibration.discrepancy("level", np.nan), calibration.discrepancy("level_std", np.nan)
+    gain, offset = calibration.values("gain", 1.0), np.nan_to_num(calibration.std("offset"))
+    of_gain = np.nan_to_num(calibration.std("gain")) * np.abs(model)
+    square = (level + 2 * level_std) ** 2 + (variance + (of_gain**2 + offset**2) / gain**2).mean(axis=0)
+    passes: Array = np.where(np.isnan(level), fixed, np.maximum(EXPECTED * np.sqrt(square), floor))
+    return passes
+
+
+def _rest_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
     begin = mover.position.copy()
     try:
         mover.travel(pose, ACCELERATION)
@@ -119,21 +162,8 @@ def _rest_at(mover: Mover, pose: Array, everything: Mask) -> StaticReading | Non
         mover.hold_all()
         mover.travel(begin, ACCELERATION)
         return None
-    return mover.rest(everything)
-
-
-def _tolerance(calibration: CalibrationRecord | None, model: Array, variance: Array, rated: Array) -> Array:
-    """RMS that passes (n,) [N·m]: what records with a discrepancy expect of themselves, else fixed bounds."""
-    floor = NOISE_FLOOR * rated
-    fixed: Array = np.maximum(TOLERANCE * np.abs(model).max(axis=0), floor)
-    if calibration is None:
-        return fixed
-    level, level_std = calibration.discrepancy("level", np.nan), calibration.discrepancy("level_std", np.nan)
-    gain, offset = calibration.values("gain", 1.0), np.nan_to_num(calibration.std("offset"))
-    of_gain = np.nan_to_num(calibration.std("gain")) * np.abs(model)
-    square = (level + 2 * level_std) ** 2 + (variance + (of_gain**2 + offset**2) / gain**2).mean(axis=0)
-    passes: Array = np.where(np.isnan(level), fixed, np.maximum(EXPECTED * np.sqrt(square), floor))
-    return passes
+    rest = mover.rest(np.ones(mover.link.n, dtype=bool))
+    return rest.position, rest.torque
 
 
 def verify_poses(limits: DriveLimits, section: SweepSection, count: int, seed: int, begin: Array) -> Array:
@@ -143,21 +173,57 @@ def verify_poses(limits: DriveLimits, section: SweepSection, count: int, seed: i
     return nearest_first(ends[:, 0] + generator.random((count, len(ends))) * (ends[:, 1] - ends[:, 0]), begin)
 
 
-@dataclass(frozen=True, eq=False)
-class _SensorConversion:
-    """Conversion of what the controllers send to angles and torques."""
+def _creep_poses(ground: CreepGround, count: int, seed: int, begin: Array) -> Array:
+    """Random poses (P, n) [rad] about which nothing touches, each reached straight from the one before."""
+    random = np.random.default_rng([seed, 6])
+    ends = np.array([ground.range(joint) for joint in range(ground.arm.n)]) + CREEP_WAY / 2 * np.array([1.0, -1.0])
+    here, found = begin, list[Array]()
+    for _ in range(200 * count):
+        pose: Array = random.uniform(ends[:, 0], ends[:, 1])
+        if ground.way(pose - CREEP_WAY / 2, pose + CREEP_WAY / 2) and ground.way(here, pose):
+            found.append(pose)
+            here = pose
+            if len(found) == count:
+                break
+    if ground.geometry is None and found:
+        return nearest_first(np.array(found), begin)
+    return np.array(found)
 
-    installed: TorqueCalibration[Array]
-    calibrated: TorqueCalibration[Array]
-    record: CalibrationRecord | None
 
-    @classmethod
-    def of(cls, link: ArmDriver, record: CalibrationRecord | None) -> "_SensorConversion":
-        installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
-        return cls(installed, installed if record is None else record.torque_calibration(installed), record)
+def _half_sum_at(mover: Mover, pose: Array) -> tuple[Array, Array] | None:
+    """By creeps of all joints together, up and down about the pose."""
+    begin = mover.position.copy()
+    try:
+        mover.travel(pose - CREEP_WAY / 2, 1.5)
+        up, down = _creep(mover, CREEP_WAY), _creep(mover, -CREEP_WAY)
+    except Stalled:
+        mover.hold_all()
+        mover.travel(begin, 1.0)
+        return None
+    return pose, _half_sum(up, down, pose)
 
-    def angle(self, reading: Array) -> Array:
-        return reading if self.record is None else self.record.angle(reading)
 
-    def torque(self, reading: Array) -> Array:
-        return self.calibrated.invert(self.installed.apply(reading))
+def _creep(mover: Mover, way: float) -> list[Sample]:
+    """All joints together by `way` [rad]."""
+    period, start = mover.link.period, mover.command.position.copy()
+    count = round(abs(way) / CREEP_SPEED / period)
+    rows = start + way * (np.arange(1, count + 1) / count)[:, None]
+    n = mover.link.n
+    return mover.follow(rows, ReadingBounds(np.full(n, -np.inf), np.full(n, np.inf), np.full(n, STALL)))
+
+
+def _half_sum(up: list[Sample], down: list[Sample], pose: Array) -> Array:
+    """Torque (n,) in the middle of both ways, each direction by a line through its samples."""
+    means = []
+    for samples in (up, down):
+        position, torque = stack(samples, "position"), stack(samples, "torque")
+        line = np.empty(len(pose))
+        for joint, at in enumerate(pose):
+            q, v = position[:, joint], torque[:, joint]
+            kept = np.isfinite(q) & np.isfinite(v) & (np.abs(q - at) < CREEP_WAY / 2 - CREEP_LEAD / 2)
+            if kept.sum() < 4:
+                raise Refused(f"joint {joint + 1}: too few samples in a creep of {CREEP_WAY} rad")
+            line[joint] = np.polynomial.polynomial.polyfit(q[kept] - at, v[kept], 1)[0]
+        means.append(line)
+    half_sum: Array = (means[0] + means[1]) / 2
+    return half_sum

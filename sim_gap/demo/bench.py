@@ -13,11 +13,11 @@ from armlink.link.types import Command, Sample
 from armlink.recording.files import save_recording
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.choice import sweep_motion
+from calib.arm.sweep_section import sweep_motion
 from calib.motion.trajectory import trajectory
 from calib.plan.types import SweepPlan
 from calib.records.records import CalibrationRecord
-from calib.sweep.run import Progress
+from calib.sweep.sweep_pass import Progress
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from gcomp.gravity.batch import GravityModel

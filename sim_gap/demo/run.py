@@ -15,13 +15,12 @@ from armlink.extras import has_extra
 from armlink.link.types import Sample
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
-from calib.arm.sweep_section import CreepSection, sweep_section
+from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
 from calib.commissioning.arm_text import assumed_lines
 from calib.commissioning.model_judgement import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
-from calib.creep.choice import sweep_motion
 from calib.creep.record import CreepCalibration
-from calib.creep.run import contacts, run_creep
+from calib.dataset import SweepData
 from calib.install.journaled_write import install
 from calib.install.plausibility import admit
 from calib.motion.random_work import WorkMotion, work_targets
@@ -34,7 +33,7 @@ from calib.records.store import RecordStore
 from calib.report import calibration
 from calib.report.figures import verify_figure
 from calib.report.page import ReportSection, paragraph
-from calib.sweep.dataset import SweepData
+from calib.sweep.run import run_sweep
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from sim_bus.sim_section import with_realism
@@ -166,11 +165,11 @@ class Demo:
                 else:
                     first = {each.joint: each for each in reversed(plan.sweeps)}.values()
                     short = plan.model_copy(update={"sweeps": tuple(each for each in plan.sweeps if each in first)})
-                    made = run_creep(bench.link, bench.arm, folder, progress=screen.update, plan=short)
+                    made = run_sweep(bench.link, bench.arm, folder, progress=screen.update, plan=short)
             if mass:
                 bench.simulated.detach_mass()
             notes = made.plan.notes if made.plan is not None and not passes else ()
-            for said in (*notes, *(each.reason for each in contacts(made))):
+            for said in (*notes, *(each.reason for each in made.contacts)):
                 self.account.say(said)
             passes.append(made)
         return passes
@@ -248,16 +247,12 @@ class Demo:
         account.note(not_identifiable={f"{joint}.{name}": why for (joint, name), why in fit.reasons.items()})
         swept = "was swept without and with"
         if isinstance(fit, CreepCalibration):
-            swept, parts = (
-                "crept through its range without, with and again without",
-                calibration.creep_sections(fit.fit),
-            )
-            friction = {name: _estimate(fit.fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
+            swept = "crept through its range without, with and again without"
+            friction = {name: _estimate(fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
             friction["coulomb"]["true"] = true["coulomb"]
             account.note(friction=friction, disturbed=fit.findings, sag=None)
             names += ("coulomb", "load", "viscous")
-        else:
-            parts = calibration.sections(calibration.Calibrated(self.bench.arm, passes, fit, record, None))
+        parts = calibration.sections(calibration.Calibrated(self.bench.arm, passes, fit, record, None))
         columns: dict[str, tuple[Array, Array]] = {}
         for name in names:
             columns[name.replace("_", " ")] = fit.value(name), fit.ci95(name)[:, 1] - fit.value(name)

@@ -11,10 +11,10 @@ from sweep_arms import arm_content, largest_torque
 from armlink.arm_file import ArmFile, load_arm, parse_arm
 from armlink.link.link import Link
 from calib.arm.kinematics import gcomp_arm
+from calib.dataset import SweepData
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.records.records import PARAMETERS
-from calib.sweep.dataset import SweepData
 from calib.sweep.run import run_sweep
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.bus.lock_step import LockStepBus

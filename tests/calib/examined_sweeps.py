@@ -7,10 +7,10 @@ import numpy as np
 from sweep_arms import synthetic_pass
 
 from armlink.arm_file import ArmFile
+from calib.dataset import SweepData
 from calib.fit.sensor_fit import SensorFit
 from calib.motion.static_reading import StaticReading
 from calib.plan.sweep_plan import plan_sweep
-from calib.sweep.dataset import SweepData
 from calib.sweep.scout import rough_model
 from sim_bus.truth import Truth
 

@@ -18,10 +18,10 @@ from sweep_arms import random_arm, with_section
 
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import DriveLimits
+from calib.dataset import SweepData
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.plan.types import SweepPlan
-from calib.sweep import run as runner
-from calib.sweep.dataset import SweepData
+from calib.sweep import step_pass as runner
 from sim_bus.sim_section import EffectEntry
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -143,7 +143,7 @@ def stick(simulated: SimulatedArm, bit: int) -> None:
 @contextmanager
 def _weakened(simulated: SimulatedArm, wanted: bool) -> Iterator[Callable[[], int]]:
     """The plan presses one resting joint too weakly for gravity; gives how often a joint was pressed again."""
-    plans, more, slips = runner._final_plan, runner._StepPass._firmer, []
+    plans, more, slips = runner._final_plan, runner.StepPass._firmer, []
 
     def weak(*given: Any) -> SweepPlan:
         plan = plans(*given)
@@ -167,7 +167,7 @@ def _weakened(simulated: SimulatedArm, wanted: bool) -> Iterator[Callable[[], in
         return more(*given)
 
     with (
-        patch.object(runner._StepPass, "_firmer", counted),
+        patch.object(runner.StepPass, "_firmer", counted),
         patch.object(runner, "_final_plan", weak if wanted else plans),
     ):
         yield lambda: len(slips)

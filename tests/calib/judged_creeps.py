@@ -11,15 +11,14 @@ from armlink.arm_file import ArmFile, parse_arm
 from armlink.arrays import Array
 from armlink.link.link import Link
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.choice import is_vertical
 from calib.creep.fit import QUANTILE, CreepFit, fit_creep
+from calib.creep.levers import is_vertical
 from calib.creep.plan import plan_creep
-from calib.creep.record import missing
-from calib.creep.run import contacts, run_creep
+from calib.creep.record import CreepCalibration
+from calib.dataset import SweepData
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
 from calib.plan.types import SweepPlan
-from calib.sweep.dataset import SweepData
 from calib.sweep.run import run_sweep
 from gcomp.arm.mass_moments import base_parameters
 from gcomp.gravity.torque import gravity_torque
@@ -133,7 +132,7 @@ def creep_passes(arm: ArmFile, simulated: SimulatedArm, out: Path, seed: int = 0
                 simulated.attach_mass(mass)
             else:
                 simulated.detach_mass()
-            made.append(run_creep(link, arm, out / name, reference_mass=mass, plan=used))
+            made.append(run_sweep(link, arm, out / name, reference_mass=mass, plan=used))
         link.disable()
     return made
 
@@ -143,7 +142,7 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
     fit, described, n = fit_creep(arm, data), gcomp_arm(arm), len(arm.joint_names)
     truth, state = simulated.truth, simulated.plant._imperfections
     gain = warm_gain(simulated, fit)
-    lost = missing(fit)
+    lost = CreepCalibration(fit).reasons
     seen = np.array([(name, "gain") not in lost for name in fit.names])
     off = np.where(seen, fit.value("gain") / gain - 1, np.nan)
     pairs = {
@@ -171,7 +170,7 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
     wrong += [f"{fit.names[j]}: friction {friction[j]:+.3f}" for j in range(n) if abs(friction[j]) > bound[j]]
     wrong += [f"{fit.names[j]}: gravity {share[j]:.2%}" for j in range(n) if share[j] > GRAVITY]
     wrong += [f"{name}: vertical, but a gain is given" for name in upright if (name, "gain") not in lost]
-    wrong += list(fit.findings) + [each.reason for one in data for each in contacts(one)]
+    wrong += list(fit.findings) + [each.reason for one in data for each in one.contacts]
     return CreepVerdict(
         fit.names, off, scores, friction, share,
         np.full(n, np.nan) if steps is None else np.where(loaded, steps / np.maximum(largest, 1e-9), np.nan),

@@ -6,7 +6,7 @@ Readings v = k·τ(c·φ + θ0) + o; τ by plain transforms and moments of point
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from calib.sweep.dataset import SweepData
+from calib.dataset import SweepData
 
 Array = np.ndarray
 LOST = 1e-6

@@ -12,10 +12,9 @@ import numpy as np
 from sweep_arms import SAMPLES, reading_of
 
 from armlink.arm_file import ArmFile
+from calib.dataset import Manifest, SweepData
 from calib.plan.sweep_plan import plan_sweep
-from calib.plan.types import SweepPlan
-from calib.sweep.dataset import Manifest, SweepData
-from calib.sweep.run import APPROACH
+from calib.plan.types import APPROACH, SweepPlan
 from calib.sweep.scout import rough_model
 from sim_bus.physics.joint_torques import Cables, unevenness
 from sim_bus.physics.sensors import NOISE_BLOCK

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile, parse_arm
+from calib.dataset import Manifest, SweepData
 from calib.motion.static_reading import StaticReading
 from calib.plan.types import SweepPlan
-from calib.sweep.dataset import Manifest, SweepData
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

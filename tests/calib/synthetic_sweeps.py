@@ -4,9 +4,9 @@ import numpy as np
 from sweep_arms import synthetic_pass
 
 from armlink.arm_file import ArmFile
+from calib.dataset import SweepData
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import SweepPlan
-from calib.sweep.dataset import SweepData
 from calib.sweep.scout import rough_model
 from sim_bus.truth import Truth
 

@@ -24,12 +24,12 @@ from armlink.link.types import Command
 from calib.arm.kinematics import model_arm
 from calib.creep.fit import fit_creep
 from calib.creep.plan import plan_creep
-from calib.creep.record import calibration_record
-from calib.creep.run import run_creep
+from calib.creep.record import CreepCalibration
 from calib.install.journaled_write import install
 from calib.install.plausibility import admit
 from calib.plan.types import SweepPlan
 from calib.records.store import RecordStore
+from calib.sweep.run import run_sweep
 from gcomp.gravity.batch import GravityModel
 from sim_gap.demo.bench import WEAK_SHARE, Bench, sag_poses, weak_hold
 from sim_gap.demo.run import quick
@@ -103,9 +103,9 @@ def run(seed: int, folder: Path, wrong: bool) -> bool:
     passes = []
     for name, mass in (("empty", 0.0), ("loaded", plan.reference_mass), ("again", 0.0)):
         bench.simulated.attach_mass(mass) if mass else bench.simulated.detach_mass()
-        passes.append(run_creep(link, arm, folder / name, reference_mass=mass, plan=plan))
+        passes.append(run_sweep(link, arm, folder / name, reference_mass=mass, plan=plan))
     fit = fit_creep(arm, passes)
-    record = calibration_record(fit, arm)
+    record = CreepCalibration(fit).record(arm)
     before = measured(bench, plan, model_arm(believed).beta, np.zeros(link.n))
     install(admit(record, arm, store), store, link, by="campaign", reason="creep sweeps", check=None)
     after = measured(bench, plan, fit.beta, record.values("position_offset", 0.0))

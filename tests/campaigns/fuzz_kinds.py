@@ -45,9 +45,9 @@ from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.commands.poses_csv import load_poses
 from calib.daemon.settings import daemon_section
+from calib.dataset import load_data
 from calib.observer.decision import DriftFinding
 from calib.records.store import RecordStore
-from calib.sweep.dataset import load_data
 from gcomp.arm.load import load_model
 from gcomp.errors import BadModel
 from sim_bus.truth import Truth

@@ -22,7 +22,7 @@ from sweep_arms import random_arm, with_section
 
 from armlink.arm_file import ArmFile
 from armlink.link.link import Link
-from calib.sweep.dataset import SweepData, load_data
+from calib.dataset import SweepData, load_data
 from calib.sweep.run import run_sweep
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm

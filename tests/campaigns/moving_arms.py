@@ -22,7 +22,7 @@ from judged_creeps import creep_arm
 from calib.arm.kinematics import gcomp_arm
 from calib.creep.fit import fit_rows
 from calib.creep.plan import plan_creep
-from calib.creep.record import calibration_record, gravity_record
+from calib.creep.record import CreepCalibration
 from calib.observer.motion.observer import MovingObserver
 
 GAIN, FRICTION, PAYLOAD = 0.05, 1.3, 0.3
@@ -39,8 +39,8 @@ def run(seed: int, rows: int) -> dict[str, tuple[bool, bool, str]]:
     made = draw_creep(arm, plan, seed, plan.reference_mass)
     kinematics, rated = gcomp_arm(arm), arm.require_link().rated_torques
     fit = fit_rows(kinematics, made.rows, rated)
-    calibration = calibration_record(fit, arm)
-    gravity = gravity_record(fit, arm, calibration)
+    calibration = CreepCalibration(fit).record(arm)
+    gravity = CreepCalibration(fit).gravity.record(arm, calibration)
     told: dict[str, tuple[bool, bool, str]] = {}
     for kind in KINDS:
         observer, events = MovingObserver(kinematics, calibration, gravity, rated), []

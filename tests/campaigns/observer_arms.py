@@ -21,8 +21,8 @@ from bounds import exit_status
 from drawn_arms import drawn_arm
 from real_arm import RealArm
 
-from calib.observer.effect_dictionary import DRIFT
 from calib.observer.events import Event
+from calib.observer.evidence import DRIFT
 from calib.observer.observer import Observer
 
 GAIN, OFFSET = {1: 0.03, 3: 0.05}, {1: 0.02, 3: 0.04}

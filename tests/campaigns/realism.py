@@ -21,9 +21,9 @@ from realistic_sweeps import RestingArm, both_passes, plans
 
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
+from calib.dataset import SweepData
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
-from calib.sweep.dataset import SweepData
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 from sim_bus.sim_section import with_realism
 from sim_bus.simulated_arm import SimulatedArm

@@ -30,8 +30,8 @@ from real_time import ARMLINK, FALSE, keep_busy
 from armlink.arm_file import ArmFile, load_arm
 from armlink.bus.open import open_link_bus
 from armlink.drives.canopen.pdo import RPDO1
+from calib.dataset import load_data
 from calib.fit.sensor_fit import fit_sensors
-from calib.sweep.dataset import load_data
 from gcomp.arrays import Array
 from sim_bus.truth import Truth
 

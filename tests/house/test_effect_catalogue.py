@@ -7,7 +7,7 @@ import pytest
 
 from armlink.effect_catalogue import CATALOGUE
 from calib.fit import unmodelled_effects
-from calib.observer.effect_dictionary import CAUSES
+from calib.observer.cause_test import CAUSES
 from sim_bus.effects.registry import NOT_SIMULATED
 from sim_bus.effects.registry import effects as forward_effects
 from sim_gap.blind.effects import DRAWS, NOT_DRAWN

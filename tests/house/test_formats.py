@@ -15,9 +15,9 @@ from armlink.arm_file import ArmFile
 from armlink.recording.files import SUFFIXES
 from armlink.recording.mcap import TOPICS
 from armlink.recording.recording import COLUMNS, Recording
+from calib.dataset import Manifest, PlanLine, StallLine
 from calib.motion.static_reading import StaticReading
 from calib.records.records import ArmRecord, CalibrationRecord, GravityRecord
-from calib.sweep.dataset import Manifest, PlanLine, StallLine
 from sim_bus.effects.registry import NOT_SIMULATED
 from sim_bus.effects.registry import effects as forward_effects
 from sim_gap.effects.laws import LAWS

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from armlink.bus.can_bus import CanBus
+    from armlink.drives.findings import SetupFinding
     from calib.commissioning.drive_match import Ask, Match
-    from calib.commissioning.finding import SetupFinding
 
 SCHEMA = "armlink.new/1"
 
@@ -114,7 +114,7 @@ def _tell(
     console.print(f"{out}: {told}")
     suggest(step)
     answer = {"out": str(out), "name": name, "joints": joints, "next": step}
-    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [found.to_json() for found in findings]})
+    write_json(json_file, {"schema": SCHEMA, **answer, "findings": [vars(found) for found in findings]})
     return 1 if findings else 0
 
 

@@ -39,5 +39,5 @@ def doctor(
     else:
         console.print("no errors")
         suggest(command_line("check", arm, bus=bus))
-    write_json(json_file, {"schema": "armlink.doctor/1", "arm": arm, "findings": [each.to_json() for each in findings]})
+    write_json(json_file, {"schema": "armlink.doctor/1", "arm": arm, "findings": [vars(each) for each in findings]})
     return 1 if errors else 0

@@ -222,6 +222,6 @@ def _answer(made: "NewArm", step: str) -> dict[str, Any]:
         ],
         "aside": [{"joint": name, "why": why} for name, why in draft.aside],
         "assumed": draft.assumed,
-        "findings": [found.to_json() for found in made.findings],
+        "findings": [vars(found) for found in made.findings],
         "next": step,
     }

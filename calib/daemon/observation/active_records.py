@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from armlink.errors import ArmlinkError
 from calib.daemon.environment import BusJobs, Environment
-from calib.daemon.observation.active_observation import ActiveObservation
+from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
 from calib.daemon.state.event_log import EventLog

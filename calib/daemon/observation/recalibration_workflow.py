@@ -7,7 +7,6 @@ from concurrent.futures import Future
 
 from armlink.errors import ArmlinkError, BusFault, Refused
 from calib.daemon.environment import BusJobs
-from calib.daemon.observation.observer_feed import Samples
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
 from calib.daemon.state.event_log import EventLog
@@ -21,7 +20,10 @@ from calib.observer.recalibrator import APPLIED_BY, Recalibration, Recalibrator
 from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
+from gcomp.arrays import Array
 
+Samples = tuple[Array, Array, Array]
+"""t (K,) [s], position (K, n) [rad], torque (K, n) [N·m]."""
 Installed = Callable[[CalibrationRecord, DriftFinding], None]
 
 DAY = 86400.0

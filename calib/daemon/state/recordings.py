@@ -63,7 +63,9 @@ class Recordings:
         if batch.t[-1] - self._failed_at < RETRY_SECONDS:
             return
         try:
-            if batch.t[0] - self._last > LONGEST_PAUSE or batch.t[0] < self._last or self._old(float(batch.t[0])):
+            pause, age = batch.t[0] - self._last, batch.t[0] - self._begun
+            old = self._writer is not None and age > self._settings.minutes * 60.0
+            if old or not 0.0 <= pause <= LONGEST_PAUSE:
                 self._rotate(float(batch.t[0]))
             self._write(batch)
         except OSError as error:
@@ -79,9 +81,6 @@ class Recordings:
                 writer.__exit__(None, None, None)
             except OSError as error:
                 log.error("recordings: %s", error)
-
-    def _old(self, t: float) -> bool:
-        return self._writer is not None and t - self._begun > self._settings.minutes * 60.0
 
     def _write(self, batch: Batch) -> None:
         assert self._writer is not None

@@ -3,8 +3,8 @@
 from dataclasses import replace
 from typing import Any
 
-from calib.observer.effect_dictionary import DRIFT
 from calib.observer.events import Event
+from calib.observer.evidence import DRIFT
 
 Description = tuple[str, str, dict[str, Any]]
 """(kind, text, evidence)"""

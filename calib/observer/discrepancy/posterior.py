@@ -1,25 +1,11 @@
 """The discrepancy and the gravity model as reference rows have shown them (docs/theory.md)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from calib.observer.discrepancy.kernel import Kernel, Points
 from calib.observer.discrepancy.level import DiscrepancyLevel
+from calib.observer.discrepancy.reference import Rows
 from gcomp.arrays import Array
-
-
-@dataclass(frozen=True)
-class Data:
-    """N reference rows."""
-
-    points: Points
-    residual: Array
-    """Readings less gravity model as installed (N, n) [N·m]."""
-    columns: Array
-    """Columns (N, n, P) of the model's stated uncertainty, with unit prior, shared by all joints."""
-    epoch: Array
-    """Number of the stretch of time that each row is of (N,); 0 is the one right after the installation."""
 
 
 class Posterior:
@@ -32,30 +18,33 @@ class Posterior:
         noise: Array,
         free: Array,
         thermal: Array,
-        data: Data,
-        shared: int,
+        rows: Rows,
+        points: Points,
+        of_model: Array,
     ) -> None:
         """noise (n,) [N·m]: of one row. free (n,) [N·m]: size of an offset or gain's change between two epochs. thermal
         (n,) [N·m]: how far a zero moves as the joint warms by `kernel.WARM`.
 
-        In later epochs than the first the sensors may have drifted: those rows tell the discrepancy but for an offset
-        and a gain of their own. `shared` is P.
+        rows, N reference rows at `points`: in later epochs than the first the sensors may have drifted, so that those
+        rows tell the discrepancy but for an offset and a gain of their own. of_model: columns (N, n, P) of the model's
+        stated uncertainty, with unit prior, shared by all joints.
         """
-        self._kernel, self._level, self._thermal, self._data = kernel, level, thermal, data
+        self._kernel, self._level, self._thermal, self._points = kernel, level, thermal, points
+        shared = of_model.shape[2]
         self._whitener: Array | None = None
         self._mean: Array = np.zeros(shared)
         self._factor: Array = np.eye(shared)
-        if not len(data.epoch):
+        if not len(rows):
             return
-        covariance = self._between(data.points, data.points)
-        t = data.points.torque.T
-        later = (data.epoch[:, None] == data.epoch[None]) & (data.epoch[:, None] > 0)
+        covariance = self._between(points, points)
+        t = points.torque.T
+        later = (rows.epoch[:, None] == rows.epoch[None]) & (rows.epoch[:, None] > 0)
         covariance += later * free[:, None, None] ** 2 * (1.0 + t[:, :, None] * t[:, None, :])
-        index = np.arange(len(data.epoch))
+        index = np.arange(len(rows))
         covariance[:, index, index] += (noise**2 + level.rough**2)[:, None]
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
-        columns = self._whitener @ data.columns.swapaxes(0, 1)
-        residual = self._whitener @ data.residual.T[:, :, None]
+        columns = self._whitener @ of_model.swapaxes(0, 1)
+        residual = self._whitener @ rows.residual.T[:, :, None]
         flat = columns.reshape(-1, shared)
         information = np.eye(shared) + flat.T @ flat
         self._mean = np.asarray(np.linalg.solve(information, flat.T @ residual.ravel()))
@@ -72,7 +61,7 @@ class Posterior:
         covariance = self._between(points, points)
         mean = at @ self._mean
         if self._whitener is not None:
-            across = self._between(self._data.points, points)
+            across = self._between(self._points, points)
             known = self._whitener @ across
             covariance -= known.swapaxes(1, 2) @ known
             mean = mean + (known.swapaxes(1, 2) @ self._left)[:, :, 0]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.saved_values import UNREADABLE, known
+from calib.observer.saved_values import known
 from gcomp.arrays import Array, as_array
 
 EPOCH_ROWS = 40
@@ -96,20 +96,15 @@ class Reference:
         values = {name: [known(getattr(rows, name)) for rows in (self.rows, self._pending)] for name in ROWS}
         return {"reference": {**values, "open": self._epoch}}
 
-    def restore(self, values: dict[str, Any]) -> bool:
-        """Continue from saved values; False, and nothing changed, if they do not fit. Older states have none."""
+    def restore(self, values: dict[str, Any]) -> None:
+        """Older states have none."""
         n = self.rows.position.shape[1]
         if "reference" not in values:
             self.forget()
-            return True
-        try:
-            saved = values["reference"]
-            rows, pending = (_read({name: saved[name][part] for name in ROWS if name in saved}, n) for part in (0, 1))
-            epoch = int(saved["open"])
-        except UNREADABLE:
-            return False
-        self.rows, self._pending, self._epoch = rows, pending, epoch
-        return True
+            return
+        saved = values["reference"]
+        rows = [_read({name: saved[name][part] for name in ROWS if name in saved}, n) for part in (0, 1)]
+        (self.rows, self._pending), self._epoch = rows, int(saved["open"])
 
 
 def _read(saved: dict[str, Any], n: int) -> Rows:

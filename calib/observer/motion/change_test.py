@@ -5,14 +5,13 @@ by BIC, as in the test at rest (docs/theory.md, section 6).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 
 import numpy as np
 
 from calib.creep.parameters import family_slices
-from calib.observer.cause_test import Verdict, smallest_noticed_change, solve_whitened, span
 from calib.observer.config import ObserverConfig
+from calib.observer.evidence import ChangeFit, ChangeHypothesis, ResidualTest, Verdict
 from calib.observer.motion.belief import USUAL_ROWS, MotorBelief
 from calib.observer.motion.passages import Passage
 from gcomp.arm.mass_moments import payload_columns
@@ -29,29 +28,6 @@ PAYLOAD_ROUNDS = 2
 """Further linearisations of a payload."""
 
 
-@dataclass(frozen=True, eq=False)
-class ChangeHypothesis:
-    """A change: its columns (K, p) in the readings, per unit of each parameter."""
-
-    cause: str
-    """gain, offset, friction (a share of it) or payload (mass and first moment of the last link's load)."""
-    joint: int | None
-    columns: Array
-
-    @property
-    def name(self) -> tuple[str, int | None]:
-        return self.cause, self.joint
-
-
-@dataclass(frozen=True, eq=False)
-class _ChangeFit:
-    candidate: ChangeHypothesis
-    bic: float
-    chi2: float
-    values: Array
-    covariance: Array
-
-
 class ChangeTest:
     """The candidates fitted to K rows."""
 
@@ -59,46 +35,36 @@ class ChangeTest:
         """Rows after those that the belief rests on."""
         self._config, self._belief, self._passages = config, belief, passages
         residual, jacobian, covariance = belief.linearised(passages)
-        self._root = np.linalg.cholesky(covariance)
         joint = np.array([each.joint for each in passages])
-        candidates = _candidates(belief, jacobian, joint)
-        white = self._whitened(np.column_stack([residual, *(each.columns for each in candidates)]))
-        self._white: Array = white[:, 0]
-        ends = np.cumsum([1, *(each.columns.shape[1] for each in candidates)])
-        self._candidates = [
-            replace(each, columns=white[:, begin:end])
-            for each, (begin, end) in zip(candidates, pairwise(ends), strict=True)
-        ]
-        """With whitened columns."""
-        self.chi2 = float(self._white @ self._white)
+        self.found = ResidualTest(residual, covariance, _candidates(belief, jacobian, joint))
 
     def verdict(self) -> Verdict:
         """The change that explains the rows; cause "none", "unknown" or "ambiguous" where no single one does."""
-        fits = sorted((self._fit(each) for each in self._candidates), key=lambda fit: fit.bic)
+        fits = sorted(map(self._fit, range(len(self.found.hypotheses))), key=lambda fit: fit.bic)
         nothing, config = np.empty(0), self._config
-        none = Verdict("none", None, 1.0, nothing, np.empty((0, 0)), {"misfit": self._misfit(self.chi2, 0)})
-        if not fits or self.chi2 - fits[0].bic < config.evidence:
-            return none if self._misfit(self.chi2, 0) <= MISFIT else _with_cause(none, "unknown")
+        none = Verdict("none", None, 1.0, nothing, np.empty((0, 0)), {"misfit": self._misfit(self.found.chi2, 0)})
+        if not fits or self.found.chi2 - fits[0].bic < config.evidence:
+            return none if self._misfit(self.found.chi2, 0) <= MISFIT else _with_cause(none, "unknown")
         best, others = fits[0], fits[1:]
-        scores = np.array([fit.bic for fit in fits] + [self.chi2])
+        scores = np.array([fit.bic for fit in fits] + [self.found.chi2])
         weight = np.exp(-(scores - best.bic) / 2)
         nearest = others[0].bic - best.bic if others else np.inf
-        evidence = {"none": round(self.chi2 - best.bic, 1), "next": round(float(nearest), 1)}
-        inexact = INEXACT**2 * (self.chi2 - best.chi2)
+        evidence = {"none": round(self.found.chi2 - best.bic, 1), "next": round(float(nearest), 1)}
+        inexact = INEXACT**2 * (self.found.chi2 - best.chi2)
         evidence["misfit"] = self._misfit(best.chi2 - inexact, len(best.values))
         values, covariance = best.values, best.covariance
-        cause, joint = best.candidate.name
+        cause, joint = best.hypothesis.cause, best.hypothesis.joint
         found = Verdict(cause, joint, float(1 / weight.sum()), values, covariance, evidence)
         if evidence["misfit"] > MISFIT or (cause == "payload" and values[0] < 0):
             return _with_cause(found, "unknown")
-        rivals = [fit.candidate for fit in others if fit.bic - best.bic < config.evidence]
+        rivals = [fit.hypothesis for fit in others if fit.bic - best.bic < config.evidence]
         if rivals:
             return _with_cause(found, "ambiguous", tuple(each.cause for each in rivals))
         return found
 
     def denies(self, cause: str, joint: int | None, values: Array) -> bool:
         """Whether these rows show that an earlier change of these values is there no more."""
-        own = next((each for each in self._candidates if each.name == (cause, joint)), None)
+        own = self._index(cause, joint)
         if own is None:
             return False
         fit = self._fit(own)
@@ -114,55 +80,43 @@ class ChangeTest:
         """
         config = self._config
         before = np.diag([config.initial_gain_std**-2 * 1e-2, config.initial_offset_std**-2 * 1e-2])
-        columns = [each.columns for each in self._candidates if each.name in (("gain", joint), ("offset", joint))]
+        places = [self._index(cause, joint) for cause in ("gain", "offset")]
+        columns = [self.found.columns[place] for place in places if place is not None]
         if not columns:
             return np.zeros(2), np.linalg.inv(before)
         white = np.hstack(columns)
         covariance = np.asarray(np.linalg.inv(white.T @ white + before), dtype=np.float64)
-        change: Array = covariance @ white.T @ self._white
+        change: Array = covariance @ white.T @ self.found.residual
         return change, covariance
 
     def noticed(self, cause: str, joint: int) -> float:
         """Size of a change that is noticed in one case of two by as many rows: over "none", and over every rival."""
-        own = next((each for each in self._candidates if each.name == (cause, joint)), None)
+        own = self._index(cause, joint)
         if own is None:
             return float("nan")
-        others = (each.columns for each in self._candidates if each is not own)
-        rivals = ((span(columns), columns.shape[1]) for columns in others)
-        return smallest_noticed_change(own.columns[:, 0], rivals, self._config.evidence)
+        rivals = [k for k in range(len(self.found.hypotheses)) if k != own]
+        return self.found.noticed(own, rivals, self._config.evidence)
 
-    def _whitened(self, columns: Array) -> Array:
-        white: Array = np.linalg.solve(self._root, columns)
-        return white
+    def _index(self, cause: str, joint: int | None) -> int | None:
+        known = [(each.cause, each.joint) for each in self.found.hypotheses]
+        return known.index((cause, joint)) if (cause, joint) in known else None
 
-    def _fit(self, candidate: ChangeHypothesis) -> _ChangeFit:
-        if candidate.cause == "payload":
-            return self._fit_payload(candidate)
-        return self._least_squares(candidate, self._white, 0.0)
-
-    def _fit_payload(self, candidate: ChangeHypothesis) -> _ChangeFit:
-        """Linearised again at the load found: friction goes with torque, whose sign a load may turn."""
-        arm, values = self._belief.arm, np.zeros(4)
-        per_unit = np.column_stack(payload_columns(arm))
-        fit = self._least_squares(candidate, self._white, values)
-        for _ in range(PAYLOAD_ROUNDS):
-            values = fit.values
+    def _fit(self, index: int) -> ChangeFit:
+        """A payload is linearised again at the load found: friction goes with torque, whose sign a load may turn."""
+        fit, own = self.found.fit(index), self.found.hypotheses[index]
+        for _ in range(PAYLOAD_ROUNDS if own.cause == "payload" else 0):
+            arm, values = self._belief.arm, fit.values
+            per_unit = np.column_stack(payload_columns(arm))
             residual, jacobian, _ = self._belief.linearised(self._passages, per_unit @ values)
             columns = jacobian[:, family_slices(arm.n)["beta"]] @ per_unit
-            white = self._whitened(np.column_stack([residual, columns]))
-            fit = self._least_squares(replace(candidate, columns=white[:, 1:]), white[:, 0], values)
+            white = self.found.whitened(np.column_stack([residual, columns]))
+            change = self.found.fit_columns([own], white[:, 1:], white[:, 0])
+            fit = replace(change, values=values + change.values)
         return fit
 
-    def _least_squares(self, candidate: ChangeHypothesis, target: Array, around: Array | float) -> _ChangeFit:
-        """The candidate's parameters from whitened residuals that it has at values `around`."""
-        found = solve_whitened(candidate.columns, target)
-        bic = found.chi2 + found.shown * float(np.log(len(target)))
-        return _ChangeFit(candidate, bic, found.chi2, around + found.values, found.covariance)
-
     def _misfit(self, chi2: float, parameters: int) -> float:
-        """χ² above its degrees of freedom, in standard deviations, those of the rows' own scatter included."""
-        free, known = max(len(self._white) - parameters, 1), len(self._belief.learnt) + USUAL_ROWS
-        return round(float((chi2 - free) / np.sqrt(2 * free * (1 + free / known))), 2)
+        known = len(self._belief.learnt) + USUAL_ROWS
+        return self.found.misfit(chi2, parameters, (len(self._passages) - parameters) / known)
 
 
 def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[ChangeHypothesis]:

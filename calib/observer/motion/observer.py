@@ -160,7 +160,8 @@ class MovingObserver:
         """The rows that the belief rests on, and those since, as JSON values."""
         rows = {"learnt": self._belief.learnt, "block": self._block, "recent": self._recent}
         saved: dict[str, Any] = {name: [each.to_json() for each in some] for name, some in rows.items()}
-        return {"schema": SCHEMA, "count": self._count.tolist(), "reported": self._reported_json(), **saved}
+        reported = [self._reported.cause, self._reported.joint, self._reported.values.tolist()]
+        return {"schema": SCHEMA, "count": self._count.tolist(), "reported": reported, **saved}
 
     def restore(self, values: dict[str, Any]) -> bool:
         n = self.arm.n
@@ -181,9 +182,6 @@ class MovingObserver:
         self._block, self._recent, self._count = block, recent, count
         self._reported, self._tested = reported, None
         return True
-
-    def _reported_json(self) -> list[Any]:
-        return [self._reported.cause, self._reported.joint, self._reported.values.tolist()]
 
     def _angle(self, position: Array) -> Array:
         return np.asarray(self._position_gain * position + self._position_offset)

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 
 from calib.observer.config import ObserverConfig
-from calib.observer.saved_values import UNREADABLE
 from gcomp.arrays import Array, as_array
 
 CHANNELS = ("gain up", "gain down", "offset up", "offset down")
@@ -52,12 +51,7 @@ class Cusum:
         """The sums and how long they have been rising, as JSON values."""
         return {"sums": self._sums.tolist(), "rising": self._rising.tolist()}
 
-    def restore(self, values: dict[str, Any]) -> bool:
-        """Continue from saved values; False, and nothing changed, if they do not fit."""
-        try:
-            sums = as_array("sums", values["sums"], self._sums.shape)
-            rising = as_array("rising", values.get("rising", np.zeros_like(sums)), self._sums.shape).astype(int)
-        except UNREADABLE:
-            return False
-        self._sums, self._rising = sums, rising
-        return True
+    def restore(self, values: dict[str, Any]) -> None:
+        shape, unknown = self._sums.shape, np.zeros_like(self._sums)
+        self._sums = as_array("sums", values["sums"], shape)
+        self._rising = as_array("rising", values.get("rising", unknown), shape).astype(int)

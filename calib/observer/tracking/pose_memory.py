@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 
 from calib.observer.config import ObserverConfig
-from calib.observer.saved_values import UNREADABLE
 from gcomp.arrays import Array, as_array
 
 
@@ -57,19 +56,12 @@ class PoseMemory:
         """Poses, mean residuals and counts as JSON values."""
         return {"places": [self._position.tolist(), self._mean.tolist(), self._count.tolist()]}
 
-    def restore(self, values: dict[str, Any]) -> bool:
-        """Continue from saved values; False, and nothing changed, if they do not fit."""
-        n = self._position.shape[1]
-        try:
-            position, mean, count = values["places"]
-            poses = len(position)
-            position = as_array("position", np.reshape(position, (-1, n)), (poses, n))
-            mean = as_array("mean", np.reshape(mean, (-1, n)), (poses, n))
-            count = as_array("count", count, (poses,)).astype(int)
-        except UNREADABLE:
-            return False
-        self._position, self._mean, self._count = position, mean, count
-        return True
+    def restore(self, values: dict[str, Any]) -> None:
+        position, mean, count = values["places"]
+        poses, n = len(position), self._position.shape[1]
+        self._position = as_array("position", np.reshape(position, (-1, n)), (poses, n))
+        self._mean = as_array("mean", np.reshape(mean, (-1, n)), (poses, n))
+        self._count = as_array("count", count, (poses,)).astype(int)
 
     def _find(self, position: Array) -> int | None:
         if not len(self._position):

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from calib.observer.config import ObserverConfig
-from calib.observer.saved_values import UNREADABLE
 from gcomp.arrays import Array, as_array
 
 
@@ -87,16 +86,12 @@ class SensorFilter:
         arrays = {name: getattr(self, name).tolist() for name in ("state", "covariance", "accepted", "rejected")}
         return {**arrays, "recent": [torque.tolist() for torque in self._recent]}
 
-    def restore(self, values: dict[str, Any]) -> bool:
-        """Continue from saved values; False, and nothing changed, if they do not fit."""
+    def restore(self, values: dict[str, Any]) -> None:
         n = len(self.state)
-        try:
-            state = as_array("state", values["state"], (n, 2))
-            covariance = as_array("covariance", values["covariance"], (n, 2, 2))
-            accepted, rejected = (as_array(name, values[name], (n,)).astype(int) for name in ("accepted", "rejected"))
-            recent = [as_array("recent", torque, (n,)) for torque in values["recent"]]
-        except UNREADABLE:
-            return False
-        self.state, self.covariance, self.accepted, self.rejected = state, covariance, accepted, rejected
+        self.state = as_array("state", values["state"], (n, 2))
+        self.covariance = as_array("covariance", values["covariance"], (n, 2, 2))
+        self.accepted, self.rejected = (
+            as_array(key, values[key], (n,)).astype(int) for key in ("accepted", "rejected")
+        )
+        recent = [as_array("recent", torque, (n,)) for torque in values["recent"]]
         self._recent = deque(recent, maxlen=self._recent.maxlen)
-        return True

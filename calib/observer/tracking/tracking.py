@@ -1,7 +1,6 @@
 """Tracking of every joint's sensor row by row: noise, filtered gain and offset, change detection."""
 
 from collections import deque
-from copy import copy
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from calib.observer.cause_test import CauseTest, DetectionLimits, limits
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import DriftFinding
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.saved_values import UNREADABLE, read_rows, save_rows
+from calib.observer.saved_values import read_rows, restored, save_rows
 from calib.observer.tracking.cusum import Cusum
 from calib.observer.tracking.pose_memory import PoseMemory
 from calib.observer.tracking.sensor_filter import SensorFilter
@@ -186,24 +185,16 @@ class Tracking:
         own["suspected_rows"] = self._suspected
         return own | self.belief.save() | self.filter.save() | self._cusum.save() | self._poses.save()
 
-    def restore(self, values: dict[str, Any]) -> bool:
-        """Continue from saved values; False, and nothing changed, if they do not fit."""
-        belief, sensors = copy(self.belief), copy(self.filter)
-        cusum, poses = copy(self._cusum), copy(self._poses)
-        try:
-            sigma, rows = as_array("sigma", values["sigma"], self.sigma.shape), int(values["rows"])
-            saved = values.get("since", [])
-            since = read_rows([[*row[:4], *row[5:]] for row in saved], len(sigma))
-            known, suspected = [bool(row[4]) for row in saved], int(values.get("suspected_rows", 0))
-        except UNREADABLE:
-            return False
-        fits = belief.restore(values) and sensors.restore(values) and cusum.restore(values) and poses.restore(values)
-        if not fits:
-            return False
-        self.sigma, self.rows, self._suspected = sigma, rows, suspected
-        self._since = deque(zip(since, known, strict=True), maxlen=self._since.maxlen)
-        self.belief, self.filter, self._cusum, self._poses = belief, sensors, cusum, poses
-        return True
+    def restore(self, values: dict[str, Any]) -> None:
+        self.sigma, self.rows = as_array("sigma", values["sigma"], self.sigma.shape), int(values["rows"])
+        saved, self._suspected = values.get("since", []), int(values.get("suspected_rows", 0))
+        rows, known = (
+            read_rows([[*row[:4], *row[5:]] for row in saved], len(self.sigma)),
+            [bool(row[4]) for row in saved],
+        )
+        self._since = deque(zip(rows, known, strict=True), maxlen=self._since.maxlen)
+        self.belief, self.filter = restored(self.belief, values), restored(self.filter, values)
+        self._cusum, self._poses = restored(self._cusum, values), restored(self._poses, values)
 
 
 def _arrays(rows: list[StaticReading]) -> tuple[Array, Array, Array, Array]:

@@ -14,10 +14,10 @@ from armlink.arm_file import load_arm
 from armlink.cli import run
 from armlink.link.link import Link
 from calib.arm.kinematics import DriveLimits
+from calib.dataset import load_data
 from calib.install import apply
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
-from calib.sweep.dataset import load_data
 from calib.sweep.run import run_sweep
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm

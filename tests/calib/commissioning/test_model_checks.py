@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armlink.arm_file import load_arm
-from calib.commissioning.finding import SetupFinding
+from armlink.drives.findings import SetupFinding
 from calib.commissioning.model_checks import model_findings
 
 

@@ -15,7 +15,7 @@ from calib.creep.fit import CreepFit, fit_rows
 from calib.creep.model import CreepModel
 from calib.creep.parameters import Doubt
 from calib.creep.plan import plan_creep
-from calib.creep.record import calibration_record, gravity_record, missing
+from calib.creep.record import CreepCalibration
 from calib.plan.types import SweepPlan
 from gcomp.gravity.torque import gravity_torque
 
@@ -103,7 +103,7 @@ def test_a_loaded_pass_alone_after_the_empty_one_passes_warming_off_as_scale() -
 
 
 def test_without_a_mass_no_torque_constant_is_given() -> None:
-    reasons = missing(fitted(drawn(5, "empty empty")))
+    reasons = CreepCalibration(fitted(drawn(5, "empty empty"))).reasons
     assert {joint for joint, parameter in reasons if parameter == "gain"} == set(arm().joint_names)
     assert "reference mass" in reasons[arm().joint_names[3], "gain"]
 
@@ -113,13 +113,13 @@ def test_a_vertical_axis_is_named_with_its_remedy() -> None:
     assert any("openarm_right_joint1" in note and "tilted" in note for note in plan(True).notes)
     made = draw_creep(arm(True), plan(True), 6, plan(True).reference_mass)
     fit = fit_rows(gcomp_arm(arm(True)), made.rows, rated)
-    reasons = missing(fit)
+    reasons = CreepCalibration(fit).reasons
     assert "vertical" in reasons["openarm_right_joint1", "gain"]
     assert [joint for joint, parameter in reasons if parameter == "gain"] == ["openarm_right_joint1"]
     assert np.abs(fit.value("gain") / made.warm_gain - 1)[1:].max() < 0.015
-    record = calibration_record(fit, arm(True))
+    record = CreepCalibration(fit).record(arm(True))
     assert record.joints[0].gain is None
-    assert not any(gravity_record(fit, arm(True), record).identifiable[:2])
+    assert not any(CreepCalibration(fit).gravity.record(arm(True), record).identifiable[:2])
 
 
 @pytest.mark.long
@@ -130,12 +130,12 @@ def test_an_arm_whose_axes_meet_has_no_scale_until_the_place_of_the_mass_is_meas
     made = draw_creep(wrist, planned, 4, planned.reference_mass)
     rated = wrist.require_link().rated_torques
     fit = fit_rows(gcomp_arm(wrist), made.rows, rated)
-    reasons = missing(fit)
+    reasons = CreepCalibration(fit).reasons
     assert all("meet in one point" in reasons[name, "gain"] for name in ("j2", "j3", "j4"))
-    assert not gravity_record(fit, wrist, None).identifiable.count(True)
+    assert not CreepCalibration(fit).gravity.record(wrist, None).identifiable.count(True)
     measured = SweepSection(reference_point=tuple(made.truth.attachment + np.array([3e-4, -4e-4, 4e-4])))
     cured = fit_rows(gcomp_arm(wrist), made.rows, rated, Doubt.of(measured))
-    assert [joint for joint, parameter in missing(cured) if parameter == "gain"] == ["j1"]
+    assert [joint for joint, parameter in CreepCalibration(cured).reasons if parameter == "gain"] == ["j1"]
     off = cured.value("gain") / made.warm_gain - 1
     assert np.abs(off[1:] / (cured.std("gain") / made.warm_gain)[1:]).max() < 3
     assert np.abs(off[1:]).max() < 0.015
@@ -158,7 +158,7 @@ def test_a_push_on_one_sweep_is_named_and_left_out() -> None:
 
 def test_records_keep_friction_and_temperature() -> None:
     made = drawn(8)
-    record = calibration_record(fitted(made), arm())
+    record = CreepCalibration(fitted(made)).record(arm())
     motor = record.joints[1].motor
     assert motor is not None
     assert motor.coulomb[0] == pytest.approx(made.state.coulomb[1], abs=0.1)
@@ -175,5 +175,5 @@ def test_a_cable_that_pulls_in_every_sweep_is_named_and_no_constant_is_given() -
     fit = fit_rows(gcomp_arm(arm()), replace(rows, reading=rows.reading + pull), arm().require_link().rated_torques)
     assert [each.joint for each in fit.springs] == ["openarm_right_joint4"]
     assert fit.springs[0].stiffness == pytest.approx(0.8, abs=0.3)
-    assert "cable" in missing(fit)["openarm_right_joint4", "gain"]
+    assert "cable" in CreepCalibration(fit).reasons["openarm_right_joint4", "gain"]
     assert not fitted(made).findings

@@ -10,13 +10,13 @@ from soft_links import soft_arm
 
 from armlink.errors import Refused
 from armlink.link.link import Link
-from calib.creep.choice import is_creep, sweep_motion
+from calib.arm.sweep_section import sweep_motion
 from calib.creep.fit import fit_creep
 from calib.creep.plan import CreepGround, check_creep_limits, plan_creep
-from calib.creep.record import calibration_record, gravity_record
-from calib.creep.run import contacts, run_creep
-from calib.creep.verify import verify_creeping
-from calib.sweep.dataset import load_data
+from calib.creep.record import CreepCalibration
+from calib.dataset import load_data
+from calib.sweep.run import run_sweep
+from calib.sweep.verify import run_verify
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -42,12 +42,12 @@ def test_passes_through_the_link_find_constants_that_verification_confirms(tmp_p
         link.enable()
         for name, mass in (("empty", 0.0), ("loaded", plan.reference_mass), ("again", 0.0)):
             simulated.attach_mass(mass, simulated.truth.attachment)
-            passes.append(run_creep(link, arm(), tmp_path / name, reference_mass=mass, plan=plan))
+            passes.append(run_sweep(link, arm(), tmp_path / name, reference_mass=mass, plan=plan))
         fit = fit_creep(arm(), passes)
-        record = calibration_record(fit, arm())
-        check = verify_creeping(link, arm(), gravity_record(fit, arm(), record), record, poses=3)
+        record = CreepCalibration(fit).record(arm())
+        check = run_verify(link, arm(), CreepCalibration(fit).gravity.record(arm(), record), record, poses=3)
         link.disable()
-    assert all(is_creep(data) and not contacts(data) for data in passes)
+    assert all(data.creeps and not data.contacts for data in passes)
     np.testing.assert_allclose(fit.value("gain") / simulated.true_sensors.gain, 1.0, atol=0.015)
     assert not fit.findings
     assert check.passed
@@ -63,9 +63,9 @@ def test_a_pass_goes_on_after_what_is_on_disk(tmp_path: Path) -> None:
     with opened(simulated) as link:
         link.start()
         link.enable()
-        run_creep(link, arm(), tmp_path / "pass", plan=half)
+        run_sweep(link, arm(), tmp_path / "pass", plan=half)
         before = load_data(tmp_path / "pass").readings
-        made = run_creep(link, arm(), tmp_path / "pass", plan=half, resume=True)
+        made = run_sweep(link, arm(), tmp_path / "pass", plan=half, resume=True)
         link.disable()
     assert len(made.readings) == len(before)
 
@@ -85,10 +85,10 @@ def test_a_joint_that_meets_something_is_led_back_and_the_sweep_is_noted(tmp_pat
         link.enable()
         simulated.plant.model.jnt_range[joint][1] = sweep.steps[len(sweep.steps) // 2]
         mixed = plan.model_copy(update={"sweeps": (*others, sweep)})
-        data = run_creep(link, arm(), tmp_path / "pass", plan=mixed)
+        data = run_sweep(link, arm(), tmp_path / "pass", plan=mixed)
         link.disable()
-    assert [each.reading for each in contacts(data)] == [sweep.name]
-    assert "fore" in contacts(data)[0].reason
+    assert [each.reading for each in data.contacts] == [sweep.name]
+    assert "fore" in data.contacts[0].reason
     assert {each.joint for each in data.readings} == {0}
 
 

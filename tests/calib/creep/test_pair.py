@@ -10,8 +10,8 @@ from armlink.errors import BadInput
 from armlink.link.link import Link
 from calib.arm.sweep_section import CreepSection, ParkedArm, SweepSection
 from calib.creep.plan import plan_creep
-from calib.creep.run import run_creep
 from calib.plan.collisions import Collided, Geometry, check_creeps
+from calib.sweep.run import run_sweep
 from sim_bus.arms import __file__ as bundled
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
@@ -45,7 +45,7 @@ def test_a_sweep_that_would_hit_the_parked_arm_is_refused_by_name_before_anythin
         link.enable()
         before = simulated.plant.position.copy()
         with pytest.raises(Collided, match=r"would touch parked openarm_right_\w+ .*mm deep"):
-            run_creep(link, pair, tmp_path / "empty", plan=plan)
+            run_sweep(link, pair, tmp_path / "empty", plan=plan)
         np.testing.assert_allclose(simulated.plant.position, before, atol=0.02)
         link.disable()
 

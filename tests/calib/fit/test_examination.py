@@ -11,13 +11,13 @@ from sweep_arms import random_arm
 
 from armlink.arm_file import ArmFile, load_arm
 from calib.arm.kinematics import gcomp_arm
+from calib.dataset import SweepData
 from calib.fit.examination import _without_plateaus
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
 from calib.fit.sweep_readings import sweep_readings
 from calib.motion.encoder_check import missing_bit, stuck_bits
 from calib.motion.static_reading import StaticReading
-from calib.sweep.dataset import SweepData
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth

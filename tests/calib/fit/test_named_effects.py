@@ -8,9 +8,9 @@ from examined_sweeps import JOINT, bent, swept
 from sweep_arms import random_arm
 
 from armlink.arm_file import ArmFile
+from calib.dataset import SweepData
 from calib.fit.sensor_fit import fit_sensors
 from calib.motion.static_reading import StaticReading
-from calib.sweep.dataset import SweepData
 from sim_bus.truth import Truth
 
 

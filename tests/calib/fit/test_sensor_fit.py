@@ -9,9 +9,9 @@ from synthetic_sweeps import passes, plans
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BadInput, Refused
+from calib.dataset import SweepData
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
-from calib.sweep.dataset import SweepData
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

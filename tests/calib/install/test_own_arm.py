@@ -12,11 +12,11 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import Refused
 from armlink.link.link import Link
 from calib.daemon.view.api_models import State
+from calib.dataset import Manifest, SweepData, drives_of
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
-from calib.sweep.dataset import Manifest, SweepData, drives_of
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth

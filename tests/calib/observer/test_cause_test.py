@@ -10,8 +10,8 @@ from drawn_arms import drawn_arm
 from effects_on_readings import CONFIG, SIGMA, payload
 
 from calib.arm.kinematics import gcomp_arm
-from calib.observer.cause_test import CauseTest, Verdict, smallest_noticed_change, span
-from calib.observer.effect_dictionary import dictionary
+from calib.observer.cause_test import CauseTest, dictionary
+from calib.observer.evidence import Verdict, smallest_noticed_change, span
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns

@@ -10,7 +10,7 @@ from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.discrepancy.kernel import Kernel
 from calib.observer.discrepancy.level import DiscrepancyLevel
-from calib.observer.effect_dictionary import DRIFT
+from calib.observer.evidence import DRIFT
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.identify.readings import StaticReadings
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calib.observer.config import ObserverConfig
+from calib.observer.saved_values import UNREADABLE, restored
 from calib.observer.tracking.pose_memory import PoseMemory
 
 CONFIG = ObserverConfig()
@@ -63,7 +64,7 @@ def test_the_latest_poses_are_remembered_until_all_are_forgotten():
 
 def test_what_is_saved_is_known_after_a_restart():
     memory, after = memory_of(np.array([[0.5, 0.1], [0.7, 0.3]])), PoseMemory(2, CONFIG)
-    assert after.restore(json.loads(json.dumps(memory.save())))
+    after.restore(json.loads(json.dumps(memory.save())))
     np.testing.assert_array_equal(after.expected(HERE, MODEL, NOISE), memory.expected(HERE, MODEL, NOISE))
     for wrong in (
         {},
@@ -71,5 +72,6 @@ def test_what_is_saved_is_known_after_a_restart():
         {"places": [[[1.0, 2.0]], [[1.0]], [1]]},
         {"places": [[["a", "b"]], [[1, 2]], [1]]},
     ):
-        assert not after.restore(wrong)
+        with pytest.raises(UNREADABLE):
+            restored(after, wrong)
     assert after.seen(HERE) == 2

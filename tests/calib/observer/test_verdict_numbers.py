@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from effects_on_readings import CONFIG, SIGMA, payload
 
-from calib.observer.cause_test import CauseTest, smallest_noticed_change
+from calib.observer.cause_test import CauseTest
+from calib.observer.evidence import smallest_noticed_change
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.gravity.torque import gravity_torque
 from gcomp.identify.readings import StaticReadings

@@ -10,9 +10,9 @@ from sweep_arms import random_arm, synthetic_pass
 from armlink.arm_file import ArmFile
 from armlink.cli import run
 from armlink.errors import BadInput
+from calib.dataset import MANIFEST, DataWriter, Manifest, PlanLine, data_sets, labels, load_data
 from calib.fit.sensor_fit import fit_sensors
 from calib.plan.sweep_plan import plan_sweep
-from calib.sweep.dataset import MANIFEST, DataWriter, Manifest, PlanLine, data_sets, labels, load_data
 from sim_bus.truth import Truth
 
 ARM = random_arm(1, 3)

@@ -13,11 +13,11 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import Refused
 from armlink.link.link import Link
 from calib.arm.kinematics import model_arm
+from calib.dataset import DataWriter, Manifest, PlanLine
 from calib.plan.plan_limits import check_bias, check_limits
 from calib.plan.rough_gravity import guess_of_model
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import SweepPlan
-from calib.sweep.dataset import DataWriter, Manifest, PlanLine
 from calib.sweep.run import run_sweep
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm

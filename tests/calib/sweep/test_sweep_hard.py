@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hard_cases import Outcome, hard_arm, judge, stick, sweep_case
 
+from calib.dataset import load_data
 from calib.motion.encoder_check import EncoderFault
-from calib.sweep.dataset import load_data
 
 SEED = {"range": 1, "slip": 7, "vertical": 3}
 

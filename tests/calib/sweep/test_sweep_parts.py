@@ -18,12 +18,12 @@ from armlink.link.integral import slowest_time
 from armlink.link.types import Sample
 from calib.arm.sweep_section import SweepSection
 from calib.commands.screen import unsettled_lines
+from calib.dataset import DataWriter, Manifest, PlanLine, encode, load_data
 from calib.motion.mover import STOP_TOLERANCE, Mover
 from calib.motion.settle_rule import SettleRule
 from calib.motion.static_reading import StaticReading
 from calib.motion.trajectory import trajectory
 from calib.plan.sweep_plan import plan_sweep
-from calib.sweep.dataset import DataWriter, Manifest, PlanLine, encode, load_data
 from gcomp.arrays import Array
 from sim_bus.truth import Truth
 

@@ -8,7 +8,7 @@ from sweep_arms import at_rate, random_arm, with_section
 
 from armlink.errors import BusFault
 from armlink.link.link import Link
-from calib.sweep.dataset import load_data
+from calib.dataset import load_data
 from calib.sweep.run import run_sweep
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.node.cia402 import PowerState

@@ -13,11 +13,11 @@ from armlink.errors import HostLate, Refused, Stall
 from armlink.link.link import Link
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import sweep_section
+from calib.dataset import SweepData, load_data
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.motion.mover import Mover, Slipped
-from calib.sweep import run as runner
-from calib.sweep.dataset import SweepData, load_data
+from calib.sweep import step_pass as runner
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import run_verify
 from sim_bus.bus.lock_step import LockStepBus
@@ -189,7 +189,7 @@ def test_a_joint_that_cannot_be_held_on_its_stop_is_noticed(chain: Chain) -> Non
 def test_a_joint_that_slips_is_pressed_harder_and_at_its_limit_the_others_move_slower(chain: Chain) -> None:
     limits = DriveLimits.of(chain.arm)
     mover = Mover(chain.link, sweep_section(chain.arm), limits)
-    run = runner._StepPass(mover, None, None, lambda: 0.0, [])
+    run = runner.StepPass(chain.arm, mover, None, chain.data[0], None, lambda stall: False)
     assert chain.data[0].plan is not None
     sweep = chain.data[0].plan.sweeps[0]
     joint = int(np.flatnonzero(sweep.stops)[0])

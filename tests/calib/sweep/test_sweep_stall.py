@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from small_pair import ARMLINK, FALSE, describe, simulated
 
-from calib.sweep.dataset import load_data
+from calib.dataset import load_data
 
 pytestmark = pytest.mark.slow
 

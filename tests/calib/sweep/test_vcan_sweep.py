@@ -7,7 +7,7 @@ import pytest
 from small_pair import MASS, SEED, armlink, describe, simulated
 
 from armlink.arm_file import load_arm
-from calib.sweep.dataset import load_data
+from calib.dataset import load_data
 from sim_bus.truth import Truth
 
 pytestmark = pytest.mark.vcan

@@ -23,7 +23,7 @@ from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID, SDO_RESPONS
 from armlink.drives.canopen.profile import Profile, lacking
 from armlink.drives.canopen.sdo import NodeServices, Pump, PumpedNetwork
 from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE, told_units
-from armlink.drives.findings import DriveFinding, FoundDrive
+from armlink.drives.findings import SetupFinding, FoundDrive
 from armlink.errors import BusFault
 
 SEARCH_SECONDS = 0.3
@@ -134,7 +134,7 @@ class FoundNodes:
         return FoundDrive(identity.node, identity.vendor, identity.product, *ratings, None if own else keys)
 
 
-def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[DriveFinding]:
+def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFinding]:
     """Findings about the drives of an arm on an open bus of this name; raises BusFault."""
     link, drives = arm_file.require_link(), FoundNodes(opened)
     by_node, ours = {each.node: each for each in drives.found}, {joint.settings.node for joint in link.joints}
@@ -146,22 +146,22 @@ def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[DriveF
         if drive is None:
             find = f"armlink new {arm_file.argument} --bus {bus} --out found.yaml"
             remedy = f"check its power, wiring and node id{unknown}; the drives are found by {find}"
-            yield DriveFinding("error", f"no answer on {bus}", where, remedy)
+            yield SetupFinding("error", f"no answer on {bus}", where, remedy)
             continue
         for differs in identity_mismatches(expected_identity(joint, sheet), vars(drives.identities[node])):
             remedy = "connect the right arm, or correct identity under link.joints"
-            yield DriveFinding("error", f"another controller: {differs}", where, remedy)
+            yield SetupFinding("error", f"another controller: {differs}", where, remedy)
         if abs(drive.rated_torque - joint.rated_torque) > RATED_TORQUE_TOLERANCE * joint.rated_torque:
             what = f"its rated torque (6076h) is {drive.rated_torque:g} N·m, the arm file has {joint.rated_torque:g}"
-            yield DriveFinding(
+            yield SetupFinding(
                 "error", what, where, f"set rated_torque: {drive.rated_torque:g}, or connect its own drive"
             )
         if drive.max_torque < joint.max_torque * (1 - RATED_TORQUE_TOLERANCE):
             what = f"the drive allows {drive.max_torque:g} N·m (6072h), max_torque is {joint.max_torque:g}"
-            yield DriveFinding("warning", what, where, f"lower max_torque to {drive.max_torque:g}, or raise 6072h")
+            yield SetupFinding("warning", what, where, f"lower max_torque to {drive.max_torque:g}, or raise 6072h")
     if spare and len(drives.found) - len(spare) == len(link.joints):
         what = f"nodes {', '.join(map(str, spare))} answer and belong to no joint"
-        yield DriveFinding("hint", what, bus, "a gripper or another arm: nothing is sent to them")
+        yield SetupFinding("hint", what, bus, "a gripper or another arm: nothing is sent to them")
 
 
 def scan_report(

@@ -11,11 +11,11 @@ from armlink.link.types import Command
 from calib.arm.kinematics import gcomp_arm
 from calib.creep.fit import fit_creep
 from calib.creep.plan import plan_creep
-from calib.creep.record import calibration_record, gravity_record
-from calib.creep.run import run_creep
+from calib.creep.record import CreepCalibration
 from calib.motion.trajectory import trajectory
 from calib.observer.events import Event
 from calib.observer.observer import observer_of
+from calib.sweep.run import run_sweep
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -34,11 +34,11 @@ def test_a_load_is_told_while_the_arm_carries_it(tmp_path: Path) -> None:
         passes = []
         for name, mass in (("empty", 0.0), ("loaded", plan.reference_mass), ("again", 0.0)):
             simulated.attach_mass(mass)
-            passes.append(run_creep(link, arm, tmp_path / name, reference_mass=mass, plan=plan))
+            passes.append(run_sweep(link, arm, tmp_path / name, reference_mass=mass, plan=plan))
         fit = fit_creep(arm, passes)
-        record = calibration_record(fit, arm)
+        record = CreepCalibration(fit).record(arm)
         rated = arm.require_link().rated_torques
-        watching = observer_of(gcomp_arm(arm), record, gravity_record(fit, arm, record), rated)
+        watching = observer_of(gcomp_arm(arm), record, CreepCalibration(fit).gravity.record(arm, record), rated)
         held = record.torque_calibration()
 
         def work(rows: int) -> list[Event]:

@@ -14,11 +14,12 @@ from judged_creeps import creep_arm
 from calib.arm.kinematics import gcomp_arm
 from calib.creep.fit import fit_rows
 from calib.creep.plan import plan_creep
-from calib.creep.record import calibration_record, gravity_record
+from calib.creep.record import CreepCalibration
 from calib.daemon.view.event_text import describe
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
-from calib.observer.motion.change_test import ChangeHypothesis, ChangeTest
+from calib.observer.evidence import ChangeHypothesis, ResidualTest
+from calib.observer.motion.change_test import ChangeTest
 from calib.observer.motion.observer import MovingObserver
 from calib.observer.observer import Observer, observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -34,8 +35,8 @@ def calibrated() -> tuple[Any, DrawnCreep, CalibrationRecord, GravityRecord]:
     plan = plan_creep(arm)
     made = draw_creep(arm, plan, SEED, plan.reference_mass)
     fit = fit_rows(gcomp_arm(arm), made.rows, arm.require_link().rated_torques)
-    record = calibration_record(fit, arm)
-    return arm, made, record, gravity_record(fit, arm, record)
+    record = CreepCalibration(fit).record(arm)
+    return arm, made, record, CreepCalibration(fit).gravity.record(arm, record)
 
 
 def observer() -> MovingObserver:
@@ -89,9 +90,8 @@ def test_a_change_that_hardly_explains_the_rows_is_none(size: float, cause: str)
     """Fifty rows of whitened noise, and a gain's column in them."""
     random, test = np.random.default_rng(6), ChangeTest.__new__(ChangeTest)
     gain = ChangeHypothesis("gain", 0, random.standard_normal((50, 1)))
-    test._config, test._belief, test._candidates = ObserverConfig(), SimpleNamespace(learnt=range(100)), [gain]  # type: ignore[assignment]
-    test._white = random.standard_normal(50) + size * gain.columns[:, 0]
-    test.chi2 = float(test._white @ test._white)
+    test._config, test._belief, test._passages = ObserverConfig(), SimpleNamespace(learnt=range(100)), [None] * 50  # type: ignore[assignment, list-item]
+    test.found = ResidualTest(random.standard_normal(50) + size * gain.columns[:, 0], np.eye(50), [gain])
     assert test.verdict().cause == cause
 
 

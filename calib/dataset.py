@@ -153,6 +153,16 @@ class SweepData:
         return self.plan is not None and len(self.readings) >= self.plan.readings
 
     @property
+    def contacts(self) -> tuple[StallLine, ...]:
+        """Creeps that ended because the joint met something."""
+        return tuple(stall for stall in self.stalls if stall.contact)
+
+    @property
+    def creeps(self) -> bool:
+        """Whether it is of creep sweeps instead of steps at rest."""
+        return self.plan is not None and any(sweep.speed is not None for sweep in self.plan.sweeps)
+
+    @property
     def unsettled(self) -> tuple[StaticReading, ...]:
         """Readings that were taken before the arm was at rest."""
         return tuple(reading for reading in self.readings if not reading.settled)
@@ -330,6 +340,13 @@ def data_sets(given: Sequence[Path | SweepData]) -> list[SweepData]:
     return found
 
 
+def all_creep(data: Sequence[SweepData]) -> bool:
+    """Whether the data sets are creep sweeps; raises BadInput where some are and some are not."""
+    if any(each.creeps for each in data) and (other := next((each for each in data if not each.creeps), None)):
+        raise BadInput(f"{other.path}: steps at rest, but the other directories are creep sweeps: give one kind")
+    return bool(data) and data[0].creeps
+
+
 def labels(paths: Sequence[Path]) -> list[str]:
     """Names of the data of these paths in records and findings: last names, or the paths where two have the same."""
     names = [path.resolve().name for path in paths]
@@ -346,7 +363,7 @@ def _missing(data: SweepData) -> str:
     if data.plan is None:
         return "its first sweep"
     made = Counter(reading.sweep for reading in data.readings)
-    met = {stall.reading for stall in data.stalls if stall.contact}  # of creeping joints: not repeated
+    met = {stall.reading for stall in data.contacts}  # of creeping joints: not repeated
     for sweep in data.plan.sweeps:
         if sweep.name not in met and made[sweep.name] < (1 if sweep.speed else sweep.readings):
             return f"the end of sweep {sweep.name}"

@@ -1,0 +1,154 @@
+"""Steps at rest: the scout, then each sweep from step to step, its resting joints pressed on stops or held."""
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.errors import Refused, Stall
+from calib.motion.mover import Slipped, Stalled
+from calib.motion.static_reading import StaticReading
+from calib.plan.collisions import check_plan
+from calib.plan.plan_limits import check_bias, check_limits
+from calib.plan.sweep_plan import plan_sweep
+from calib.plan.types import APPROACH, Sweep, SweepPlan
+from calib.sweep.scout import SCOUT, SLOWER, rough_model, run_scout
+from calib.sweep.sweep_pass import SweepPass
+from gcomp.arrays import Array
+
+STOP_DISTANCE = 0.02
+"""Distance from a stop at which creeping begins [rad]."""
+RETRIES = 3
+"""How often a joint that slipped or stalled is tried again before the sweep gives up."""
+
+
+class StepPass(SweepPass):
+    total, acceleration = 0, 1.0
+
+    def planned(self, seed: int, reference_mass: float, given: SweepPlan | None) -> SweepPlan:
+        """That of the data set, else a new one, with the bias torques that the scout finds."""
+        self.readings, self.refuge = list(self.data.readings), self.mover.position.copy()
+        plan = self.data.plan
+        if plan is None:
+            first = plan_sweep(self.arm, seed=seed, reference_mass=reference_mass)
+            self._check(first)
+            self.total = first.readings
+            self._scout(first)
+            resolution = self.mover.known_resolution
+            plan = _final_plan(self.arm, first, self.readings, reference_mass, seed, resolution)
+            self._check(plan)
+            self.keep(plan)
+        else:
+            check_bias(self.arm, plan)
+            self._check(plan)
+            self.mover.resolution = np.where(self.data.resolution > 0, self.data.resolution, np.inf)
+        self.total = plan.readings
+        self.acceleration, self.refuge = plan.travel_acceleration, np.array(plan.scout[0])
+        self.mover.average_to(plan.standard_error)
+        return plan
+
+    def _check(self, plan: SweepPlan) -> None:
+        check_limits(self.arm, plan)
+        check_plan(self.arm, plan)
+
+    def _save(self, reading: StaticReading) -> None:
+        self.writer.append(reading)
+        self.readings.append(reading)
+        joint, name = reading.joint, f"{reading.sweep} {reading.index + 1}"
+        curve = [] if joint is None else [each.torque[joint] for each in self.readings if each.sweep == reading.sweep]
+        self.tell(len(self.readings), self.total, len(self.data.readings), name, curve)
+
+    def _scout(self, plan: SweepPlan) -> None:
+        """Take the scout poses that are still to be taken."""
+        while True:
+            done = {reading.index for reading in self.readings if reading.sweep == SCOUT}
+            try:
+                return run_scout(self.mover, plan, done, self._save)
+            except Stall as stall:
+                self.bridge(stall, f"{SCOUT} {len(done) + 1}")
+
+    def sweep(self, sweep: Sweep) -> None:
+        """Take the readings of one sweep that are still to be taken; a joint that slips is pressed again."""
+        done = {reading.index for reading in self.readings if reading.sweep == sweep.name}
+        open_readings = [index for index in range(sweep.readings) if index not in done]
+        bias = np.array(sweep.bias)
+        retries, standing, detour = 0, False, False
+        while open_readings:
+            index = open_readings[0]
+            try:
+                if not standing:
+                    self._rest_others(sweep, bias, *sweep.target(index), detour=detour)
+                    standing = True
+                rest = self._step(sweep, *sweep.target(index))
+            except Stall as stall:
+                standing, detour = False, True
+                self.bridge(stall, f"{sweep.name} {index + 1}")
+                continue
+            except Slipped as slip:
+                retries += 1
+                standing, detour = False, True
+                sweep, bias = self._firmer(sweep, bias, slip.joint, retries)
+                continue
+            except Stalled:
+                retries += 1
+                standing, detour = False, True
+                self.acceleration *= SLOWER
+                if retries > RETRIES:
+                    raise
+                continue
+            self._save(rest.within(sweep.name, index, np.array(sweep.servo), sweep.joint, sweep.target(index)[1]))
+            open_readings.pop(0)
+
+    def _rest_others(self, sweep: Sweep, bias: Array, target: float, direction: int, *, detour: bool = False) -> None:
+        """Bring the resting joints to their places, by way of a pose known to be good, and press or hold them there."""
+        mover = self.mover
+        if detour:
+            mover.come_to_rest()
+            mover.travel(self.refuge, self.acceleration)
+        mover.hold_all()
+        goal = np.array(sweep.rest)
+        stops = np.array(sweep.stops, dtype=np.int64) * ~np.array(sweep.servo)
+        for joint in np.flatnonzero(stops):
+            goal[joint] = mover.before_stop(int(joint), int(stops[joint]), STOP_DISTANCE)
+        goal[sweep.joint] = target - direction * APPROACH
+        mover.travel(goal, self.acceleration)
+        if stops.any():
+            mover.press(stops, bias)
+
+    def _step(self, sweep: Sweep, target: float, direction: int) -> StaticReading:
+        """Bring the swept joint to a step from its side and read."""
+        mover, joint = self.mover, sweep.joint
+        goal = mover.command.position.copy()
+        if direction * (target - goal[joint]) < APPROACH / 2:
+            goal[joint] = target - direction * APPROACH
+            mover.travel(goal, sweep.acceleration)
+        goal[joint] = target
+        mover.travel(goal, sweep.acceleration)
+        counts = np.array(sweep.servo)
+        counts[joint] = True
+        return mover.rest(counts)
+
+    def _firmer(self, sweep: Sweep, bias: Array, joint: int, retries: int) -> tuple[Sweep, Array]:
+        """For a joint that slipped: a fifth more torque or, where it has all that it may, slower motion of the others.
+
+        Raises Refused where that was tried often enough.
+        """
+        name, limit = self.mover.link.names[joint], self.mover.limits.max_torque[joint]
+        more = bias.copy()
+        more[joint] = np.clip(1.2 * bias[joint], -limit, limit)
+        if retries > RETRIES:
+            raise Refused(
+                f"{name}: slips off its stop in sweep {sweep.name} at {bias[joint]:.1f} N·m of {limit:.1f} allowed:"
+                " lessen sweep.acceleration, or hold by servo (sweep.hold: servo)"
+            )
+        if more[joint] == bias[joint]:
+            self.acceleration *= SLOWER
+            sweep = sweep.model_copy(update={"acceleration": SLOWER * sweep.acceleration})
+        return sweep, more
+
+
+def _final_plan(
+    arm: ArmFile, first: SweepPlan, readings: list[StaticReading], mass: float, seed: int, resolution: Array
+) -> SweepPlan:
+    """The plan with bias torques, and the scout poses that were reached."""
+    plan = plan_sweep(arm, rough_model(arm, readings), seed=seed, reference_mass=mass, resolution=resolution)
+    reached = tuple(first.scout[reading.index] for reading in readings if reading.sweep == SCOUT)
+    return plan.model_copy(update={"scout": reached})

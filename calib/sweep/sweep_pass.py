@@ -1,0 +1,75 @@
+"""A pass of sweeps under way: what steps at rest and creeps at constant speed have in common."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+from armlink.arm_file import ArmFile
+from armlink.errors import HostLate, Stall
+from calib.dataset import DataWriter, PlanLine, StallLine, SweepData
+from calib.motion.mover import Mover
+from calib.plan.types import Sweep, SweepPlan
+from calib.sweep.stalls import OnStall, repeat_work, restart
+
+Progress = Callable[[int, int, float, str], None]
+"""Called with (readings or sweeps done, how many in all, seconds left, what is being done)."""
+
+BARS = "▁▂▃▄▅▆▇█"
+
+
+class SweepPass(ABC):
+    """`planned`, then `sweep` for each sweep of the plan, then `rest`."""
+
+    def __init__(
+        self,
+        arm: ArmFile,
+        mover: Mover,
+        writer: DataWriter,
+        data: SweepData,
+        progress: Progress | None,
+        on_stall: OnStall,
+    ) -> None:
+        """`data` is what the writer's directory has so far."""
+        self.arm, self.mover, self.writer, self.data = arm, mover, writer, data
+        self.progress: Progress = progress or (lambda *_: None)
+        self._began, self._on_stall = time.monotonic(), on_stall
+
+    @abstractmethod
+    def planned(self, seed: int, reference_mass: float, given: SweepPlan | None) -> SweepPlan:
+        """The plan of this pass, checked and on disk: that of the data set, else the one given, else a new one."""
+
+    @abstractmethod
+    def sweep(self, sweep: Sweep) -> None:
+        """Take the readings of one sweep that are still to be taken, each on disk before the next is begun."""
+
+    def rest(self) -> None:
+        """Every joint under position control, holding."""
+        try:
+            self.mover.hold_all()
+            self.mover.cycle()
+        except Stall as stall:
+            self.bridge(stall, "end")
+
+    def keep(self, plan: SweepPlan) -> None:
+        self.writer.append(PlanLine(plan=plan, resolution=tuple(self.mover.known_resolution.tolist())))
+
+    def bridge(self, stall: Stall, reading: str) -> None:
+        """Note a stall, enable the joints again and hold them where they stand; raises it if that is not wanted."""
+
+        def note(stall: Stall) -> None:
+            late = stall.late * 1e3 if isinstance(stall, HostLate) else None
+            self.writer.append(StallLine(t=self.mover.seen_at, late_ms=late, reading=reading, reason=str(stall)))
+
+        restart(self.mover.link, self._on_stall, stall, note)
+        repeat_work(self.mover.link, self._on_stall, self.mover.resume)
+
+    def tell(self, done: int, total: int, before: int, name: str, curve: Sequence[float]) -> None:
+        """Report what is done, `before` of it by an earlier run; with a plot of the torques of the sweep under way."""
+        left = (time.monotonic() - self._began) / max(done - before, 1) * max(total - done, 0)
+        self.progress(done, total, left, f"{name} {sparkline(curve)}" if curve else name)
+
+
+def sparkline(values: Sequence[float]) -> str:
+    low, high = min(values), max(values)
+    steps = (len(BARS) - 1) / max(high - low, 1e-12)
+    return "".join(BARS[round((value - low) * steps)] for value in values)
