@@ -13,7 +13,7 @@ from typing import Any
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.can_bus import CanBus
 from armlink.drives.base import BasicDrives
-from armlink.drives.findings import SetupFinding, FoundDrives, Result
+from armlink.drives.findings import FoundDrives, Result, SetupFinding
 from armlink.drives.orders import power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits

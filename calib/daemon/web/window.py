@@ -10,7 +10,8 @@ import numpy as np
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
-from armlink.recording.mcap import TOPICS, RecordingWriter
+from armlink.recording.joint_messages import TOPICS
+from armlink.recording.mcap import RecordingWriter
 from calib.daemon.view.api_models import WindowRows
 from calib.daemon.view.view import DaemonView, Window
 from calib.daemon.web.history import Histories

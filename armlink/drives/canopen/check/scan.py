@@ -23,7 +23,7 @@ from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID, SDO_RESPONS
 from armlink.drives.canopen.profile import Profile, lacking
 from armlink.drives.canopen.sdo import NodeServices, Pump, PumpedNetwork
 from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE, told_units
-from armlink.drives.findings import SetupFinding, FoundDrive
+from armlink.drives.findings import FoundDrive, SetupFinding
 from armlink.errors import BusFault
 
 SEARCH_SECONDS = 0.3
