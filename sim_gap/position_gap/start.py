@@ -4,12 +4,13 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+from scipy.stats import qmc
 
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
 from gcomp.estimate.problem import NORMAL
-from sim_gap.position_gap.choice import FEW, LoopSearch, Progress
-from sim_gap.position_gap.fit import LoopFit, batch, residuals
+from sim_gap.position_gap.choice import FEW, LoopSearch, Progress, costs_of
+from sim_gap.position_gap.fit import LoopFit, batch, evaluate, residuals
 from sim_gap.position_gap.parameters import Scales
 from sim_gap.position_gap.plant import Servos
 from sim_gap.position_gap.windows import Windows, thin_moving
@@ -22,6 +23,20 @@ FRICTIONS = 0.0, 0.4
 """Least Coulomb friction that is tried with each gain, as a share of the gain times the RMS error."""
 LEAST_DAMPING = 0.2
 """Least damping that is tried with each gain, over the root of gain times inertia (2 is critical)."""
+SERVOS = 64
+"""Servos with limits of torque and of speed and with a lag that are drawn: a power of two, as Sobol's sequence asks."""
+SERVO_RANGES = {
+    "kp": (0.003, 30.0),
+    "viscous": (0.2, 10.0),
+    "coulomb": (0.02, 2.0),
+    "limit": (0.5, 50.0),
+    "lag": (0.003, 1.0),
+    "slew": (0.05, 5.0),
+}
+"""Their ranges, each drawn in its logarithm: over the model's gain, the root of gain times inertia, the joint's torque
+(friction and limit), 1 s, and the highest speed of the joint."""
+BEST_SERVOS = 3
+"""Drawn servos of each joint from which a fit begins."""
 TURNS = 0.02
 """Speed over which friction changes its direction there [rad/s]."""
 RESTS_RAD = 0.002
@@ -76,17 +91,14 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     costs = np.einsum("ptjw,tjw->pj", np.minimum(np.abs(gaps), 1.0) ** 2, few.data.weight)
     best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
-    names = ("kp", "viscous", "coulomb")
-    # a joint that swings with its servo off shows friction and inertia against gravity, and only both together
-    free = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2)).tolist()
-    active = tuple(
-        () if rest else (*names, "armature") if swings else names for rest, swings in zip(at_rest, free, strict=True)
-    )
+    names = ("kp", "viscous", "coulomb", "armature")  # what every joint has
+    active = tuple(() if rest else names for rest in at_rest)
     kept = {"controller.stiffness"} if not own.complete else set()
     search = replace(search, kept=frozenset(kept))
     few = replace(few, nominal=search.nominal)
     # all rows count at first: far from the arm's motion a robust fit would take the motion for outliers
     fit = few.improve(LoopFit(point, active), 5, NORMAL)
+    fit = _limited_servos(few, fit, own)
     if np.any(search.nominal["creep"] > 0.0):
         rest = {"creep": np.zeros(search.data.joints)}
         at_rest_fit = few.improve(fit.with_values(**rest), 4, NORMAL)
@@ -94,6 +106,57 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
         if float((few.score(at_rest_fit) - few.score(fit)).sum()) < PRICE:
             search, fit = replace(search, nominal={**search.nominal, **rest}), at_rest_fit
     return search, replace(fit, rms=None)
+
+
+def _limited_servos(search: LoopSearch, fit: LoopFit, own: Servos) -> LoopFit:
+    """The fit, or one that begins at a drawn servo with limits, at each joint where such a one is better as drawn.
+
+    A saturated servo hides its gain and its lag, so that no step from one without limits leads there.
+    """
+    drawn = _drawn_servos(search, fit, own)
+    names = [name for name in SERVO_RANGES if name != "lag" or search.nominal["lag"].any()]
+    costs, cost = costs_of(search, drawn), costs_of(search, [fit.point])[0]
+    order, moves = costs.argsort(axis=0), np.array([bool(own) for own in fit.active])
+    for rank in range(BEST_SERVOS):
+        better = moves & (costs[order[rank], np.arange(search.data.joints)] < cost)
+        if not better.any():
+            break
+        begin = {
+            name: np.where(better, [drawn[b][name][j] for j, b in enumerate(order[rank])], values)
+            for name, values in fit.point.items()
+        }
+        active = tuple(
+            tuple(dict.fromkeys((*before, *names))) if b else before
+            for before, b in zip(fit.active, better, strict=True)
+        )
+        made = search.improve(LoopFit(begin, active), 5)
+        after = costs_of(search, [made.point])[0]
+        pays = after < cost
+        cost = np.where(pays, after, cost)
+        point = {name: np.where(pays, made.point[name], values) for name, values in fit.point.items()}
+        chosen = tuple(a if p else b for a, b, p in zip(made.active, fit.active, pays, strict=True))
+        fit = evaluate(search.data, LoopFit(point, chosen))
+    return fit
+
+
+def _drawn_servos(search: LoopSearch, fit: LoopFit, own: Servos) -> list[dict[str, Array]]:
+    """Points with servos drawn over `SERVO_RANGES`, by Sobol's sequence and so the same each time."""
+    low, high = np.log(np.array([*SERVO_RANGES.values()])).T
+    nominal, scales = search.nominal, search.scales
+    centre = np.where(np.isfinite(own.kp), nominal["kp"], fit.point["kp"])
+    still = np.isin(np.arange(search.data.joints), sorted(search.resting))
+    points = []
+    for row in np.exp(qmc.scale(qmc.Sobol(len(low), rng=0).random(SERVOS), low, high)):
+        share = dict(zip(SERVO_RANGES, row.tolist(), strict=True))
+        point = {name: values.copy() for name, values in fit.point.items()}
+        point["kp"] = centre * share["kp"]
+        point["viscous"] = share["viscous"] * np.sqrt(point["kp"] * scales.inertia)
+        point["coulomb"] = share["coulomb"] * scales.torque
+        point["limit"] = share["limit"] * scales.torque
+        point["lag"] = np.where(nominal["lag"] > 0.0, share["lag"], 0.0)
+        point["slew"] = share["slew"] * search.size_of("slew")
+        points.append({n: np.where(still, fit.point[n], values) for n, values in point.items()})
+    return points
 
 
 def _points(search: LoopSearch, own: Servos) -> list[dict[str, Array]]:

@@ -28,8 +28,8 @@ from sim_gap.position_gap.training.training_files import (
     write_exported,
     write_samples,
 )
+from sim_gap.report.motion_figure import motion_figure
 from sim_gap.report.page import write_report
-from sim_gap.report.position_page import motion_figure
 
 REAL = model_text(kp=15.0, friction=0.25)
 
