@@ -10,7 +10,7 @@ from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
 from gcomp.estimate.problem import NORMAL
 from sim_gap.position_gap.choice import FEW, LoopSearch, Progress, costs_of
-from sim_gap.position_gap.fit import LoopFit, batch, evaluate, residuals
+from sim_gap.position_gap.fit import LoopFit, batch, residuals
 from sim_gap.position_gap.parameters import Scales
 from sim_gap.position_gap.plant import Servos
 from sim_gap.position_gap.windows import Windows, thin_moving
@@ -91,14 +91,17 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     costs = np.einsum("ptjw,tjw->pj", np.minimum(np.abs(gaps), 1.0) ** 2, few.data.weight)
     best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
-    names = ("kp", "viscous", "coulomb", "armature")  # what every joint has
-    active = tuple(() if rest else names for rest in at_rest)
+    names = ("kp", "viscous", "coulomb")
+    # a joint that swings with its servo off shows friction and inertia against gravity, and only both together
+    free = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2)).tolist()
+    active = tuple(
+        () if rest else (*names, "armature") if swings else names for rest, swings in zip(at_rest, free, strict=True)
+    )
     kept = {"controller.stiffness"} if not own.complete else set()
     search = replace(search, kept=frozenset(kept))
     few = replace(few, nominal=search.nominal)
     # all rows count at first: far from the arm's motion a robust fit would take the motion for outliers
     fit = few.improve(LoopFit(point, active), 5, NORMAL)
-    fit = _limited_servos(few, fit, own)
     if np.any(search.nominal["creep"] > 0.0):
         rest = {"creep": np.zeros(search.data.joints)}
         at_rest_fit = few.improve(fit.with_values(**rest), 4, NORMAL)
@@ -108,20 +111,22 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     return search, replace(fit, rms=None)
 
 
-def _limited_servos(search: LoopSearch, fit: LoopFit, own: Servos) -> LoopFit:
-    """The fit, or one that begins at a drawn servo with limits, at each joint where such a one is better as drawn.
+def limited_servo_starts(search: LoopSearch, fit: LoopFit) -> list[LoopFit]:
+    """Fits that begin at drawn servos with limits, each at the joints where such a one as drawn is better than `fit`.
 
     A saturated servo hides its gain and its lag, so that no step from one without limits leads there.
     """
-    drawn = _drawn_servos(search, fit, own)
+    few = replace(search, data=thin_moving(search.data, FEW))
+    drawn = _drawn_servos(few, fit)
     names = [name for name in SERVO_RANGES if name != "lag" or search.nominal["lag"].any()]
-    costs, cost = costs_of(search, drawn), costs_of(search, [fit.point])[0]
-    order, moves = costs.argsort(axis=0), np.array([bool(own) for own in fit.active])
+    costs, cost = costs_of(few, drawn), costs_of(few, [fit.point])[0]
+    order, moves = costs.argsort(axis=0), ~np.isin(np.arange(search.data.joints), sorted(search.resting))
+    starts = []
     for rank in range(BEST_SERVOS):
         better = moves & (costs[order[rank], np.arange(search.data.joints)] < cost)
         if not better.any():
             break
-        begin = {
+        point = {
             name: np.where(better, [drawn[b][name][j] for j, b in enumerate(order[rank])], values)
             for name, values in fit.point.items()
         }
@@ -129,21 +134,15 @@ def _limited_servos(search: LoopSearch, fit: LoopFit, own: Servos) -> LoopFit:
             tuple(dict.fromkeys((*before, *names))) if b else before
             for before, b in zip(fit.active, better, strict=True)
         )
-        made = search.improve(LoopFit(begin, active), 5)
-        after = costs_of(search, [made.point])[0]
-        pays = after < cost
-        cost = np.where(pays, after, cost)
-        point = {name: np.where(pays, made.point[name], values) for name, values in fit.point.items()}
-        chosen = tuple(a if p else b for a, b, p in zip(made.active, fit.active, pays, strict=True))
-        fit = evaluate(search.data, LoopFit(point, chosen))
-    return fit
+        starts.append(few.improve(LoopFit(point, active, fit.shared), 5))
+    return starts
 
 
-def _drawn_servos(search: LoopSearch, fit: LoopFit, own: Servos) -> list[dict[str, Array]]:
+def _drawn_servos(search: LoopSearch, fit: LoopFit) -> list[dict[str, Array]]:
     """Points with servos drawn over `SERVO_RANGES`, by Sobol's sequence and so the same each time."""
     low, high = np.log(np.array([*SERVO_RANGES.values()])).T
     nominal, scales = search.nominal, search.scales
-    centre = np.where(np.isfinite(own.kp), nominal["kp"], fit.point["kp"])
+    centre = np.where(np.isfinite(search.data.plant.servos.kp), nominal["kp"], fit.point["kp"])
     still = np.isin(np.arange(search.data.joints), sorted(search.resting))
     points = []
     for row in np.exp(qmc.scale(qmc.Sobol(len(low), rng=0).random(SERVOS), low, high)):
