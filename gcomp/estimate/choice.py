@@ -6,6 +6,7 @@ All is linear about one point, so that a choice takes no further evaluation of t
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -336,18 +337,19 @@ def choose(
     progress: Callable[[Name], None] = lambda name: None,
 ) -> list[Name]:
     """Effects in the order in which they pay most beside those there, from the ones `chosen` on; then those that do
-    not pay any more are taken out, but for those `kept`."""
+    not pay any more are taken out, but for those `kept`: one by one, and two of the same channels that only undo each
+    other."""
     by_name = {effect.name: effect for effect in effects}
     current = [name for name in chosen if name in by_name]
 
     def free(names: Iterable[Name]) -> frozenset[int]:
         return frozenset(k for name in names for k in by_name[name].parameters)
 
-    def pays(less: Sequence[Name], more: Sequence[Name], effect: Effect[Name]) -> float:
-        """Gain beyond the price; not positive for one that is not sure over the folds."""
+    def pays(less: Sequence[Name], more: Sequence[Name], *between: Name) -> float:
+        """Gain beyond the prices of what is between; not positive for one that is not sure over the folds."""
         shown = evidence(terms, free(less), free(more))
         sure = shown.fall > SIGNIFICANT * shown.error or shown.error == 0.0
-        return shown.fall - price_of(effect) if sure else -np.inf
+        return shown.fall - sum(price_of(by_name[name]) for name in between) if sure else -np.inf
 
     for _ in range(most):
         best: Name | None = None
@@ -355,7 +357,7 @@ def choose(
         for effect in effects:
             if effect.name in current or not set(effect.needs) <= set(current):
                 continue
-            worth = pays(current, [*current, effect.name], effect)
+            worth = pays(current, [*current, effect.name], effect.name)
             if worth > gain:
                 best, gain = effect.name, worth
         if best is None:
@@ -363,14 +365,19 @@ def choose(
         progress(best)
         current.append(best)
     fixed = set(kept)
+    acts_on = {
+        effect.name: frozenset(c for c, index in enumerate(terms.acting) if np.isin(effect.parameters, index).any())
+        for effect in effects
+    }
     while True:
         needed = {need for name in current for need in by_name[name].needs}
-        losses = [
-            (pays([n for n in current if n != name], current, by_name[name]), k)
-            for k, name in enumerate(current)
-            if name not in fixed and name not in needed
-        ]
-        worst = min(losses, default=(1.0, -1))
-        if worst[0] > 0.0:
+        loose = [name for name in current if name not in fixed and name not in needed]
+        pairs = [pair for pair in combinations(loose, 2) if acts_on[pair[0]] == acts_on[pair[1]]]
+        for groups in ([(name,) for name in loose], pairs):
+            losses = ((pays([n for n in current if n not in out], current, *out), out) for out in groups)
+            least, worst = min(losses, key=lambda each: each[0], default=(1.0, ()))
+            if least <= 0.0:
+                break
+        else:
             return current
-        current.pop(worst[1])
+        current = [name for name in current if name not in worst]

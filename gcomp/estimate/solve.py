@@ -15,6 +15,8 @@ STILL = 1e-3
 """Relative fall of a channel's cost below which its fit ends."""
 LONGEST_STEP = 1.5
 """Longest step of a parameter, in its own coordinate."""
+SHORTENED = 6
+"""Times that a step is shortened before a fit ends."""
 EASIER, HARDER = 0.2, 10.0
 """Factors on the damping after a step that lowers the cost, and after one that does not."""
 
@@ -74,12 +76,12 @@ def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterati
         about = linearise(problem, theta, moving, now)
         now = about.residual
         variance = scale_of(problem, about.residual)
-        before = cost_of(problem, about.residual, variance) + _prior_cost(problem, theta, channels)
+        before = cost_of(problem, about.residual, variance) + prior_cost(problem, theta, channels)
         weight = problem.weight * robust_weight(about.residual, variance, problem.freedom) / variance[:, None]
-        for _ in range(3):
+        for _ in range(SHORTENED):
             trial = problem.within(theta + _step(problem, about, weight, damping))
             left = problem.predict(trial[None])[0]
-            after = cost_of(problem, left, variance) + _prior_cost(problem, trial, channels)
+            after = cost_of(problem, left, variance) + prior_cost(problem, trial, channels)
             lower = after < before if not shared else np.full(channels, after.sum() < before.sum())
             damping = np.where(lower, damping * EASIER, damping * HARDER)
             if lower[busy].any():
@@ -97,7 +99,7 @@ def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterati
     return RobustFit(theta, residual, scale_of(problem, residual))
 
 
-def _prior_cost(problem: EstimationProblem, theta: Array, channels: int) -> Array:
+def prior_cost(problem: EstimationProblem, theta: Array, channels: int) -> Array:
     """Cost of parameters away from their nominal values by channel; of those of all channels at the first, (C,)."""
     out = np.zeros(channels)
     for value, p in zip(theta, problem.parameters, strict=True):

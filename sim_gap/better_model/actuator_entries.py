@@ -22,7 +22,6 @@ ISAAC_LAB = {
     "friction": "friction",
     "dynamic_friction": "friction",
     "viscous_friction": "viscous",
-    "effort_limit": "limit",
 }
 MJLAB = {
     "stiffness": "stiffness",
@@ -38,6 +37,10 @@ POSITION, MOTOR = "BuiltinPositionActuatorCfg", "BuiltinMotorActuatorCfg"
 """mjlab's entries of position controllers, and of motors that take torques."""
 Row = Mapping[str, float | None]
 """Values of one joint; None for what the entry does not give."""
+LIMIT_OF_ISAAC_LAB = """    limit = "actuator_effort_limit"
+    if limit not in getattr(DelayedPDActuatorCfg, "__dataclass_fields__", {limit}):
+        limit = "effort_limit"  # before Isaac Lab 3
+"""
 HEAD = '''"""Actuators of the corrected model, written by gap diagnose --out-actuators.
 
 Gains in N·m/rad and N·m·s/rad, friction and limits in N·m, rotor inertia in kg·m²; delays in physics steps of
@@ -64,6 +67,7 @@ def write_entries(
         + "\ndef isaac_lab():\n"
         + '    """Entries of `ArticulationCfg.actuators`."""\n'
         + "    from isaaclab.actuators import DelayedPDActuatorCfg\n\n"
+        + LIMIT_OF_ISAAC_LAB
         + f"    return {{\n{isaac}\n    }}\n\n\n"
         + "def mjlab():\n"
         + '    """Entries of `EntityArticulationInfoCfg.actuators`."""\n'
@@ -87,7 +91,8 @@ def steps_of(delay: Array, step: float) -> dict[str, float]:
 def _isaac(name: str, row: Row) -> str:
     steps = f"min_delay={row['least']:.0f}, max_delay={row['most']:.0f}"
     gains = "" if row.get("stiffness") is not None else "stiffness=None, damping=None, "
-    entry = f"joint_names_expr=[{_pattern(name)}], {gains}{_given(ISAAC_LAB, row)}, {steps}"
+    limit = "" if row.get("limit") is None else f", **{{limit: {row['limit']:.6g}}}"
+    entry = f"joint_names_expr=[{_pattern(name)}], {gains}{_given(ISAAC_LAB, row)}, {steps}{limit}"
     return f"        {_literal(name)}: DelayedPDActuatorCfg(\n            {entry}\n        ),"
 
 

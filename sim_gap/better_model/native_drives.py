@@ -51,7 +51,8 @@ def put_delay(actuator: Any, delay: float) -> None:
 
 
 def hold(model: Any, data: Any, actuators: Sequence[int], commands: Array) -> None:
-    """Let actuators be as if each had been given its command (n,) for long, the joints at rest where they are.
+    """Let actuators be as they are at joints that rest where they are: as if each had been given its command (n,) for
+    long, or the nearest to it under which friction keeps the joint where it is.
 
     A simulation that begins takes every earlier command for 0: with a delay, a lag or a slew limit it first drives the
     joint there. The integral part of a PID holds what gravity and springs ask for. `data` has its positions; the
@@ -64,14 +65,18 @@ def hold(model: Any, data: Any, actuators: Sequence[int], commands: Array) -> No
     pid, lags = mujoco.mjtDyn.mjDYN_PID, (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
     for i, command in zip(actuators, commands.tolist(), strict=True):
         data.ctrl[model.actuator_ctrladr[i]] = command
+        gear, joint, kp = model.actuator_gear[i, 0], model.actuator_trnid[i, 0], -model.actuator_biasprm[i, 1]
+        length, dof = gear * data.qpos[model.jnt_qposadr[joint]], model.jnt_dofadr[joint]
+        asked, friction = asked_for[dof] / gear, model.dof_frictionloss[dof] / abs(gear)
+        ki = model.actuator_gainprm[i, 0] if model.actuator_dyntype[i] == pid else 0.0
+        if kp > 0.0:
+            rests = length if ki > 0.0 else length + asked / kp
+            command = min(max(command, rests - friction / kp), rests + friction / kp)
         if count := int(model.actuator_history[i, 0]):
             mujoco.mj_initCtrlHistory(model, data, i, None, np.full((count, 1), command))
         state = data.act[model.actuator_actadr[i] : model.actuator_actadr[i] + model.actuator_actnum[i]]
         kind = mujoco.mjtDyn(int(model.actuator_dyntype[i]))
         if kind in lags or (kind == pid and model.actuator_dynprm[i, 1] > 0.0):
             state[0] = command
-        if kind == pid and (ki := model.actuator_gainprm[i, 0]) > 0.0:
-            gear, joint = model.actuator_gear[i, 0], model.actuator_trnid[i, 0]
-            error = command - gear * data.qpos[model.jnt_qposadr[joint]]
-            kp = -model.actuator_biasprm[i, 1]
-            state[-1] = (asked_for[model.jnt_dofadr[joint]] / gear - kp * error) / ki
+        if ki > 0.0:
+            state[-1] = (asked - kp * (command - length)) / ki

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, Effect, LinearTerms, choose, price_of, terms_of
 from gcomp.estimate.problem import FREEDOM, linearise
-from gcomp.estimate.solve import cost_of, scale_of
+from gcomp.estimate.solve import cost_of, prior_cost, scale_of
 from sim_gap.position_gap.fit import (
     INDEPENDENT_S,
     Layout,
     LoopFit,
+    Point,
     batch,
     evaluate,
     improve,
@@ -29,6 +30,8 @@ FOLDS = 6
 LEAST_FALL = 0.025
 """Least relative fall of a joint's RMS by an effect: half of what makes a cause (`judge.LEAST_SHRINK`), which may come
 as two effects at first."""
+OF_EVERY_JOINT = "friction.coulomb", "friction.viscous", "actuator.rotor_inertia"
+"""Effects that every joint has, of which a model states a guess: they pay no price."""
 QUIET = 1.1
 """Noise floors up to which nothing is left to explain."""
 ROUNDS, FITTING = 3, 3
@@ -206,7 +209,8 @@ def look_about(
             for need in (EFFECTS[name.partition("#")[0]].needs if joints[0] >= 0 else ())
             if not active_in(search.nominal, need, joints[0])
         )
-        effects[name] = Effect(name, numbers, needs, least)
+        price = 0.0 if name.partition("#")[0] in OF_EVERY_JOINT else None
+        effects[name] = Effect(name, numbers, needs, least, price)
     return About(search, fit, layout, terms_of(problem, about, folds_of(search.data)), effects)
 
 
@@ -227,7 +231,7 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
 
 
 def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: None) -> tuple[LoopFit, About]:
-    """Choose effects about the fit and fit them, until the choice stays; the fit, and what was looked at last.
+    """Choose effects about the fit and fit them, until the choice stays; the best fit, and what was looked at last.
 
     After the first time only those are looked at that were worth their price by themselves or are there.
     """
@@ -236,6 +240,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     kept = [n for n in every if n.partition("#")[0] in search.kept]
     looked = {*names, *unexplained_at(search, fit)}
     levels = {name: best_level(search, fit, name) for name in LEVELS}
+    best, most = fit, worth(search, fit)
     for number in range(ROUNDS):
         progress(f"round {number + 1}: {len(names)} effects of joints and arm")
         about = look_about(search, fit, looked, levels)
@@ -243,28 +248,42 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         if number == 0:
             looked = {*promising(about, names), *found, *names}
         made = search.improve(entered(search, about.moved(found)), FITTING)
-        if not {*names} <= {*found} and worth(search, made) < worth(search, fit):
+        reached = worth(search, made)
+        if not {*names} <= {*found} and reached < most:
             # what was taken out mattered more than the linear terms say: only what comes in does so
             found = [*names, *(name for name in found if name not in names)]
             made = search.improve(entered(search, about.moved(found)), FITTING)
+            reached = worth(search, made)
         same, names, fit = set(found) == set(names), found, made
+        if reached >= most:
+            best, most = made, reached
         if same:
-            return fit, about
-    about = look_about(search, fit, looked, levels)
+            break
+    if not same or best is not fit:
+        fit, names = best, chosen_of(search, best)
+        about = look_about(search, fit, looked, levels)
     found = choose(about.terms, [about.effects[n] for n in names], names, kept)
     if set(found) != set(names):
         made = search.improve(about.moved(found), 4)
-        if worth(search, made) >= worth(search, fit):
+        if worth(search, made) >= most:
             fit, about = made, look_about(search, made, looked, levels)
     return fit, about
 
 
 def worth(search: LoopSearch, fit: LoopFit) -> float:
-    """Logarithm of the likelihood of a fit less the price of its parameters, but for a constant."""
+    """Logarithm of the probability of a fit less the price of its parameters, but for a constant."""
     layout = Layout(search.data, search.scales, fit.point, names_of(fit))
     problem = layout.problem(search.nominal, {}, search.floor)
-    residual = problem.predict(layout.theta(layout.point)[None])[0]
-    return -float(cost_of(problem, residual, scale_of(problem, residual)).sum()) - PRICE * len(layout.names)
+    unlikely = prior_cost(problem, layout.theta(layout.point), search.data.joints).sum()
+    paid = sum(not any(name in EFFECTS[e].parameters for e in OF_EVERY_JOINT) for _, name in layout.names)
+    return -float(costs_of(search, [fit.point])[0].sum() + unlikely) - PRICE * paid
+
+
+def costs_of(search: LoopSearch, points: Sequence[Point]) -> Array:
+    """Negative logarithm of the likelihood of each joint at P points, (P, J), but for a constant."""
+    problem = Layout(search.data, search.scales, points[0], ()).problem(search.nominal, {}, search.floor)
+    left = residuals(search.data, batch(points)).transpose(0, 2, 1, 3).reshape(len(points), search.data.joints, -1)
+    return np.stack([cost_of(problem, each, scale_of(problem, each)) for each in left])
 
 
 def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[str]:

@@ -25,9 +25,8 @@ INDEPENDENT_S = 0.5
 """Time over which residuals are correlated [s]."""
 DIFFERENCE, RELATIVE = 0.05, 0.02
 """Steps of finite differences: in units of the size at which a parameter is tried, and of a logarithm."""
-PRIOR, PRIOR_RELATIVE = 10.0, 3.0
-"""Standard deviation of any parameter of an effect before any recording: in units of the size at which it is tried, and
-of a logarithm."""
+PRIOR_RELATIVE = 3.0
+"""Standard deviation of the logarithm of a gain before any recording."""
 Point = Mapping[str, Array]
 """Parameter → (J,)."""
 
@@ -128,9 +127,9 @@ class Layout:
         if name in LOGARITHMIC:
             ends, own, usual = (float(np.log(max(low, 1e-12))), float(np.log(high))), PRIOR_RELATIVE, RELATIVE
         elif name in INVERSE:
-            ends, own, usual = (0.0, size / low), PRIOR, DIFFERENCE
+            ends, own, usual = (0.0, size / low), PARAMETERS[name].spread, DIFFERENCE
         else:
-            ends, own, usual = (low / size, high / size), PRIOR, DIFFERENCE
+            ends, own, usual = (low / size, high / size), PARAMETERS[name].spread, DIFFERENCE
         return FittedParameter(
             name, to_coordinate(name, float(nominal[name][j]), size), own, *ends, channel=j, step=step or usual
         )

@@ -12,14 +12,24 @@ from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.choice import QUIET, About, LoopSearch, groups_of, look_about, select, without_group
+from sim_gap.position_gap.choice import (
+    QUIET,
+    About,
+    LoopSearch,
+    groups_of,
+    look_about,
+    select,
+    unexplained_at,
+    without_group,
+    worth,
+)
 from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.judge import Stage, rms_on, stages
 from sim_gap.position_gap.links import shared_effects
 from sim_gap.position_gap.parameters import PARAMETERS
 from sim_gap.position_gap.plant import MovedModel, held_parts, nominal_point
 from sim_gap.position_gap.sound_arm import SoundGap, split_gap
-from sim_gap.position_gap.start import controller_name, noise_floor, scales_of, starting_fit
+from sim_gap.position_gap.start import controller_name, limited_servo_starts, noise_floor, scales_of, starting_fit
 from sim_gap.position_gap.training.bands import Band, band
 from sim_gap.position_gap.training.export import Exported, export_fit, export_with_module, native_fit, widen_ranges
 from sim_gap.position_gap.training.jackknife import gaps_left_out, terms_of
@@ -161,7 +171,13 @@ def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None])
     if complete and bool(np.all(rms_on(search.data, bare) < QUIET * search.floor)):
         return search, bare, look_about(search, bare, [])
     search, fit = starting_fit(search, search.data.plant.servos, progress)
-    return search, *select(search, fit, progress)
+    best, about = select(search, fit, progress)
+    if unexplained_at(search, best) and (starts := limited_servo_starts(search, best)):
+        progress("servos with limits to begin with")
+        other, beside = select(search, max(starts, key=lambda each: worth(search, each)), progress)
+        if worth(search, other) > worth(search, best):
+            return search, other, beside
+    return search, best, about
 
 
 def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:

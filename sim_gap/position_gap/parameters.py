@@ -19,6 +19,8 @@ class LoopParameter:
     high: float = np.inf
     scale: str = "1"
     """`torque` (RMS torque of the joint), `damping`, `inertia`, `angle` (RMS of the error) or `1`."""
+    spread: float = 10.0
+    """Standard deviation before any recording, in units of the size at which it is tried."""
 
 
 PARAMETERS = {
@@ -39,7 +41,8 @@ PARAMETERS = {
         LoopParameter("stribeck", "N·m", 0.0, 0.2, 0.0, np.inf, "torque"),
         LoopParameter("stribeck_velocity", "rad/s", 0.1, 0.1, 0.01, 1.0),
         LoopParameter("creep", "rad/s", 0.0, 0.02, 0.0, 0.5),
-        LoopParameter("load", "N·m/(N·m)", 0.0, 0.1, 0.0, 2.0),
+        # gears lose a tenth to two fifths of the torque that they carry (Harmonic Drive's efficiency charts)
+        LoopParameter("load", "N·m/(N·m)", 0.0, 0.1, 0.0, 2.0, spread=2.0),
         LoopParameter("asymmetry", "1", 0.0, 0.1, -0.95, 0.95),
         LoopParameter("armature", "kg·m²", 0.0, 0.3, 0.0, np.inf, "inertia"),
         LoopParameter("spring", "N·m/rad", 0.0, 0.1, 0.0, np.inf, "torque"),

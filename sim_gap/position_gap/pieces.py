@@ -17,14 +17,33 @@ class Piece:
     """Integral of the command up to each of them [rad·s], (K + 1, n)."""
     served: Mask
     """Whether each row is commanded, (K, n)."""
+    position: Array
+    """Position at the beginning, (n,) [rad]."""
+    asked: Array
+    """Torque that gravity and springs ask for there, (n,) [N·m]."""
+    rests: Mask
+    """Whether each joint rests there, (n,)."""
 
-    def command(self, edges: Array, delay: Array) -> Array:
-        """Mean command between the times `edges` (T + 1,), each joint's later by its `delay` (n,) [s]; (T, n)."""
+    def earlier_command(self, asked: Array, friction: Array, stiffness: Array) -> Array:
+        """Command before the first row, (n,) [rad]: the first one, or of a joint that rests where that would have moved
+        it the nearest to it that would not.
+
+        `asked` is the torque that a servo of this `stiffness` has to hold, `friction` what holds by itself; (n,) each.
+        """
+        first, _ = self.held
+        low, high = (self.position + (asked + side * friction) / stiffness for side in (-1.0, 1.0))
+        return np.where(self.rests, np.clip(first, low, high), first)
+
+    def command(self, edges: Array, delay: Array, earlier: Array) -> Array:
+        """Mean command between the times `edges` (T + 1,), each joint's later by its `delay` (n,) [s]; (T, n).
+
+        `earlier` is the command before the first row, (n,).
+        """
         made = [np.interp(edges - late, self.ends, column) for late, column in zip(delay, self.area.T, strict=True)]
-        # before the first row the first command held, after the last one the last
+        # after the last row the last command holds
         outside = [
             np.minimum(edges - late - self.ends[0], 0.0) * first + np.maximum(edges - late - self.ends[-1], 0.0) * last
-            for late, first, last in zip(delay, *self.held, strict=True)
+            for late, first, last in zip(delay, earlier, self.held[1], strict=True)
         ]
         return np.asarray(np.diff(np.column_stack(made) + np.column_stack(outside), axis=0) / np.diff(edges)[:, None])
 

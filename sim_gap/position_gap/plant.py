@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -290,21 +291,41 @@ class MovedModel:
 
     # ---- commands
 
-    def commands(self, piece: Piece, begin: float, steps: int, point: Mapping[str, Array], scale: float) -> Array:
-        """Input of each servo at each step of a window, (steps, J) [rad]."""
+    def earlier_command(self, piece: Piece, point: Mapping[str, Array], scale: float) -> Array:
+        """Command before a piece, (J,) [rad]: one at which what rests at its beginning had come to rest."""
+        asked = np.where(point["ki"] > 0.0, 0.0, piece.asked * (1.0 - point["feed"]) + point["offset"])
+        stiffness = np.maximum(point["kp"] * point["gain"] * scale, 1e-9)
+        friction = point["coulomb"] + point["stribeck"] + point["load"] * np.abs(asked) + point["dead"] * stiffness
+        return piece.earlier_command(asked, friction, stiffness)
+
+    def commands(
+        self, piece: Piece, begin: float, steps: int, point: Mapping[str, Array], scale: float, earlier: Array
+    ) -> Array:
+        """Input of each servo at each step of a window, (steps, J) [rad]; `earlier` is that before the piece."""
         late = point["delay"] - self.servos.delay
         edges: Array = begin + self.dt * np.arange(steps + 1, dtype=float)
-        given = piece.command(edges, late)
+        given = piece.command(edges, late, earlier)
         most = np.where(self.pid & np.isfinite(self.servos.slew), np.inf, point["slew"]) * self.dt
         if np.isfinite(most).any():
-            for k in range(1, steps):
-                given[k] = given[k - 1] + np.clip(given[k] - given[k - 1], -most, most)
+            given = follow(given, earlier if begin == 0.0 else given[0], most)
         ahead = point["kd"] / np.maximum(point["kp"] * scale, 1e-9)
         if np.any(ahead):
             wide = max(1, round(SPEED_S / self.dt))
-            speed = piece.command(edges + SPEED_S, late) - piece.command(edges - SPEED_S, late)
+            speed = np.subtract(*(piece.command(edges + side * SPEED_S, late, earlier) for side in (1.0, -1.0)))
             given = given + ahead * speed / (2.0 * wide * self.dt)
         return given
+
+
+def follow(given: Array, before: Array, most: Array) -> Array:
+    """What comes of a command (T, n) at a limit of its change `most` from step to step, from `before` on, (n,) each."""
+    edges = [0, *(np.flatnonzero(np.any(np.diff(given, axis=0) != 0.0, axis=1)) + 1).tolist(), len(given)]
+    out, last = np.empty_like(given), before
+    for first, end in pairwise(edges):  # the command stays between them
+        away = last - given[first]
+        left = np.abs(away) - most * np.arange(1.0, end - first + 1)[:, None]
+        out[first:end] = given[first] + np.copysign(np.maximum(left, 0.0), away)
+        last = out[end - 1]
+    return out
 
 
 @contextmanager

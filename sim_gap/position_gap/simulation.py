@@ -66,7 +66,8 @@ class World:
         self.plant, self.model, self.data, self.w, self.point = plant, model, data, w, point
         self.piece, self.scale, self.at = data.pieces[data.piece[w]], float(data.scale[w]), data.at[:, w]
         self.steps = int(np.ceil(self.at.max() / plant.dt - 1e-6)) + 1
-        self.given = plant.commands(self.piece, float(data.begin[w]), self.steps, point, self.scale)
+        self.earlier = plant.earlier_command(self.piece, point, self.scale)
+        self.given = plant.commands(self.piece, float(data.begin[w]), self.steps, point, self.scale, self.earlier)
         self.served = self.piece.served_at(data.begin[w] + plant.dt * np.arange(self.steps))
         self.track = np.empty((self.steps + 1, plant.n))
         self.laws = laws_of(point, plant)
@@ -115,8 +116,8 @@ class World:
         return np.asarray(self.track[whole] * (1.0 - share) + self.track[whole + 1] * share)
 
     def begin(self, model: Any, d: Any) -> None:
-        """The recorded state; actuators as if the command had been there for long, an integral part with what gathered
-        since the start."""
+        """The recorded state; actuators as if the command before had been there for long, an integral part with what
+        gathered since the start."""
         import mujoco
 
         plant, data, w = self.plant, self.data, self.w
@@ -124,11 +125,11 @@ class World:
         drives = plant.servos.actuator[plant.driven].tolist()
         if len(drives) and model.na + int(model.actuator_history[drives, 0].sum()):
             d.qpos[plant.places] = data.first[:, w]
-            first = self.piece.held[0] if data.begin[w] > 0.0 else self.given[0]
-            hold(model, d, drives, (first * plant.gear)[plant.driven])
+            before = self.given[0] if data.begin[w] > 0.0 else self.earlier
+            hold(model, d, drives, (self.earlier * plant.gear)[plant.driven])
             for i, j in zip(drives, np.flatnonzero(plant.driven).tolist(), strict=True):
                 count, place = int(model.actuator_history[i, 0]), int(model.actuator_actadr[i])
-                now = self.given[0, j] * plant.gear[j]
+                now = before[j] * plant.gear[j]
                 if count:
                     mujoco.mj_initCtrlHistory(model, d, i, None, np.full((count, 1), now))
                 if plant.pid[j]:
@@ -145,7 +146,7 @@ class World:
         """Integral of the error of servos whose integral part is a law, (J,): what holds at first and what came."""
         ki = np.maximum(self.point["ki"], 1e-9)
         q = self.data.first[:, self.w]
-        error = self.piece.held[0] - q
+        error = self.earlier - q
         asked = self.plant.sim.arm.torque(q[None], 0 * q[None], 0 * q[None])[0]
         return np.asarray((asked / self.point["gain"] - self.point["kp"] * error) / ki + self.data.error_sum[:, self.w])
 

@@ -4,11 +4,12 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+from scipy.stats import qmc
 
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
 from gcomp.estimate.problem import NORMAL
-from sim_gap.position_gap.choice import FEW, LoopSearch, Progress
+from sim_gap.position_gap.choice import FEW, LoopSearch, Progress, costs_of
 from sim_gap.position_gap.fit import LoopFit, batch, residuals
 from sim_gap.position_gap.parameters import Scales
 from sim_gap.position_gap.plant import Servos
@@ -22,6 +23,20 @@ FRICTIONS = 0.0, 0.4
 """Least Coulomb friction that is tried with each gain, as a share of the gain times the RMS error."""
 LEAST_DAMPING = 0.2
 """Least damping that is tried with each gain, over the root of gain times inertia (2 is critical)."""
+SERVOS = 64
+"""Servos with limits of torque and of speed and with a lag that are drawn: a power of two, as Sobol's sequence asks."""
+SERVO_RANGES = {
+    "kp": (0.003, 30.0),
+    "viscous": (0.2, 10.0),
+    "coulomb": (0.02, 2.0),
+    "limit": (0.5, 50.0),
+    "lag": (0.003, 1.0),
+    "slew": (0.05, 5.0),
+}
+"""Their ranges, each drawn in its logarithm: over the model's gain, the root of gain times inertia, the joint's torque
+(friction and limit), 1 s, and the highest speed of the joint."""
+BEST_SERVOS = 3
+"""Drawn servos of each joint from which a fit begins."""
 TURNS = 0.02
 """Speed over which friction changes its direction there [rad/s]."""
 RESTS_RAD = 0.002
@@ -94,6 +109,53 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
         if float((few.score(at_rest_fit) - few.score(fit)).sum()) < PRICE:
             search, fit = replace(search, nominal={**search.nominal, **rest}), at_rest_fit
     return search, replace(fit, rms=None)
+
+
+def limited_servo_starts(search: LoopSearch, fit: LoopFit) -> list[LoopFit]:
+    """Fits that begin at drawn servos with limits, each at the joints where such a one as drawn is better than `fit`.
+
+    A saturated servo hides its gain and its lag, so that no step from one without limits leads there.
+    """
+    few = replace(search, data=thin_moving(search.data, FEW))
+    drawn = _drawn_servos(few, fit)
+    names = [name for name in SERVO_RANGES if name != "lag" or search.nominal["lag"].any()]
+    costs, cost = costs_of(few, drawn), costs_of(few, [fit.point])[0]
+    order, moves = costs.argsort(axis=0), ~np.isin(np.arange(search.data.joints), sorted(search.resting))
+    starts = []
+    for rank in range(BEST_SERVOS):
+        better = moves & (costs[order[rank], np.arange(search.data.joints)] < cost)
+        if not better.any():
+            break
+        point = {
+            name: np.where(better, [drawn[b][name][j] for j, b in enumerate(order[rank])], values)
+            for name, values in fit.point.items()
+        }
+        active = tuple(
+            tuple(dict.fromkeys((*before, *names))) if b else before
+            for before, b in zip(fit.active, better, strict=True)
+        )
+        starts.append(few.improve(LoopFit(point, active, fit.shared), 5))
+    return starts
+
+
+def _drawn_servos(search: LoopSearch, fit: LoopFit) -> list[dict[str, Array]]:
+    """Points with servos drawn over `SERVO_RANGES`, by Sobol's sequence and so the same each time."""
+    low, high = np.log(np.array([*SERVO_RANGES.values()])).T
+    nominal, scales = search.nominal, search.scales
+    centre = np.where(np.isfinite(search.data.plant.servos.kp), nominal["kp"], fit.point["kp"])
+    still = np.isin(np.arange(search.data.joints), sorted(search.resting))
+    points = []
+    for row in np.exp(qmc.scale(qmc.Sobol(len(low), rng=0).random(SERVOS), low, high)):
+        share = dict(zip(SERVO_RANGES, row.tolist(), strict=True))
+        point = {name: values.copy() for name, values in fit.point.items()}
+        point["kp"] = centre * share["kp"]
+        point["viscous"] = share["viscous"] * np.sqrt(point["kp"] * scales.inertia)
+        point["coulomb"] = share["coulomb"] * scales.torque
+        point["limit"] = share["limit"] * scales.torque
+        point["lag"] = np.where(nominal["lag"] > 0.0, share["lag"], 0.0)
+        point["slew"] = share["slew"] * search.size_of("slew")
+        points.append({n: np.where(still, fit.point[n], values) for n, values in point.items()})
+    return points
 
 
 def _points(search: LoopSearch, own: Servos) -> list[dict[str, Array]]:

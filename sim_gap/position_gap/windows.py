@@ -34,8 +34,12 @@ MISSING_ROWS, MISSING_S = 6.0, 0.25
 """Time without a row at which a piece ends: in periods, and at least [s]."""
 STEP_RATIO, STEP_RAD = 6.0, 0.05
 """Step of a position that no motion makes: this many times the larger of the steps beside it, and this much more."""
-BEGINNING_ROWS = 5
-"""Rows from which position and velocity at the start of a short piece follow."""
+BEGINNING_S, BEGINNING_ROWS = 0.02, 5
+"""Time between the positions from which the velocity at the start of a short piece follows [s]; rows that it needs."""
+SLOPE_NOISE = np.sqrt(26.0) / 2.0
+"""Noise of the slope at the first of three positions, over that of a position and the time between them."""
+NOISE_SIZES = 3.0
+"""Standard deviations of noise that a velocity has to exceed."""
 NORMAL_MEDIAN = 0.6745
 """Median of the amount of a standard normal value."""
 MOVES, FAST = 0.5, 0.8
@@ -147,9 +151,9 @@ def windows_of(
             part = slice_rows(recording, rows)
             if np.isfinite(part.position).all(axis=1).sum() < BEGINNING_ROWS:
                 continue
-            made = _cut(plant.sim, part, number, len(pieces))
+            piece, made = _cut(plant.sim, part, number, len(pieces))
             if made:
-                pieces.append(_piece(part))
+                pieces.append(piece)
                 parts += made
     if not parts:
         raise BadInput(f"{labels[0]}: no part of at least {LEAST_S:g} s without a break in which positions are read")
@@ -176,7 +180,8 @@ def _padded(given: Any, longest: int, name: str) -> Array:
     return np.concatenate([values, 0.0 * more if name == "weight" else more])
 
 
-def _piece(part: Recording) -> Piece:
+def _piece(sim: SimModel, part: Recording, start: Array, velocity: Array) -> Piece:
+    """The commands of a part that begins with these positions and velocities, (n,) each."""
     given = part.position_command
     assert given is not None
     served = np.isfinite(given)
@@ -188,18 +193,19 @@ def _piece(part: Recording) -> Piece:
         filled[: int(np.argmax(there)), j] = filled[int(np.argmax(there)), j]
     ends = np.append(part.t, part.t[-1] + period_of(part)) - part.t[0]
     area = np.vstack([np.zeros((1, filled.shape[1])), np.cumsum(filled * np.diff(ends)[:, None], axis=0)])
-    return Piece(ends, area, served)
+    asked = sim.arm.torque(start[None], 0.0 * start[None], 0.0 * start[None])[0] + sim.arm.spring_torque(start[None])[0]
+    return Piece(ends, area, served, start, asked, served[0] & (velocity == 0.0))
 
 
-def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> list[dict[str, Any]]:
-    """Windows of one piece."""
+def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> tuple[Piece, list[dict[str, Any]]]:
+    """One piece and its windows."""
     t, q = part.t - part.t[0], part.position
     seen = np.isfinite(q)
     filled = np.column_stack(
         [np.interp(t, t[s], x[s]) if s.any() else 0.0 * t for x, s in zip(q.T, seen.T, strict=True)]
     )
-    q0, v0 = _beginning(t, filled)
     noise = _noise(filled)
+    q0, v0 = _beginning(t, filled, noise)
     smooth, v, a = _smoothed(t, filled)
     arm = sim.arm
     torque = arm.torque(smooth, v, a) + arm.spring_torque(smooth) + arm.armature * a
@@ -238,7 +244,7 @@ def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> list[dict[s
             }
         )
         begin = t[first] + (SHORT_S if short else WINDOW_S)
-    return out
+    return _piece(sim, part, q0, v0), out
 
 
 def _noise(q: Array) -> Array:
@@ -260,16 +266,18 @@ def _smoothed(t: Array, q: Array) -> tuple[Array, Array, Array]:
     return tuple(np.column_stack([np.interp(t, even, x) for x in y.T]) for y in (smooth, v, a))  # type: ignore[return-value]
 
 
-def _beginning(t: Array, q: Array) -> tuple[Array, Array]:
-    """Position and velocity at the first row by a parabola through the first ones; 0 for a velocity in doubt."""
-    few, near = q[:BEGINNING_ROWS], t[:BEGINNING_ROWS]
-    terms = np.column_stack([np.ones_like(near), near, near**2])
-    inverse = np.linalg.pinv(terms)
-    fit = inverse @ few
-    noise = np.sqrt(np.mean((few - terms @ fit) ** 2, axis=0) * BEGINNING_ROWS / max(BEGINNING_ROWS - 3, 1))
-    doubt = 3.0 * noise * np.linalg.norm(inverse[1])
-    v = np.where(np.abs(fit[1]) > doubt, fit[1], 0.0)
-    return np.where(v == 0.0, few[0], fit[0]), v
+def _beginning(t: Array, q: Array, noise: Array) -> tuple[Array, Array]:
+    """Position and velocity at the first row; 0 for a velocity that noise, or a motion that only begins, may make.
+
+    The velocity is the parabola's through three positions, in doubt by what it changes by from one to the next.
+    """
+    apart = max(1, round(BEGINNING_S / float(np.median(np.diff(t)))))
+    first, second, third = q[0], q[apart], q[2 * apart]
+    step = t[apart] - t[0]
+    change = (third - 2.0 * second + first) / step
+    v = (second - first) / step - 0.5 * change
+    doubt = np.maximum(np.abs(change), NOISE_SIZES * SLOPE_NOISE * noise / step)
+    return first, np.where(np.abs(v) > doubt, v, 0.0)
 
 
 def _in_one_order(recordings: Sequence[Recording]) -> list[int]:

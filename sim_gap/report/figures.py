@@ -29,8 +29,8 @@ def gap_bars(answer: Diagnosis) -> Any:
     figure.add_scatter(name="noise floor", x=names, y=answer.noise_floor, mode="markers", marker=marker)
     top = float(np.nanmax(answer.heldout_before)) * 2.0
     low = float(max(np.nanmin(np.concatenate([answer.noise_floor, answer.heldout_after])) / 3.0, top * 1e-6))
-    figure.update_yaxes(type="log", title="RMS [N·m]", range=[np.log10(low), np.log10(top)], dtick=1)
-    figure.update_layout(title="Torque gap on held-out data", barmode="group", height=380, legend=BELOW_TITLE)
+    figure.update_yaxes(type="log", title=f"RMS [{answer.unit}]", range=[np.log10(low), np.log10(top)], dtick=1)
+    figure.update_layout(title="Gap on held-out data", barmode="group", height=380, legend=BELOW_TITLE)
     return figure
 
 

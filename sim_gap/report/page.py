@@ -1,26 +1,32 @@
 """The diagnosis as sections of a report: verdict, causes, gap before and after, figures of the residuals."""
 
 from pathlib import Path
-from typing import Any
 
 from armlink.effect_catalogue import CATALOGUE
 from calib.report.page import ReportSection as Section
 from calib.report.page import html_of, paragraph, paragraphs, render, verdict_line
 from calib.report.tables import ReportTable
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
+from sim_gap.position_gap.identify import Identified
 from sim_gap.report.cause_figures import cause_figure, law_figure
 from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, parameter_rows, sentence
 from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
-from sim_gap.report.position_page import position_sections
+from sim_gap.report.motion_figure import motion_sections
 from sim_gap.report.time_figures import torque_over_time
+
+PARAMETERS = {
+    "N·m": "Fitted parameters, each as a difference to what the model has.",
+    "rad": "Fitted parameters, each as the arm has it.",
+}
+"""What the parameters of a diagnosis are, by the unit of its gap."""
 
 
 def sections(answer: Diagnosis) -> list[Section]:
     """Sections for a separate page or for a part of another report."""
-    if answer.unit == "rad":
-        return position_sections(answer)
     out = [_verdict(answer), _gap(answer)]
-    if answer.internals is not None:
+    if isinstance(answer.internals, Identified):
+        out += motion_sections(answer.internals, answer.causes)
+    elif answer.internals is not None:
         out += [*_over_time(answer), *_causes(answer), *_laws(answer), *_residuals(answer)]
     return out
 
@@ -35,25 +41,28 @@ def _verdict(answer: Diagnosis) -> Section:
     if answer.causes:
         tables.append(
             ReportTable(
-                ("effect", "joints", "RMS before [N·m]", "after [N·m]", "shrink", "confidence"),
+                ("effect", "joints", f"RMS before [{answer.unit}]", f"after [{answer.unit}]", "shrink", "confidence"),
                 [_cause_row(cause) for cause in answer.causes],
                 "Causes in order, each added to those above it; RMS on held-out data over the joints of the cause.",
                 texts=2,
             )
         )
+    if rows := [row for cause in (*answer.causes, *answer.minor) for row in parameter_rows(cause)]:
         tables.append(
             ReportTable(
                 ("effect", "joint", "parameter", "value", "95 % interval", "unit"),
-                [row for cause in answer.causes for row in parameter_rows(cause)],
-                "Fitted parameters, each as a difference to what the model has.",
+                rows,
+                PARAMETERS[answer.unit],
                 texts=3,
             )
         )
-    return Section("Verdict and causes", html, (), tables)
+    return Section("Verdict and causes", html, [gap_bars(answer)], tables)
 
 
 def _cause_row(cause: Cause) -> list[str]:
-    effect = html_of("<b>{}</b><br><small>{}</small>", cause.effect, CATALOGUE[cause.effect].description)
+    effect = html_of("<b>{}</b>", cause.effect)
+    if cause.effect in CATALOGUE:  # effects of a position controller are not: no sweep knows them
+        effect += html_of("<br><small>{}</small>", CATALOGUE[cause.effect].description)
     if cause.confounded_with:
         others = ", ".join(cause.confounded_with)
         effect += html_of("<br><small>or {}: {}</small>", others, cause.separate_by or "")
@@ -82,12 +91,10 @@ def _gap(answer: Diagnosis) -> Section:
     ]
     header = ("joint", "noise floor", "training data: before", "after", "held-out data: before", "after")
     text = (
-        f"Torque gap of the simulation, RMS in N·m per joint, of the nominal model and with the causes added. "
+        f"Gap of the simulation, RMS in {answer.unit} per joint, of the nominal model and with the causes added. "
         f"The held-out data, {answer.heldout_is}, were used neither for the fit nor for the selection of effects."
     )
-    figures: list[Any] = [gap_bars(answer)]
-    if answer.rollout is not None:
-        figures.append(rollout_bars(answer.names, answer.rollout))
+    figures = [] if answer.rollout is None else [rollout_bars(answer.names, answer.rollout)]
     return Section("Gap before and after", paragraph(text), figures, [ReportTable(header, rows)])
 
 

@@ -126,3 +126,12 @@ def search_on(text: str, recordings: Sequence[Recording], floor: float = 3e-4) -
     data = windows_of(plant, recordings, [f"run {k}" for k in range(len(recordings))])
     point = nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()})
     return LoopSearch(data, scales_of(data), point, np.full(data.joints, floor))
+
+
+def weight_text(friction: float, armature: float, actuator: str) -> str:
+    """One servo that turns a weight beside its axis."""
+    return f"""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="horn">
+<joint name="servo" axis="0 -1 0" frictionloss="{friction}" armature="{armature}" damping="0.02"
+ solreffriction="0.01 1" solimpfriction="0.999 0.9999 0.001 0.5 2"/>
+<inertial pos="0.16 0 0" mass="0.35" diaginertia="5e-4 5e-4 2e-4"/></body></worldbody>
+<actuator>{actuator}</actuator></mujoco>"""

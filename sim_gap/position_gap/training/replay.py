@@ -70,8 +70,8 @@ def replay(arm: Simulated, recording: Recording, longest: float = LONGEST_S) -> 
     """Times (K,), simulated and measured positions (K, n) of the parts of a recording that are commanded without a
     break; nothing of one without commands.
 
-    Each part begins at its first measured position at rest, as if the first command had been there for long; each
-    joint's actuator gets the command held from row to row, for at most `longest` [s] in all.
+    Each part begins at its first measured position at rest, under a command that keeps it there (`hold`); each joint's
+    actuator gets the command held from row to row, for at most `longest` [s] in all.
     """
     rows = commanded_rows(recording, longest)
     parts = [_replay(arm, slice_rows(recording, part)) for part in rows]

@@ -3,6 +3,7 @@
 import ast
 import re
 import sys
+from dataclasses import make_dataclass
 from types import ModuleType, SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
@@ -30,6 +31,9 @@ HOSTILE = (
 NAMES = st.one_of(st.sampled_from(HOSTILE), st.text(st.characters(exclude_categories=["Cs"]), max_size=30))
 
 
+OTHER_FIELDS = [(name, float, 0.0) for name in ("stiffness", "damping", "min_delay", "max_delay")]
+
+
 def entries_of(name: str, folder: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     """What the written file makes with frameworks that keep what they are given; names of the file."""
     path = folder / "entries.py"
@@ -43,6 +47,21 @@ def entries_of(name: str, folder: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         patch.setitem(sys.modules, "isaaclab.actuators", framework)
         exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), names)
         return names["isaac_lab"](), names
+
+
+@pytest.mark.parametrize("name", ["actuator_effort_limit", "effort_limit"])
+def test_a_limit_has_the_name_that_the_installed_isaac_lab_knows(name, tmp_path, monkeypatch):
+    """Isaac Lab 3 renamed it: https://isaac-sim.github.io/IsaacLab/release/3.0.0, `ActuatorBaseCfg`."""
+    entry = make_dataclass("DelayedPDActuatorCfg", [("joint_names_expr", list), *OTHER_FIELDS, (name, float, 0.0)])
+    framework = ModuleType("isaaclab.actuators")
+    framework.DelayedPDActuatorCfg = entry  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "isaaclab", ModuleType("isaaclab"))
+    monkeypatch.setitem(sys.modules, "isaaclab.actuators", framework)
+    row = {"stiffness": 1.0, "damping": 0.1, "limit": 2.5, "least": 0.0, "most": 1.0}
+    write_entries({"elbow": row}, tmp_path / "entries.py", 0.002)
+    names: dict[str, Any] = {}
+    exec((tmp_path / "entries.py").read_text(encoding="utf-8"), names)
+    assert getattr(names["isaac_lab"]()["elbow"], name) == 2.5
 
 
 def test_names_of_actuator_entries_are_literals(tmp_path):

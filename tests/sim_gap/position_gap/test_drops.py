@@ -5,6 +5,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from servo_arm import weight_text
 
 from armlink.recording.corrections import AS_IT_IS
 from armlink.recording.recording import Recording
@@ -14,14 +15,6 @@ from sim_gap.model.known_gains import parse_known_gains
 from sim_gap.model.load import load_model
 
 COUNT = 2 * np.pi / 4096
-
-
-def servo(friction: float, armature: float, actuator: str) -> str:
-    return f"""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="horn">
-<joint name="servo" axis="0 -1 0" frictionloss="{friction}" armature="{armature}" damping="0.02"
- solreffriction="0.01 1" solimpfriction="0.999 0.9999 0.001 0.5 2"/>
-<inertial pos="0.16 0 0" mass="0.35" diaginertia="5e-4 5e-4 2e-4"/></body></worldbody>
-<actuator>{actuator}</actuator></mujoco>"""
 
 
 def drop(text: str, held: float, seconds: float, start: float) -> Recording:
@@ -46,9 +39,9 @@ POSITION = '<position name="servo" joint="servo" kp="30" kv="2"/>'
 def test_drops_show_friction_and_rotor(tmp_path: Path) -> None:
     random = np.random.default_rng(1128)
     friction, armature = random.uniform(0.2, 0.35), random.uniform(0.015, 0.025)
-    real = servo(friction, armature, POSITION)
+    real = weight_text(friction, armature, POSITION)
     sim = tmp_path / "sim.xml"
-    sim.write_text(servo(0.1, 0.005, POSITION), encoding="utf-8")
+    sim.write_text(weight_text(0.1, 0.005, POSITION), encoding="utf-8")
     drops = [drop(real, random.uniform(0.5, 2.0), 5.0, random.uniform(-0.3, 0.2)) for _ in range(4)]
     found = diagnose(str(sim), drops[:2], drops[2:])
     assert (found.heldout_after < 0.15 * found.heldout_before).all()
@@ -61,7 +54,7 @@ def test_known_gains_are_the_models(tmp_path: Path) -> None:
     """Of a model with a motor; what is written has a position actuator."""
     random = np.random.default_rng(1128)
     t, kp = np.arange(0.0, 12.0, 0.02), float(random.uniform(20.0, 40.0))
-    text = servo(0.1, 0.01, POSITION.replace('kp="30"', f'kp="{kp}"'))
+    text = weight_text(0.1, 0.01, POSITION.replace('kp="30"', f'kp="{kp}"'))
     model = mujoco.MjModel.from_xml_string(text)
     recordings = []
     for phase in random.uniform(0.0, 6.0, 2):
@@ -73,7 +66,7 @@ def test_known_gains_are_the_models(tmp_path: Path) -> None:
             mujoco.mj_step(model, data, 10)
         recordings.append(Recording(t=t, position=q, position_command=command))
     sim = tmp_path / "sim.xml"
-    sim.write_text(servo(0.1, 0.01, '<motor name="servo" joint="servo"/>'), encoding="utf-8")
+    sim.write_text(weight_text(0.1, 0.01, '<motor name="servo" joint="servo"/>'), encoding="utf-8")
     found = diagnose(str(sim), recordings[:1], recordings[1:], known_gains=parse_known_gains(f"kp={kp},kd=2"))
     assert found.verdict == "no_gap"
     assert (found.heldout_before < 1e-3).all()
@@ -82,7 +75,7 @@ def test_known_gains_are_the_models(tmp_path: Path) -> None:
 def test_a_short_roll_out_alone_is_no_proof_of_a_wrong_sign() -> None:
     """A square wave of a second, half a period behind, among others that follow."""
     random = np.random.default_rng(1128)
-    text = servo(0.1, 0.01, POSITION)
+    text = weight_text(0.1, 0.01, POSITION)
     arm = load_model(mujoco.MjModel.from_xml_string(text)).arm
     recordings = []
     for late in (0.0, 0.0, 0.0, 0.5):
