@@ -317,7 +317,7 @@ class MovedModel:
 
 
 def follow(given: Array, before: Array, most: Array) -> Array:
-    """What comes of a command (T, n) at a limit of its change `most` from step to step, from `before` on, (n,) each."""
+    """A command (T, n) that changes by at most `most` from step to step, from `before` on, (n,) each."""
     edges = [0, *(np.flatnonzero(np.any(np.diff(given, axis=0) != 0.0, axis=1)) + 1).tolist(), len(given)]
     out, last = np.empty_like(given), before
     for first, end in pairwise(edges):  # the command stays between them

@@ -18,7 +18,7 @@ PARAMETERS = {
     "N·m": "Fitted parameters, each as a difference to what the model has.",
     "rad": "Fitted parameters, each as the arm has it.",
 }
-"""What the parameters of a diagnosis are, by the unit of its gap."""
+"""Meaning of the parameters of a diagnosis, by the unit of its gap."""
 
 
 def sections(answer: Diagnosis) -> list[Section]:
