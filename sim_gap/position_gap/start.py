@@ -145,7 +145,7 @@ def _drawn_servos(search: LoopSearch, fit: LoopFit) -> list[dict[str, Array]]:
     centre = np.where(np.isfinite(search.data.plant.servos.kp), nominal["kp"], fit.point["kp"])
     still = np.isin(np.arange(search.data.joints), sorted(search.resting))
     points = []
-    for row in np.exp(qmc.scale(qmc.Sobol(len(low), rng=0).random(SERVOS), low, high)):
+    for row in np.exp(qmc.scale(qmc.Sobol(len(low), scramble=False).random(SERVOS), low, high)):
         share = dict(zip(SERVO_RANGES, row.tolist(), strict=True))
         point = {name: values.copy() for name, values in fit.point.items()}
         point["kp"] = centre * share["kp"]
