@@ -36,7 +36,7 @@ SERVO_RANGES = {
 """Their ranges, each drawn in its logarithm: over the model's gain, the root of gain times inertia, the joint's torque
 (friction and limit), 1 s, and the highest speed of the joint."""
 BEST_SERVOS = 3
-"""Drawn servos of each joint from which a fit begins."""
+"""Drawn servos of each joint from which a fit begins, the best first."""
 TURNS = 0.02
 """Speed over which friction changes its direction there [rad/s]."""
 RESTS_RAD = 0.002
@@ -111,28 +111,22 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     return search, replace(fit, rms=None)
 
 
-def limited_servo_starts(search: LoopSearch, fit: LoopFit) -> list[LoopFit]:
-    """Fits that begin at drawn servos with limits, each at the joints where such a one as drawn is better than `fit`.
+def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[LoopFit]:
+    """Fits that begin at the best of drawn servos with limits at the joints `where` (J,), and at `fit` elsewhere.
 
     A saturated servo hides its gain and its lag, so that no step from one without limits leads there.
     """
     few = replace(search, data=thin_moving(search.data, FEW))
     drawn = _drawn_servos(few, fit)
     names = [name for name in SERVO_RANGES if name != "lag" or search.nominal["lag"].any()]
-    costs, cost = costs_of(few, drawn), costs_of(few, [fit.point])[0]
-    order, moves = costs.argsort(axis=0), ~np.isin(np.arange(search.data.joints), sorted(search.resting))
     starts = []
-    for rank in range(BEST_SERVOS):
-        better = moves & (costs[order[rank], np.arange(search.data.joints)] < cost)
-        if not better.any():
-            break
+    for best in costs_of(few, drawn).argsort(axis=0)[:BEST_SERVOS]:
         point = {
-            name: np.where(better, [drawn[b][name][j] for j, b in enumerate(order[rank])], values)
+            name: np.where(where, [drawn[b][name][j] for j, b in enumerate(best)], values)
             for name, values in fit.point.items()
         }
         active = tuple(
-            tuple(dict.fromkeys((*before, *names))) if b else before
-            for before, b in zip(fit.active, better, strict=True)
+            tuple(dict.fromkeys((*own, *names))) if tried else own for own, tried in zip(fit.active, where, strict=True)
         )
         starts.append(few.improve(LoopFit(point, active, fit.shared), 5))
     return starts
