@@ -128,7 +128,7 @@ def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[
         active = tuple(
             tuple(dict.fromkeys((*own, *names))) if tried else own for own, tried in zip(fit.active, where, strict=True)
         )
-        starts.append(few.improve(LoopFit(point, active, fit.shared), 5))
+        starts.append(replace(few.improve(LoopFit(point, active, fit.shared), 5), rms=None))
     return starts
 
 
