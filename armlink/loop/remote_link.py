@@ -9,7 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Concatenate, ParamSpec, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from armlink.arrays import Array
 from armlink.drives.orders import DriveIdentity
 from armlink.errors import BusFault
 from armlink.link.ends import EndCause, cause_of
-from armlink.link.link import Link
 from armlink.link.park import park
 from armlink.link.types import Calibration, Command, Controller, DriveSerial, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.channel import Channel, Closed
@@ -26,9 +25,6 @@ from armlink.loop.ending import TOLD_EVERY, see_out
 from armlink.loop.messages import Alive, Call, Cut, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, said
-
-R = TypeVar("R")
-P = ParamSpec("P")
 
 CHUNK = 50
 """Rows of one message: unpickling more would hold up a cycle."""
@@ -52,9 +48,8 @@ class RemoteLink:
         self._stopped: Stopped | None = None
         self._answers: dict[int, LoopAnswer] = {}
         self._in_force: Command | None = None
-        self.torque_sent = self.position_sent = np.full(self.n, np.nan)
-        """Targets of the newest sample taken (n,) [N·m] and [rad]."""
-        self.position_step = np.full(self.n, np.inf)
+        self._torque_sent = self._position_sent = np.full(self.n, np.nan)
+        self._step = np.full(self.n, np.inf)
         self._told = self._heard = time.monotonic()
         self._tell_on: Tell = lambda text: None
         ours, theirs = socket.socketpair()
@@ -89,8 +84,60 @@ class RemoteLink:
         return self._process.poll()
 
     @property
+    def position_step(self) -> Array:
+        """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
+        return self._step
+
+    @property
+    def position_sent(self) -> Array:
+        """Target position of the newest sample taken (n,) [rad]."""
+        return self._position_sent
+
+    @property
+    def torque_sent(self) -> Array:
+        """Target torque of the newest sample taken (n,) [N·m]."""
+        return self._torque_sent
+
+    @property
     def stats(self) -> Stats:
+        """Counters since the first cycle."""
         found: Stats = self._call("stats")
+        return found
+
+    def scan(self) -> list[DriveIdentity]:
+        """Identity and state of each joint's controller."""
+        found: list[DriveIdentity] = self._call("scan")
+        return found
+
+    def start(self) -> None:
+        self._call("start")
+        self._step = self._call("position_step")
+
+    def enable(self) -> Sample:
+        return self._enabled("enable")
+
+    def recover(self) -> Sample:
+        return self._enabled("recover")
+
+    def _enabled(self, how: str) -> Sample:
+        self._stopped = None
+        sample: Sample = self._call(how)
+        self._samples.clear()
+        self._position_sent, self._torque_sent = self._call("position_sent"), self._call("torque_sent")
+        self._in_force = Command.hold(self._position_sent)
+        return sample
+
+    def park(self) -> None:
+        self.inside(park, lambda text: None)
+
+    def disable(self) -> None:
+        self._call("disable")
+
+    def stop(self) -> None:
+        self._call("stop")
+
+    def read_calibration(self, joint: int) -> Calibration:
+        found: Calibration = self._call("read_calibration", joint)
         return found
 
     @property
@@ -98,52 +145,17 @@ class RemoteLink:
         found: tuple[str, ...] = self._call("uncalibrated")
         return found
 
-    def _there(self, method: Callable[Concatenate[Link, P], R], *args: P.args, **kw: P.kwargs) -> R:
-        """The answer of a method of the link in the other process."""
-        found: R = self._call(method.__name__, *args, **kw)
+    def read_temperatures(self) -> Array:
+        found: Array = self._call("read_temperatures")
         return found
 
-    def scan(self) -> list[DriveIdentity]:
-        return self._there(Link.scan)
-
-    def start(self) -> None:
-        self._there(Link.start)
-        self.position_step = self._call("position_step")
-
-    def enable(self) -> Sample:
-        return self._enabled(Link.enable)
-
-    def recover(self) -> Sample:
-        return self._enabled(Link.recover)
-
-    def _enabled(self, how: Callable[[Link], Sample]) -> Sample:
-        self._stopped = None
-        sample = self._there(how)
-        self._samples.clear()
-        self.position_sent, self.torque_sent = self._call("position_sent"), self._call("torque_sent")
-        self._in_force = Command.hold(self.position_sent)
-        return sample
-
-    def park(self) -> None:
-        self.inside(park, lambda text: None)
-
-    def disable(self) -> None:
-        self._there(Link.disable)
-
-    def stop(self) -> None:
-        self._there(Link.stop)
-
-    def read_calibration(self, joint: int) -> Calibration:
-        return self._there(Link.read_calibration, joint)
-
-    def read_temperatures(self) -> Array:
-        return self._there(Link.read_temperatures)
-
     def drive_serial(self, joint: int) -> DriveSerial:
-        return self._there(Link.drive_serial, joint)
+        found: DriveSerial = self._call("drive_serial", joint)
+        return found
 
     def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
-        return self._there(Link.write_calibration, joint, calibration, store)
+        found: Calibration = self._call("write_calibration", joint, calibration, store)
+        return found
 
     def inside(self, function: Callable[..., Any], tell: Tell, *args: Any, **kw: Any) -> Any:
         """Call `function(link, tell, ...)` in the process that makes the cycles."""
@@ -172,10 +184,10 @@ class RemoteLink:
         for begin in range(0, len(setpoints), CHUNK):
             self._put(Play(number, setpoints[begin : begin + CHUNK]))
         yield from self._take(number, len(setpoints))
-        last = setpoints.command(len(setpoints) - 1)
-        self._in_force = Command(last.mode.copy(), last.torque.copy(), last.position.copy(), guard=last.guard)
+        self._in_force = _copy(setpoints.command(len(setpoints) - 1))
 
     def run(self, controller: Controller) -> Samples:
+        """As Link.run, in the other process."""
         number = next(self._numbers)
         self._put(RunController(number, pickle.dumps(controller)))
         yield from self._take(number, sys.maxsize)
@@ -213,7 +225,7 @@ class RemoteLink:
                 raise BusFault(f"no cycle was made for {SAMPLE:g} s: the process that drives the arm hangs")
         self._tell()
         id, row, content = self._samples.popleft()
-        sample, self.torque_sent, self.position_sent = unpack(content)
+        sample, self._torque_sent, self._position_sent = unpack(content)
         return id, row, sample
 
     def _raise_stopped(self) -> None:
@@ -282,6 +294,10 @@ class RemoteLink:
             if not see_out(self._channel, lambda: self._process.poll() is None, cause, tell):
                 self._process.kill()
             self._process.wait()
+
+
+def _copy(command: Command) -> Command:
+    return Command(command.mode.copy(), command.torque.copy(), command.position.copy(), guard=command.guard)
 
 
 def _same(one: Command, other: Command) -> bool:
