@@ -58,8 +58,8 @@ def test_a_servo_that_limits_its_speed_is_found_from_a_model_that_filters(tmp_pa
     real = weight_text(0.3, 0.02, FILTERED.format(kv=1, lag=lag, limit=20).replace('kp="25"', 'kp="60"'))
     sim = tmp_path / "sim.xml"
     sim.write_text(weight_text(0.1, 0.005, FILTERED.format(kv=3, lag=0.1, limit=20)), encoding="utf-8")
-    shapes = [(random.uniform(0.2, 1.6), random.choice((0.25, 0.5, 9.0))) for _ in range(24)]
+    shapes = [(random.uniform(0.2, 1.6), random.choice((0.25, 0.5, 9.0))) for _ in range(16)]
     runs = [roll_out(real, size * (-1) ** k, 1.5, slew, half) for k, (size, half) in enumerate(shapes)]
-    found = diagnose(str(sim), runs[:14], runs[14:])
+    found = diagnose(str(sim), runs[:10], runs[10:])
     assert (found.heldout_after < 0.2 * found.heldout_before).all()
     assert found.internals.fit.point["slew"][0] == pytest.approx(slew, rel=0.1)
