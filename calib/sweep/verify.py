@@ -110,6 +110,8 @@ def run_verify(
         calibration.require(arm_file)
     elif creeping:
         raise BadInput(f"{arm_file.name}: its drives keep no calibration: verify needs a calibration record")
+    installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
+    wanted = installed if calibration is None else calibration.torque_calibration(installed)
     beta = np.array(gravity.require(arm_file).beta)
     mover = Mover(link, section, limits)
     mover.hold_all()
@@ -118,8 +120,6 @@ def run_verify(
         read_at, held_out = _half_sum_at, _creep_poses(CreepGround.of(arm_file), poses, seed, mover.position)
     else:
         read_at, held_out = _rest_at, verify_poses(limits, section, poses, seed, mover.position)
-    installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
-    wanted = installed if calibration is None else calibration.torque_calibration(installed)
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
     for number, pose in enumerate(held_out, start=1):
