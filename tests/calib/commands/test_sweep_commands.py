@@ -38,7 +38,7 @@ def arm_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "effects": [{"effect": each.effect, "joint": each.joint, **each.parameters} for each in arm.sim.effects],
     }
     content["link"]["rate"] = 50
-    content["sweep"] = {"steps": 5, "acceleration": 10.0, "gain_std": 0.005}
+    content["sweep"] = {"steps": 5, "acceleration": 10.0, "gain_std": 0.003}
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
 

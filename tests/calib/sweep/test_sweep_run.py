@@ -52,7 +52,7 @@ def enabled(simulated: SimulatedArm) -> Link:
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
     """Both passes of a three-joint arm, the first cut off in the middle of a sweep and resumed."""
     folder: Path = tmp_path_factory.mktemp("sweeps")
-    arm = with_section(at_rate(random_arm(21, 3), 50.0), steps=5, acceleration=10.0, gain_std=0.004)
+    arm = with_section(at_rate(random_arm(21, 3), 50.0), steps=5, acceleration=10.0, gain_std=0.002)
     simulated = SimulatedArm(arm, Truth.draw(arm, 3), 3)
 
     def cut(done: int, total: int, left: float, text: str) -> None:
