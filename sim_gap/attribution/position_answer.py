@@ -10,7 +10,6 @@ from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE
 from sim_gap.attribution.diagnosis import HINT, Cause, Diagnosis, EffectRollout, Rollout, Signs, Verdict
 from sim_gap.attribution.position_notes import notes, running_free
-from sim_gap.attribution.verdict import EXPLAINED
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.choice import groups_of
@@ -29,6 +28,7 @@ from sim_gap.position_gap.training.replay import (
 )
 from sim_gap.position_gap.training.spread import interval, payload_centre
 from sim_gap.residuals.location import Location
+from sim_gap.residuals.residual_set import EXPLAINED
 from sim_gap.search.estimate import Value
 
 STRUCTURE = 2.0

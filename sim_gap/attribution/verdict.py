@@ -13,7 +13,7 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Signs, Verdict
 from sim_gap.residuals.layout import Row
-from sim_gap.residuals.residual_set import ResidualSet, root_mean_square
+from sim_gap.residuals.residual_set import EXPLAINED, ResidualSet, root_mean_square
 
 WEIGHTS = {"constant": -3.37, "evidence": 0.42, "left": -0.87, "elsewhere": -2.9, "outside": 1.3}
 """Weights of the constant and of each feature."""
@@ -50,8 +50,6 @@ def features(signs: Signs) -> dict[str, float]:
     }
 
 
-EXPLAINED = 0.3
-"""Largest share of the RMS of the gap, above the noise, that remains in an explained diagnosis."""
 NEAR, ROW_LEFT = 2.0, 0.15
 """Most that may remain of a row: this many times its margin, or this share of its RMS."""
 CARRIES = 0.3

@@ -50,6 +50,22 @@ def put_delay(actuator: Any, delay: float) -> None:
         actuator.nsample = min(MOST_SAMPLES, int(np.ceil(delay / LEAST_STEP_S)) + 2)
 
 
+def resting_command(
+    command: Array | float,
+    position: Array | float,
+    asked: Array | float,
+    friction: Array | float,
+    stiffness: Array | float,
+) -> Array:
+    """The nearest to a command under which a joint at rest stays at its position.
+
+    `asked` is the torque that a servo of this stiffness has to hold, `friction` what holds by itself (theory.md,
+    section 13).
+    """
+    low, high = (position + (asked + side * friction) / stiffness for side in (-1.0, 1.0))
+    return np.asarray(np.clip(command, low, high))
+
+
 def hold(model: Any, data: Any, actuators: Sequence[int], commands: Array) -> None:
     """Let actuators be as they are at joints that rest where they are: as if each had been given its command (n,) for
     long, or the nearest to it under which friction keeps the joint where it is.
@@ -70,8 +86,7 @@ def hold(model: Any, data: Any, actuators: Sequence[int], commands: Array) -> No
         asked, friction = asked_for[dof] / gear, model.dof_frictionloss[dof] / abs(gear)
         ki = model.actuator_gainprm[i, 0] if model.actuator_dyntype[i] == pid else 0.0
         if kp > 0.0:
-            rests = length if ki > 0.0 else length + asked / kp
-            command = min(max(command, rests - friction / kp), rests + friction / kp)
+            command = float(resting_command(command, length, 0.0 if ki > 0.0 else asked, friction, kp))
         if count := int(model.actuator_history[i, 0]):
             mujoco.mj_initCtrlHistory(model, data, i, None, np.full((count, 1), command))
         state = data.act[model.actuator_actadr[i] : model.actuator_actadr[i] + model.actuator_actnum[i]]

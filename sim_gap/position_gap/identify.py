@@ -19,7 +19,6 @@ from sim_gap.position_gap.choice import (
     groups_of,
     look_about,
     select,
-    unexplained_at,
     without_group,
     worth,
 )
@@ -37,12 +36,10 @@ from sim_gap.position_gap.training.replay import nominal, replay_rms
 from sim_gap.position_gap.training.spread import Covariance, covariance, covariance_within, known_before
 from sim_gap.position_gap.training.unreached_limits import find_unreached
 from sim_gap.position_gap.windows import Windows, thin, thin_moving, windows_of
+from sim_gap.residuals.residual_set import EXPLAINED
 
 FITTED, JUDGED = 12, 24
 """Most windows of the fit, and of the judgement."""
-MOST_LEFT = 0.3
-"""Share of a joint's gap that a search may leave before it begins elsewhere, too: a tenth of its square, as a verdict
-asks for."""
 TORQUE_MARGIN, SHARE_MARGIN = 0.08, 0.15
 """Torque that matters [N·m], at most this share of a joint's torque; over the gain it is a gap of position, at most
 this share of the tracking error."""
@@ -175,11 +172,12 @@ def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None])
         return search, bare, look_about(search, bare, [])
     search, fit = starting_fit(search, search.data.plant.servos, progress)
     best, about = select(search, fit, progress)
-    hidden = rms_on(search.data, best) > MOST_LEFT * rms_on(search.data, bare)
-    hidden &= ~np.isin(np.arange(search.data.joints), sorted(search.resting))
-    if complete and hidden.any() and unexplained_at(search, best):
+    left = rms_on(search.data, best)
+    unexplained = left > np.maximum(EXPLAINED * rms_on(search.data, bare), QUIET * search.floor)
+    unexplained &= ~np.isin(np.arange(search.data.joints), sorted(search.resting))
+    if complete and unexplained.any():
         progress("servos with limits to begin with")
-        starts = limited_servo_starts(search, best, hidden)
+        starts = limited_servo_starts(search, best, unexplained)
         other, beside = select(search, max(starts, key=lambda each: worth(search, each)), progress)
         if worth(search, other) > worth(search, best):
             return search, other, beside

@@ -24,16 +24,6 @@ class Piece:
     rests: Mask
     """Whether each joint rests there, (n,)."""
 
-    def earlier_command(self, asked: Array, friction: Array, stiffness: Array) -> Array:
-        """Command before the first row, (n,) [rad]: the first one, or of a joint that rests where that would have moved
-        it the nearest to it that would not.
-
-        `asked` is the torque that a servo of this `stiffness` has to hold, `friction` what holds by itself; (n,) each.
-        """
-        first, _ = self.held
-        low, high = (self.position + (asked + side * friction) / stiffness for side in (-1.0, 1.0))
-        return np.where(self.rests, np.clip(first, low, high), first)
-
     def command(self, edges: Array, delay: Array, earlier: Array) -> Array:
         """Mean command between the times `edges` (T + 1,), each joint's later by its `delay` (n,) [s]; (T, n).
 

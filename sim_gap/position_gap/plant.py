@@ -21,6 +21,7 @@ from sim_gap.better_model.corrected_model import (
     mass_centre_inertia,
     mujoco_quaternion,
 )
+from sim_gap.better_model.native_drives import resting_command
 from sim_gap.effects.base import tilt_gravity
 from sim_gap.effects.link import point_mass
 from sim_gap.model.load import SimModel, linear_part
@@ -292,11 +293,12 @@ class MovedModel:
     # ---- commands
 
     def earlier_command(self, piece: Piece, point: Mapping[str, Array], scale: float) -> Array:
-        """Command before a piece, (J,) [rad]: one at which what rests at its beginning had come to rest."""
+        """Command before a piece, (J,) [rad]: its first, or of a joint that rests the nearest under which it stays."""
         asked = np.where(point["ki"] > 0.0, 0.0, piece.asked * (1.0 - point["feed"]) + point["offset"])
         stiffness = np.maximum(point["kp"] * point["gain"] * scale, 1e-9)
         friction = point["coulomb"] + point["stribeck"] + point["load"] * np.abs(asked) + point["dead"] * stiffness
-        return piece.earlier_command(asked, friction, stiffness)
+        first, _ = piece.held
+        return np.where(piece.rests, resting_command(first, piece.position, asked, friction, stiffness), first)
 
     def commands(
         self, piece: Piece, begin: float, steps: int, point: Mapping[str, Array], scale: float, earlier: Array

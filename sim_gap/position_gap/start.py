@@ -117,38 +117,36 @@ def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[
     A saturated servo hides its gain and its lag, so that no step from one without limits leads there.
     """
     few = replace(search, data=thin_moving(search.data, FEW))
-    drawn = _drawn_servos(few, fit)
+    drawn = _drawn_servos(few, fit, where)
     names = [name for name in SERVO_RANGES if name != "lag" or search.nominal["lag"].any()]
+    active = tuple(
+        tuple(dict.fromkeys((*own, *names))) if tried else own for own, tried in zip(fit.active, where, strict=True)
+    )
     starts = []
     for best in costs_of(few, drawn).argsort(axis=0)[:BEST_SERVOS]:
-        point = {
-            name: np.where(where, [drawn[b][name][j] for j, b in enumerate(best)], values)
-            for name, values in fit.point.items()
-        }
-        active = tuple(
-            tuple(dict.fromkeys((*own, *names))) if tried else own for own, tried in zip(fit.active, where, strict=True)
-        )
+        point = {name: np.array([drawn[b][name][j] for j, b in enumerate(best)]) for name in fit.point}
         starts.append(replace(few.improve(LoopFit(point, active, fit.shared), 5), rms=None))
     return starts
 
 
-def _drawn_servos(search: LoopSearch, fit: LoopFit) -> list[dict[str, Array]]:
-    """Points with servos drawn over `SERVO_RANGES`, by Sobol's sequence and so the same each time."""
+def _drawn_servos(search: LoopSearch, fit: LoopFit, where: Mask) -> list[dict[str, Array]]:
+    """Points with servos drawn over `SERVO_RANGES` at the joints `where` (J,), by Sobol's sequence and so the same each
+    time."""
     low, high = np.log(np.array([*SERVO_RANGES.values()])).T
     nominal, scales = search.nominal, search.scales
-    centre = np.where(np.isfinite(search.data.plant.servos.kp), nominal["kp"], fit.point["kp"])
-    still = np.isin(np.arange(search.data.joints), sorted(search.resting))
     points = []
     for row in np.exp(qmc.scale(qmc.Sobol(len(low), scramble=False).random(SERVOS), low, high)):
         share = dict(zip(SERVO_RANGES, row.tolist(), strict=True))
-        point = {name: values.copy() for name, values in fit.point.items()}
-        point["kp"] = centre * share["kp"]
-        point["viscous"] = share["viscous"] * np.sqrt(point["kp"] * scales.inertia)
-        point["coulomb"] = share["coulomb"] * scales.torque
-        point["limit"] = share["limit"] * scales.torque
-        point["lag"] = np.where(nominal["lag"] > 0.0, share["lag"], 0.0)
-        point["slew"] = share["slew"] * search.size_of("slew")
-        points.append({n: np.where(still, fit.point[n], values) for n, values in point.items()})
+        kp = nominal["kp"] * share["kp"]
+        servo = {
+            "kp": kp,
+            "viscous": share["viscous"] * np.sqrt(kp * scales.inertia),
+            "coulomb": share["coulomb"] * scales.torque,
+            "limit": share["limit"] * scales.torque,
+            "lag": np.where(nominal["lag"] > 0.0, share["lag"], 0.0),
+            "slew": share["slew"] * search.size_of("slew"),
+        }
+        points.append({name: np.where(where, servo.get(name, values), values) for name, values in fit.point.items()})
     return points
 
 

@@ -271,13 +271,12 @@ def _beginning(t: Array, q: Array, noise: Array) -> tuple[Array, Array]:
 
     The velocity is the parabola's through three positions, in doubt by what it changes by from one to the next.
     """
-    apart = max(1, round(BEGINNING_S / float(np.median(np.diff(t)))))
-    first, second, third = q[0], q[apart], q[2 * apart]
-    step = t[apart] - t[0]
-    change = (third - 2.0 * second + first) / step
-    v = (second - first) / step - 0.5 * change
-    doubt = np.maximum(np.abs(change), NOISE_SIZES * SLOPE_NOISE * noise / step)
-    return first, np.where(np.abs(v) > doubt, v, 0.0)
+    apart = min(max(1, round(BEGINNING_S / float(np.median(np.diff(t))))), (len(t) - 1) // 2)
+    (early, late), (before, after) = np.diff(t[: 2 * apart + 1 : apart]), np.diff(q[: 2 * apart + 1 : apart], axis=0)
+    change = after / late - before / early
+    v = before / early - change * early / (early + late)
+    doubt = np.maximum(np.abs(change), NOISE_SIZES * SLOPE_NOISE * noise / early)
+    return q[0], np.where(np.abs(v) > doubt, v, 0.0)
 
 
 def _in_one_order(recordings: Sequence[Recording]) -> list[int]:

@@ -16,7 +16,7 @@ from sim_gap.report.time_figures import torque_over_time
 
 PARAMETERS = {
     "N·m": "Fitted parameters, each as a difference to what the model has.",
-    "rad": "Fitted parameters, each as the arm has it.",
+    "rad": "Fitted parameters: of joints and controller as the arm has them, of links, zeros and base the change.",
 }
 """Meaning of the parameters of a diagnosis, by the unit of its gap."""
 
@@ -47,7 +47,8 @@ def _verdict(answer: Diagnosis) -> Section:
                 texts=2,
             )
         )
-    if rows := [row for cause in (*answer.causes, *answer.minor) for row in parameter_rows(cause)]:
+    minor = answer.minor if isinstance(answer.internals, Identified) else ()  # those of torque weigh nothing
+    if rows := [row for cause in (*answer.causes, *minor) for row in parameter_rows(cause)]:
         tables.append(
             ReportTable(
                 ("effect", "joint", "parameter", "value", "95 % interval", "unit"),

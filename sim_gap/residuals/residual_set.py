@@ -22,6 +22,8 @@ SHARP = 25.0
 """Least ratio of the residual's second difference (RMS) near these changes to that elsewhere."""
 LEAST_LEFT = 0.2
 """Share of a recording that must remain."""
+EXPLAINED = 0.3
+"""Largest share of the RMS of the gap, above the noise, that remains in an explained diagnosis."""
 
 
 def near_impacts(s: PreparedSignals, channel: str, residual: Array) -> dict[int, Mask]:
