@@ -100,7 +100,7 @@ class MitDrives(BasicDrives[K]):
 
     def _sent(self, joint: int, grid: Grid, steps: Steps, power: Power) -> Frame:
         frame = self.coded(joint, steps)
-        self.memory[joint].sent = order_of(self.decoded(*frame, grid))._replace(power=power)
+        self.memory[joint].sent = order_of(self.decoded(*frame, grid), power)
         return frame
 
     def mit_setup(
@@ -146,10 +146,10 @@ class MitDrives(BasicDrives[K]):
             )
 
 
-def order_of(command: MitCommand) -> Order:
+def order_of(command: MitCommand, power: Power = ON) -> Order:
     """The order that a command stands for: position control where it has stiffness."""
     position, velocity, kp, kd, torque = command
-    return Order(ON, False, POSITION if kp > 0 else TORQUE, position, velocity, torque, kp, kd)
+    return Order(power, False, POSITION if kp > 0 else TORQUE, position, velocity, torque, kp, kd)
 
 
 def round_within(command: MitCommand, grid: Grid, limits: Limits, position: float, velocity: float) -> Steps:
