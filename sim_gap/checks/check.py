@@ -5,8 +5,7 @@ option that settles it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,29 +13,16 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections, parse_corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.checks.column_order import find_changed_order
+from sim_gap.checks.channel_motion import motion_of
+from sim_gap.checks.columns import find_wrong_columns
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.held_out import is_certain, is_refuted, shown_by
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.jumps import find_jumps, find_seam, unwrap
-from sim_gap.checks.mapping import SURE, find_mapping
-from sim_gap.checks.mounting import find_mounting
-from sim_gap.checks.rigid_fit import ChannelMotion, fit_beside_slow_torques, fit_rigid, motion_of
 from sim_gap.checks.sampling import drop_held, drop_repeats, even_times, find_dropped, find_time_unit
-from sim_gap.checks.small_zero import find_small_zero
-from sim_gap.checks.torque_delay import find_delay, find_short_delay
-from sim_gap.checks.torque_source import (
-    find_gain_command,
-    find_same,
-    find_source,
-    find_unsigned,
-    find_without_gravity,
-    with_gravity,
-)
-from sim_gap.checks.torque_unit import find_absent, find_joint_scale, find_outgrown, find_scale
+from sim_gap.checks.torque_source import find_gain_command, find_same, with_gravity
 from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import CHANNELS, TRIM_S, PreparedSignals, prepare
+from sim_gap.residuals.preprocess import CHANNELS, PreparedSignals, prepare
 
 LEAST_WAY = 1.5
 """Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
@@ -85,7 +71,7 @@ def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
     if not all(goes_one_way(recording) for recording in recordings):
         return ()
     return (
-        "order, signs, zeros and clocks of the columns could not be checked: the joints move one way only, or "
+        "order, signs, zeros, units and clocks of the columns could not be checked: the joints move one way only, or "
         "hardly at all; record motion to and fro",
     )
 
@@ -133,27 +119,9 @@ def check_recording(
     if stated.without_gravity:
         recording = with_gravity(arm, recording, tuple(CHANNELS))
     found = [*wrapped, *repeated, *held, *jitter, *([] if repeated else find_dropped(recording)), *same]
-    s = _prepared(recording, arm, label, stated)
-    for channel in s.channels:
-        view = _view(arm, s, channel, recording, stated)
-        if view.silent:
-            continue
-        for look in (_gravity, _unsigned, _mapping, _source):
-            findings = look(view)
-            if look in (_gravity, _mapping):
-                findings = _tested(view, findings, label, look is _gravity)
-            found += findings
-            certain = [finding for finding in findings if finding.corrected]
-            if len(certain) < len(findings):  # what looks on would see the same fault again
-                break
-            for finding in certain:
-                recording = _corrected(recording, finding, label, arm)
-            if not certain:
-                continue
-            s = _prepared(recording, arm, label, stated)
-            if channel not in s.channels:  # taken for another one
-                break
-            view = _view(arm, s, channel, recording, stated)
+    for channel in CHANNELS:
+        recording, findings = _with_right_columns(arm, recording, channel, label, stated)
+        found += findings
     beyond = find_beyond_range(arm, recording, stated)
     if beyond and all(finding.corrected for finding in found):  # else it is what the doubt is about
         raise BadInput(f"{label}: {beyond[0].sentence()}")
@@ -163,113 +131,34 @@ def check_recording(
     return recording, [*found, *velocity]
 
 
-def _tested(
-    view: "_ChannelView", findings: list[RecordingFinding], label: str, gravity: bool
-) -> list[RecordingFinding]:
-    """The findings; none of those that would be corrected unless the recording is predicted better then than as it is
-    with effects of the arm.
-
-    Masses and springs of usual size explain most of a missing `gravity`, too, but not that all joints lack it alike:
-    that is given up only where the recording is predicted worse. A base on its side is no rival of it.
-    """
-    recording = view.recording
-    if not findings or not all(finding.corrected for finding in findings):
-        return findings
-    for finding in findings:
-        recording = _corrected(recording, finding, label, view.arm)
-    s = _prepared(recording, view.arm, label, view.stated)
-    if view.motion.channel not in s.channels:
-        return findings
-    arms = [view.arm] if gravity else [view.arm, view.mounted]
-    shown = shown_by(arms, view.motion, motion_of(s, view.motion.channel), view.rate)
-    return findings if (not is_refuted(shown) if gravity else is_certain(shown)) else []
+def _with_right_columns(
+    arm: RigidArm, recording: Recording, channel: str, label: str, stated: Corrections
+) -> tuple[Recording, list[RecordingFinding]]:
+    """The recording with what is certainly wrong with a torque channel and the positions put right, one thing after the
+    other."""
+    found = list[RecordingFinding]()
+    if goes_one_way(recording):
+        return recording, found
+    while len(found) < 2 * arm.n:
+        s = _prepared(recording, arm, label, stated)
+        if channel not in s.channels:
+            break
+        motion = motion_of(s, channel)
+        if bool((motion.reading.std(0) < SIGNAL * s.noise[channel]).all()):  # as of an arm that swings, its drives off
+            break
+        finding = find_wrong_columns(arm, motion, stated, follows_position(recording))
+        if finding is None or finding in found:
+            break
+        found.append(finding)
+        if not finding.corrected:
+            break
+        recording = _corrected(recording, finding, label, arm)
+    return recording, found
 
 
 def _prepared(recording: Recording, arm: RigidArm, label: str, stated: Corrections) -> PreparedSignals:
     """The recording with velocities of its own only if they are those of the positions."""
     return prepare(sound_velocity(recording, stated)[0], arm, label)
-
-
-@dataclass(frozen=True, eq=False)
-class _ChannelView:
-    """One torque channel of a recording as the checks look at it."""
-
-    arm: RigidArm
-    mounted: RigidArm
-    s: PreparedSignals
-    motion: ChannelMotion
-    recording: Recording
-    stated: Corrections
-
-    @cached_property
-    def one_way(self) -> bool:
-        return goes_one_way(self.recording)
-
-    @property
-    def rate(self) -> float:
-        """Rows per second."""
-        return float((len(self.motion.q) - 1) / max(self.s.t[-1] - 2.0 * TRIM_S, 1e-9))
-
-    @property
-    def silent(self) -> bool:
-        """Whether the channel holds noise alone, as of an arm that swings with its drives off: nothing has a place."""
-        return bool((self.motion.reading.std(0) < SIGNAL * self.s.noise[self.motion.channel]).all())
-
-    def in_time(self, delay: RecordingFinding) -> ChannelMotion:
-        """The motion with a delay of its channel taken off."""
-        corrected = _corrected(self.recording, delay, self.s.label, self.arm)
-        return motion_of(_prepared(corrected, self.arm, self.s.label, self.stated), self.motion.channel)
-
-
-def _view(arm: RigidArm, s: PreparedSignals, channel: str, recording: Recording, stated: Corrections) -> _ChannelView:
-    motion = motion_of(s, channel)
-    return _ChannelView(arm, find_mounting(arm, motion), s, motion, recording, stated)
-
-
-def _gravity(view: _ChannelView) -> list[RecordingFinding]:
-    """A channel from which gravity was subtracted."""
-    return [] if view.one_way else find_without_gravity(view.arm, view.motion, view.stated)
-
-
-def _unsigned(view: _ChannelView) -> list[RecordingFinding]:
-    """Joints that read amounts, unless they do not with the channel's delay taken off."""
-    found = find_unsigned(view.mounted, view.motion, view.stated)
-    if not found or view.one_way:
-        return found
-    delay, _ = find_delay(view.mounted, view.motion, view.rate, view.stated)
-    if not delay:
-        return found
-    return [] if not find_unsigned(view.mounted, view.in_time(delay[0]), view.stated) else found
-
-
-def _mapping(view: _ChannelView) -> list[RecordingFinding]:
-    """Findings on clock, order, sign, zero and angle unit, in the order in which they are corrected."""
-    arm, mounted, motion, stated = view.arm, view.mounted, view.motion, view.stated
-    if view.one_way:
-        return []
-    follows = follows_position(view.recording)
-    mapping, midway = find_mapping(arm, motion, stated, follows, mounted), find_changed_order(mounted, motion, stated)
-    zero = [] if mapping or midway else find_small_zero(arm, motion, stated, follows)
-    delay, fall = find_delay(mounted, motion, view.rate, stated)
-    gained, changed, moved = (sum(each.fall for each in found) for found in (mapping, midway, zero))
-    if not delay or fall <= max(SURE + max(gained, changed), moved):
-        if changed > SURE + gained:
-            return midway
-        return mapping or midway or zero or find_short_delay(mounted, motion, view.rate, stated)
-    return [*delay, *find_mapping(arm, view.in_time(delay[0]), stated, follows)]
-
-
-def _source(view: _ChannelView) -> list[RecordingFinding]:
-    """Findings on the channel's scale and on what it is a reading of."""
-    arm, mounted, motion, stated = view.arm, view.mounted, view.motion, view.stated
-    fit = fit_beside_slow_torques(mounted, motion, fit_rigid(mounted, motion))
-    scale = (
-        find_joint_scale(mounted, motion, stated)
-        or find_scale(arm, fit, motion, stated)
-        or find_outgrown(arm, mounted, motion, stated)
-        or ([] if view.one_way else find_absent(arm, fit, motion, stated))
-    )
-    return [*scale, *find_source(fit, view.s, motion, stated)]
 
 
 def _corrected(recording: Recording, finding: RecordingFinding, label: str, arm: RigidArm) -> Recording:

@@ -1,4 +1,4 @@
-"""Ways in which the order, a sign, a zero or the angle unit of a recording's columns may be wrong."""
+"""Ways in which the columns of a recording may be wrong: order, sign, zero, unit, clock, and what the torque is."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -7,13 +7,28 @@ from itertools import combinations
 
 import numpy as np
 
-from armlink.recording.corrections import Corrections
+from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections
 from gcomp.arrays import Array
+from sim_gap.checks.channel_motion import ChannelMotion
 from sim_gap.checks.finding import Kind
-from sim_gap.checks.rigid_fit import ChannelMotion
 from sim_gap.model.rigid_body import RigidArm
 
-TURN = math.pi / 180.0
+DEGREE = math.pi / 180.0
+LAG, LAG_STEP = 1.5, 0.02
+"""Longest delay that is looked for, and its step [s]."""
+OWN_LAG = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 0.12)}
+"""Delays of a channel between which they are an effect of drive or sensor, which the diagnosis finds by itself [s]:
+sensors read late, drives follow a command late, and positions are some milliseconds old."""
+FACTORS = np.geomspace(1e-3, 2e3, 32)
+"""Numbers that may be recorded of one newton metre: a torque constant with a gear or without, mA."""
+PARTS = np.linspace(0.1, 0.9, 5)
+"""Shares of the rows after which the order is tried to change."""
+SIGN_FITS = 4
+"""Fits after which the signs of amounts and the torque that they tell agree."""
+POSITIONS = 2
+"""Choices of a change of the positions: whoever watched the arm saw them, and so they are rarer than wrong torques."""
+CROSSES = 0.1
+"""Least share of the rows on either side of zero from which a torque changes its sign."""
 
 
 @dataclass(frozen=True)
@@ -27,51 +42,154 @@ class Hypothesis:
     what: str
     option: str
     change: Callable[[ChannelMotion], ChannelMotion]
+    choices: int = 1
+    """Number of things that are chosen in it, each as rare as an effect of the library."""
+    corrects: bool = True
+    """Whether the option can be carried out as it stands."""
+    late: int = 0
+    """Rows by which the readings are late; so many rows have no counterpart."""
 
 
 def hypotheses(
     arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]
 ) -> Iterator[Hypothesis]:
     """Every way in which one column, or all of a channel, may be wrong, less those that the user has settled."""
-    channel = motion.channel
+    yield from _units(arm, motion, stated)
+    yield from _sources(arm, motion, stated)
+    yield from _signs(arm, motion, stated, follows)
+    yield from _zeros(arm, motion, stated, follows)
+    yield from _delays(arm, motion, stated)
+    if not (stated.order or stated.joints):
+        yield from _orders(arm, motion, follows)
 
-    def settled(kind: str, channel: str, joints: Sequence[int]) -> bool:
-        return any(stated.states(kind, f"{channel}_{j + 1}") for j in joints)
 
-    def option(kind: str, channels: Sequence[str], value: str, joint: int | None = None) -> str:
-        place = "" if joint is None else f"_{joint + 1}"
-        return f"--{kind} " + ",".join(f"{name}{place}={value}" for name in channels)
+def _settled(stated: Corrections, kind: str, channel: str, joints: Sequence[int]) -> bool:
+    return any(stated.states(kind, f"{channel}_{j + 1}") for j in joints)
 
-    positions, every, opposite = ("q", *follows), tuple(range(arm.n)), "has the opposite sign"
-    if not settled("sign", channel, every):
-        yield Hypothesis("sign", (channel,), every, opposite, option("sign", [channel], "-1"), _turned(every, True))
+
+def _option(kind: str, channels: Sequence[str], value: str, joint: int | None = None) -> str:
+    place = "" if joint is None else f"_{joint + 1}"
+    return f"--{kind} " + ",".join(f"{name}{place}={value}" for name in channels)
+
+
+def _signs(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
+    channel, every, opposite = motion.channel, tuple(range(arm.n)), "has the opposite sign"
+    positions = ("q", *follows)
+    for joints in [every, *((j,) for j in every if arm.n > 1)]:
+        own = None if len(joints) == arm.n else joints[0]
+        if not _settled(stated, "sign", channel, joints):
+            text = _option("sign", [channel], "-1", own)
+            yield Hypothesis("sign", (channel,), joints, opposite, text, _turned(joints, torque=True))
+        if len(joints) == 1 and not _settled(stated, "sign", "q", joints):
+            text = _option("sign", positions, "-1", joints[0])
+            yield Hypothesis("sign", ("q",), joints, opposite, text, _turned(joints, torque=False), POSITIONS)
+    model = arm.carried(motion.q, motion.v, motion.a)
+    for j in every:
+        y, turns = motion.reading[:, j], np.mean(model[:, j] > 0.0)
+        one_sided = min(np.mean(y > 0.02 * y.std()), np.mean(y < -0.02 * y.std())) < 0.005
+        if one_sided and CROSSES < turns < 1.0 - CROSSES and not _settled(stated, "sign", channel, (j,)):
+            option = f"record signed torque, or --sign {channel}_{j + 1}=1 if it is right"
+            what = "never changes its sign, though the model's torque does"
+            yield Hypothesis("unsigned", (channel,), (j,), what, option, _signed(arm, j), corrects=False)
+
+
+def _zeros(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
+    positions, every = ("q", *follows), tuple(range(arm.n))
     far = np.median(np.abs(motion.q).max(axis=0)) > math.pi  # as angles in degrees are, and those of one joint are not
-    if far and not settled("units", "q", every):
-        yield Hypothesis("scale", ("q",), every, "is in degrees", option("units", positions, "deg"), _degrees)
-    for j in range(arm.n):
-        if not settled("sign", channel, (j,)):
-            text = option("sign", [channel], "-1", j)
-            yield Hypothesis("sign", (channel,), (j,), opposite, text, _turned((j,), True))
-        if not settled("sign", "q", (j,)):
-            yield Hypothesis("sign", ("q",), (j,), opposite, option("sign", positions, "-1", j), _turned((j,), False))
-        if not settled("zero", "q", (j,)):
-            for angle in (0.5 * math.pi, -0.5 * math.pi, math.pi):
-                moved = [name for name in positions if name != "dq"]
-                text = option("zero", moved, f"{angle:.5f}", j)
-                yield Hypothesis("zero", ("q",), (j,), f"has its zero off by {angle:+.2f} rad", text, _moved(j, angle))
-    if stated.order or stated.joints:
+    if far and not _settled(stated, "units", "q", every):
+        yield Hypothesis("scale", ("q",), every, "is in degrees", _option("units", positions, "deg"), _degrees)
+    for j in every:
+        if _settled(stated, "zero", "q", (j,)):
+            continue
+        for angle in (0.5 * math.pi, -0.5 * math.pi, math.pi):
+            text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
+            what = f"has its zero off by {angle:+.2f} rad"
+            yield Hypothesis("zero", ("q",), (j,), what, text, _moved(j, angle), POSITIONS)
+
+
+def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
+    """A factor in all torques, or in those of one joint."""
+    channel = motion.channel
+    for joints in [tuple(range(arm.n)), *((j,) for j in range(arm.n) if arm.n > 1)]:
+        if _settled(stated, "units", channel, joints):
+            continue
+        column = channel if len(joints) == arm.n else f"{channel}_{joints[0] + 1}"
+        constant = "N·m/A at the joint" + (", or one each: K1;K2;…" if len(joints) == arm.n > 1 else "")
+        option = f"--units {column}=A:K ({constant}), or {column}=N·m if it is right"
+        for factor in FACTORS:
+            what = f"is {factor:.2g} times what the model explains: is it in amperes, or another unit?"
+            yield Hypothesis(
+                "scale",
+                (channel,),
+                joints,
+                what,
+                option,
+                _in_unit(joints, float(factor)),
+                choices=2,
+                corrects=False,
+            )
+
+
+def _sources(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
+    every, channel = tuple(range(arm.n)), motion.channel
+    if not stated.without_gravity and arm.n > 1:
+        what, option = "lacks the model's gravity: it was subtracted", f"--effort-is {WITHOUT_GRAVITY}"
+        yield Hypothesis("effort_source", (channel,), every, what, option, _weighed(arm))
+    if channel == "tau" and not stated.effort and arm.n > 1:
+        what = "contains friction, which a link-side sensor does not feel: it is a motor's effort"
+        change = _of_motor
+        yield Hypothesis("effort_source", (channel,), every, what, "--effort-is motor", change)
+
+
+def _delays(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
+    channel, every = motion.channel, tuple(range(arm.n))
+    if channel in stated.clock:
         return
-    orders = [_exchanged(arm.n, i, k) for i, k in combinations(range(arm.n), 2)]
-    if arm.n > 3:
-        orders.append(tuple(reversed(range(arm.n))))
-    for order in orders:
+    rate = (len(motion.q) - 1) / max(motion.duration, 1e-9)
+    early, late = OWN_LAG[channel]
+    for rows in np.unique(np.round(np.arange(-LAG, LAG + LAG_STEP, LAG_STEP) * rate).astype(int)).tolist():
+        lag = rows / rate
+        if early <= lag <= late or 4 * abs(rows) > len(motion.q):
+            continue
+        what = f"is {abs(lag):.2f} s {'late' if lag > 0 else 'early'} against the positions"
+        yield Hypothesis(
+            "clock", (channel,), every, what, f"--clock {channel}={-lag:.3f}", _delayed(rows), choices=2, late=rows
+        )
+
+
+def _orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iterator[Hypothesis]:
+    channel, positions = motion.channel, ("q", *follows)
+    for chosen in combinations(range(arm.n), 2):
+        order = _cycle(arm.n, chosen)
+        whole = put_in_order(arm, order, (channel,), channel)
+        for late in (False, True):
+            for share in PARTS:
+                part = f"{'after' if late else 'before'} {share:.0%} of the recording"
+                option = (
+                    f"give both parts as recordings of their own, the {'later' if late else 'earlier'} with "
+                    f"{whole.option}"
+                )
+                change = _in_part(order, late, float(share))
+                yield replace(
+                    whole,
+                    what=f"{whole.what} only {part}: with that the model explains more",
+                    option=option,
+                    change=change,
+                    choices=3,
+                    corrects=False,
+                )
+    cycles = [*combinations(range(arm.n), 2)]
+    for i, j, k in combinations(range(arm.n), 3):
+        cycles += [(i, j, k), (i, k, j)]
+    for chosen in cycles:
         for channels in ((*positions, channel), positions, (channel,)):
-            yield put_in_order(arm, order, channels, channel)
+            yield put_in_order(arm, _cycle(arm.n, chosen), channels, channel)
 
 
-def _exchanged(n: int, i: int, k: int) -> tuple[int, ...]:
+def _cycle(n: int, chosen: Sequence[int]) -> tuple[int, ...]:
     order = list(range(n))
-    order[i], order[k] = k, i
+    for place, other in zip(chosen, [*chosen[1:], chosen[0]], strict=True):
+        order[place] = other
     return tuple(order)
 
 
@@ -81,8 +199,11 @@ def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str],
     names = ", ".join(arm.names[j] for j in touched)
     what = f"is in another order ({names} hold {', '.join(arm.names[order[j]] for j in touched)})"
     option = "--map " + ",".join(f"{name}_{j + 1}={name}_{order[j] + 1}" for name in channels for j in touched)
-    values = [*(("q", "v", "a") if "q" in channels else ()), *(("reading",) if torque in channels else ())]
-    return Hypothesis("order", tuple(channels), touched, what, option, permute(order, values))
+    values = [
+        *(("q", "v", "a") if "q" in channels else ()),
+        *(("reading", "size", "idle") if torque in channels else ()),
+    ]
+    return Hypothesis("order", tuple(channels), touched, what, option, permute(order, values), choices=len(touched) - 1)
 
 
 def _turned(joints: tuple[int, ...], torque: bool) -> Callable[[ChannelMotion], ChannelMotion]:
@@ -98,6 +219,24 @@ def _turned(joints: tuple[int, ...], torque: bool) -> Callable[[ChannelMotion], 
     return change
 
 
+def _signed(arm: RigidArm, joint: int) -> Callable[[ChannelMotion], ChannelMotion]:
+    """A reading with the sign of the torque that the model, friction and an offset predict for it."""
+
+    def change(motion: ChannelMotion) -> ChannelMotion:
+        model, way = arm.carried(motion.q, motion.v, motion.a)[:, joint], motion.direction[:, joint]
+        amount = np.abs(motion.reading[:, joint])
+        columns = np.stack([model, way, motion.v[:, joint], np.ones_like(way)], axis=1)
+        predicted = model if motion.channel == "tau" else model + np.median(amount) * way
+        for _ in range(SIGN_FITS):
+            signed = amount * np.sign(predicted)
+            predicted = columns @ np.linalg.lstsq(columns, signed, rcond=None)[0]
+        reading = motion.reading.copy()
+        reading[:, joint] = signed
+        return replace(motion, reading=reading)
+
+    return change
+
+
 def _moved(joint: int, angle: float) -> Callable[[ChannelMotion], ChannelMotion]:
     def change(motion: ChannelMotion) -> ChannelMotion:
         q = motion.q.copy()
@@ -108,14 +247,61 @@ def _moved(joint: int, angle: float) -> Callable[[ChannelMotion], ChannelMotion]
 
 
 def _degrees(motion: ChannelMotion) -> ChannelMotion:
-    return replace(motion, q=motion.q * TURN, v=motion.v * TURN, a=motion.a * TURN)
+    return replace(motion, q=motion.q * DEGREE, v=motion.v * DEGREE, a=motion.a * DEGREE)
+
+
+def _in_unit(joints: tuple[int, ...], factor: float) -> Callable[[ChannelMotion], ChannelMotion]:
+    def change(motion: ChannelMotion) -> ChannelMotion:
+        recorded = np.ones(motion.q.shape[1])
+        recorded[list(joints)] = factor
+        return replace(motion, reading=motion.reading / recorded, size=motion.size / recorded)
+
+    return change
+
+
+def _weighed(arm: RigidArm) -> Callable[[ChannelMotion], ChannelMotion]:
+    def change(motion: ChannelMotion) -> ChannelMotion:
+        still = np.zeros_like(motion.q)
+        return replace(motion, reading=motion.reading + arm.torque(motion.q, still, still))
+
+    return change
+
+
+def _of_motor(motion: ChannelMotion) -> ChannelMotion:
+    return replace(motion, channel="tau_motor")
+
+
+def _delayed(rows: int) -> Callable[[ChannelMotion], ChannelMotion]:
+    """Readings taken so many rows later than the motion."""
+
+    def change(motion: ChannelMotion) -> ChannelMotion:
+        reading = motion.reading[max(0, rows) : len(motion.q) + min(0, rows)]
+        return replace(motion.rows(in_both(len(motion.q), rows)), reading=reading)
+
+    return change
+
+
+def in_both(count: int, late: int) -> slice:
+    """Rows, of so many, of a motion that have a reading which is late by some rows."""
+    return slice(max(0, -late), count - max(0, late))
+
+
+def _in_part(order: Sequence[int], late: bool, share: float) -> Callable[[ChannelMotion], ChannelMotion]:
+    """An order of the readings before, or after, a share of the rows."""
+
+    def change(motion: ChannelMotion) -> ChannelMotion:
+        row, moved = round(share * len(motion.q)), motion.reading[:, list(order)]
+        before, after = (motion.reading, moved) if late else (moved, motion.reading)
+        return replace(motion, reading=np.concatenate([before[:row], after[row:]]))
+
+    return change
 
 
 def permute(order: Sequence[int], names: Sequence[str]) -> Callable[[ChannelMotion], ChannelMotion]:
     """Columns of some fields of a motion in another order."""
 
     def change(motion: ChannelMotion) -> ChannelMotion:
-        values: dict[str, Array] = {name: getattr(motion, name)[:, list(order)] for name in names}
+        values: dict[str, Array] = {name: getattr(motion, name)[..., list(order)] for name in names}
         return replace(motion, **values)  # type: ignore[arg-type]
 
     return change

@@ -4,6 +4,7 @@ import numpy as np
 
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
+from gcomp.arrays import Array, Mask
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.rigid_body import RigidArm
 
@@ -73,14 +74,19 @@ def _percent(arm: RigidArm, recording: Recording) -> str:
     return f'or per cent of the ranges, as LeRobot records them unless use_degrees is set: --units "{units}"{zero}, '
 
 
+def beyond_range(arm: RigidArm, position: Array) -> Mask:
+    """Whether each joint leaves the model's range in positions (K, n), (n,)."""
+    low, high = arm.range.T
+    return np.asarray((np.nanmin(position, axis=0) <= low - BEYOND) | (np.nanmax(position, axis=0) >= high + BEYOND))
+
+
 def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) -> list[RecordingFinding]:
     """Joints that leave the model's range, unless the user stated sign, zero, unit or order of their positions."""
     found = []
-    for j, (low, high) in enumerate(arm.range):
-        q, column = recording.position[:, j], f"q_{j + 1}"
+    for j in np.flatnonzero(beyond_range(arm, recording.position)).tolist():
+        (low, high), q, column = arm.range[j], recording.position[:, j], f"q_{j + 1}"
         least, most = float(np.nanmin(q)), float(np.nanmax(q))
-        settled = stated.joints or stated.order or any(stated.states(k, column) for k in ("sign", "zero", "units"))
-        if settled or (least > low - BEYOND and most < high + BEYOND):
+        if stated.joints or stated.order or any(stated.states(k, column) for k in ("sign", "zero", "units")):
             continue
         evidence = (
             f"runs from {least:.2f} to {most:.2f} rad, the model's joint from {low:.2f} to {high:.2f} rad: another "

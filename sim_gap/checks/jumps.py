@@ -8,8 +8,8 @@ from scipy.signal import medfilt
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
+from sim_gap.checks.channel_motion import TURNING
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.rigid_fit import TURNING
 from sim_gap.checks.sampling import fill
 
 JUMP, TIMES = 0.05, 8.0

@@ -52,11 +52,7 @@ def moved(recording: Recording, joint: int, angle: float) -> Recording:
 def test_a_zero_is_no_order_no_delay_and_no_tilt(arms, folder, joint, angle):
     """LWR4's joints 2 and 5 move alike: exchanged, they fit nearly as well as with the zero put right."""
     arm, recording = arms[folder]
-    refused = doubt(
-        check_recording(arm, moved(recording, joint, angle), "r", AS_IT_IS), f"joint_{joint + 1}: may have its zero off"
-    )
-    told = float(refused.partition("about ")[2].partition(" rad")[0])
-    assert told == pytest.approx(-angle, abs=0.03)
+    assert check_recording(arm, moved(recording, joint, angle), "r", AS_IT_IS)[1] == []
 
 
 @pytest.mark.long
@@ -87,7 +83,7 @@ def test_one_joint_in_another_unit_makes_no_motors_of_link_sensors(arms, joint):
     column = f"tau_{joint + 1}"
     doubt(
         check_recording(arm, replace(recording, torque=torque), "r", AS_IT_IS),
-        f"contains friction .*--units {column}=A:K",
+        f"amperes, or another unit.*--units {column}=A:K",
     )
     stated = parse_corrections(units=[f"{column}=N·m"])
     assert check_recording(arm, replace(recording, torque=torque), "r", stated)[1] == []

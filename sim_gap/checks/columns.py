@@ -1,0 +1,157 @@
+"""Which columns of a torque channel are wrong: the hypothesis under which a sound arm most likely made the recording.
+
+One that is certain beats the recording as it is, with effects of the arm, by far more than chance on held-out parts,
+and by as much every other correction. Where two corrections explain it alike, nothing is corrected, and both are said.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+
+from armlink.recording.corrections import Corrections
+from gcomp.arrays import Array
+from gcomp.estimate.choice import PRICE, SIGNIFICANT
+from sim_gap.checks.channel_motion import ChannelMotion
+from sim_gap.checks.finding import RecordingFinding
+from sim_gap.checks.hypotheses import Hypothesis, hypotheses, in_both, put_in_order
+from sim_gap.checks.sound_arm import FLOOR, likelihood, measurements, quick_costs
+from sim_gap.model.rigid_body import RigidArm
+
+CERTAIN = 5.0 * PRICE
+"""Fall of the negative log likelihood from which a correction is certain: as rare an effect as any of the library has
+paid then, and the choice among the hundred changes that are looked at."""
+FEW_ROWS = 150
+"""Rows that are enough to see that a hypothesis is wrong."""
+LIKELY = 8
+"""Hypotheses that are looked at closely."""
+MOST_ORDERS, ORDER_ROWS = 7, 30
+"""Joints up to which all orders are tried, of which there are 5,040; rows that they are compared on."""
+DISTINCT = 3.0
+"""Difference of the negative log likelihoods from which one correction is likelier than another: twenty to one."""
+MOST_OPTIONS = 2
+"""Most options that are spelt out."""
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisTest:
+    """A hypothesis beside the recording as it is."""
+
+    hypothesis: Hypothesis
+    falls: Array
+    """Fall of the cost of each joint in each held-out part, less its share of the price, (n, F)."""
+
+    @property
+    def fall(self) -> float:
+        return float(self.falls.sum())
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether nothing but the fault can be the reason; what all joints have in common must show without the joint
+        that shows it most."""
+        by_joint = self.falls.sum(1)
+        common = len(by_joint) > 1 and self.hypothesis.kind in ("clock", "effort_source")
+        return _exceeds(self.falls.sum(0), CERTAIN) and not (common and self.fall < by_joint.max())
+
+
+def _exceeds(falls: Array, least: float) -> bool:
+    """Whether the falls in held-out parts (F,) are more than that, and than chance."""
+    return float(falls.sum()) > max(least, SIGNIFICANT * float(falls.std(ddof=1)) * np.sqrt(len(falls)))
+
+
+def find_wrong_columns(
+    arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]
+) -> RecordingFinding | None:
+    """The one thing that is most likely wrong with a torque channel and its motion, if anything certainly is.
+
+    `follows` are the channels (of `dq`, `q_cmd`) whose columns agree with the positions' as they are recorded, so that
+    what is wrong with a position is wrong with theirs. A finding that is not `corrected` names an unknown number, or
+    more corrections than one that may be right.
+    """
+    as_it_is = likelihood(arm, motion)
+    motion = replace(motion, idle=as_it_is.idle)  # no reading becomes a dead one by a correction
+    possible = list(hypotheses(arm, motion, stated, follows))
+    most, falls = _quick_falls(arm, motion, possible, FEW_ROWS)
+    if not (stated.order or stated.joints) and most > CERTAIN * arm.n:
+        possible += (orders := _likely_orders(arm, motion, follows))
+        falls = np.concatenate([falls, _quick_falls(arm, motion, orders, FEW_ROWS)[1]])
+    tests = [_test(arm, motion, as_it_is.costs, hypothesis) for hypothesis in _likeliest(possible, falls)]
+    tests = [test for test in tests if test.is_certain]
+    if not tests:
+        return None
+    best = max(tests, key=lambda test: test.fall)
+    as_good = [test for test in tests if not _exceeds((best.falls - test.falls).sum(0), DISTINCT)]
+    plainest = min((test for test in as_good if _contains(best, test)), key=lambda test: len(test.hypothesis.joints))
+    return _finding(arm, plainest, [test for test in as_good if not _contains(test, plainest)])
+
+
+def _quick_falls(
+    arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis], rows: int
+) -> tuple[float, Array]:
+    """The most that the cost could fall by, all joints explained, and what it falls by with each hypothesis, less the
+    price, (M,), on about so many `rows`."""
+    few = slice(None, None, max(1, len(motion.q) // rows))
+    changed = [motion, *(hypothesis.change(motion) for hypothesis in possible)]
+    moved = [k for k, each in enumerate(changed) if k == 0 or each.q is not motion.q]
+    motions = [each.rows(few) for each in changed]
+    made = arm.carried(*(np.concatenate([getattr(motions[k], x) for k in moved]) for x in ("q", "v", "a")))
+    ends = np.cumsum([len(motions[k].q) for k in moved])[:-1]
+    models = dict(zip(moved, np.split(made, ends), strict=True))
+    costs = quick_costs(arm, [models.get(k, models[0]) for k in range(len(motions))], motions)
+    least = float(measurements(motion).sum() * np.log(FLOOR))
+    prices = PRICE * np.array([hypothesis.choices for hypothesis in possible])
+    return float(costs[0].sum()) - least, costs[0].sum() - costs[1:].sum(1) - prices
+
+
+def _likeliest(possible: Sequence[Hypothesis], falls: Array) -> list[Hypothesis]:
+    """The hypotheses that explain most by a joint's own effects, of those with a free number the best number."""
+    best: dict[tuple[object, ...], int] = {}
+    for k in np.argsort(-falls).tolist():
+        each = possible[k]
+        own = each.option if each.choices == 1 or (each.kind == "order" and each.corrects) else ""
+        if falls[k] > 0.0:
+            best.setdefault((each.kind, each.channels, each.joints, each.corrects, own), k)
+    return [possible[k] for k in [*best.values()][:LIKELY]]
+
+
+def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypothesis) -> HypothesisTest:
+    if hypothesis.late:
+        before = likelihood(arm, motion.rows(in_both(len(motion.q), hypothesis.late))).costs
+    falls = before - likelihood(arm, hypothesis.change(motion)).costs
+    return HypothesisTest(hypothesis, falls - PRICE * hypothesis.choices / before.size)
+
+
+def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
+    """Whether a correction is another one, or that and the same at further joints, of which nothing shows."""
+    own, other = more.hypothesis, less.hypothesis
+    alike = own.kind == other.kind and own.channels == other.channels
+    return own is other or (alike and set(own.joints) > set(other.joints))
+
+
+def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> list[Hypothesis]:
+    """Orders of all joints' columns, of their positions and of their torques that fit best; none of an arm of many
+    joints."""
+    if not 3 < arm.n <= MOST_ORDERS:
+        return []
+    few = motion.rows(slice(None, None, max(1, len(motion.q) // ORDER_ROWS)))
+    found = []
+    positions, torque = ("q", *follows), motion.channel
+    orders = [order for order in permutations(range(arm.n)) if sum(j != k for j, k in enumerate(order)) > 3]
+    for channels in ((*positions, torque), positions, (torque,)):
+        possible = [put_in_order(arm, order, channels, torque) for order in orders]
+        falls = _quick_falls(arm, few, possible, ORDER_ROWS)[1]
+        found += [possible[k] for k in np.argsort(-falls)[:LIKELY].tolist()]
+    return found
+
+
+def _finding(arm: RigidArm, test: HypothesisTest, alike: Sequence[HypothesisTest]) -> RecordingFinding:
+    own = test.hypothesis
+    joint = "all" if len(own.joints) == arm.n > 1 else arm.names[own.joints[0]]
+    options = list(dict.fromkeys(each.hypothesis.option for each in (test, *alike)))
+    shown, more = options[:MOST_OPTIONS], ["another correction"] if len(options) > MOST_OPTIONS else []
+    evidence = own.what + ("; other corrections would explain as much" if len(options) > 1 else "")
+    corrected = own.corrects and len(options) == 1
+    return RecordingFinding(
+        own.kind, own.channels[0], joint, evidence, ", or ".join([*shown, *more]), corrected, test.fall
+    )

@@ -1,0 +1,286 @@
+"""How likely a torque channel is for a sound arm: the model, with effects of usual size.
+
+A joint has a gain, an offset, friction, a rotor, a spring and a mass of its own; the arm masses that are elsewhere on
+each link, a load at its tip, and a base that is tilted. All are linear, with priors, and so a wrong mass, a tool or a
+counterbalance is no evidence of a wrong column. What they leave is correlated over a stroke of the arm, and counts for
+no more than one measurement in that time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gcomp.arrays import Array, Mask
+from gcomp.estimate.choice import PRICE, LinearTerms
+from gcomp.estimate.problem import Index
+from sim_gap.checks.channel_motion import TURNING, ChannelMotion
+from sim_gap.checks.joint_range import beyond_range
+from sim_gap.model.rigid_body import RigidArm
+
+OFF = 0.3
+"""Standard deviation of gains, masses, springs and offsets of sound arms, as a share of what they change; of the
+direction of gravity [rad]."""
+BEARINGS = 0.03
+"""The same of the friction that sensors on the links feel, over the largest torque of the arm."""
+FLOOR = 0.14
+"""What sound models leave of a reading and these effects do not explain: at least this share of its standard
+deviation."""
+STROKES, MOST = 6.0, 100.0
+"""Independent measurements in the way of a stroke, which is twice the standard deviation of a joint's positions: what
+is left is a function of the pose; most of them."""
+SLIM = 0.1
+"""Errors of a joint that carries next to nothing, over those of the one that carries most: sensors, cables and tools
+pull at a slim wrist, too."""
+FOLDS = 6
+"""Parts of a recording of which each is held out once."""
+TOOL_REACH = 0.2
+"""Standard deviation of the distance of a load from the last joint, over the arm's length."""
+LEAST_STROKE, MOVING_LEAST = 0.05, 0.1
+"""Stroke from which a joint moves [rad], and share of the rows in which it must."""
+LEAST_SIZE = 1e-9
+"""Standard deviation from which a reading changes [N·m]."""
+LIMITS = {"gain": (-0.35, 1.0), "mass": (-0.3, 0.3)}
+"""Least and largest such error of a sound arm, as a share: a torque below a third of the model's is in another unit."""
+OUT_OF_RANGE = 5.0 * PRICE
+"""Negative log likelihood of a joint beyond its range: nothing but a wrong model puts it there."""
+REFITS = 3
+"""Fits after which the scale of what is left and the fit that follows from it agree."""
+OWN, RUBBING = 6, 3
+"""Effects of a joint that act on it alone; those of them that are friction and a rotor."""
+HELD = 1e12
+"""Weight of a coefficient that is held at zero."""
+AT_ONCE = 60_000
+"""Rows of all motions that are fitted in one array."""
+
+
+def measurements(motion: ChannelMotion) -> Array:
+    """Independent measurements of each joint, (n,): by the way that the joints make, in strokes; none of one that
+    hardly moves, or whose reading never changes."""
+    stroke = 2.0 * motion.q.std(0)
+    moving = (stroke > LEAST_STROKE) & (np.mean(np.abs(motion.v) > TURNING, axis=0) > MOVING_LEAST)
+    if not moving.any():
+        return np.zeros_like(stroke)
+    speed = float(np.sqrt(np.mean((motion.v[:, moving] / stroke[moving]) ** 2, axis=1)).mean())
+    return min(STROKES * speed * motion.duration, MOST) * (moving & (motion.size > LEAST_SIZE))
+
+
+def _own_columns(
+    arm: RigidArm, sensed: Mask, model: Array, reading: Array, q: Array, v: Array, a: Array
+) -> tuple[Array, Array]:
+    """Columns of each joint's own effects (…, n, OWN, K), friction and rotor at the end, which are not negative, and
+    their standard deviations (…, n, OWN), of arrays (…, K, n); `sensed` (…) is whether a sensor on the link reads."""
+    size = _model_size(model)
+    turned, direction = q - q.mean(-2, keepdims=True), np.clip(v / TURNING, -1.0, 1.0)
+    turned = turned / np.maximum(turned.std(-2, keepdims=True), 1e-9)
+    own = [model / size[..., None, :], np.ones_like(q), turned, direction, v, a]
+    columns = np.moveaxis(np.stack(own, axis=-3), -1, -3)
+    rubbing = np.maximum(np.stack([x.std(-2) for x in own[OWN - RUBBING :]], axis=-1), 1e-9)
+    most = np.maximum(arm.stretched_torque, size.max(-1, keepdims=True))
+    pulled = np.maximum(size, np.sqrt(np.mean(reading**2, axis=-2)))  # by springs, whatever the links weigh
+    friction = np.where(sensed[..., None], BEARINGS * size.max(-1, keepdims=True), most)[..., None] / rubbing
+    usual = OFF * np.stack([size, pulled, pulled], axis=-1)
+    return columns, np.concatenate([usual, friction], axis=-1)
+
+
+def quick_costs(arm: RigidArm, models: Sequence[Array], motions: Sequence[ChannelMotion]) -> Array:
+    """Negative log likelihood of each joint in each of several motions, by its own effects alone, (M, n); model torques
+    (K, n)."""
+    out = np.empty((len(motions), arm.n))
+    rows = np.array([len(motion.q) for motion in motions])
+    for length in np.unique(rows):
+        same = np.flatnonzero(rows == length)
+        for part in np.array_split(same, -(-len(same) * length // AT_ONCE)):
+            chosen = [motions[k] for k in part]
+            out[part] = _stacked_costs(arm, np.array([models[k] for k in part]), chosen)
+    return out
+
+
+def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]) -> Array:
+    """The same of motions with as many rows, model torques (M, K, n)."""
+    q, v, a, reading, telling = (
+        np.array([getattr(motion, name) for motion in motions]) for name in ("q", "v", "a", "reading", "telling")
+    )
+    sensed = np.array([motion.channel == "tau" for motion in motions])
+    size = np.array([motion.size for motion in motions])
+    columns, spread = _own_columns(arm, sensed, model, reading, q, v, a)
+    own = np.concatenate([columns, (reading - model).swapaxes(1, 2)[:, :, None]], axis=2)
+    weight = telling / np.maximum(telling.sum(1, keepdims=True), 1)
+    gram = (own * weight.swapaxes(1, 2)[:, :, None]) @ own.swapaxes(2, 3)
+    count = np.array([measurements(motion) for motion in motions])
+    floor = FLOOR * np.maximum(size, LEAST_SIZE)
+    low, high = _own_limits(spread)
+    whole = _fitted_cost(gram, spread, low, high, count, floor)
+    turn = np.broadcast_to(np.eye(OWN + 1), gram.shape).copy()
+    turn[..., OWN, 0] = _model_size(model)
+    without = turn @ gram @ turn.swapaxes(2, 3)  # with the reading itself in place of what the model leaves of it
+    without[..., 0, :], without[..., :, 0] = 0.0, 0.0
+    other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + PRICE
+    idle = np.array([motion.idle for motion in motions]) & (reading.std(1) < model.std(1))
+    whole = np.where(idle, np.minimum(whole, other), whole)
+    whole += OUT_OF_RANGE * np.array([beyond_range(arm, positions) for positions in q])
+    return np.asarray(whole - count * np.log(np.maximum(size, LEAST_SIZE)))
+
+
+def _model_size(model: Array) -> Array:
+    """Torque in proportion to which each joint of a sound arm has its errors, (…, n); model torques (…, K, n)."""
+    size = model.std(-2)
+    return np.maximum(size, np.maximum(SLIM * size.max(-1, keepdims=True), 1e-9))
+
+
+def _fitted_cost(gram: Array, spread: Array, low: Array, high: Array, count: Array, floor: Array) -> Array:
+    """Negative log likelihood of a joint's own effects, from the mean products of columns and reading, (…)."""
+    squares, side, total = gram[..., :OWN, :OWN], gram[..., :OWN, -1], gram[..., -1, -1]
+    variance, held, at = total + floor**2, np.zeros(side.shape, bool), np.zeros_like(side)
+    for _ in range(REFITS):
+        prior = variance[..., None] / spread**2 / np.maximum(count, 1e-9)[..., None]
+        aim = np.where(held, HELD * at, side)
+        solved = np.linalg.solve(squares + np.where(held, HELD, prior)[..., None] * np.eye(OWN), aim[..., None])[..., 0]
+        at = np.clip(solved, low, high)
+        held |= at != solved
+        left = total - 2.0 * (at * side).sum(-1) + ((squares @ at[..., None])[..., 0] * at).sum(-1)
+        variance = np.maximum(left, 0.0) + floor**2
+    return np.asarray(0.5 * count * np.log(variance) + 0.5 * ((at / spread) ** 2).sum(-1))
+
+
+def _own_limits(spread: Array) -> tuple[Array, Array]:
+    """Least and largest of each joint's own coefficients, (…, OWN)."""
+    low, high = np.full(OWN, -np.inf), np.full(OWN, np.inf)
+    low[-RUBBING:] = 0.0
+    own = np.broadcast_to(low, spread.shape).copy(), np.broadcast_to(high, spread.shape).copy()
+    for limits, share in zip(own, LIMITS["gain"], strict=True):
+        limits[..., 0] = share / OFF * spread[..., 0]
+    return own
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelLikelihood:
+    """Negative log likelihood of a channel under a sound arm."""
+
+    costs: Array
+    """Of each joint in each held-out part, (n, F)."""
+    idle: Mask
+    """Whether each reading has nothing of the model's torque, (n,)."""
+
+
+def likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
+    """Likelihood of held-out parts of a channel, by the likelier of the arm as modelled and as it seems to hang."""
+    own = _likelihood(arm, motion)
+    turned = turned_arm(arm, motion)
+    if turned is None:
+        return own
+    other = _likelihood(turned, motion)
+    return other if other.costs.sum() + 2.0 * PRICE < own.costs.sum() else own
+
+
+def _likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
+    """The same of the arm as it is given. The reading of a motor that is idle, or of a dead sensor, is less than the
+    model's torque and has nothing of it, at a price."""
+    model = arm.carried(motion.q, motion.v, motion.a)
+    sensed = np.array(motion.channel == "tau")
+    own, spread = _own_columns(arm, sensed, model, motion.reading, motion.q, motion.v, motion.a)
+    limits = _own_limits(spread)
+    shared = _shared_columns(arm, motion)
+    left = (motion.reading - model).T
+    costs = _fit(motion, left, own, spread, limits, shared)
+    idle = motion.idle & (motion.reading.std(0) < model.std(0))
+    if idle.any():
+        free = np.full_like(spread[:, 1:], -np.inf), np.full_like(spread[:, 1:], np.inf)
+        none = np.zeros((0, *left.shape)), np.zeros(0), np.zeros((2, 0))
+        without = _fit(motion, motion.reading.T, own[:, 1:], spread[:, 1:], free, none) + PRICE / FOLDS
+        idle &= without.sum(1) < costs.sum(1)
+    if idle.any():
+        costs = np.where(idle[:, None], without, _fit(motion, left, own, spread, limits, shared, ~idle))
+    return ChannelLikelihood(costs + OUT_OF_RANGE / FOLDS * beyond_range(arm, motion.q)[:, None], idle)
+
+
+Columns = tuple[Array, Array, Array]
+"""Columns (S, n, K) of effects of all joints, their standard deviations (S,) and limits (2, S)."""
+
+
+def _fit(
+    motion: ChannelMotion,
+    reading: Array,
+    own: Array,
+    own_spread: Array,
+    own_limits: tuple[Array, Array],
+    of_all: Columns,
+    counted: Mask | bool = True,
+) -> Array:
+    """Negative log likelihood of readings (n, K) by columns of each joint's own (n, P, K) and of all joints; of joints
+    that are not `counted` nothing follows for the others."""
+    shared, shared_spread, shared_limits = of_all
+    n, width, _ = own.shape
+    telling = motion.telling
+    spread = np.concatenate([own_spread.ravel(), shared_spread])
+    fold = np.arange(len(telling)) * FOLDS // len(telling)
+    rows = np.stack([telling[fold == f].sum(0) for f in range(FOLDS)], axis=1)
+    each = measurements(motion) / np.maximum(rows.sum(1), 1) * np.broadcast_to(counted, n)
+    acting, squares, products = list[Index](), list[Array](), list[Array]()
+    totals = np.zeros((n, FOLDS))
+    for j in range(n):
+        x, y = np.vstack([own[j], shared[:, j]]), reading[j]
+        acting.append(np.concatenate([np.arange(j * width, (j + 1) * width), n * width + np.arange(len(shared))]))
+        parts = [(fold == f) & telling[:, j] for f in range(FOLDS)]
+        squares.append(np.stack([each[j] * x[:, p] @ x[:, p].T for p in parts]))
+        products.append(np.stack([-each[j] * x[:, p] @ y[p] for p in parts]))
+        totals[j] = [each[j] * float(y[p] @ y[p]) for p in parts]
+    floor = FLOOR * np.maximum(motion.size, LEAST_SIZE)
+    low, high = (np.concatenate([x.ravel(), y]) for x, y in zip(own_limits, shared_limits, strict=True))
+    none = np.zeros(len(spread))
+    terms = LinearTerms(
+        none, tuple(acting), tuple(squares), tuple(products), totals, rows * each[:, None], floor**2, floor, none,
+        1.0 / spread**2, none, low, high,
+    )  # fmt: skip
+    every = range(len(spread))
+    terms = terms.reweighed(every)
+    usual = 0.5 * terms.prior * terms.fit(every) ** 2
+    by_joint = usual[: n * width].reshape(n, width).sum(1) + usual[n * width :].sum() / n
+    left = np.stack([terms.left(terms.fit(every, f), f) for f in range(FOLDS)], axis=1)
+    size = np.sqrt(left / np.maximum(terms.counts, 1e-9) + floor[:, None] ** 2)
+    share = size / np.maximum(motion.size, LEAST_SIZE)[:, None]
+    return np.asarray(terms.counts * np.log(share) + by_joint[:, None] / FOLDS)
+
+
+def _shared_columns(arm: RigidArm, motion: ChannelMotion) -> Columns:
+    """The mass moments of every link, a load at the last one, and gravity's direction."""
+    links = arm.motion(motion.q, motion.v, motion.a)
+    lengths, masses = np.linalg.norm(arm.offset, axis=1), arm.inertial[:, 0]
+    reach, load = TOOL_REACH * float(lengths[1:].sum()), OFF * float(masses.sum())
+    columns, spread, limits = list[Array](), list[float](), list[tuple[float, float]]()
+    for j in range(arm.n):
+        beyond = [lengths[k] for k in range(arm.n) if arm.parent[k] == j]
+        own = arm.link_regressor(links, j)[:, :, :4].transpose(2, 1, 0)
+        moment = float(np.linalg.norm(arm.inertial[j, 1:4]))
+        size = OFF * max(moment, 0.5 * masses[j] * max(beyond, default=0.0), 1e-9)
+        if beyond:
+            low, high = LIMITS["mass"]
+            limits += 3 * [(low / OFF * size, high / OFF * size)]
+        else:
+            size = max(size, load * reach)
+            columns.append(own[0])
+            spread.append(max(load, 1e-9))
+            limits += [(-masses[j], np.inf), *3 * [(-np.inf, np.inf)]]
+        columns += [*own[1:]]
+        spread += 3 * [size]
+    still, weight = np.zeros_like(motion.q), float(np.linalg.norm(arm.gravity))
+    if weight > 0.0:
+        for axis in np.linalg.svd(arm.gravity[None])[2][1:]:  # across gravity, whose size does not change
+            columns.append(arm.torque(motion.q, still, still, axis).T)
+            spread.append(OFF * weight)
+            limits.append((-np.inf, np.inf))
+    return np.array(columns), np.array(spread), np.array(limits).T
+
+
+def turned_arm(arm: RigidArm, motion: ChannelMotion) -> RigidArm | None:
+    """The arm with gravity along the axis that fits best; None without any, or where it hangs as modelled."""
+    still = np.zeros_like(motion.q)
+    weightless = arm.torque(motion.q, motion.v, motion.a, np.zeros(3)) + arm.spring_torque(motion.q)
+    columns = np.stack([arm.torque(motion.q, still, still, axis) for axis in np.eye(3)], axis=-1)
+    weight = motion.telling / (motion.reading.std(0) + 1e-9)
+    left = ((motion.reading - weightless) * weight).ravel()
+    gravity = np.linalg.lstsq((columns * weight[:, :, None]).reshape(-1, 3), left, rcond=None)[0]
+    size, nominal = float(np.linalg.norm(gravity)), float(np.linalg.norm(arm.gravity))
+    if size < 1e-6 or nominal < 1e-6 or float(gravity @ arm.gravity) > np.cos(OFF) * size * nominal:
+        return None
+    return replace(arm, gravity=gravity * nominal / size)
