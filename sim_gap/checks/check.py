@@ -139,6 +139,8 @@ def _with_right_columns(
     found = list[RecordingFinding]()
     if goes_one_way(recording):
         return recording, found
+    both = recording.torque is not None and recording.motor_torque is not None
+    settled = replace(stated, effort=stated.effort or "link") if both else stated  # friction there is that of bearings
     while len(found) < 2 * arm.n:
         s = _prepared(recording, arm, label, stated)
         if channel not in s.channels:
@@ -146,8 +148,8 @@ def _with_right_columns(
         motion = motion_of(s, channel)
         if bool((motion.reading.std(0) < SIGNAL * s.noise[channel]).all()):  # as of an arm that swings, its drives off
             break
-        finding = find_wrong_columns(arm, motion, stated, follows_position(recording))
-        if finding is None or finding in found:
+        finding = find_wrong_columns(arm, motion, settled, follows_position(recording))
+        if finding is None or finding.option in {each.option for each in found}:
             break
         found.append(finding)
         if not finding.corrected:

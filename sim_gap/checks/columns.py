@@ -52,12 +52,13 @@ class HypothesisTest:
         that shows it most."""
         by_joint = self.falls.sum(1)
         common = len(by_joint) > 1 and self.hypothesis.kind in ("clock", "effort_source")
-        return _exceeds(self.falls.sum(0), CERTAIN) and not (common and self.fall < by_joint.max())
+        alone = common and self.fall < float(by_joint.max())
+        return not alone and _exceeds(self.falls.sum(0), CERTAIN)
 
 
 def _exceeds(falls: Array, least: float) -> bool:
     """Whether the falls in held-out parts (F,) are more than that, and than chance."""
-    return float(falls.sum()) > max(least, SIGNIFICANT * float(falls.std(ddof=1)) * np.sqrt(len(falls)))
+    return bool(falls.sum() > max(least, SIGNIFICANT * falls.std(ddof=1) * np.sqrt(len(falls))))
 
 
 def find_wrong_columns(

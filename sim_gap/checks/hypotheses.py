@@ -178,12 +178,12 @@ def _orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Ite
                     choices=3,
                     corrects=False,
                 )
-    cycles = [*combinations(range(arm.n), 2)]
+    cycles: list[tuple[int, ...]] = [*combinations(range(arm.n), 2)]
     for i, j, k in combinations(range(arm.n), 3):
         cycles += [(i, j, k), (i, k, j)]
-    for chosen in cycles:
+    for cycle in cycles:
         for channels in ((*positions, channel), positions, (channel,)):
-            yield put_in_order(arm, _cycle(arm.n, chosen), channels, channel)
+            yield put_in_order(arm, _cycle(arm.n, cycle), channels, channel)
 
 
 def _cycle(n: int, chosen: Sequence[int]) -> tuple[int, ...]:

@@ -1,9 +1,8 @@
 """How likely a torque channel is for a sound arm: the model, with effects of usual size.
 
-A joint has a gain, an offset, friction, a rotor, a spring and a mass of its own; the arm masses that are elsewhere on
-each link, a load at its tip, and a base that is tilted. All are linear, with priors, and so a wrong mass, a tool or a
-counterbalance is no evidence of a wrong column. What they leave is correlated over a stroke of the arm, and counts for
-no more than one measurement in that time.
+A joint has a gain, an offset, a spring, friction and a rotor of its own; the arm has masses that are elsewhere on each
+link, a load at its tip, and a base that is tilted. All are linear, with priors, and so a wrong mass, a tool or a
+counterbalance is no evidence of a wrong column (docs/theory.md, section 14).
 """
 
 from collections.abc import Sequence
@@ -27,8 +26,8 @@ FLOOR = 0.14
 """What sound models leave of a reading and these effects do not explain: at least this share of its standard
 deviation."""
 STROKES, MOST = 6.0, 100.0
-"""Independent measurements in the way of a stroke, which is twice the standard deviation of a joint's positions: what
-is left is a function of the pose; most of them."""
+"""Independent measurements in a stroke of twice the standard deviation of a joint's positions, for what is left is a
+function of the pose; most of a recording."""
 SLIM = 0.1
 """Errors of a joint that carries next to nothing, over those of the one that carries most: sensors, cables and tools
 pull at a slim wrist, too."""
@@ -49,7 +48,7 @@ REFITS = 3
 OWN, RUBBING = 6, 3
 """Effects of a joint that act on it alone; those of them that are friction and a rotor."""
 HELD = 1e12
-"""Weight of a coefficient that is held at zero."""
+"""Weight of a coefficient that is held at a bound."""
 AT_ONCE = 60_000
 """Rows of all motions that are fitted in one array."""
 
@@ -62,7 +61,7 @@ def measurements(motion: ChannelMotion) -> Array:
     if not moving.any():
         return np.zeros_like(stroke)
     speed = float(np.sqrt(np.mean((motion.v[:, moving] / stroke[moving]) ** 2, axis=1)).mean())
-    return min(STROKES * speed * motion.duration, MOST) * (moving & (motion.size > LEAST_SIZE))
+    return np.asarray(min(STROKES * speed * motion.duration, MOST) * (moving & (motion.size > LEAST_SIZE)))
 
 
 def _own_columns(
@@ -125,7 +124,7 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
 def _model_size(model: Array) -> Array:
     """Torque in proportion to which each joint of a sound arm has its errors, (…, n); model torques (…, K, n)."""
     size = model.std(-2)
-    return np.maximum(size, np.maximum(SLIM * size.max(-1, keepdims=True), 1e-9))
+    return np.asarray(np.maximum(size, np.maximum(SLIM * size.max(-1, keepdims=True), 1e-9)))
 
 
 def _fitted_cost(gram: Array, spread: Array, low: Array, high: Array, count: Array, floor: Array) -> Array:

@@ -54,7 +54,8 @@ def said(arm, spoiled: Recording, sound: Recording) -> tuple[str, Recording | No
     except BadInput as error:
         return f"refused: {error}", None
     text = "; ".join(f"{each.finding} {each.option}" for each in found)
-    return text, corrected if found and differs(corrected, sound) else None
+    asked = any(not each.corrected for each in found)  # then the recording is as it was, and the options are told
+    return text, corrected if found and not asked and differs(corrected, sound) else None
 
 
 def differs(corrected: Recording, sound: Recording) -> bool:
