@@ -29,6 +29,9 @@ class ChannelMotion:
     idle: Mask
     """Whether each reading may have nothing of the model's torque, (n,): of a motor that is idle, a dead sensor."""
 
+    rubs: bool = True
+    """Whether the friction of gears may be in the readings, as in a motor's."""
+
     @property
     def direction(self) -> Array:
         """Sign of the velocity, rounded off around zero (K, n)."""
@@ -45,10 +48,11 @@ class ChannelMotion:
 
 
 def motion_of(s: PreparedSignals, channel: str) -> ChannelMotion:
-    """The compared rows of a recording, thinned to about `ROWS`."""
+    """The compared rows of a recording, thinned to about `ROWS`. A sensor on the link feels no gear; where the motor's
+    torque is recorded too, what it feels is behind it."""
     t = s.filtered(s.t)
     thin = slice(None, None, max(1, len(t) // ROWS))
     q, v, a, reading = (s.filtered(x)[thin] for x in (s.q, s.v, s.a, s.reading[channel]))
-    return ChannelMotion(
-        q, v, a, reading, channel, float(t[-1] - t[0]), reading.std(0), np.ones(reading.shape[1], bool)
-    )
+    size, idle = reading.std(0), np.ones(reading.shape[1], bool)
+    rubs = channel != "tau" or "tau_motor" in s.channels
+    return ChannelMotion(q, v, a, reading, channel, float(t[-1] - t[0]), size, idle, rubs)

@@ -4,7 +4,7 @@ Run before anything is fitted. A finding that is certain is corrected; one that 
 option that settles it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -90,19 +90,23 @@ def check_recordings(
     Returns the corrected recordings and the findings of all. What is not certain is left as recorded and among the
     findings. Raises BadInput for times, counts and angles that no arm can have.
     """
-    checked, found = list[Recording](), dict[object, RecordingFinding]()
-    for recording, label in zip(recordings, labels, strict=True):
-        corrected, findings = check_recording(arm, recording, label, stated)
-        checked.append(corrected)
+    each = [check_recording(arm, r, label, stated) for r, label in zip(recordings, labels, strict=True)]
+    options = [{finding.option for finding in findings if finding.corrected} for _, findings in each]
+    known = set().union(*options)
+    for k, own in enumerate(options):
+        if known > own:  # one set-up: what is certain in one recording is likely in another
+            each[k] = check_recording(arm, recordings[k], labels[k], stated, known)
+    checked, found = [recording for recording, _ in each], dict[object, RecordingFinding]()
+    for _, findings in each:
         for finding in findings:  # a doubt is asked about once, whatever each recording shows of it
             found.setdefault(finding if finding.corrected else (finding.joint, finding.option), finding)
     return checked, list(found.values())
 
 
 def check_recording(
-    arm: RigidArm, recording: Recording, label: str, stated: Corrections
+    arm: RigidArm, recording: Recording, label: str, stated: Corrections, known: Collection[str] = ()
 ) -> tuple[Recording, list[RecordingFinding]]:
-    """Check and correct one recording, as `check_recordings`."""
+    """Check and correct one recording, as `check_recordings`; `known` are options that corrected others."""
     for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
         raise BadInput(f"{label}: {finding.sentence()}")
     recording, wrapped = unwrap(recording)
@@ -120,7 +124,7 @@ def check_recording(
         recording = with_gravity(arm, recording, tuple(CHANNELS))
     found = [*wrapped, *repeated, *held, *jitter, *([] if repeated else find_dropped(recording)), *same]
     for channel in CHANNELS:
-        recording, findings = _with_right_columns(arm, recording, channel, label, stated)
+        recording, findings = _with_right_columns(arm, recording, channel, label, stated, known)
         found += findings
     beyond = find_beyond_range(arm, recording, stated)
     if beyond and all(finding.corrected for finding in found):  # else it is what the doubt is about
@@ -132,15 +136,13 @@ def check_recording(
 
 
 def _with_right_columns(
-    arm: RigidArm, recording: Recording, channel: str, label: str, stated: Corrections
+    arm: RigidArm, recording: Recording, channel: str, label: str, stated: Corrections, known: Collection[str]
 ) -> tuple[Recording, list[RecordingFinding]]:
     """The recording with what is certainly wrong with a torque channel and the positions put right, one thing after the
     other."""
     found = list[RecordingFinding]()
     if goes_one_way(recording):
         return recording, found
-    both = recording.torque is not None and recording.motor_torque is not None
-    settled = replace(stated, effort=stated.effort or "link") if both else stated  # friction there is that of bearings
     while len(found) < 2 * arm.n:
         s = _prepared(recording, arm, label, stated)
         if channel not in s.channels:
@@ -148,7 +150,7 @@ def _with_right_columns(
         motion = motion_of(s, channel)
         if bool((motion.reading.std(0) < SIGNAL * s.noise[channel]).all()):  # as of an arm that swings, its drives off
             break
-        finding = find_wrong_columns(arm, motion, settled, follows_position(recording))
+        finding = find_wrong_columns(arm, motion, stated, follows_position(recording), known)
         if finding is None or finding.option in {each.option for each in found}:
             break
         found.append(finding)

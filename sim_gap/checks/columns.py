@@ -4,7 +4,7 @@ One that is certain beats the recording as it is, with effects of the arm, by fa
 and by as much every other correction. Where two corrections explain it alike, nothing is corrected, and both are said.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -41,6 +41,8 @@ class HypothesisTest:
     hypothesis: Hypothesis
     falls: Array
     """Fall of the cost of each joint in each held-out part, less its share of the price, (n, F)."""
+    least: float
+    """Fall that makes it certain."""
 
     @property
     def fall(self) -> float:
@@ -53,7 +55,7 @@ class HypothesisTest:
         by_joint = self.falls.sum(1)
         common = len(by_joint) > 1 and self.hypothesis.kind in ("clock", "effort_source")
         alone = common and self.fall < float(by_joint.max())
-        return not alone and _exceeds(self.falls.sum(0), CERTAIN)
+        return not alone and _exceeds(self.falls.sum(0), self.least)
 
 
 def _exceeds(falls: Array, least: float) -> bool:
@@ -62,13 +64,18 @@ def _exceeds(falls: Array, least: float) -> bool:
 
 
 def find_wrong_columns(
-    arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]
+    arm: RigidArm,
+    motion: ChannelMotion,
+    stated: Corrections,
+    follows: Sequence[str],
+    known: Collection[str] = (),
 ) -> RecordingFinding | None:
     """The one thing that is most likely wrong with a torque channel and its motion, if anything certainly is.
 
     `follows` are the channels (of `dq`, `q_cmd`) whose columns agree with the positions' as they are recorded, so that
-    what is wrong with a position is wrong with theirs. A finding that is not `corrected` names an unknown number, or
-    more corrections than one that may be right.
+    what is wrong with a position is wrong with theirs. `known` are options that corrected other recordings of the
+    set-up, and need not be chosen again. A finding that is not `corrected` names an unknown number, or more corrections
+    than one that may be right.
     """
     as_it_is = likelihood(arm, motion)
     motion = replace(motion, idle=as_it_is.idle)  # no reading becomes a dead one by a correction
@@ -77,7 +84,8 @@ def find_wrong_columns(
     if not (stated.order or stated.joints) and most > CERTAIN * arm.n:
         possible += (orders := _likely_orders(arm, motion, follows))
         falls = np.concatenate([falls, _quick_falls(arm, motion, orders, FEW_ROWS)[1]])
-    tests = [_test(arm, motion, as_it_is.costs, hypothesis) for hypothesis in _likeliest(possible, falls)]
+    likely = [*(each for each in possible if each.option in known), *_likeliest(possible, falls)]
+    tests = [_test(arm, motion, as_it_is.costs, each, each.option in known) for each in dict.fromkeys(likely)]
     tests = [test for test in tests if test.is_certain]
     if not tests:
         return None
@@ -116,11 +124,12 @@ def _likeliest(possible: Sequence[Hypothesis], falls: Array) -> list[Hypothesis]
     return [possible[k] for k in [*best.values()][:LIKELY]]
 
 
-def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypothesis) -> HypothesisTest:
+def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypothesis, known: bool) -> HypothesisTest:
     if hypothesis.late:
         before = likelihood(arm, motion.rows(in_both(len(motion.q), hypothesis.late))).costs
     falls = before - likelihood(arm, hypothesis.change(motion)).costs
-    return HypothesisTest(hypothesis, falls - PRICE * hypothesis.choices / before.size)
+    price = 0.0 if known else PRICE * hypothesis.choices
+    return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN)
 
 
 def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:

@@ -1,7 +1,7 @@
 """A finding of the check of a recording, and options that correct columns."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Kind = Literal[
@@ -23,8 +23,8 @@ class RecordingFinding:
     """Option of `armlink gap diagnose` that makes, or prevents, the correction."""
     corrected: bool
     """Whether it was corrected; where it was not, the recording is diagnosed as it stands."""
-    fall: float = 0.0
-    """Fall of the logarithm of what the model leaves unexplained, summed over the joints."""
+    fall: float = field(default=0.0, compare=False)
+    """Fall of the negative log likelihood of a sound arm."""
 
     def sentence(self) -> str:
         where = f"{self.channel} of {'all joints' if self.joint == 'all' else self.joint}"

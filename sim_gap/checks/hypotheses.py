@@ -135,10 +135,9 @@ def _sources(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Itera
     if not stated.without_gravity and arm.n > 1:
         what, option = "lacks the model's gravity: it was subtracted", f"--effort-is {WITHOUT_GRAVITY}"
         yield Hypothesis("effort_source", (channel,), every, what, option, _weighed(arm))
-    if channel == "tau" and not stated.effort and arm.n > 1:
+    if not (motion.rubs or stated.effort) and arm.n > 1:
         what = "contains friction, which a link-side sensor does not feel: it is a motor's effort"
-        change = _of_motor
-        yield Hypothesis("effort_source", (channel,), every, what, "--effort-is motor", change)
+        yield Hypothesis("effort_source", (channel,), every, what, "--effort-is motor", _of_motor)
 
 
 def _delays(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
@@ -268,7 +267,7 @@ def _weighed(arm: RigidArm) -> Callable[[ChannelMotion], ChannelMotion]:
 
 
 def _of_motor(motion: ChannelMotion) -> ChannelMotion:
-    return replace(motion, channel="tau_motor")
+    return replace(motion, channel="tau_motor", rubs=True)
 
 
 def _delayed(rows: int) -> Callable[[ChannelMotion], ChannelMotion]:

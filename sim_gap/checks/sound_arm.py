@@ -65,10 +65,10 @@ def measurements(motion: ChannelMotion) -> Array:
 
 
 def _own_columns(
-    arm: RigidArm, sensed: Mask, model: Array, reading: Array, q: Array, v: Array, a: Array
+    arm: RigidArm, rubs: Mask, model: Array, reading: Array, q: Array, v: Array, a: Array
 ) -> tuple[Array, Array]:
     """Columns of each joint's own effects (…, n, OWN, K), friction and rotor at the end, which are not negative, and
-    their standard deviations (…, n, OWN), of arrays (…, K, n); `sensed` (…) is whether a sensor on the link reads."""
+    their standard deviations (…, n, OWN), of arrays (…, K, n); `rubs` (…) as in `ChannelMotion`."""
     size = _model_size(model)
     turned, direction = q - q.mean(-2, keepdims=True), np.clip(v / TURNING, -1.0, 1.0)
     turned = turned / np.maximum(turned.std(-2, keepdims=True), 1e-9)
@@ -77,7 +77,7 @@ def _own_columns(
     rubbing = np.maximum(np.stack([x.std(-2) for x in own[OWN - RUBBING :]], axis=-1), 1e-9)
     most = np.maximum(arm.stretched_torque, size.max(-1, keepdims=True))
     pulled = np.maximum(size, np.sqrt(np.mean(reading**2, axis=-2)))  # by springs, whatever the links weigh
-    friction = np.where(sensed[..., None], BEARINGS * size.max(-1, keepdims=True), most)[..., None] / rubbing
+    friction = np.where(rubs[..., None], most, BEARINGS * size.max(-1, keepdims=True))[..., None] / rubbing
     usual = OFF * np.stack([size, pulled, pulled], axis=-1)
     return columns, np.concatenate([usual, friction], axis=-1)
 
@@ -100,9 +100,9 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     q, v, a, reading, telling = (
         np.array([getattr(motion, name) for motion in motions]) for name in ("q", "v", "a", "reading", "telling")
     )
-    sensed = np.array([motion.channel == "tau" for motion in motions])
+    rubs = np.array([motion.rubs for motion in motions])
     size = np.array([motion.size for motion in motions])
-    columns, spread = _own_columns(arm, sensed, model, reading, q, v, a)
+    columns, spread = _own_columns(arm, rubs, model, reading, q, v, a)
     own = np.concatenate([columns, (reading - model).swapaxes(1, 2)[:, :, None]], axis=2)
     weight = telling / np.maximum(telling.sum(1, keepdims=True), 1)
     gram = (own * weight.swapaxes(1, 2)[:, :, None]) @ own.swapaxes(2, 3)
@@ -176,8 +176,8 @@ def _likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
     """The same of the arm as it is given. The reading of a motor that is idle, or of a dead sensor, is less than the
     model's torque and has nothing of it, at a price."""
     model = arm.carried(motion.q, motion.v, motion.a)
-    sensed = np.array(motion.channel == "tau")
-    own, spread = _own_columns(arm, sensed, model, motion.reading, motion.q, motion.v, motion.a)
+    rubs = np.array(motion.rubs)
+    own, spread = _own_columns(arm, rubs, model, motion.reading, motion.q, motion.v, motion.a)
     limits = _own_limits(spread)
     shared = _shared_columns(arm, motion)
     left = (motion.reading - model).T
