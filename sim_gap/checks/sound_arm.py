@@ -23,8 +23,7 @@ direction of gravity [rad]."""
 BEARINGS = 0.03
 """The same of the friction that sensors on the links feel, over the largest torque of the arm."""
 FLOOR = 0.14
-"""What sound models leave of a reading and these effects do not explain: at least this share of its standard
-deviation."""
+"""Least share of a reading's standard deviation that models of sound arms leave, with these effects."""
 STROKES, MOST = 6.0, 100.0
 """Independent measurements in a stroke of twice the standard deviation of a joint's positions, for what is left is a
 function of the pose; most of a recording."""

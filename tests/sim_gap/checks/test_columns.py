@@ -1,4 +1,4 @@
-"""What is wrong with the columns of one torque channel: certain where a sound arm cannot have made it, else nothing."""
+"""Wrong columns of one torque channel: certain where a sound arm cannot have made it, else nothing is said."""
 
 from dataclasses import replace
 
