@@ -187,7 +187,7 @@ class Demo:
         with self.account.stage("recording motion for the gap diagnosis") as screen:
             for number, name in enumerate(("train", "heldout")):
                 seed, path = 1000 * (self.seed + 1) + number, self.folder / f"{name}{SUFFIX}"
-                made.append(self.bench.record_motion(seconds[number], seed, record, path, screen.update))
+                made.append(self.bench.record_motion(seconds[number], seed, record, path, screen.count))
         return made
 
     def _drift(self, record: CalibrationRecord, model: GravityRecord, check: Verification) -> None:
@@ -211,7 +211,8 @@ class Demo:
                 before = bench.sensor_error(joint)
             written = [t for t, outcome in history.recalibrations if outcome.applied]
             state = "recalibrated" if written else "the arm works" if began == np.inf else "the sensor has drifted"
-            screen.update(int(sample.t - start), int(WORK_SECONDS), WORK_SECONDS - sample.t + start, state)
+            end = min(written[-1] - start + WATCHED_SECONDS if written else np.inf, WORK_SECONDS)
+            screen.count(int(sample.t - start), int(end), f"s of work, {state}")
             return bool(written) and sample.t - written[-1] >= WATCHED_SECONDS
 
         observer = Observer.of_records(described, record, model, section.rated_torques)

@@ -185,3 +185,9 @@ def test_new_asks_on_a_terminal_for_what_the_model_does_not_state(folder, tmp_pa
     assert "\x1b" not in waiting
     assert "-2.50 +2.50" in after
     assert f"{LONG}4" in after
+    command[-1] = str(tmp_path / "b.yaml")
+    asked, again, rest = on_terminal(command, "or Enter", "2 -2\nabc\n-2.4 2.4", columns=100)
+    said = asked + again + rest
+    assert said.count("or Enter") == 3, "a slip of the fingers is asked again"
+    assert "expected two numbers, the lower first" in said
+    assert "-2.40 +2.40" in said
