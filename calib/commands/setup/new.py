@@ -131,6 +131,8 @@ def new(
                 )
             return copy(found, out, str(bus), bundled is not None, json_file)
         return rewire(found, out, str(bus), hand(by_hand, interactive), json_file)
+    if bus is not None:
+        open_named(bus).shutdown()  # before anything is asked: answers are not lost to a bus that is not there
     with console.status(f"reading {model} and looking for collisions"):
         asked = Terminal(console) if interactive else None
         made = new_arm(
