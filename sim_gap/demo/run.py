@@ -40,6 +40,7 @@ from sim_bus.sim_section import with_realism
 from sim_bus.truth import Truth
 from sim_gap.demo.account import Account
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
+from sim_gap.demo.beside import beside
 from sim_gap.model.load import compile_model
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
@@ -132,11 +133,12 @@ class Demo:
             if plan is not None:
                 sags |= self._sag(plan, "calibrated", gravity.beta, record.values("position_offset", 0.0))
                 account.note(sag={"poses": len(sag_poses(plan)), **sags})
-            self._tell_gravity(check, bench.gravity_errors(truth, gravity.beta, record, self.seed), sags)
-            if not bench.creeping:
-                self._drift(record, model, check)
-            account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
-            gap, bus = diagnose(compile_model(arm.path), *recordings), link.stats
+            with beside(diagnose, compile_model(arm.path), *recordings) as diagnosed:
+                self._tell_gravity(check, bench.gravity_errors(truth, gravity.beta, record, self.seed), sags)
+                if not bench.creeping:
+                    self._drift(record, model, check)
+                account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
+                gap, bus = diagnosed(), link.stats
             link.disable()
         self.store.close()
         account.find(sentence(gap))
