@@ -62,7 +62,7 @@ def with_lever(candidates: Candidates) -> Candidates:
 
 @dataclass(frozen=True, eq=False)
 class StopDesign:
-    """What each joint's candidates tell of the unknowns."""
+    """Information on the unknowns that each joint's candidates give."""
 
     candidates: list[Candidates]
     information: list[Array]
