@@ -45,7 +45,8 @@ def _parts(table: Table, console: Console, options: ConsoleOptions) -> list[Tabl
     """The table cut between columns, whole cells in each part; empty where the first column does not tell the rows
     apart, or it takes too many parts."""
     parts, rest = list[Table](), table.columns[1:]
-    if len({str(cell) for cell in table.columns[0].cells}) < table.row_count:
+    keys = {str(cell) for cell in table.columns[0].cells}
+    if "" in keys or len(keys) < table.row_count:
         return []
     while rest:
         for count in range(len(rest), 0, -1):

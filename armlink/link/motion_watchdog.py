@@ -17,7 +17,6 @@ or a lost frame did to the time between them. The encoder's resolution widens bo
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 
 from armlink.arrays import Array
 from armlink.link.bus_watchdog import SLOW_CYCLES
@@ -110,17 +109,19 @@ class MotionWatch:
     ) -> None:
         """The newest readings (n,) of a cycle: positions [rad] that were taken between `earliest` and `latest` [s], and
         velocities [rad/s] that came at `came` [s], NaN where none came of late."""
-        rows = zip(position, earliest, latest, velocity, came, strict=True)
-        for joint, (own, row) in enumerate(zip(self._joints, rows, strict=True)):
-            self.proven[joint], self.ahead[joint], self.contradicted[joint] = self._judged(own, *row)
+        proven, ahead, contradicted, judged = self.proven, self.ahead, self.contradicted, self._judged
+        rows = zip(self._joints, position, earliest, latest, velocity, came, strict=True)
+        for joint, (own, here, since, until, told, heard) in enumerate(rows):
+            proven[joint], ahead[joint], contradicted[joint] = judged(own, here, since, until, told, heard)
             self.unexplained[joint] = abs(own.apart)
 
     def _judged(
         self, own: _Joint, here: float, since: float, until: float, told: float, came: float
     ) -> tuple[float, float, bool]:
         """`proven`, `ahead` and `contradicted` of one joint by its newest readings."""
-        known = told == told  # not NaN
-        age, speed = (FILTER_TIME + until - came, abs(told)) if known else (0.0, 0.0)
+        age = speed = 0.0
+        if told == told:  # not NaN
+            age, speed = FILTER_TIME + until - came, abs(told)
         if until > own.newest:
             own.newest = until
         else:
@@ -128,32 +129,38 @@ class MotionWatch:
         row = own.at = (own.at + 1) % len(own.positions)
         own.positions[row], own.earliest[row], own.latest[row] = here, since, until
         least, steady = _present(own, here, until)
-        proven, own.steady = min(steady, own.steady), steady
+        proven = own.steady if own.steady < steady else steady
+        own.steady = steady
         present = speed if speed > least else least
         self._compare(own, here, since, until, told, present, age)
-        ahead = max(least, self._extrapolated(own, here, since, until)) if present > IDLE_SHARE * own.most else least
-        told_before, own.told = own.told, speed if age <= self._delay else 0.0
-        unseen = told_before > own.most and (1 - SHARE) * told_before > max(_fastest(own, ago) for ago in self._newest)
-        explained = WAY + 2 * own.step + SHARE * own.way + (max(self._delay, own.age) + own.width) * own.peak
+        most, delay = own.most, self._delay
+        ahead = max(least, self._extrapolated(own, here, since, until)) if present > IDLE_SHARE * most else least
+        told_before, own.told = own.told, speed if age <= delay else 0.0
+        unseen = told_before > most and (1 - SHARE) * told_before > max(_fastest(own, ago) for ago in self._newest)
+        oldest = own.age if own.age > delay else delay
+        explained = WAY + 2 * own.step + SHARE * own.way + (oldest + own.width) * own.peak
         return proven, ahead, unseen or abs(own.apart) > explained
 
     def _extrapolated(self, own: _Joint, here: float, since: float, until: float) -> float:
         """Least speed when an order acts, from the means over the newest cycles and those before [rad/s]."""
         middle, lead, found = (since + until) / 2, REACTION_CYCLES * self._period, 0.0
         exact = own.step / 2 + own.peak * own.width / 2
-        for near, far in pairwise(LAGS):
-            at, before = own.at - near, own.at - far
-            then, earlier = ((own.earliest[each] + own.latest[each]) / 2 for each in (at, before))
+        at, positions, began, ended = own.at, own.positions, own.earliest, own.latest
+        row = at - LAGS[0]
+        there, then = positions[row], (began[row] + ended[row]) / 2
+        for lag in LAGS[1:]:
+            row = at - lag
+            before, earlier = positions[row], (began[row] + ended[row]) / 2
             interval, interval_before = middle - then, then - earlier
-            if not (interval > 0.0 and interval_before > 0.0):
-                continue
-            mean = (here - own.positions[at]) / interval
-            mean_before = (own.positions[at] - own.positions[before]) / interval_before
-            reach = interval / 2 + lead
-            speed = abs(mean + (mean - mean_before) / ((interval + interval_before) / 2) * reach)
-            least = speed - exact * (2 / interval + 4 * reach / interval**2)
-            if least > found:  # not NaN
-                found = least
+            if interval > 0.0 and interval_before > 0.0:
+                mean = (here - there) / interval
+                mean_before = (there - before) / interval_before
+                reach = interval / 2 + lead
+                speed = abs(mean + (mean - mean_before) / ((interval + interval_before) / 2) * reach)
+                least = speed - exact * (2 / interval + 4 * reach / interval**2)
+                if least > found:  # not NaN
+                    found = least
+            there, then = before, earlier
         return found
 
     def _compare(
@@ -168,12 +175,17 @@ class MotionWatch:
         else:
             moved, turned = here - own.before, told * elapsed
             if moved - turned == moved - turned:  # neither is NaN
-                keep = max(1.0 - elapsed / MEMORY, 0.0)
+                keep = 1.0 - elapsed / MEMORY
+                if keep < 0.0:
+                    keep = 0.0
                 own.apart = keep * own.apart + moved - turned
-                own.way = keep * own.way + max(abs(moved), abs(turned))
-        own.peak, own.age = max(keep * own.peak, speed), max(keep * own.age, age)
+                far, wide = abs(moved), abs(turned)
+                own.way = keep * own.way + (wide if wide > far else far)
+        peak, oldest = keep * own.peak, keep * own.age
+        own.peak, own.age = speed if speed > peak else peak, age if age > oldest else oldest
         if new:
-            own.width = max(keep * own.width, until - since)
+            width, taken = keep * own.width, until - since
+            own.width = taken if taken > width else width
             own.before, own.time = here, middle
 
 
@@ -182,9 +194,10 @@ def _present(own: _Joint, here: float, until: float) -> tuple[float, float]:
     at, positions, earliest, step = own.at, own.positions, own.earliest, own.step
     least, steady = 0.0, math.inf
     for lag in PRESENT:
-        longest = until - earliest[at - lag]
+        row = at - lag
+        longest = until - earliest[row]
         if longest > 0.0:
-            mean = (abs(here - positions[at - lag]) - step) / longest
+            mean = (abs(here - positions[row]) - step) / longest
             if mean < 0.0:
                 mean = 0.0
             if mean > least:  # not NaN

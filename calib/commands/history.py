@@ -83,11 +83,11 @@ def _print(
     if not rows:
         console.print(f"{title}: no records yet")
         return
-    table = Table("", "record", "kind", "created", "replaces", "confirmed by", "note", title=title)
+    table = Table("record", "", "kind", "created", "replaces", "confirmed by", "note", title=title)
     for row in rows:
         created = row["created"][:19] + row["created"][-6:]  # whole seconds
-        shown = (row["id"], row["kind"], created, row["parent"] or "", row["confirmed_by"] or "", row["note"])
-        table.add_row("current" if row["current"] else "", *shown)
+        shown = (row["kind"], created, row["parent"] or "", row["confirmed_by"] or "", row["note"])
+        table.add_row(row["id"], "current" if row["current"] else "", *shown)
     console.print(table)
     lines = Table("when", "what", "record", "by", "why", title="Current records and controller writes")
     happened = [(line.at, f"{line.kind} current", line.record, line.by, line.reason) for line in log]
@@ -97,6 +97,7 @@ def _print(
     ]
     for event in sorted(happened, key=lambda each: each[0]):
         lines.add_row(*event)
-    console.print(lines)
+    if happened:
+        console.print(lines)
     current = [f"{row['kind']} record {row['id']}" for row in rows if row["current"]]
     console.print(f"current: {', '.join(current) or 'none'}")

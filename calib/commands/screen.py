@@ -39,24 +39,25 @@ class SweepScreen:
             PlainColumn("{task.description}"),
             BarColumn(bar_width=min(40, _CONSOLE.width // 5)),
             PlainColumn("{task.completed:.0f}/{task.total:.0f}"),
-            PlainColumn("{task.fields[left]}  {task.fields[text]}"),
+            PlainColumn("{task.fields[text]}"),
         )
         self._progress = Progress(*columns, console=_CONSOLE, transient=False, disable=not _CONSOLE.is_terminal)
         self._title, self._told, self._period = title, time.monotonic(), line_period
-        self._task = self._progress.add_task("" if above else title, total=1, left="", text="connecting")
+        self._task = self._progress.add_task("" if above else title, total=1, text="connecting")
 
     def update(self, done: int, total: int, seconds_left: float, text: str) -> None:
         self._update(done, total, f"{int(seconds_left) // 60}:{int(seconds_left) % 60:02d} left", text)
 
-    def count(self, done: int, total: int) -> None:
-        self._update(done, total, "", "poses")
+    def count(self, done: int, total: int, what: str = "poses") -> None:
+        self._update(done, total, "", what)
 
     def _update(self, done: int, total: int, left: str, text: str) -> None:
         """On the bar; where there is no terminal, a line now and then."""
-        self._progress.update(self._task, completed=done, total=total, left=left, text=text)
+        told = [each for each in (left, text) if each]
+        self._progress.update(self._task, completed=done, total=total, text="  ".join(told))
         if self._progress.disable and time.monotonic() - self._told >= self._period:
             self._told = time.monotonic()
-            _CONSOLE.print("  ".join(part for part in (self._title, f"{done}/{total}", left, text) if part))
+            _CONSOLE.print("  ".join([*[self._title] * bool(self._title), f"{done}/{total}", *told]))
 
     def on_stall(self, keep_going: int) -> Callable[[Stall], bool]:
         """An OnStall that goes on by itself so often, then asks; without a terminal it then gives up."""
@@ -122,6 +123,7 @@ def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
+    rows = list[list[str]]()
     for sweep in plan.sweeps:
         cells = []
         for joint in range(len(arm.joint_names)):
@@ -133,13 +135,18 @@ def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
                 end = "▲" if sweep.stops[joint] > 0 else "▼"
                 cells.append(end if sweep.bias is None else f"{end}{sweep.bias[joint]:+.1f}")
         table.add_row(sweep.name, f"{sweep.steps[0]:.2f} … {sweep.steps[-1]:.2f}", f"{sweep.lever:.2f}", *cells)
+        rows.append(cells)
     console.print(table)
     if short != list(arm.joint_names):
         columns = (f"{number} {name}" for number, name in zip(short, arm.joint_names, strict=True))
         console.print(f"columns: {', '.join(columns)}")
-    console.print(
-        "↔ sweeps; ▲ ▼ rests on its upper or lower stop, pressed with the torque [N·m]; = held by its servo [rad]"
-    )
+    signs, pressed = {cell[0] for cells in rows for cell in cells}, any(sweep.bias for sweep in plan.sweeps)
+    legend = ["↔ sweeps"]
+    if signs & {"▲", "▼"}:
+        legend.append("▲ ▼ rests on its upper or lower stop" + ", pressed with the torque [N·m]" * pressed)
+    if "=" in signs:
+        legend.append("= held by its servo [rad]")
+    console.print("; ".join(legend))
     for note in plan.notes:
         console.print(note, style="yellow")
 

@@ -173,12 +173,15 @@ def _run(
     from calib.sweep.run import run_sweep
     from calib.sweep.stalls import repeat_work
 
+    def pushed(done: int, total: int) -> None:
+        screen.count(done, total, "stops, each touched by its joint")
+
     link.enable()
     on_stall = screen.on_stall(keep_going)
     heard = repeat_work(link, on_stall, lambda: listen(link, arm_file))
     found = heard
     if check_stops and sweep_motion(arm_file) == "steps":
-        found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, screen.count))
+        found = repeat_work(link, on_stall, lambda: find_stops(link, arm_file, heard, pushed))
     data = run_sweep(
         link,
         arm_file,

@@ -101,6 +101,8 @@ class Geometry:
         self._mujoco.mj_kinematics(model, data)
         self._mujoco.mj_comPos(model, data)
         self._mujoco.mj_collision(model, data)
+        if data.ncon == 0:  # at most of the many poses that a plan looks at
+            return np.empty((0, 2), dtype=np.intp), np.empty(0)
         bodies = np.sort(model.geom_bodyid[data.contact.geom], axis=1)
         counts = (data.contact.dist < -DEPTH) & ~self._own[bodies[:, 0], bodies[:, 1]]
         return bodies[counts], -data.contact.dist[counts]

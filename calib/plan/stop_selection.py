@@ -60,32 +60,42 @@ def with_lever(candidates: Candidates) -> Candidates:
     return candidates.kept(sufficient_levers(candidates.lever))
 
 
-def choose_stops(
-    kinematics: Arm,
-    candidates: list[Candidates],
-    counts: list[int],
-    moments: list[Array],
-    sigma: Array,
-    mass: float,
-    speed: Array,
-) -> list[list[int]]:
-    """For each joint's candidates, the indices of the `counts` combinations that together are best.
+@dataclass(frozen=True, eq=False)
+class StopDesign:
+    """Information on the unknowns that each joint's candidates give."""
 
-    Best is D-optimal, less `TRAVEL_COST` for each second of travel from one sweep to the next at `speed` (n,) [rad/s].
-    `moments` are the mass moments β (2n,) [kg·m] for which the design is made, several guesses if they are unknown;
-    sigma (n,) [N·m] of one reading; mass [kg] of the second pass.
-    """
-    flange, free = kinematics.span[-1], free_mask(kinematics.n, UNKNOWN)
-    guesses = [Parameters.nominal(kinematics.n, beta=beta, rho=flange) for beta in moments]
-    information = [
-        np.stack([_information(kinematics, guess, each, sigma, free, mass) for guess in guesses]) for each in candidates
-    ]
-    prior = np.stack([np.diag(_prior_std(guess, sigma)[free] ** -2.0) for guess in guesses])
+    candidates: list[Candidates]
+    information: list[Array]
+    """JᵀJ (G, C, p, p) of each joint's candidates, for G guesses at the mass moments."""
+    prior: Array
+    """(G, p, p) before any reading."""
 
-    def travel(chosen: list[list[int]], place: int, slot: int) -> Array:
-        return TRAVEL_COST * _seconds(candidates, chosen, place, slot, speed)
+    @classmethod
+    def of(
+        cls, kinematics: Arm, candidates: list[Candidates], moments: list[Array], sigma: Array, mass: float
+    ) -> "StopDesign":
+        """`moments` are the mass moments β (2n,) [kg·m] for which the design is made, several guesses if they are
+        unknown; sigma (n,) [N·m] of one reading; mass [kg] of the second pass."""
+        flange, free = kinematics.span[-1], free_mask(kinematics.n, UNKNOWN)
+        guesses = [Parameters.nominal(kinematics.n, beta=beta, rho=flange) for beta in moments]
+        information = [
+            np.stack([_information(kinematics, guess, each, sigma, free, mass) for guess in guesses])
+            for each in candidates
+        ]
+        prior = np.stack([np.diag(_prior_std(guess, sigma)[free] ** -2.0) for guess in guesses])
+        return cls(candidates, information, prior)
 
-    return select(information, prior, counts, cost=travel)
+    def choose(self, counts: list[int], speed: Array) -> list[list[int]]:
+        """For each joint's candidates, the indices of the `counts` combinations that together are best.
+
+        Best is D-optimal, less `TRAVEL_COST` for each second of travel from one sweep to the next at `speed` (n,)
+        [rad/s].
+        """
+
+        def travel(chosen: list[list[int]], place: int, slot: int) -> Array:
+            return TRAVEL_COST * _seconds(self.candidates, chosen, place, slot, speed)
+
+        return select(self.information, self.prior, counts, cost=travel)
 
 
 def guessed_moments(kinematics: Arm, seed: int) -> list[Array]:

@@ -19,7 +19,7 @@ from calib.plan.plan_limits import SERVO_GAP
 from calib.plan.poses import Poses, scout_poses, sweep_range
 from calib.plan.predicted_precision import predicted_gain_std, worst_gain_std
 from calib.plan.rough_gravity import HAND, GravityGuess, reach
-from calib.plan.stop_selection import Candidates, choose_stops, guessed_moments
+from calib.plan.stop_selection import Candidates, StopDesign, guessed_moments
 from calib.plan.sweep_options import PlannedArm, sweep_options
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arm.arm import Arm
@@ -72,11 +72,18 @@ def plan_sweep(
     masses = [given] if given else reference_masses(planned.kinematics, planned.limits, options, guess)
     poses = section.loaded_poses if reference_mass else section.poses
     scout = scout_poses(planned.kinematics, section, planned.limits, seed, planned.geometry)
-    for more in (*range(MORE_POSES + 1), 0):  # none more where those do not suffice
-        sweeps = _choose(planned, options, poses + more, moments, masses[-1])
-        mass, gain_std = _lightest(planned, sweeps, scout, masses, resolution)
-        if gain_std is None or gain_std <= FINEST * goal:
+    design = StopDesign.of(
+        planned.kinematics, options, moments, section.standard_error * planned.limits.rated, masses[-1]
+    )
+    tried = []
+    for more in range(MORE_POSES + 1):
+        sweeps = _choose(planned, design, poses + more)
+        tried.append((sweeps, *_lightest(planned, sweeps, scout, masses, resolution)))
+        if tried[-1][-1] is None or tried[-1][-1] <= FINEST * goal:
             break
+    else:
+        tried = tried[:1]  # none more where those do not suffice
+    sweeps, mass, gain_std = tried[-1]
     finer = 1.0 if gain_std is None else float(np.clip(gain_std / goal, 1.0, FINEST))
     if gain_std is not None and gain_std > ENOUGH * FINEST * goal:
         notes.append(
@@ -115,17 +122,13 @@ def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess |
         )
 
 
-def _choose(
-    planned: PlannedArm, options: list[Candidates], poses: int, moments: list[Array], mass: float
-) -> tuple[Sweep, ...]:
-    """The best sweeps, `poses` of each joint, for a second pass with `mass` [kg]."""
-    section, limits = planned.section, planned.limits
-    counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in options]
-    sigma, speed = section.standard_error * limits.rated, section.travel_speed * limits.speed
-    picks = choose_stops(planned.kinematics, options, counts, moments, sigma, mass, speed)
+def _choose(planned: PlannedArm, design: StopDesign, poses: int) -> tuple[Sweep, ...]:
+    """The best sweeps, `poses` of each joint."""
+    counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in design.candidates]
+    picks = design.choose(counts, planned.section.travel_speed * planned.limits.speed)
     return tuple(
         _sweep(planned, f"{planned.kinematics.names[each.joint]}.{number}", each, pick)
-        for each, chosen in zip(options, picks, strict=True)
+        for each, chosen in zip(design.candidates, picks, strict=True)
         for number, pick in enumerate(chosen, start=1)
     )
 

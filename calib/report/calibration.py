@@ -232,7 +232,9 @@ def _left_out(done: Calibrated, fit: SensorFit) -> ReportSection:
         f"armlink verify {done.arm.argument} --report verify.html"
     )
     return ReportSection(
-        "Model against sensor (the paper's Figure 6)", paragraph(text), [left_out_figure(fit.names, sensor, model)]
+        "Model against sensor (as Figure 6 of Ma and Hollerbach)",
+        paragraph(text),
+        [left_out_figure(fit.names, sensor, model)],
     )
 
 

@@ -31,7 +31,10 @@ def write_report(
     )
     rows = [[name, *(f"{column[joint]:.4f}" for column in numbers)] for joint, name in enumerate(result.names)]
     section = ReportSection(
-        "Model against sensor (the paper's Figure 6)", html, [verify_figure(result)], [ReportTable(header, rows)]
+        "Model against sensor (as Figure 6 of Ma and Hollerbach)",
+        html,
+        [verify_figure(result)],
+        [ReportTable(header, rows)],
     )
     title = f"Verification: {arm.name} {arm.serial}"
     render(

@@ -44,16 +44,21 @@ def select(
     slots = [
         (group, slot) for group, each in enumerate(information) for slot in range(min(counts[group], each.shape[1]))
     ]
+    changes, seen = 0, dict[tuple[int, int], int]()
     for turn in range(1 + exchanges):
         for group, slot in slots:
             each, picks = information[group], chosen[group]
             if turn:
+                if seen[group, slot] == changes:  # compared with all others already, among the same selection
+                    continue
                 total -= each[:, picks[slot]]
             score = _score(total[:, None] + each, criterion, unit)
             if cost is not None:
                 score -= cost(chosen, group, slot)
             score[[pick for other, pick in enumerate(picks) if other != slot]] = -np.inf
-            picks[slot : slot + 1] = [int(np.argmax(score))]
+            best = [int(np.argmax(score))]
+            changes += picks[slot : slot + 1] != best
+            seen[group, slot], picks[slot : slot + 1] = changes, best
             total += each[:, picks[slot]]
     return chosen
 

@@ -1,5 +1,6 @@
 """The demo's bench: a simulated arm with a hidden truth, the link to it, and motions and checks of the demo's own."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from calib.arm.sweep_section import sweep_motion
 from calib.motion.trajectory import trajectory
 from calib.plan.types import SweepPlan
 from calib.records.records import CalibrationRecord
-from calib.sweep.sweep_pass import Progress
 from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from gcomp.gravity.batch import GravityModel
@@ -69,14 +69,19 @@ class Bench:
         return {"poses": poses, "max_torque": largest, "rms_error": rms, "max_abs_error": np.abs(error).max(axis=0)}
 
     def record_motion(
-        self, seconds: float, seed: int, calibration: CalibrationRecord, path: Path, progress: Progress
+        self,
+        seconds: float,
+        seed: int,
+        calibration: CalibrationRecord,
+        path: Path,
+        progress: Callable[[int, int, str], None],
     ) -> Recording:
         """Every cycle of a motion of its own, positions as the calibration corrects them; kept as MCAP too."""
         link, rows, targets = self.link, list[Sample](), multisine(self, seconds, seed)
         self.travel(link.position_sent, targets[0])
         for k, target in enumerate(targets):
             rows.append(link.cycle(Command.hold(target)))
-            progress(k, len(targets), seconds - k * link.period, path.stem)
+            progress(k + 1, len(targets), f"cycles, {path.stem}")
         recording = Recording(
             t=np.array([row.t for row in rows]) - rows[0].t,
             position=calibration.angle(np.array([row.position for row in rows])),

@@ -40,6 +40,7 @@ from sim_bus.sim_section import with_realism
 from sim_bus.truth import Truth
 from sim_gap.demo.account import Account
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
+from sim_gap.demo.beside import beside
 from sim_gap.model.load import compile_model
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
@@ -132,11 +133,12 @@ class Demo:
             if plan is not None:
                 sags |= self._sag(plan, "calibrated", gravity.beta, record.values("position_offset", 0.0))
                 account.note(sag={"poses": len(sag_poses(plan)), **sags})
-            self._tell_gravity(check, bench.gravity_errors(truth, gravity.beta, record, self.seed), sags)
-            if not bench.creeping:
-                self._drift(record, model, check)
-            account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
-            gap, bus = diagnose(compile_model(arm.path), *recordings), link.stats
+            with beside(diagnose, compile_model(arm.path), *recordings) as diagnosed:
+                self._tell_gravity(check, bench.gravity_errors(truth, gravity.beta, record, self.seed), sags)
+                if not bench.creeping:
+                    self._drift(record, model, check)
+                account.say("diagnosing the gap between the recording and the nominal simulation", "bold")
+                gap, bus = diagnosed(), link.stats
             link.disable()
         self.store.close()
         account.find(sentence(gap))
@@ -187,7 +189,7 @@ class Demo:
         with self.account.stage("recording motion for the gap diagnosis") as screen:
             for number, name in enumerate(("train", "heldout")):
                 seed, path = 1000 * (self.seed + 1) + number, self.folder / f"{name}{SUFFIX}"
-                made.append(self.bench.record_motion(seconds[number], seed, record, path, screen.update))
+                made.append(self.bench.record_motion(seconds[number], seed, record, path, screen.count))
         return made
 
     def _drift(self, record: CalibrationRecord, model: GravityRecord, check: Verification) -> None:
@@ -211,7 +213,8 @@ class Demo:
                 before = bench.sensor_error(joint)
             written = [t for t, outcome in history.recalibrations if outcome.applied]
             state = "recalibrated" if written else "the arm works" if began == np.inf else "the sensor has drifted"
-            screen.update(int(sample.t - start), int(WORK_SECONDS), WORK_SECONDS - sample.t + start, state)
+            end = min(written[-1] - start + WATCHED_SECONDS if written else np.inf, WORK_SECONDS)
+            screen.count(int(sample.t - start), int(end), f"s of work, {state}")
             return bool(written) and sample.t - written[-1] >= WATCHED_SECONDS
 
         observer = Observer.of_records(described, record, model, section.rated_torques)

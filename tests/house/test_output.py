@@ -185,3 +185,22 @@ def test_new_asks_on_a_terminal_for_what_the_model_does_not_state(folder, tmp_pa
     assert "\x1b" not in waiting
     assert "-2.50 +2.50" in after
     assert f"{LONG}4" in after
+    command[-1] = str(tmp_path / "b.yaml")
+    asked, again, rest = on_terminal(command, "or Enter", "2 -2\nabc\n-2.4 2.4", columns=100)
+    said = asked + again + rest
+    assert said.count("or Enter") == 3, "a slip of the fingers is asked again"
+    assert "expected two numbers, the lower first" in said
+    assert "-2.40 +2.40" in said
+
+
+def test_new_asks_nothing_where_the_bus_is_not_there(folder, tmp_path):
+    """Answers would be lost. The bus is looked at first, on a terminal as on a pipe."""
+    shutil.copy(folder / "arm.urdf", tmp_path)
+    master, slave = pty.openpty()
+    command = [sys.executable, "-m", "armlink.cli", "new", "arm.urdf", "--bus", "socketcan:no_such_bus"]
+    done = subprocess.run(command, stdin=slave, capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
+    os.close(master)
+    os.close(slave)
+    assert done.returncode == 3
+    assert "cannot open it" in done.stderr
+    assert "or Enter" not in done.stderr

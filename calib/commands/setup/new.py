@@ -131,6 +131,8 @@ def new(
                 )
             return copy(found, out, str(bus), bundled is not None, json_file)
         return rewire(found, out, str(bus), hand(by_hand, interactive), json_file)
+    if bus is not None:
+        open_named(bus).shutdown()  # before anything is asked: answers are not lost to a bus that is not there
     with console.status(f"reading {model} and looking for collisions"):
         asked = Terminal(console) if interactive else None
         made = new_arm(
@@ -182,7 +184,8 @@ def _show(console: Any, made: "NewArm") -> None:
     from calib.commissioning.arm_text import assumed_lines
 
     draft = made.draft
-    table = Table("joint", "node", "stops [rad]", "rated [N·m]", "largest [N·m]", title=f"{draft.name}: {made.out}")
+    ends = "stops [rad]" if draft.servo is None else "range [rad]"
+    table = Table("joint", "node", ends, "rated [N·m]", "largest [N·m]", title=f"{draft.name}: {made.out}")
     for joint in draft.joints:
         stops = "the model's" if joint.stops is None else f"{joint.stops[0]:+.2f} {joint.stops[1]:+.2f}"
         table.add_row(joint.name, str(joint.node), stops, f"{joint.rated_torque:g}", f"{joint.max_torque:g}")

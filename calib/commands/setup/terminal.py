@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from typer import BadParameter
+
 from armlink.commands.plain_console import PlainConsole, ask, confirm
 from armlink.errors import BadInput
 
@@ -79,16 +81,30 @@ class Terminal:
         for number, chain in enumerate(chains, start=1):
             names = ", ".join(joint.name for joint in chain.joints)
             self._console.print(f"{number}: ends in {chain.tip}: {names}")
-        number = int(ask("The model has several arms. Which one?", type=int, default=1))
-        return chains[min(max(number, 1), len(chains)) - 1]
+        numbered = {str(number): chain for number, chain in enumerate(chains, start=1)}
+
+        def chosen(text: str) -> "Chain":
+            if text.strip() not in numbered:
+                raise BadParameter(f"{text}: expected a number from 1 to {len(chains)}")
+            return numbered[text.strip()]
+
+        answer: Chain = ask("The model has several arms. Which one?", default="1", value_proc=chosen)
+        return answer
 
     def stops(self, joint: str) -> tuple[float, float] | None:
-        text = ask(
-            f"{joint} has no limits in the model. Give its lower and upper stop [rad], such as -2.9 2.9,"
-            " or Enter for none",
-            default="",
-            show_default=False,
+        """Asked again until the answer can be read: what was answered before is not lost."""
+        question = "Give its lower and upper stop [rad], such as -2.9 2.9, or Enter for none"
+        given: tuple[float, float] | None = ask(
+            f"{joint} has no limits in the model. {question}", default="", show_default=False, value_proc=_two_stops
         )
-        if not text.strip():
-            return None
-        return parse_stops([f"{joint}:{':'.join(text.replace(',', ' ').split())}"])[joint]
+        return given
+
+
+def _two_stops(text: str) -> tuple[float, float] | None:
+    """An answer of two numbers; None for an empty one."""
+    if not text.strip():
+        return None
+    try:
+        return parse_stops([f"joint:{':'.join(text.replace(',', ' ').split())}"])["joint"]
+    except BadInput:
+        raise BadParameter(f"{text}: expected two numbers, the lower first") from None

@@ -76,3 +76,9 @@ def test_a_long_title_is_a_line_above_and_not_folded_into_the_table():
     table = Table("joint", title="Model against sensor at 24 poses [N·m]")
     table.add_row("j1")
     assert shown(table, 60)[0].rstrip() == "Model against sensor at 24 poses [N·m]"
+
+
+def test_a_table_whose_first_column_is_empty_is_not_cut_into_parts_without_names():
+    table = Table("", "record", "note")
+    table.add_row("", "59dc5835", "after the sweeps of spring")
+    assert next(line.split() for line in shown(table, 20)) == ["record", "59dc5835"]

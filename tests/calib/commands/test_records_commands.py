@@ -40,6 +40,17 @@ def test_history_lists_records_and_log(kept, capsys) -> None:
     assert [line["record"] for line in answer["activations"]] == [first, second]
 
 
+@pytest.mark.parametrize("columns", [60, 80, 200])
+def test_every_line_of_history_says_which_record(kept, capsys, monkeypatch, columns) -> None:
+    """Also where the table is cut: the mark of the current one is no name of a row."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    path, first, second = kept
+    assert run(["history", "sarcos", "--store", path]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    assert len(rows) >= 4
+    assert all(first in row or second in row for row in rows)
+
+
 def test_history_shows_one_record_as_yaml_that_can_be_imported(kept, capsys, tmp_path) -> None:
     path, first, _ = kept
     assert run(["history", "sarcos", "--store", path, "--record", first]) == 0

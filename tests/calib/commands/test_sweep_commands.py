@@ -90,8 +90,10 @@ def test_from_sweeps_to_a_verified_model(
 
 def test_plan_prints_and_moves_nothing(arm_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["sweep", str(arm_path), "--plan", "--picture", str(tmp_path / "plan.html"), "--json", "-"]) == 0
-    plan = json.loads(capsys.readouterr().out)
-    assert [sweep["joint"] for sweep in plan["sweeps"]] == [1, 1, 0, 0]
+    said = capsys.readouterr()
+    assert [sweep["joint"] for sweep in json.loads(said.out)["sweeps"]] == [1, 1, 0, 0]
+    legend = next(line for line in said.err.splitlines() if line.startswith("↔ "))
+    assert legend == "↔ sweeps; ▲ ▼ rests on its upper or lower stop", "no sign that the table has not"
 
 
 def test_a_dry_run_makes_the_whole_sweep_on_the_simulated_arm(
