@@ -16,19 +16,19 @@ from gcomp.estimate.choice import PRICE, SIGNIFICANT
 from sim_gap.checks.channel_motion import ChannelMotion
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, hypotheses, in_both, put_in_order
-from sim_gap.checks.sound_arm import FLOOR, likelihood, measurements, quick_costs
+from sim_gap.checks.sound_arm import LEAST_RESIDUAL, likelihood, measurements, quick_costs
 from sim_gap.model.rigid_body import RigidArm
 
-CERTAIN = 5.0 * PRICE
+CERTAIN_FALL = 5.0 * PRICE
 """Fall of the negative log likelihood from which a correction is certain: as rare an effect as any of the library has
 paid then, and the choice among the hundred changes that are looked at."""
-FEW_ROWS = 150
+SCREENING_ROWS = 150
 """Rows that are enough to see that a hypothesis is wrong."""
-LIKELY = 8
+MOST_CANDIDATES = 8
 """Hypotheses that are looked at closely."""
-MOST_ORDERS, ORDER_ROWS = 7, 30
+MOST_ORDERED_JOINTS, ORDER_ROWS = 7, 30
 """Joints up to which all orders are tried, of which there are 5,040; rows that they are compared on."""
-DISTINCT = 3.0
+DISTINCT_FALL = 3.0
 """Difference of the negative log likelihoods from which one correction is likelier than another: twenty to one."""
 MOST_OPTIONS = 2
 """Most options that are spelt out."""
@@ -80,17 +80,17 @@ def find_wrong_columns(
     as_it_is = likelihood(arm, motion)
     motion = replace(motion, idle=as_it_is.idle)  # no reading becomes a dead one by a correction
     possible = list(hypotheses(arm, motion, stated, follows))
-    most, falls = _quick_falls(arm, motion, possible, FEW_ROWS)
-    if not (stated.order or stated.joints) and most > CERTAIN * arm.n:
+    most, falls = _quick_falls(arm, motion, possible, SCREENING_ROWS)
+    if not (stated.order or stated.joints) and most > CERTAIN_FALL * arm.n:
         possible += (orders := _likely_orders(arm, motion, follows))
-        falls = np.concatenate([falls, _quick_falls(arm, motion, orders, FEW_ROWS)[1]])
+        falls = np.concatenate([falls, _quick_falls(arm, motion, orders, SCREENING_ROWS)[1]])
     likely = [*(each for each in possible if each.option in known), *_likeliest(possible, falls)]
     tests = [_test(arm, motion, as_it_is.costs, each, each.option in known) for each in dict.fromkeys(likely)]
     tests = [test for test in tests if test.is_certain]
     if not tests:
         return None
     best = max(tests, key=lambda test: test.fall)
-    as_good = [test for test in tests if not _exceeds((best.falls - test.falls).sum(0), DISTINCT)]
+    as_good = [test for test in tests if not _exceeds((best.falls - test.falls).sum(0), DISTINCT_FALL)]
     plainest = min((test for test in as_good if _contains(best, test)), key=lambda test: len(test.hypothesis.joints))
     return _finding(arm, plainest, [test for test in as_good if not _contains(test, plainest)])
 
@@ -108,7 +108,7 @@ def _quick_falls(
     ends = np.cumsum([len(motions[k].q) for k in moved])[:-1]
     models = dict(zip(moved, np.split(made, ends), strict=True))
     costs = quick_costs(arm, [models.get(k, models[0]) for k in range(len(motions))], motions)
-    least = float(measurements(motion).sum() * np.log(FLOOR))
+    least = float(measurements(motion).sum() * np.log(LEAST_RESIDUAL))
     prices = PRICE * np.array([hypothesis.choices for hypothesis in possible])
     return float(costs[0].sum()) - least, costs[0].sum() - costs[1:].sum(1) - prices
 
@@ -121,7 +121,7 @@ def _likeliest(possible: Sequence[Hypothesis], falls: Array) -> list[Hypothesis]
         own = each.option if each.choices == 1 or (each.kind == "order" and each.corrects) else ""
         if falls[k] > 0.0:
             best.setdefault((each.kind, each.channels, each.joints, each.corrects, own), k)
-    return [possible[k] for k in [*best.values()][:LIKELY]]
+    return [possible[k] for k in [*best.values()][:MOST_CANDIDATES]]
 
 
 def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypothesis, known: bool) -> HypothesisTest:
@@ -129,7 +129,7 @@ def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypot
         before = likelihood(arm, motion.rows(in_both(len(motion.q), hypothesis.late))).costs
     falls = before - likelihood(arm, hypothesis.change(motion)).costs
     price = 0.0 if known else PRICE * hypothesis.choices
-    return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN)
+    return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN_FALL)
 
 
 def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
@@ -142,7 +142,7 @@ def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
 def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> list[Hypothesis]:
     """Orders of all joints' columns, of their positions and of their torques that fit best; none of an arm of many
     joints."""
-    if not 3 < arm.n <= MOST_ORDERS:
+    if not 3 < arm.n <= MOST_ORDERED_JOINTS:
         return []
     few = motion.rows(slice(None, None, max(1, len(motion.q) // ORDER_ROWS)))
     found = []
@@ -151,7 +151,7 @@ def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str])
     for channels in ((*positions, torque), positions, (torque,)):
         possible = [put_in_order(arm, order, channels, torque) for order in orders]
         falls = _quick_falls(arm, few, possible, ORDER_ROWS)[1]
-        found += [possible[k] for k in np.argsort(-falls)[:LIKELY].tolist()]
+        found += [possible[k] for k in np.argsort(-falls)[:MOST_CANDIDATES].tolist()]
     return found
 
 
@@ -162,6 +162,4 @@ def _finding(arm: RigidArm, test: HypothesisTest, alike: Sequence[HypothesisTest
     shown, more = options[:MOST_OPTIONS], ["another correction"] if len(options) > MOST_OPTIONS else []
     evidence = own.what + ("; other corrections would explain as much" if len(options) > 1 else "")
     corrected = own.corrects and len(options) == 1
-    return RecordingFinding(
-        own.kind, own.channels[0], joint, evidence, ", or ".join([*shown, *more]), corrected, test.fall
-    )
+    return RecordingFinding(own.kind, own.channels[0], joint, evidence, ", or ".join([*shown, *more]), corrected)

@@ -1,7 +1,7 @@
 """A finding of the check of a recording, and options that correct columns."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 Kind = Literal[
@@ -23,8 +23,6 @@ class RecordingFinding:
     """Option of `armlink gap diagnose` that makes, or prevents, the correction."""
     corrected: bool
     """Whether it was corrected; where it was not, the recording is diagnosed as it stands."""
-    fall: float = field(default=0.0, compare=False)
-    """Fall of the negative log likelihood of a sound arm."""
 
     def sentence(self) -> str:
         where = f"{self.channel} of {'all joints' if self.joint == 'all' else self.joint}"
@@ -33,7 +31,7 @@ class RecordingFinding:
         return f"{where}: {self.evidence} ({self.finding}; diagnosed as recorded; otherwise: {self.option})"
 
     def to_json(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "fall"}
+        return dict(vars(self))
 
 
 def exchange_option(channel: str, holds: Mapping[int, int]) -> str:

@@ -14,20 +14,20 @@ from sim_gap.checks.finding import Kind
 from sim_gap.model.rigid_body import RigidArm
 
 DEGREE = math.pi / 180.0
-LAG, LAG_STEP = 1.5, 0.02
+LONGEST_DELAY, DELAY_STEP = 1.5, 0.02
 """Longest delay that is looked for, and its step [s]."""
-OWN_LAG = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 0.12)}
+DRIVE_DELAYS = {"tau": (-0.03, 0.06), "tau_motor": (-0.03, 0.03), "tau_cmd": (-0.12, 0.12)}
 """Delays of a channel between which they are an effect of drive or sensor, which the diagnosis finds by itself [s]:
 sensors read late, drives follow a command late, and positions are some milliseconds old."""
-FACTORS = np.geomspace(1e-3, 2e3, 32)
+UNIT_FACTORS = np.geomspace(1e-3, 2e3, 32)
 """Numbers that may be recorded of one newton metre: a torque constant with a gear or without, mA."""
-PARTS = np.linspace(0.1, 0.9, 5)
+ORDER_CHANGES = np.linspace(0.1, 0.9, 5)
 """Shares of the rows after which the order is tried to change."""
 SIGN_FITS = 4
 """Fits after which the signs of amounts and the torque that they tell agree."""
-POSITIONS = 2
+POSITION_CHOICES = 2
 """Choices of a change of the positions: whoever watched the arm saw them, and so they are rarer than wrong torques."""
-CROSSES = 0.1
+LEAST_SIGN_SHARE = 0.1
 """Least share of the rows on either side of zero from which a torque changes its sign."""
 
 
@@ -82,12 +82,16 @@ def _signs(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: S
             yield Hypothesis("sign", (channel,), joints, opposite, text, _turned(joints, torque=True))
         if len(joints) == 1 and not _settled(stated, "sign", "q", joints):
             text = _option("sign", positions, "-1", joints[0])
-            yield Hypothesis("sign", ("q",), joints, opposite, text, _turned(joints, torque=False), POSITIONS)
+            yield Hypothesis("sign", ("q",), joints, opposite, text, _turned(joints, torque=False), POSITION_CHOICES)
     model = arm.carried(motion.q, motion.v, motion.a)
     for j in every:
         y, turns = motion.reading[:, j], np.mean(model[:, j] > 0.0)
         one_sided = min(np.mean(y > 0.02 * y.std()), np.mean(y < -0.02 * y.std())) < 0.005
-        if one_sided and CROSSES < turns < 1.0 - CROSSES and not _settled(stated, "sign", channel, (j,)):
+        if (
+            one_sided
+            and LEAST_SIGN_SHARE < turns < 1.0 - LEAST_SIGN_SHARE
+            and not _settled(stated, "sign", channel, (j,))
+        ):
             option = f"record signed torque, or --sign {channel}_{j + 1}=1 if it is right"
             what = "never changes its sign, though the model's torque does"
             yield Hypothesis("unsigned", (channel,), (j,), what, option, _signed(arm, j), corrects=False)
@@ -104,7 +108,7 @@ def _zeros(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: S
         for angle in (0.5 * math.pi, -0.5 * math.pi, math.pi):
             text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
             what = f"has its zero off by {angle:+.2f} rad"
-            yield Hypothesis("zero", ("q",), (j,), what, text, _moved(j, angle), POSITIONS)
+            yield Hypothesis("zero", ("q",), (j,), what, text, _moved(j, angle), POSITION_CHOICES)
 
 
 def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
@@ -116,7 +120,7 @@ def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterato
         column = channel if len(joints) == arm.n else f"{channel}_{joints[0] + 1}"
         constant = "N·m/A at the joint" + (", or one each: K1;K2;…" if len(joints) == arm.n > 1 else "")
         option = f"--units {column}=A:K ({constant}), or {column}=N·m if it is right"
-        for factor in FACTORS:
+        for factor in UNIT_FACTORS:
             what = f"is {factor:.2g} times what the model explains: is it in amperes, or another unit?"
             yield Hypothesis(
                 "scale",
@@ -145,8 +149,10 @@ def _delays(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterat
     if channel in stated.clock:
         return
     rate = (len(motion.q) - 1) / max(motion.duration, 1e-9)
-    early, late = OWN_LAG[channel]
-    for rows in np.unique(np.round(np.arange(-LAG, LAG + LAG_STEP, LAG_STEP) * rate).astype(int)).tolist():
+    early, late = DRIVE_DELAYS[channel]
+    for rows in np.unique(
+        np.round(np.arange(-LONGEST_DELAY, LONGEST_DELAY + DELAY_STEP, DELAY_STEP) * rate).astype(int)
+    ).tolist():
         lag = rows / rate
         if early <= lag <= late or 4 * abs(rows) > len(motion.q):
             continue
@@ -162,7 +168,7 @@ def _orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Ite
         order = _cycle(arm.n, chosen)
         whole = put_in_order(arm, order, (channel,), channel)
         for late in (False, True):
-            for share in PARTS:
+            for share in ORDER_CHANGES:
                 part = f"{'after' if late else 'before'} {share:.0%} of the recording"
                 option = (
                     f"give both parts as recordings of their own, the {'later' if late else 'earlier'} with "

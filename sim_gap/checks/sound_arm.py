@@ -11,44 +11,42 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcomp.arrays import Array, Mask
-from gcomp.estimate.choice import PRICE, LinearTerms
+from gcomp.estimate.choice import PRICE, REWEIGHINGS, LinearTerms
 from gcomp.estimate.problem import Index
 from sim_gap.checks.channel_motion import TURNING, ChannelMotion
 from sim_gap.checks.joint_range import beyond_range
 from sim_gap.model.rigid_body import RigidArm
 
-OFF = 0.3
+ERROR_STD = 0.3
 """Standard deviation of gains, masses, springs and offsets of sound arms, as a share of what they change; of the
 direction of gravity [rad]."""
-BEARINGS = 0.03
+BEARING_FRICTION_STD = 0.03
 """The same of the friction that sensors on the links feel, over the largest torque of the arm."""
-FLOOR = 0.14
+LEAST_RESIDUAL = 0.14
 """Least share of a reading's standard deviation that models of sound arms leave, with these effects."""
-STROKES, MOST = 6.0, 100.0
+MEASUREMENTS_PER_STROKE, MOST_MEASUREMENTS = 6.0, 100.0
 """Independent measurements in a stroke of twice the standard deviation of a joint's positions, for what is left is a
 function of the pose; most of a recording."""
-SLIM = 0.1
+LEAST_TORQUE_SHARE = 0.1
 """Errors of a joint that carries next to nothing, over those of the one that carries most: sensors, cables and tools
 pull at a slim wrist, too."""
 FOLDS = 6
 """Parts of a recording of which each is held out once."""
-TOOL_REACH = 0.2
+LOAD_DISTANCE_STD = 0.2
 """Standard deviation of the distance of a load from the last joint, over the arm's length."""
-LEAST_STROKE, MOVING_LEAST = 0.05, 0.1
+SMALLEST_STROKE, SMALLEST_MOVING_SHARE = 0.05, 0.1
 """Stroke from which a joint moves [rad], and share of the rows in which it must."""
-LEAST_SIZE = 1e-9
+SMALLEST_TORQUE = 1e-9
 """Standard deviation from which a reading changes [N·m]."""
-LIMITS = {"gain": (-0.35, 1.0), "mass": (-0.3, 0.3)}
+ERROR_LIMITS = {"gain": (-0.35, 1.0), "mass": (-0.3, 0.3)}
 """Least and largest such error of a sound arm, as a share: a torque below a third of the model's is in another unit."""
-OUT_OF_RANGE = 5.0 * PRICE
+RANGE_COST = 5.0 * PRICE
 """Negative log likelihood of a joint beyond its range: nothing but a wrong model puts it there."""
-REFITS = 3
-"""Fits after which the scale of what is left and the fit that follows from it agree."""
-OWN, RUBBING = 6, 3
+JOINT_EFFECTS, FRICTION_EFFECTS = 6, 3
 """Effects of a joint that act on it alone; those of them that are friction and a rotor."""
-HELD = 1e12
+BOUND_WEIGHT = 1e12
 """Weight of a coefficient that is held at a bound."""
-AT_ONCE = 60_000
+ROWS_AT_ONCE = 60_000
 """Rows of all motions that are fitted in one array."""
 
 
@@ -56,28 +54,31 @@ def measurements(motion: ChannelMotion) -> Array:
     """Independent measurements of each joint, (n,): by the way that the joints make, in strokes; none of one that
     hardly moves, or whose reading never changes."""
     stroke = 2.0 * motion.q.std(0)
-    moving = (stroke > LEAST_STROKE) & (np.mean(np.abs(motion.v) > TURNING, axis=0) > MOVING_LEAST)
+    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(motion.v) > TURNING, axis=0) > SMALLEST_MOVING_SHARE)
     if not moving.any():
         return np.zeros_like(stroke)
     speed = float(np.sqrt(np.mean((motion.v[:, moving] / stroke[moving]) ** 2, axis=1)).mean())
-    return np.asarray(min(STROKES * speed * motion.duration, MOST) * (moving & (motion.size > LEAST_SIZE)))
+    return np.asarray(
+        min(MEASUREMENTS_PER_STROKE * speed * motion.duration, MOST_MEASUREMENTS)
+        * (moving & (motion.size > SMALLEST_TORQUE))
+    )
 
 
 def _own_columns(
     arm: RigidArm, rubs: Mask, model: Array, reading: Array, q: Array, v: Array, a: Array
 ) -> tuple[Array, Array]:
-    """Columns of each joint's own effects (…, n, OWN, K), friction and rotor at the end, which are not negative, and
-    their standard deviations (…, n, OWN), of arrays (…, K, n); `rubs` (…) as in `ChannelMotion`."""
+    """Columns of the P own effects of each joint (…, n, P, K), friction and rotor at the end, which are not negative,
+    and their standard deviations (…, n, P), of arrays (…, K, n); `rubs` (…) as in `ChannelMotion`."""
     size = _model_size(model)
     turned, direction = q - q.mean(-2, keepdims=True), np.clip(v / TURNING, -1.0, 1.0)
     turned = turned / np.maximum(turned.std(-2, keepdims=True), 1e-9)
     own = [model / size[..., None, :], np.ones_like(q), turned, direction, v, a]
     columns = np.moveaxis(np.stack(own, axis=-3), -1, -3)
-    rubbing = np.maximum(np.stack([x.std(-2) for x in own[OWN - RUBBING :]], axis=-1), 1e-9)
+    rubbing = np.maximum(np.stack([x.std(-2) for x in own[JOINT_EFFECTS - FRICTION_EFFECTS :]], axis=-1), 1e-9)
     most = np.maximum(arm.stretched_torque, size.max(-1, keepdims=True))
     pulled = np.maximum(size, np.sqrt(np.mean(reading**2, axis=-2)))  # by springs, whatever the links weigh
-    friction = np.where(rubs[..., None], most, BEARINGS * size.max(-1, keepdims=True))[..., None] / rubbing
-    usual = OFF * np.stack([size, pulled, pulled], axis=-1)
+    friction = np.where(rubs[..., None], most, BEARING_FRICTION_STD * size.max(-1, keepdims=True))[..., None] / rubbing
+    usual = ERROR_STD * np.stack([size, pulled, pulled], axis=-1)
     return columns, np.concatenate([usual, friction], axis=-1)
 
 
@@ -88,7 +89,7 @@ def quick_costs(arm: RigidArm, models: Sequence[Array], motions: Sequence[Channe
     rows = np.array([len(motion.q) for motion in motions])
     for length in np.unique(rows):
         same = np.flatnonzero(rows == length)
-        for part in np.array_split(same, -(-len(same) * length // AT_ONCE)):
+        for part in np.array_split(same, -(-len(same) * length // ROWS_AT_ONCE)):
             chosen = [motions[k] for k in part]
             out[part] = _stacked_costs(arm, np.array([models[k] for k in part]), chosen)
     return out
@@ -106,34 +107,36 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     weight = telling / np.maximum(telling.sum(1, keepdims=True), 1)
     gram = (own * weight.swapaxes(1, 2)[:, :, None]) @ own.swapaxes(2, 3)
     count = np.array([measurements(motion) for motion in motions])
-    floor = FLOOR * np.maximum(size, LEAST_SIZE)
+    floor = LEAST_RESIDUAL * np.maximum(size, SMALLEST_TORQUE)
     low, high = _own_limits(spread)
     whole = _fitted_cost(gram, spread, low, high, count, floor)
-    turn = np.broadcast_to(np.eye(OWN + 1), gram.shape).copy()
-    turn[..., OWN, 0] = _model_size(model)
+    turn = np.broadcast_to(np.eye(JOINT_EFFECTS + 1), gram.shape).copy()
+    turn[..., JOINT_EFFECTS, 0] = _model_size(model)
     without = turn @ gram @ turn.swapaxes(2, 3)  # with the reading itself in place of what the model leaves of it
     without[..., 0, :], without[..., :, 0] = 0.0, 0.0
     other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + PRICE
     idle = np.array([motion.idle for motion in motions]) & (reading.std(1) < model.std(1))
     whole = np.where(idle, np.minimum(whole, other), whole)
-    whole += OUT_OF_RANGE * np.array([beyond_range(arm, positions) for positions in q])
-    return np.asarray(whole - count * np.log(np.maximum(size, LEAST_SIZE)))
+    whole += RANGE_COST * np.array([beyond_range(arm, positions) for positions in q])
+    return np.asarray(whole - count * np.log(np.maximum(size, SMALLEST_TORQUE)))
 
 
 def _model_size(model: Array) -> Array:
     """Torque in proportion to which each joint of a sound arm has its errors, (…, n); model torques (…, K, n)."""
     size = model.std(-2)
-    return np.asarray(np.maximum(size, np.maximum(SLIM * size.max(-1, keepdims=True), 1e-9)))
+    return np.asarray(np.maximum(size, np.maximum(LEAST_TORQUE_SHARE * size.max(-1, keepdims=True), 1e-9)))
 
 
 def _fitted_cost(gram: Array, spread: Array, low: Array, high: Array, count: Array, floor: Array) -> Array:
     """Negative log likelihood of a joint's own effects, from the mean products of columns and reading, (…)."""
-    squares, side, total = gram[..., :OWN, :OWN], gram[..., :OWN, -1], gram[..., -1, -1]
+    squares, side, total = gram[..., :JOINT_EFFECTS, :JOINT_EFFECTS], gram[..., :JOINT_EFFECTS, -1], gram[..., -1, -1]
     variance, held, at = total + floor**2, np.zeros(side.shape, bool), np.zeros_like(side)
-    for _ in range(REFITS):
+    for _ in range(REWEIGHINGS):
         prior = variance[..., None] / spread**2 / np.maximum(count, 1e-9)[..., None]
-        aim = np.where(held, HELD * at, side)
-        solved = np.linalg.solve(squares + np.where(held, HELD, prior)[..., None] * np.eye(OWN), aim[..., None])[..., 0]
+        aim = np.where(held, BOUND_WEIGHT * at, side)
+        solved = np.linalg.solve(
+            squares + np.where(held, BOUND_WEIGHT, prior)[..., None] * np.eye(JOINT_EFFECTS), aim[..., None]
+        )[..., 0]
         at = np.clip(solved, low, high)
         held |= at != solved
         left = total - 2.0 * (at * side).sum(-1) + ((squares @ at[..., None])[..., 0] * at).sum(-1)
@@ -142,12 +145,12 @@ def _fitted_cost(gram: Array, spread: Array, low: Array, high: Array, count: Arr
 
 
 def _own_limits(spread: Array) -> tuple[Array, Array]:
-    """Least and largest of each joint's own coefficients, (…, OWN)."""
-    low, high = np.full(OWN, -np.inf), np.full(OWN, np.inf)
-    low[-RUBBING:] = 0.0
+    """Least and largest of each joint's own coefficients, (…, P)."""
+    low, high = np.full(JOINT_EFFECTS, -np.inf), np.full(JOINT_EFFECTS, np.inf)
+    low[-FRICTION_EFFECTS:] = 0.0
     own = np.broadcast_to(low, spread.shape).copy(), np.broadcast_to(high, spread.shape).copy()
-    for limits, share in zip(own, LIMITS["gain"], strict=True):
-        limits[..., 0] = share / OFF * spread[..., 0]
+    for limits, share in zip(own, ERROR_LIMITS["gain"], strict=True):
+        limits[..., 0] = share / ERROR_STD * spread[..., 0]
     return own
 
 
@@ -189,7 +192,7 @@ def _likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
         idle &= without.sum(1) < costs.sum(1)
     if idle.any():
         costs = np.where(idle[:, None], without, _fit(motion, left, own, spread, limits, shared, ~idle))
-    return ChannelLikelihood(costs + OUT_OF_RANGE / FOLDS * beyond_range(arm, motion.q)[:, None], idle)
+    return ChannelLikelihood(costs + RANGE_COST / FOLDS * beyond_range(arm, motion.q)[:, None], idle)
 
 
 Columns = tuple[Array, Array, Array]
@@ -223,7 +226,7 @@ def _fit(
         squares.append(np.stack([each[j] * x[:, p] @ x[:, p].T for p in parts]))
         products.append(np.stack([-each[j] * x[:, p] @ y[p] for p in parts]))
         totals[j] = [each[j] * float(y[p] @ y[p]) for p in parts]
-    floor = FLOOR * np.maximum(motion.size, LEAST_SIZE)
+    floor = LEAST_RESIDUAL * np.maximum(motion.size, SMALLEST_TORQUE)
     low, high = (np.concatenate([x.ravel(), y]) for x, y in zip(own_limits, shared_limits, strict=True))
     none = np.zeros(len(spread))
     terms = LinearTerms(
@@ -236,7 +239,7 @@ def _fit(
     by_joint = usual[: n * width].reshape(n, width).sum(1) + usual[n * width :].sum() / n
     left = np.stack([terms.left(terms.fit(every, f), f) for f in range(FOLDS)], axis=1)
     size = np.sqrt(left / np.maximum(terms.counts, 1e-9) + floor[:, None] ** 2)
-    share = size / np.maximum(motion.size, LEAST_SIZE)[:, None]
+    share = size / np.maximum(motion.size, SMALLEST_TORQUE)[:, None]
     return np.asarray(terms.counts * np.log(share) + by_joint[:, None] / FOLDS)
 
 
@@ -244,16 +247,16 @@ def _shared_columns(arm: RigidArm, motion: ChannelMotion) -> Columns:
     """The mass moments of every link, a load at the last one, and gravity's direction."""
     links = arm.motion(motion.q, motion.v, motion.a)
     lengths, masses = np.linalg.norm(arm.offset, axis=1), arm.inertial[:, 0]
-    reach, load = TOOL_REACH * float(lengths[1:].sum()), OFF * float(masses.sum())
+    reach, load = LOAD_DISTANCE_STD * float(lengths[1:].sum()), ERROR_STD * float(masses.sum())
     columns, spread, limits = list[Array](), list[float](), list[tuple[float, float]]()
     for j in range(arm.n):
         beyond = [lengths[k] for k in range(arm.n) if arm.parent[k] == j]
         own = arm.link_regressor(links, j)[:, :, :4].transpose(2, 1, 0)
         moment = float(np.linalg.norm(arm.inertial[j, 1:4]))
-        size = OFF * max(moment, 0.5 * masses[j] * max(beyond, default=0.0), 1e-9)
+        size = ERROR_STD * max(moment, 0.5 * masses[j] * max(beyond, default=0.0), 1e-9)
         if beyond:
-            low, high = LIMITS["mass"]
-            limits += 3 * [(low / OFF * size, high / OFF * size)]
+            low, high = ERROR_LIMITS["mass"]
+            limits += 3 * [(low / ERROR_STD * size, high / ERROR_STD * size)]
         else:
             size = max(size, load * reach)
             columns.append(own[0])
@@ -265,7 +268,7 @@ def _shared_columns(arm: RigidArm, motion: ChannelMotion) -> Columns:
     if weight > 0.0:
         for axis in np.linalg.svd(arm.gravity[None])[2][1:]:  # across gravity, whose size does not change
             columns.append(arm.torque(motion.q, still, still, axis).T)
-            spread.append(OFF * weight)
+            spread.append(ERROR_STD * weight)
             limits.append((-np.inf, np.inf))
     return np.array(columns), np.array(spread), np.array(limits).T
 
@@ -279,6 +282,6 @@ def turned_arm(arm: RigidArm, motion: ChannelMotion) -> RigidArm | None:
     left = ((motion.reading - weightless) * weight).ravel()
     gravity = np.linalg.lstsq((columns * weight[:, :, None]).reshape(-1, 3), left, rcond=None)[0]
     size, nominal = float(np.linalg.norm(gravity)), float(np.linalg.norm(arm.gravity))
-    if size < 1e-6 or nominal < 1e-6 or float(gravity @ arm.gravity) > np.cos(OFF) * size * nominal:
+    if size < 1e-6 or nominal < 1e-6 or float(gravity @ arm.gravity) > np.cos(ERROR_STD) * size * nominal:
         return None
     return replace(arm, gravity=gravity * nominal / size)

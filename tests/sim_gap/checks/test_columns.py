@@ -12,7 +12,7 @@ from sim_gap.checks.channel_motion import ChannelMotion
 from sim_gap.checks.columns import find_wrong_columns
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, hypotheses
-from sim_gap.checks.sound_arm import FLOOR, likelihood, measurements
+from sim_gap.checks.sound_arm import LEAST_RESIDUAL, likelihood, measurements
 from sim_gap.model.load import load_model
 
 ARM = load_model(mujoco.MjModel.from_xml_string(THREE)).arm
@@ -49,7 +49,7 @@ def test_a_sound_channel_is_explained_to_the_floor_of_what_models_leave():
     read = channel(sound(friction=0.3))
     assert found(read) is None
     share = np.exp(likelihood(ARM, read).costs.sum(1) / measurements(read))
-    np.testing.assert_array_less(share, 1.3 * FLOOR)
+    np.testing.assert_array_less(share, 1.3 * LEAST_RESIDUAL)
 
 
 @pytest.mark.parametrize("late", [0.4, -0.3, 1.1])
