@@ -123,9 +123,9 @@ def check_recording(
     if stated.without_gravity:
         recording = with_gravity(arm, recording, tuple(CHANNELS))
     found = [*wrapped, *repeated, *held, *jitter, *([] if repeated else find_dropped(recording)), *same]
-    for channel in CHANNELS:
-        recording, findings = _with_right_columns(arm, recording, channel, label, stated, known)
-        found += findings
+    if not goes_one_way(recording):
+        recording, wrong = _with_right_columns(arm, recording, label, stated, known)
+        found += wrong
     beyond = find_beyond_range(arm, recording, stated)
     if beyond and all(finding.corrected for finding in found):  # else it is what the doubt is about
         raise BadInput(f"{label}: {beyond[0].sentence()}")
@@ -136,27 +136,24 @@ def check_recording(
 
 
 def _with_right_columns(
-    arm: RigidArm, recording: Recording, channel: str, label: str, stated: Corrections, known: Collection[str]
+    arm: RigidArm, recording: Recording, label: str, stated: Corrections, known: Collection[str]
 ) -> tuple[Recording, list[RecordingFinding]]:
-    """The recording with what is certainly wrong with a torque channel and the positions put right, one thing after the
+    """The recording with what is certainly wrong with torque channels and positions put right, one thing after the
     other."""
-    found = list[RecordingFinding]()
-    if goes_one_way(recording):
-        return recording, found
-    while len(found) < 2 * arm.n:
-        s = _prepared(recording, arm, label, stated)
-        if channel not in s.channels:
-            break
-        motion = motion_of(s, channel)
-        if bool((motion.reading.std(0) < SIGNAL * s.noise[channel]).all()):  # as of an arm that swings, its drives off
-            break
-        finding = find_wrong_columns(arm, motion, stated, follows_position(recording), known)
-        if finding is None or finding.option in {each.option for each in found}:
-            break
-        found.append(finding)
-        if not finding.corrected:
-            break
-        recording = _corrected(recording, finding, label, arm)
+    found, s = list[RecordingFinding](), _prepared(recording, arm, label, stated)
+    for channel in CHANNELS:
+        while channel in s.channels and len(found) < 2 * arm.n:
+            motion = motion_of(s, channel)
+            if bool((motion.reading.std(0) < SIGNAL * s.noise[channel]).all()):  # of an arm that swings, its drives off
+                break
+            finding = find_wrong_columns(arm, motion, stated, follows_position(recording), known)
+            if finding is None or finding.option in {each.option for each in found}:
+                break
+            found.append(finding)
+            if not finding.corrected:
+                break
+            recording = _corrected(recording, finding, label, arm)
+            s = _prepared(recording, arm, label, stated)
     return recording, found
 
 

@@ -53,15 +53,17 @@ ROWS_AT_ONCE = 60_000
 def measurements(motion: ChannelMotion) -> Array:
     """Independent measurements of each joint, (n,): by the way that the joints make, in strokes; none of one that
     hardly moves, or whose reading never changes."""
-    stroke = 2.0 * motion.q.std(0)
-    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(motion.v) > TURNING, axis=0) > SMALLEST_MOVING_SHARE)
-    if not moving.any():
-        return np.zeros_like(stroke)
-    speed = float(np.sqrt(np.mean((motion.v[:, moving] / stroke[moving]) ** 2, axis=1)).mean())
-    return np.asarray(
-        min(MEASUREMENTS_PER_STROKE * speed * motion.duration, MOST_MEASUREMENTS)
-        * (moving & (motion.size > SMALLEST_TORQUE))
-    )
+    return _measurements(motion.q, motion.v, motion.size, motion.duration)
+
+
+def _measurements(q: Array, v: Array, size: Array, duration: float) -> Array:
+    """The same of motions with as many rows: q, v (…, K, n), size (…, n); (…, n)."""
+    stroke = 2.0 * q.std(-2)
+    moving = (stroke > SMALLEST_STROKE) & (np.mean(np.abs(v) > TURNING, axis=-2) > SMALLEST_MOVING_SHARE)
+    strokes = np.where(moving, 1.0 / np.maximum(stroke, SMALLEST_STROKE), 0.0)
+    squares = ((v * strokes[..., None, :]) ** 2).sum(-1) / np.maximum(moving.sum(-1), 1)[..., None]
+    count = np.minimum(MEASUREMENTS_PER_STROKE * np.sqrt(squares).mean(-1) * duration, MOST_MEASUREMENTS)
+    return np.asarray(count[..., None] * (moving & (size > SMALLEST_TORQUE)))
 
 
 def _own_columns(
@@ -106,7 +108,7 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     own = np.concatenate([columns, (reading - model).swapaxes(1, 2)[:, :, None]], axis=2)
     weight = telling / np.maximum(telling.sum(1, keepdims=True), 1)
     gram = (own * weight.swapaxes(1, 2)[:, :, None]) @ own.swapaxes(2, 3)
-    count = np.array([measurements(motion) for motion in motions])
+    count = _measurements(q, v, size, motions[0].duration)
     floor = LEAST_RESIDUAL * np.maximum(size, SMALLEST_TORQUE)
     low, high = _own_limits(spread)
     whole = _fitted_cost(gram, spread, low, high, count, floor)
