@@ -28,8 +28,9 @@ MOST_CANDIDATES = 8
 """Hypotheses that are looked at closely."""
 MOST_ORDERED_JOINTS, ORDER_ROWS = 7, 30
 """Joints up to which all orders are tried, of which there are 5,040; rows that they are compared on."""
-DISTINCT_FALL = 3.0
-"""Difference of the negative log likelihoods from which one correction is likelier than another: twenty to one."""
+DISTINCT_FALL = 3.0 * PRICE
+"""Difference of the negative log likelihoods from which one correction is likelier than another: errors
+of sound models, too, make one of two wrist joints likelier by some prices."""
 MOST_OPTIONS = 2
 """Most options that are spelt out."""
 
@@ -133,9 +134,10 @@ def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypot
 
 
 def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
-    """Whether a correction is another one, or that and the same at further joints, of which nothing shows."""
+    """Whether a correction is another one, or that and the same at further joints, of which nothing shows; a unit is
+    that of a channel."""
     own, other = more.hypothesis, less.hypothesis
-    alike = own.kind == other.kind and own.channels == other.channels
+    alike = own.kind == other.kind != "scale" and own.channels == other.channels
     return own is other or (alike and set(own.joints) > set(other.joints))
 
 

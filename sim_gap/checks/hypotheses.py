@@ -25,7 +25,7 @@ ORDER_CHANGES = np.linspace(0.1, 0.9, 5)
 """Shares of the rows after which the order is tried to change."""
 SIGN_FITS = 4
 """Fits after which the signs of amounts and the torque that they tell agree."""
-POSITION_CHOICES = 2
+POSITION_CHOICES = 4
 """Choices of a change of the positions: whoever watched the arm saw them, and so they are rarer than wrong torques."""
 LEAST_SIGN_SHARE = 0.1
 """Least share of the rows on either side of zero from which a torque changes its sign."""
@@ -120,18 +120,10 @@ def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterato
         column = channel if len(joints) == arm.n else f"{channel}_{joints[0] + 1}"
         constant = "N·m/A at the joint" + (", or one each: K1;K2;…" if len(joints) == arm.n > 1 else "")
         option = f"--units {column}=A:K ({constant}), or {column}=N·m if it is right"
-        for factor in UNIT_FACTORS:
+        for factor in UNIT_FACTORS.tolist():
             what = f"is {factor:.2g} times what the model explains: is it in amperes, or another unit?"
-            yield Hypothesis(
-                "scale",
-                (channel,),
-                joints,
-                what,
-                option,
-                _in_unit(joints, float(factor)),
-                choices=2,
-                corrects=False,
-            )
+            change = _in_unit(joints, factor)
+            yield Hypothesis("scale", (channel,), joints, what, option, change, choices=2, corrects=False)
 
 
 def _sources(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:

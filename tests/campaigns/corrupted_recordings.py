@@ -84,10 +84,14 @@ def as_recorded(realdata: Path):
         recording, folder = load_recording(path), path.parent.name
         if all(getattr(recording, name) is None for name in TORQUE_CHANNELS):
             continue
-        model = realdata / folder.removesuffix("_loads") / "sim.xml"
+        models = realdata / folder.removesuffix("_loads")
+        model = next(each for each in (models / "sim.xml", models / "sim.urdf") if each.exists())
         if path.name.startswith("designc"):
             model = model.with_name("sim_design_c.xml")
-        yield f"{folder}/{path.name}", load_model(model, (), recording.n).arm, recording
+        try:
+            yield f"{folder}/{path.name}", load_model(model, (), recording.n).arm, recording
+        except BadInput as error:  # a model of several arms
+            print(f"left out: {path.name}: {error}")
 
 
 def left_by_mujoco(model: mujoco.MjModel, recording: Recording) -> np.ndarray:
