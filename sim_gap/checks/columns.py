@@ -92,8 +92,13 @@ def find_wrong_columns(
         return None
     best = max(tests, key=lambda test: test.fall)
     as_good = [test for test in tests if not _exceeds((best.falls - test.falls).sum(0), DISTINCT_FALL)]
-    plainest = min((test for test in as_good if _contains(best, test)), key=lambda test: len(test.hypothesis.joints))
-    return _finding(arm, plainest, [test for test in as_good if not _contains(test, plainest)])
+    plainest = best
+    if best.hypothesis.kind != "scale":  # a unit is that of a channel
+        plainest = min(
+            (test for test in as_good if _contains(best, test)), key=lambda test: len(test.hypothesis.joints)
+        )
+    rivals = [test for test in as_good if not (_contains(test, plainest) or _contains(plainest, test))]
+    return _finding(arm, plainest, rivals)
 
 
 def _quick_falls(
@@ -134,10 +139,9 @@ def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypot
 
 
 def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
-    """Whether a correction is another one, or that and the same at further joints, of which nothing shows; a unit is
-    that of a channel."""
+    """Whether a correction is another one, or that and the same at further joints, of which nothing shows."""
     own, other = more.hypothesis, less.hypothesis
-    alike = own.kind == other.kind != "scale" and own.channels == other.channels
+    alike = own.kind == other.kind and own.channels == other.channels
     return own is other or (alike and set(own.joints) > set(other.joints))
 
 
