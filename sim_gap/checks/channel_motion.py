@@ -28,7 +28,6 @@ class ChannelMotion:
     """Standard deviation of what is recorded, in the unit of the reading, (n,): of a torque in another unit, say."""
     idle: Mask
     """Whether each reading may have nothing of the model's torque, (n,): of a motor that is idle, a dead sensor."""
-
     rubs: bool = True
     """Whether the friction of gears may be in the readings, as in a motor's."""
 
@@ -42,7 +41,7 @@ class ChannelMotion:
         """Rows that tell something of each joint, (K, n): friction at rest, which a motor holds, takes any value."""
         return np.asarray((np.abs(self.v) > TURNING) | (self.channel == "tau"))
 
-    def rows(self, rows: slice | Array) -> "ChannelMotion":
+    def rows(self, rows: slice) -> "ChannelMotion":
         q, v, a, reading = (x[rows] for x in (self.q, self.v, self.a, self.reading))
         return replace(self, q=q, v=v, a=a, reading=reading)
 

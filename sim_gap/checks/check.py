@@ -1,7 +1,7 @@
 """Entry point of the check: recordings and a model in, corrected recordings and findings out.
 
-Run before anything is fitted. A finding that is certain is corrected; one that is not ends the diagnosis with the
-option that settles it.
+Run before anything is fitted. A finding that is certain is corrected; one that is not names the options that settle it,
+and the recording is diagnosed as it is.
 """
 
 from collections.abc import Collection, Sequence
@@ -91,7 +91,8 @@ def check_recordings(
     findings. Raises BadInput for times, counts and angles that no arm can have.
     """
     each = [check_recording(arm, r, label, stated) for r, label in zip(recordings, labels, strict=True)]
-    options = [{finding.option for finding in findings if finding.corrected} for _, findings in each]
+    columns = {"q", *CHANNELS}
+    options = [{f.option for f in findings if f.corrected and f.channel in columns} for _, findings in each]
     known = set().union(*options)
     for k, own in enumerate(options):
         if known > own:  # one set-up: what is certain in one recording is likely in another

@@ -1,7 +1,7 @@
 """Which columns of a torque channel are wrong: the hypothesis under which a sound arm most likely made the recording.
 
-One that is certain beats the recording as it is, with effects of the arm, by far more than chance on held-out parts,
-and by as much every other correction. Where two corrections explain it alike, nothing is corrected, and both are said.
+One that is certain beats the recording as it is, with effects of the arm, by far more than chance on held-out parts.
+Where two corrections explain it alike, nothing is corrected, and both are said.
 """
 
 from collections.abc import Collection, Sequence
@@ -29,8 +29,8 @@ MOST_CANDIDATES = 8
 MOST_ORDERED_JOINTS, ORDER_ROWS = 7, 30
 """Joints up to which all orders are tried, of which there are 5,040; rows that they are compared on."""
 DISTINCT_FALL = 3.0 * PRICE
-"""Difference of the negative log likelihoods from which one correction is likelier than another: errors
-of sound models, too, make one of two wrist joints likelier by some prices."""
+"""Difference of the negative log likelihoods from which one correction is likelier than another: errors of
+sound models alone make one order of two wrist joints likelier by some prices."""
 MOST_OPTIONS = 2
 """Most options that are spelt out."""
 

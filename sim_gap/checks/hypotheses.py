@@ -142,9 +142,8 @@ def _delays(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterat
         return
     rate = (len(motion.q) - 1) / max(motion.duration, 1e-9)
     early, late = DRIVE_DELAYS[channel]
-    for rows in np.unique(
-        np.round(np.arange(-LONGEST_DELAY, LONGEST_DELAY + DELAY_STEP, DELAY_STEP) * rate).astype(int)
-    ).tolist():
+    delays = np.arange(-LONGEST_DELAY, LONGEST_DELAY + DELAY_STEP, DELAY_STEP)
+    for rows in np.unique(np.round(delays * rate).astype(int)).tolist():
         lag = rows / rate
         if early <= lag <= late or 4 * abs(rows) > len(motion.q):
             continue

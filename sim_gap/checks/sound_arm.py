@@ -169,7 +169,7 @@ class ChannelLikelihood:
 def likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
     """Likelihood of held-out parts of a channel, by the likelier of the arm as modelled and as it seems to hang."""
     own = _likelihood(arm, motion)
-    turned = turned_arm(arm, motion)
+    turned = _turned_arm(arm, motion)
     if turned is None:
         return own
     other = _likelihood(turned, motion)
@@ -275,7 +275,7 @@ def _shared_columns(arm: RigidArm, motion: ChannelMotion) -> Columns:
     return np.array(columns), np.array(spread), np.array(limits).T
 
 
-def turned_arm(arm: RigidArm, motion: ChannelMotion) -> RigidArm | None:
+def _turned_arm(arm: RigidArm, motion: ChannelMotion) -> RigidArm | None:
     """The arm with gravity along the axis that fits best; None without any, or where it hangs as modelled."""
     still = np.zeros_like(motion.q)
     weightless = arm.torque(motion.q, motion.v, motion.a, np.zeros(3)) + arm.spring_torque(motion.q)

@@ -1,4 +1,4 @@
-"""Sign of rectified readings, and source of a torque channel."""
+"""Torque channels that repeat another one, or that are the law of a drive's gains; gravity that was subtracted."""
 
 from collections.abc import Sequence
 from dataclasses import replace
