@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from armlink.commands.options import Clock, Columns, EffortIs, Header, Joints, Sign, Topic, Units, Zero
+from armlink.commands.options import reads_recordings
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
 
+    from armlink.recording.corrections import Corrections
     from sim_gap.attribution.diagnosis import Diagnosis
 
 
@@ -30,25 +31,18 @@ KnownGain = Annotated[
 ]
 
 
+@reads_recordings
 def diagnose(
     sim: Annotated[str, typer.Option(help="Nominal model: MJCF, URDF or arm file.")],
     train: Annotated[list[Path], typer.Option(help="Recording to fit; may be repeated.")],
+    stated: "Corrections",
     heldout: Annotated[
         list[Path] | None,
         typer.Option(help="Held-out recording to judge on; may be repeated. Default: the end of each --train."),
     ] = None,
-    columns: Columns = None,
-    header: Header = "",
-    joints: Joints = "",
     base: Base = None,
     tip: Tip = None,
     gains: KnownGain = "",
-    units: Units = None,
-    sign: Sign = None,
-    zero: Zero = None,
-    clock: Clock = None,
-    effort_is: EffortIs = "",
-    topic: Topic = "",
     group: Annotated[
         list[str] | None,
         typer.Option(
@@ -114,7 +108,6 @@ def diagnose(
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from armlink.extras import require_extra
-    from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
     from sim_gap.commands.gap_tables import show
@@ -130,7 +123,6 @@ def diagnose(
         require_extra("--report", "reports")
     if out_samples is not None and out_samples.suffix == ".parquet":
         require_extra("--out-samples", "parquet")
-    stated = parse_corrections(columns, header, sign, units, zero, clock, effort_is, joints, topic)
     reading = stated.of_reading()
     with console.status(f"reading {len(paths)} recordings"):
         fitted = {name: each for path in train for name, each in load_recordings(path, reading).items()}
