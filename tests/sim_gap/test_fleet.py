@@ -92,15 +92,16 @@ def test_the_command_gathers_a_table_by_arm_and_effect_and_goes_on_where_it_stop
 
 def test_recordings_in_degrees_are_followed_with_the_options_of_a_diagnosis(fleet: Path, tmp_path: Path) -> None:
     recording = load_recording(fleet / "arm_a" / "run_0" / "train.parquet")
-    turned = {name: np.degrees(getattr(recording, name)) for name in ("position", "velocity")}
-    save_recording(replace(recording, **turned), tmp_path / "2026-10-02.parquet")
+    save_recording(
+        replace(recording, position=np.degrees(recording.position), velocity=None), tmp_path / "2026-10-02.parquet"
+    )
     command = ["trend", str(tmp_path), "--sim", str(fleet / "arm_a" / "run_0" / "sim.xml"), "--json", "-"]
-    units = ["--units", "q=deg,dq=deg"]
+    units = ["--units", "q=deg"]
     first = CliRunner().invoke(app, [*command, *units], standalone_mode=False)
     assert json.loads(first.stdout)["newest"]["answer"]["causes"][0]["effect"] == "friction.coulomb"
     assert "1 recording: a change can be found from 13 on" in " ".join(first.stderr.split())
     (line,) = (tmp_path / "answers.jsonl").read_text(encoding="utf-8").splitlines()
-    assert set(json.loads(line)["options"]["units"]) == {"q", "dq"}
+    assert set(json.loads(line)["options"]["units"]) == {"q"}
     (tmp_path / "2026-10-02.parquet").write_bytes(b"")  # it is diagnosed, and need not be read again
     again = CliRunner().invoke(app, [*command, *units], standalone_mode=False)
     assert again.stdout == first.stdout
