@@ -102,27 +102,9 @@ def _left(found: Identified) -> float:
 
 
 def _matters(found: Identified, stage: Stage) -> bool:
-    return _lowers(found, stage) and _differs(found, stage)
-
-
-def _lowers(found: Identified, stage: Stage) -> bool:
     """Whether it lowers the gap of a joint that has one."""
     gap = np.maximum(stage.before, found.heldout_before)
     return bool(((stage.share > LEAST_SHRINK) & (gap > found.margin)).any())
-
-
-def _differs(found: Identified, stage: Stage) -> bool:
-    """Whether some parameter's interval leaves out the nominal value."""
-    effect, joints = stage.group
-    if not joints:
-        places = [(-1, name) for name in columns_of_effect(found, effect)]
-    else:
-        places = [(j, name) for j in joints for name in EFFECTS[effect].parameters]
-    for j, name in places:
-        _, low, high, _ = interval(found.search, found.fit, found.within, j, name)
-        if not low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= high:
-            return True
-    return False
 
 
 def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:

@@ -26,10 +26,9 @@ from sim_gap.effects.base import tilt_gravity
 from sim_gap.effects.link import point_mass
 from sim_gap.model.load import SimModel
 from sim_gap.model.solver_friction import solver_parameters
-from sim_gap.position_gap.choice import LoopSearch, effect_there, without_effect, without_group
-from sim_gap.position_gap.fit import LoopFit
-from sim_gap.position_gap.links import along, shared_effects
-from sim_gap.position_gap.parameters import EFFECTS
+from sim_gap.position_gap.choice import effect_there, without_group
+from sim_gap.position_gap.fit import LoopFit, LoopSearch
+from sim_gap.position_gap.parameters import EFFECTS, along, shared_effects
 
 BEYOND = 0.02
 """Distance beyond the end of its range from which a joint of the model would have to go on [rad]; stops are soft."""
@@ -112,7 +111,7 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
             continue
         for j in range(search.data.joints):
             if effect_there(fit, effect, j):
-                bare = without_effect(search, bare, effect, j)
+                bare = without_group(search, bare, (effect, (j,)))
     for effect in _shared_beside(search, fit, held):
         bare = without_group(search, bare, (effect, ()))
     share = compensation(search, fit)
@@ -135,7 +134,7 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
     changed = changed or bool(np.any(fit.point["kd"] != 0.0) or np.any(fit.point["feed"] != share))
     if not changed:
         return fit
-    return search.improve(replace(bare, active=tuple(wanted), rms=None), 3)
+    return search.improve(replace(bare, active=tuple(wanted)), 3)
 
 
 def needs_pid(fit: LoopFit, held: Collection[str] = NATIVE) -> Mask:
