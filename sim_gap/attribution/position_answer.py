@@ -61,7 +61,7 @@ def diagnose_positions(
     progress("replaying the corrected model")
     share = _left(found)
     made = [_cause(found, stage, share) for stage in found.stages]
-    taken = [(c, stage) for c, stage in zip(made, found.stages, strict=True) if _matters(found, stage)]
+    taken = [(c, stage) for c, stage in zip(made, found.stages, strict=True) if _lowers(found, stage)]
     causes = [c for c, _ in taken]
     minor = [c for c in made if c not in causes]
     verdict = _verdict(found, causes, share)
@@ -101,7 +101,7 @@ def _left(found: Identified) -> float:
     return float(left / max(float(np.maximum(found.heldout_before**2 - floor, 0.0).sum()), 1e-18))
 
 
-def _matters(found: Identified, stage: Stage) -> bool:
+def _lowers(found: Identified, stage: Stage) -> bool:
     """Whether it lowers the gap of a joint that has one."""
     gap = np.maximum(stage.before, found.heldout_before)
     return bool(((stage.share > LEAST_SHRINK) & (gap > found.margin)).any())
