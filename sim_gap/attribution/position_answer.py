@@ -61,7 +61,7 @@ def diagnose_positions(
     progress("replaying the corrected model")
     share = _left(found)
     made = [_cause(found, stage, share) for stage in found.stages]
-    taken = [(c, stage) for c, stage in zip(made, found.stages, strict=True) if _lowers(found, stage)]
+    taken = [(c, stage) for c, stage in zip(made, found.stages, strict=True) if _matters(found, stage)]
     causes = [c for c, _ in taken]
     minor = [c for c in made if c not in causes]
     verdict = _verdict(found, causes, share)
@@ -101,10 +101,28 @@ def _left(found: Identified) -> float:
     return float(left / max(float(np.maximum(found.heldout_before**2 - floor, 0.0).sum()), 1e-18))
 
 
+def _matters(found: Identified, stage: Stage) -> bool:
+    return _lowers(found, stage) and _differs(found, stage)
+
+
 def _lowers(found: Identified, stage: Stage) -> bool:
     """Whether it lowers the gap of a joint that has one."""
     gap = np.maximum(stage.before, found.heldout_before)
     return bool(((stage.share > LEAST_SHRINK) & (gap > found.margin)).any())
+
+
+def _differs(found: Identified, stage: Stage) -> bool:
+    """Whether some parameter's interval leaves out the nominal value."""
+    effect, joints = stage.group
+    if not joints:
+        places = [(-1, name) for name in columns_of_effect(found, effect)]
+    else:
+        places = [(j, name) for j in joints for name in EFFECTS[effect].parameters]
+    for j, name in places:
+        _, low, high, _ = interval(found.search, found.fit, found.spread, j, name)
+        if not low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= high:
+            return True
+    return False
 
 
 def _verdict(found: Identified, causes: Sequence[Cause], share: float) -> Verdict:
