@@ -26,8 +26,8 @@ from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
 from calib.commissioning.arm_text import assumed_lines
 from calib.commissioning.model_judgement import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
-from calib.creep.record import CreepCalibration
 from calib.dataset import SweepData
+from calib.fit.creep_fit import CreepFit
 from calib.install.journaled_write import install
 from calib.install.plausibility import admit
 from calib.motion.random_work import WorkMotion, work_targets
@@ -279,11 +279,11 @@ class Demo:
         account.note(sensors={name: {"true": true[name], **_estimate(fit, name)} for name in names}, drift=None)
         account.note(not_identifiable={f"{joint}.{name}": why for (joint, name), why in fit.reasons.items()})
         swept = "was swept without and with"
-        if isinstance(fit, CreepCalibration):
+        if isinstance(fit, CreepFit):
             swept = "crept through its range without, with and again without"
             friction = {name: _estimate(fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
             friction["coulomb"]["true"] = true["coulomb"]
-            account.note(friction=friction, disturbed=fit.findings, sag=None)
+            account.note(friction=friction, disturbed=[each.text for each in fit.findings], sag=None)
             names += ("coulomb", "load", "viscous")
         parts = calibration.sections(calibration.Calibrated(self.bench.arm, passes, fit, record, None))
         columns: dict[str, tuple[Array, Array]] = {}
