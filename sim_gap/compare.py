@@ -19,7 +19,7 @@ from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.position_command import is_position_only
 from sim_gap.model.known_gains import KnownGains
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.fit import residuals
+from sim_gap.position_gap.fit import LoopFit, evaluate
 from sim_gap.position_gap.parameters import PARAMETERS
 from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.training.export import widen_ranges
@@ -140,8 +140,10 @@ def _moved(
         )
     data = windows_of(plant, recordings, labels)
     point = nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()})
-    squares = (residuals(data, [point])[0] ** 2 * data.weight).sum(0)
-    return squares, data.weight.sum(0), replay_rms(nominal(sim), recordings)
+    rms = evaluate(data, LoopFit(point, ((),) * sim.n)).rms
+    assert rms is not None
+    weight = data.weight.sum(0)
+    return rms**2 * weight, weight, replay_rms(nominal(sim), recordings)
 
 
 def _torques(sim: SimModel, recordings: Sequence[Recording], labels: Sequence[str]) -> tuple[Array, Array]:

@@ -71,17 +71,6 @@ class Linearised:
     slopes: tuple[Array, ...]
     """Their derivatives there, (k, N) each."""
 
-    def moved(self, theta: Array, residual: Array, weight: Array) -> "Linearised":
-        """The same about another point: derivatives that agree with the way there, by Broyden's update, each parameter
-        in units of what it shows; `weight` is that of the rows, (C, N)."""
-        slopes = []
-        for c, (index, x) in enumerate(zip(self.acting, self.slopes, strict=True)):
-            step = theta[index] - self.theta[index]
-            shown = step * ((x * x) @ weight[c])
-            missed = residual[c] - self.residual[c] - step @ x
-            slopes.append(x + np.outer(shown, missed) / max(float(step @ shown), 1e-300))
-        return Linearised(theta, residual, self.acting, tuple(slopes))
-
 
 def linearise(
     problem: EstimationProblem, theta: Array, free: Sequence[int], residual: Array | None = None

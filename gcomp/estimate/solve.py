@@ -4,6 +4,7 @@ A row far off, as of a moment of contact, then counts little, with no threshold.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,9 +16,22 @@ STILL = 1e-3
 LONGEST_STEP = 1.5
 """Longest step of a parameter, in its own coordinate."""
 SHORTENED = 6
-"""Steps that are tried, each shorter, before a fit ends."""
-LEAST_DAMPING, HARDER = 1e-3, 10.0
-"""Damping of a step, over the curvature of the cost, and factor on it where the step does not lower the cost."""
+"""Times that a step is shortened before a fit ends."""
+EASIER, HARDER = 0.2, 10.0
+"""Factors on the damping after a step that lowers the cost, and after one that does not."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobustFit:
+    theta: Array
+    residual: Array
+    """(C, N)."""
+    variance: Array
+    """Square of the scale of the residuals, (C,)."""
+
+    def robust(self, problem: EstimationProblem) -> Array:
+        """Weight of each row beside the others of its channel by Student's t, (C, N)."""
+        return robust_weight(self.residual, self.variance, problem.freedom)
 
 
 def robust_weight(residual: Array, variance: Array, freedom: float) -> Array:
@@ -44,70 +58,45 @@ def cost_of(problem: EstimationProblem, residual: Array, variance: Array) -> Arr
     )
 
 
-def solve(
-    problem: EstimationProblem,
-    theta: Array,
-    free: Sequence[int],
-    iterations: int = 6,
-    about: Linearised | None = None,
-) -> Array:
-    """The most probable values of the free parameters from `theta` on, (K,).
+def solve(problem: EstimationProblem, theta: Array, free: Sequence[int], iterations: int = 6) -> RobustFit:
+    """The most probable values of the free parameters from `theta` (K,) on.
 
-    Derivatives are found once, or are those given `about` this point, and follow the steps (`Linearised.moved`); they
-    are found again where no step by them lowers the cost. Where no parameter acts on all channels, each takes its own
-    steps.
+    Where no parameter acts on all channels, each channel takes its own steps.
     """
     free = list(free)
-    own = np.array([problem.parameters[k].channel for k in free], np.intp)
-    together = bool(np.any(own < 0))
+    shared = any(problem.parameters[k].channel < 0 for k in free)
     channels = len(problem.weight)
-    enough = STILL * np.maximum(problem.weight.sum(1), 1.0)
+    damping, busy = np.full(channels, 1e-3), np.ones(channels, bool)
     theta = problem.within(np.array(theta, float))
-    now = problem.predict(theta[None])[0] if about is None else about.residual
-    busy, fresh = np.isin(np.arange(channels), own) | together, False
+    now: Array | None = None  # residual at theta, where it is known
     for _ in range(iterations):
-        if about is None:
-            about, fresh = linearise(problem, theta, free, now), True
-        variance = scale_of(problem, now)
-        before = cost_of(problem, now, variance) + prior_cost(problem, theta, channels)
-        weight = problem.weight * robust_weight(now, variance, problem.freedom) / variance[:, None]
-        damping, trial, higher = np.full(channels, LEAST_DAMPING), theta.copy(), busy
-        for _ in range(SHORTENED):
-            step = _step(problem, about, weight, damping)
-            promised = _promised(about, weight, step)
-            promised = np.full(channels, promised.sum() / channels) if together else promised
-            if not (busy & (promised < 0.0)).any():
-                break
-            damping[promised < 0.0] *= HARDER  # a bound shortens it otherwise
-        busy = higher = busy & (promised > enough)
-        if not busy.any():
+        moving = [k for k in free if shared or busy[problem.parameters[k].channel]]
+        if not moving:
             break
-        for _ in range(SHORTENED if fresh else 1):
-            moving = [k for k, c in zip(free, own, strict=True) if higher[c]]
-            trial[moving] = (theta + step)[moving]
+        about = linearise(problem, theta, moving, now)
+        now = about.residual
+        variance = scale_of(problem, about.residual)
+        before = cost_of(problem, about.residual, variance) + prior_cost(problem, theta, channels)
+        weight = problem.weight * robust_weight(about.residual, variance, problem.freedom) / variance[:, None]
+        for _ in range(SHORTENED):
+            trial = problem.within(theta + _step(problem, about, weight, damping))
             left = problem.predict(trial[None])[0]
             after = cost_of(problem, left, variance) + prior_cost(problem, trial, channels)
-            higher = busy & ((after >= before) if not together else (after.sum() >= before.sum()))
-            if not higher.any():
+            lower = after < before if not shared else np.full(channels, after.sum() < before.sum())
+            damping = np.where(lower, damping * EASIER, damping * HARDER)
+            if lower[busy].any():
                 break
-            damping *= HARDER
-            step = _step(problem, about, weight, damping)
-        there = theta.copy()
-        taken = [k for k, c in zip(free, own, strict=True) if (busy & ~higher)[c]]
-        there[taken] = trial[taken]
-        now = left if np.array_equal(there, trial) else problem.predict(there[None])[0] if taken else now
-        about, theta = about.moved(there, now, weight) if taken else about, there
-        if higher.any() and not fresh:
-            about = None
-            continue
-        busy, fresh = busy & ~higher, False
-    return theta
-
-
-def _promised(about: Linearised, weight: Array, step: Array) -> Array:
-    """Fall of each channel's cost by a step (K,) to first order, (C,)."""
-    linear = about.residual + np.stack([step[i] @ x for i, x in zip(about.acting, about.slopes, strict=True)])
-    return np.asarray(0.5 * (weight * (about.residual**2 - linear**2)).sum(1))
+        fall = before - after
+        if lower.any():
+            taken = [k for k in moving if lower[max(problem.parameters[k].channel, 0)]]
+            theta[taken] = trial[taken]
+            now = left if np.array_equal(theta, trial) else None
+        still = ~lower | (fall < STILL * np.maximum(problem.weight.sum(1), 1.0))
+        busy = np.full(channels, not still.all()) if shared else busy & ~(still & lower) & ~(~lower & (damping > 1e3))
+        if not lower.any():
+            break
+    residual = problem.predict(theta[None])[0] if now is None else now
+    return RobustFit(theta, residual, scale_of(problem, residual))
 
 
 def prior_cost(problem: EstimationProblem, theta: Array, channels: int) -> Array:
@@ -125,7 +114,7 @@ def precision(problem: EstimationProblem) -> Array:
 
 
 def _step(problem: EstimationProblem, about: Linearised, weight: Array, damping: Array) -> Array:
-    """Step of all free parameters within their bounds, (K,)."""
+    """Step of all free parameters, (K,)."""
     size = len(problem.parameters)
     normal, right, prior = np.zeros((size, size)), np.zeros(size), precision(problem)
     damped = np.zeros(size)
@@ -140,4 +129,4 @@ def _step(problem: EstimationProblem, about: Linearised, weight: Array, damping:
     own[np.diag_indices(len(free))] += 1e-9 * max(float(np.diag(own).max(initial=0.0)), 1e-30)
     step = np.zeros(size)
     step[free] = np.linalg.solve(own, right[free] + prior[free] * away[free])
-    return problem.within(about.theta + np.clip(step, -LONGEST_STEP, LONGEST_STEP)) - about.theta
+    return np.clip(step, -LONGEST_STEP, LONGEST_STEP)

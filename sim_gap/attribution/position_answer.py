@@ -119,7 +119,7 @@ def _differs(found: Identified, stage: Stage) -> bool:
     else:
         places = [(j, name) for j in joints for name in EFFECTS[effect].parameters]
     for j, name in places:
-        _, low, high, _ = interval(found.search, found.fit, found.spread, j, name)
+        _, low, high, _ = interval(found.search, found.fit, found.within, j, name)
         if not low <= (float(found.search.nominal[name][j]) if j >= 0 else 0.0) <= high:
             return True
     return False

@@ -83,7 +83,7 @@ def _early(found: Identified) -> list[str]:
     for j in range(found.sim.n):
         if "delay" not in found.fit.active[j]:
             continue
-        value, _, high, _ = interval(found.search, found.fit, found.spread, j, "delay")
+        value, _, high, _ = interval(found.search, found.fit, found.within, j, "delay")
         if high < 0.0:
             early[found.sim.arm.names[j]] = value
     if not early:

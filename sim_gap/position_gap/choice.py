@@ -8,9 +8,21 @@ from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, Effect, LinearTerms, choose, price_of, terms_of
+from gcomp.estimate.problem import FREEDOM, linearise
 from gcomp.estimate.solve import cost_of, prior_cost, scale_of
-from sim_gap.position_gap.fit import Layout, LoopFit, LoopSearch, Place, Point, residuals, rms_on
-from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, shared_effects, size_of
+from sim_gap.position_gap.fit import (
+    INDEPENDENT_S,
+    Layout,
+    LoopFit,
+    Point,
+    batch,
+    evaluate,
+    improve,
+    names_of,
+    residuals,
+)
+from sim_gap.position_gap.links import shared_effects, size_of
+from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, Scales
 from sim_gap.position_gap.windows import Windows, thin_moving
 
 FOLDS = 6
@@ -22,7 +34,7 @@ OF_EVERY_JOINT = "friction.coulomb", "friction.viscous", "actuator.rotor_inertia
 """Effects that every joint has, of which a model states a guess: they pay no price."""
 QUIET = 1.1
 """Noise floors up to which nothing is left to explain."""
-ROUNDS, FITTING = 3, 6
+ROUNDS, FITTING = 3, 3
 """Times that effects are chosen and fitted, and Gauss-Newton steps of each of these fits."""
 FEW = 8
 """Windows on which levels of a limit, or first gains, are compared: those are steps of a factor, not values."""
@@ -36,6 +48,47 @@ Group = tuple[str, tuple[int, ...]]
 """An effect with the joints that have it; no joints for one of the whole arm."""
 
 
+@dataclass(frozen=True, eq=False)
+class LoopSearch:
+    """Data and nominal parameters of a choice of effects."""
+
+    data: Windows
+    scales: Scales
+    nominal: dict[str, Array]
+    """Parameters of the nominal model, to which one returns that is taken out, (J,) each."""
+    floor: Array
+    """RMS below which nothing can be seen, per joint (J,) [rad]."""
+    excluded: frozenset[str] = frozenset()
+    """Effects that do not take part."""
+    kept: frozenset[str] = frozenset()
+    """Effects that are not taken out."""
+    resting: frozenset[int] = frozenset()
+    """Joints of which nothing is fitted."""
+    open_controller: bool = False
+    """Whether the nominal model has no controller, so that the fitted one is no cause of a gap."""
+
+    def score(self, fit: LoopFit) -> Array:
+        """Half the logarithm of the mean square, times independent samples, per joint (J,); less is better."""
+        assert fit.rms is not None
+        count = self.data.weight.sum(0)
+        mean = (fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0)
+        return np.asarray(0.5 * self.samples * np.log(mean + self.floor**2))
+
+    @property
+    def samples(self) -> Array:
+        """Independent samples of each joint, (J,)."""
+        return np.asarray(self.data.weight.sum((0, 2)) * min(self.data.judged_s / INDEPENDENT_S, 1.0))
+
+    def size_of(self, name: str) -> Array:
+        """Unit of the levels of a limit, (J,): the highest speed, if a joint moves at all, or the usual size."""
+        if name != "slew":
+            return self.scales.of(name)
+        return np.asarray(np.maximum(np.abs(self.data.v).max(axis=(0, 2)), PARAMETERS["slew"].low))
+
+    def improve(self, fit: LoopFit, iterations: int = 5, freedom: float = FREEDOM) -> LoopFit:
+        return improve(self.data, fit, self.scales, self.floor, self.nominal, iterations, freedom)
+
+
 def folds_of(data: Windows) -> NDArray[np.intp]:
     """Fold of each window, (W,): recordings, or parts of a few of them."""
     if len(np.unique(data.recording)) >= FOLDS:
@@ -43,9 +96,9 @@ def folds_of(data: Windows) -> NDArray[np.intp]:
     return (np.arange(data.count) * min(FOLDS, data.count) // data.count).astype(np.intp)
 
 
-def candidates_of(search: LoopSearch) -> dict[str, tuple[Place, ...]]:
+def candidates_of(search: LoopSearch) -> dict[str, tuple[tuple[int, str], ...]]:
     """Name of each effect that may act, as `effect#joint` or of the whole arm → its parameters."""
-    out: dict[str, tuple[Place, ...]] = {}
+    out: dict[str, tuple[tuple[int, str], ...]] = {}
     for effect in EFFECTS.values():
         if effect.id not in search.excluded:
             for j in range(search.data.joints):
@@ -68,7 +121,11 @@ def _may_act(search: LoopSearch, effect: str, joint: int) -> bool:
 
 def chosen_of(search: LoopSearch, fit: LoopFit) -> list[str]:
     """Names of the effects that a fit has."""
-    return [name for name, places in candidates_of(search).items() if all(fit.has(place) for place in places)]
+    return [
+        name
+        for name, places in candidates_of(search).items()
+        if all(each in (fit.active[j] if j >= 0 else fit.shared) for j, each in places)
+    ]
 
 
 def with_chosen(search: LoopSearch, fit: LoopFit, names: Sequence[str]) -> LoopFit:
@@ -84,7 +141,7 @@ def with_chosen(search: LoopSearch, fit: LoopFit, names: Sequence[str]) -> LoopF
                 point[name][j] = search.nominal[name][j]
             elif j < 0 and name not in shared:
                 point.pop(name, None)
-    return replace(fit, point=point, active=active, shared=shared)
+    return replace(fit, point=point, active=active, shared=shared, rms=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,44 +173,45 @@ def look_about(
     every = candidates_of(search)
     listed = [name for name in every if names is None or name in names]
     places = list(dict.fromkeys(place for name in listed for place in every[name]))
-    absent = [place for place in places if not fit.has(place)]
+    steps = dict[tuple[int, str], float]()
+    absent = {name for j, name in places if name not in (fit.active[j] if j >= 0 else fit.shared)}
     if levels is None:
-        levels = {name: best_level(search, fit, name) for name in LEVELS if any(name == n for _, n in absent)}
-    # the velocity over which breakaway friction fades says nothing without that friction
-    places = [place for place in places if place[1] != "stribeck_velocity" or fit.has((place[0], "stribeck"))]
-    steps = {place: _trial_step(search, fit, place, levels) for place in absent}
-    search = search.looked(fit, places, steps)
-    layout = search.layout(fit.point, places)
-    terms = terms_of(layout.problem(search.nominal, search.floor), search.linear(fit, places), folds_of(search.data))
+        levels = {name: best_level(search, fit, name) for name in LEVELS if name in absent}
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for j, name in places:
+        there = name in (fit.active[j] if j >= 0 else fit.shared)
+        if there:
+            continue
+        if j < 0:
+            steps[j, name] = 0.2 * size_of(search.data.plant.sim.arm, name)
+        elif name in LEVELS:
+            size = float(search.scales.of(name)[j])
+            own = size / float(point[name][j]) if np.isfinite(point[name][j]) else 0.0
+            steps[j, name] = size / float(levels[name][j]) - own or 0.05
+        elif name == "stribeck_velocity" or name in ("kp", "gain"):
+            steps[j, name] = 0.05
+        else:
+            steps[j, name] = 0.5 if point[name][j] == PARAMETERS[name].neutral else 0.1
+    stuck = [(j, n) for j, n in places if n == "stribeck_velocity"]  # says nothing without the friction that it is of
+    places = [p for p in places if p not in stuck or "stribeck" in fit.active[p[0]]]
+    layout = Layout(search.data, search.scales, point, places)
+    problem = layout.problem(search.nominal, steps, search.floor)
+    about = linearise(problem, layout.theta(layout.point), range(len(places)))
     at = {place: k for k, place in enumerate(places)}
-    samples = search.samples
     effects = {}
+    samples = search.samples
     for name in listed:
-        joint, own = every[name][0][0], name.partition("#")[0]
-        least = LEAST_FALL * float(samples[joint] if joint >= 0 else samples.mean())
-        needs = EFFECTS[own].needs if joint >= 0 else ()
-        effects[name] = Effect(
-            name,
-            tuple(at[place] for place in every[name] if place in at),
-            tuple(f"{need}#{joint}" for need in needs if not active_in(search.nominal, need, joint)),
-            least,
-            0.0 if own in OF_EVERY_JOINT else None,
+        numbers = tuple(at[place] for place in every[name] if place in at)
+        joints = [j for j, _ in every[name]]
+        least = LEAST_FALL * float(samples[joints[0]]) if joints[0] >= 0 else LEAST_FALL * float(samples.mean())
+        needs = tuple(
+            f"{need}#{joints[0]}"
+            for need in (EFFECTS[name.partition("#")[0]].needs if joints[0] >= 0 else ())
+            if not active_in(search.nominal, need, joints[0])
         )
-    return About(search, fit, layout, terms, effects)
-
-
-def _trial_step(search: LoopSearch, fit: LoopFit, place: Place, levels: Mapping[str, Array]) -> float:
-    """Step of a difference by a parameter that is not there, in its own coordinate."""
-    j, name = place
-    if j < 0:
-        return 0.2 * size_of(search.data.plant.sim.arm, name)
-    value = float(fit.point[name][j])
-    if name in LEVELS:
-        size = float(search.scales.of(name)[j])
-        return size / float(levels[name][j]) - (size / value if np.isfinite(value) else 0.0) or 0.05
-    if name in ("stribeck_velocity", "kp", "gain"):
-        return 0.05
-    return 0.5 if value == PARAMETERS[name].neutral else 0.1
+        price = 0.0 if name.partition("#")[0] in OF_EVERY_JOINT else None
+        effects[name] = Effect(name, numbers, needs, least, price)
+    return About(search, fit, layout, terms_of(problem, about, folds_of(search.data)), effects)
 
 
 def active_in(point: dict[str, Array], effect: str, joint: int) -> bool:
@@ -167,7 +225,7 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
     one that is always reached leads nowhere."""
     levels = np.minimum(np.array(LEVELS[name])[:, None] * search.size_of(name), fit.point[name])
     few = thin_moving(search.data, FEW)
-    gaps = residuals(few, [{**fit.point, name: level} for level in levels])
+    gaps = residuals(few, batch([{**fit.point, name: level} for level in levels]))
     squares = np.einsum("ptjw,tjw->pj", gaps**2, few.weight)
     return np.asarray(levels[squares.argmin(axis=0), np.arange(search.data.joints)])
 
@@ -186,19 +244,16 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     for number in range(ROUNDS):
         progress(f"round {number + 1}: {len(names)} effects of joints and arm")
         about = look_about(search, fit, looked, levels)
-        search = about.search
         found = choose(about.terms, list(about.effects.values()), names, kept)
         if number == 0:
             looked = {*promising(about, names), *found, *names}
-        begin = about.moved(found)
-        if not {*names} <= {*found}:
-            # what was taken out may matter more than the linear terms say: then only what comes in does so
-            more = [*names, *(name for name in found if name not in names)]
-            whole = about.moved(more)
-            if worth(search, whole) > worth(search, begin):
-                found, begin = more, whole
-        made = search.improve(begin, FITTING)
+        made = search.improve(entered(search, about.moved(found)), FITTING)
         reached = worth(search, made)
+        if not {*names} <= {*found} and reached < most:
+            # what was taken out mattered more than the linear terms say: only what comes in does so
+            found = [*names, *(name for name in found if name not in names)]
+            made = search.improve(entered(search, about.moved(found)), FITTING)
+            reached = worth(search, made)
         same, names, fit = set(found) == set(names), found, made
         if reached >= most:
             best, most = made, reached
@@ -209,16 +264,16 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
         about = look_about(search, fit, looked, levels)
     found = choose(about.terms, [about.effects[n] for n in names], names, kept)
     if set(found) != set(names):
-        made = about.search.improve(about.moved(found), FITTING)
+        made = search.improve(about.moved(found), 4)
         if worth(search, made) >= most:
-            fit = made
+            fit, about = made, look_about(search, made, looked, levels)
     return fit, about
 
 
 def worth(search: LoopSearch, fit: LoopFit) -> float:
     """Logarithm of the probability of a fit less the price of its parameters, but for a constant."""
-    layout = search.layout(fit.point, fit.places)
-    problem = layout.problem(search.nominal, search.floor)
+    layout = Layout(search.data, search.scales, fit.point, names_of(fit))
+    problem = layout.problem(search.nominal, {}, search.floor)
     unlikely = prior_cost(problem, layout.theta(layout.point), search.data.joints).sum()
     paid = sum(not any(name in EFFECTS[e].parameters for e in OF_EVERY_JOINT) for _, name in layout.names)
     return -float(costs_of(search, [fit.point])[0].sum() + unlikely) - PRICE * paid
@@ -226,14 +281,18 @@ def worth(search: LoopSearch, fit: LoopFit) -> float:
 
 def costs_of(search: LoopSearch, points: Sequence[Point]) -> Array:
     """Negative logarithm of the likelihood of each joint at P points, (P, J), but for a constant."""
-    layout = search.layout(points[0])
-    problem = layout.problem(search.nominal, search.floor)
-    return np.stack([cost_of(problem, x, scale_of(problem, x)) for x in layout.rows(residuals(search.data, points))])
+    problem = Layout(search.data, search.scales, points[0], ()).problem(search.nominal, {}, search.floor)
+    left = residuals(search.data, batch(points)).transpose(0, 2, 1, 3).reshape(len(points), search.data.joints, -1)
+    return np.stack([cost_of(problem, each, scale_of(problem, each)) for each in left])
 
 
 def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[str]:
     """Effects of the joints at which a fit leaves more than noise, and of the whole arm if it does anywhere."""
-    left = set(np.flatnonzero(rms_on(search.data, fit) > QUIET * search.floor).tolist())
+    fit = fit if fit.rms is not None else evaluate(search.data, fit)
+    assert fit.rms is not None
+    count = search.data.weight.sum(0)
+    rms = np.sqrt((fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0))
+    left = set(np.flatnonzero(rms > QUIET * search.floor).tolist())
     return [
         name for name, places in candidates_of(search).items() if (places[0][0] in left if places[0][0] >= 0 else left)
     ]
@@ -250,11 +309,28 @@ def promising(about: About, names: Sequence[str]) -> set[str]:
     }
 
 
-# ---- effects of a fit, and the fit without them
+def entered(search: LoopSearch, fit: LoopFit) -> LoopFit:
+    """The fit with what has just come in and is still neutral at the size at which it is tried."""
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for j, own in enumerate(fit.active):
+        for name in own:
+            if name == "stribeck_velocity":
+                continue
+            if point[name][j] == 0.0 and PARAMETERS[name].neutral == 0.0 and name != "delay":
+                point[name][j] = 0.1 * float(search.scales.of(name)[j])
+    return replace(fit, point=point)
+
+
+# ---- an effect put into a fit or taken out of it
 
 
 def effect_there(fit: LoopFit, effect: str, joint: int) -> bool:
-    return fit.has((joint, EFFECTS[effect].parameters[0]))
+    return EFFECTS[effect].parameters[0] in fit.active[joint]
+
+
+def shared_of(fit: LoopFit, search: LoopSearch) -> list[str]:
+    """Effects of the whole arm in a fit."""
+    return [e for e, names in shared_effects(search.data.plant.sim.arm).items() if set(names) & set(fit.shared)]
 
 
 def groups_of(fit: LoopFit, search: LoopSearch) -> list[Group]:
@@ -264,8 +340,7 @@ def groups_of(fit: LoopFit, search: LoopSearch) -> list[Group]:
         for effect in EFFECTS
         if not (search.open_controller and effect in OPEN)
     ]
-    every = shared_effects(search.data.plant.sim.arm)
-    return [group for group in own if group[1]] + [(e, ()) for e, names in every.items() if {*names} & {*fit.shared}]
+    return [group for group in own if group[1]] + [(effect, ()) for effect in shared_of(fit, search)]
 
 
 OPEN = frozenset(effect.id for effect in EFFECTS.values() if effect.controller) | {
@@ -275,19 +350,26 @@ OPEN = frozenset(effect.id for effect in EFFECTS.values() if effect.controller) 
 """Effects that a controller has that had to be found: damping may be the servo's."""
 
 
-def without_group(search: LoopSearch, fit: LoopFit, group: Group) -> LoopFit:
-    """The fit without an effect: its parameters are those of the nominal model."""
-    effect, joints = group
-    every = shared_effects(search.data.plant.sim.arm)
-    names = {*(EFFECTS[effect].parameters if joints else every[effect])}
-    point = {name: values.copy() for name, values in fit.point.items() if joints or name not in names}
+def without_effect(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> LoopFit:
+    """The fit without an effect at one joint: its parameters are those of the nominal model."""
+    names = EFFECTS[effect].parameters
+    point = {name: values.copy() for name, values in fit.point.items()}
+    for name in names:
+        point[name][joint] = search.nominal[name][joint]
     active = list(fit.active)
+    active[joint] = tuple(name for name in active[joint] if name not in names)
+    return replace(fit, point=point, active=tuple(active), rms=None)
+
+
+def without_group(search: LoopSearch, fit: LoopFit, group: Group) -> LoopFit:
+    effect, joints = group
+    if not joints:
+        names = set(shared_effects(search.data.plant.sim.arm)[effect])
+        point = {name: x for name, x in fit.point.items() if name not in names}
+        return replace(fit, point=point, shared=tuple(n for n in fit.shared if n not in names), rms=None)
     for j in joints:
-        active[j] = tuple(name for name in active[j] if name not in names)
-        for name in names:
-            point[name][j] = search.nominal[name][j]
-    shared = fit.shared if joints else tuple(name for name in fit.shared if name not in names)
-    return replace(fit, point=point, active=tuple(active), shared=shared)
+        fit = without_effect(search, fit, effect, j)
+    return fit
 
 
 def names_in(group: Group) -> list[str]:

@@ -1,13 +1,14 @@
 """Parameters of all joints fitted to simulated minus measured positions."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gcomp.arrays import Array
-from gcomp.estimate.problem import FREEDOM, EstimationProblem, FittedParameter, Linearised, linearise
+from gcomp.estimate.problem import FREEDOM, EstimationProblem, FittedParameter, linearise
 from gcomp.estimate.solve import solve
+from sim_gap.position_gap.links import range_of, size_of
 from sim_gap.position_gap.parameters import (
     INVERSE,
     LOGARITHMIC,
@@ -15,8 +16,6 @@ from sim_gap.position_gap.parameters import (
     WITH_TORQUE,
     Scales,
     from_coordinate,
-    range_of,
-    size_of,
     to_coordinate,
 )
 from sim_gap.position_gap.simulation import simulate
@@ -30,31 +29,39 @@ PRIOR_RELATIVE = 3.0
 """Standard deviation of the logarithm of a gain before any recording."""
 Point = Mapping[str, Array]
 """Parameter → (J,)."""
-Place = tuple[int, str]
-"""Joint, −1 for the whole arm, and name of a parameter."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopFit:
-    """Parameters of all joints, and those that were fitted."""
+    """Parameters of all joints, those that were fitted, and what they leave."""
 
     point: dict[str, Array]
     active: tuple[tuple[str, ...], ...]
     """Names fitted at each joint."""
     shared: tuple[str, ...] = ()
     """Names of parameters with one value for the whole arm."""
+    rms: Array | None = None
+    """RMS of the residual per joint and window [rad], (J, W)."""
 
     def with_values(self, **values: Array) -> "LoopFit":
         return replace(self, point={**self.point, **values})
 
-    @property
-    def places(self) -> list[Place]:
-        """Fitted parameters: those of the joints, then the whole arm's."""
-        return [(j, name) for j, own in enumerate(self.active) for name in own] + [(-1, name) for name in self.shared]
 
-    def has(self, place: Place) -> bool:
-        joint, name = place
-        return name in (self.active[joint] if joint >= 0 else self.shared)
+def coordinate(fit: LoopFit, scales: Scales, joint: int, name: str) -> float:
+    """A fit's value of a parameter in its own coordinate; `joint` is −1 for the whole arm."""
+    value = float(fit.point[name][max(joint, 0)])
+    return value if joint < 0 else to_coordinate(name, value, float(scales.of(name)[joint]))
+
+
+def residuals(data: Windows, values: Mapping[str, Array]) -> Array:
+    """Simulated minus measured positions, as far as they count, (P, To, J, W)."""
+    return (simulate(data, values) - data.measured) * (data.weight > 0.0)
+
+
+def root_mean_squares(data: Windows, residual: Array) -> Array:
+    """RMS over the time of each window, (…, J, W); 0 for one without samples."""
+    total = np.einsum("...tjw,tjw->...jw", residual**2, data.weight)
+    return np.asarray(np.sqrt(total / np.maximum(data.weight.sum(0), 1.0)))
 
 
 def batch(points: Sequence[Point]) -> dict[str, Array]:
@@ -62,32 +69,14 @@ def batch(points: Sequence[Point]) -> dict[str, Array]:
     return {name: np.stack([point[name] for point in points]) for name in points[0]}
 
 
-def residuals(data: Windows, points: Sequence[Point]) -> Array:
-    """Simulated minus measured positions, as far as they count, (P, To, J, W). Those of one point are kept."""
-    key = b"".join(name.encode() + values.tobytes() for name, values in sorted(points[0].items()))
-    if len(points) > 1 or key not in data.known:
-        left = (simulate(data, batch(points)) - data.measured) * (data.weight > 0.0)
-        if len(points) > 1:
-            return np.asarray(left)
-        data.known[key] = left
-    return data.known[key]
-
-
-def joint_rms(data: Windows, residual: Array) -> Array:
-    """RMS of a residual (…, To, J, W) over all windows of each joint, (…, J) [rad]."""
-    squares = np.einsum("...tjw,tjw->...j", residual**2, data.weight)
-    return np.asarray(np.sqrt(squares / np.maximum(data.weight.sum((0, 2)), 1.0)))
-
-
-def rms_on(data: Windows, fit: LoopFit) -> Array:
-    """RMS of the position gap of each joint [rad], (J,)."""
-    return joint_rms(data, residuals(data, [fit.point])[0])
+def evaluate(data: Windows, fit: LoopFit) -> LoopFit:
+    return replace(fit, rms=root_mean_squares(data, residuals(data, batch([fit.point])))[0])
 
 
 class Layout:
-    """Parameters of joints and of the whole arm in the order of an `EstimationProblem`."""
+    """Parameters of joints (joint, name) and of the whole arm (−1, name) in the order of an `EstimationProblem`."""
 
-    def __init__(self, data: Windows, scales: Scales, point: Point, names: Iterable[Place]) -> None:
+    def __init__(self, data: Windows, scales: Scales, point: Point, names: Iterable[tuple[int, str]]) -> None:
         self.data, self.scales, self.point = data, scales, dict(point)
         self.names = list(names)
         for j, name in self.names:
@@ -116,23 +105,17 @@ class Layout:
                 point[name][j] = from_coordinate(name, np.array(x), np.array(self.size(j, name)))
         return point
 
-    def rows(self, residual: Array) -> Array:
-        """Residuals (…, To, J, W) by channel, (…, J, N)."""
-        return np.moveaxis(residual, -2, -3).reshape(*residual.shape[:-3], self.data.joints, -1)
-
-    def problem(
-        self, nominal: Point, floor: Array, steps: Mapping[Place, float] | None = None, freedom: float = FREEDOM
-    ) -> EstimationProblem:
-        """`steps` are those of differences that are not the usual ones."""
-        own = steps or {}
-        parameters = tuple(self._parameter(j, name, nominal, own.get((j, name))) for j, name in self.names)
-        weight = self.rows(self.data.weight * min(self.data.judged_s / INDEPENDENT_S, 1.0))
-        block = np.broadcast_to(np.arange(self.data.count), (len(self.data.measured), self.data.count)).ravel()
+    def problem(self, nominal: Point, steps: Mapping[tuple[int, str], float], floor: Array) -> EstimationProblem:
+        parameters = tuple(self._parameter(j, name, nominal, steps.get((j, name))) for j, name in self.names)
+        shape = (self.data.joints, -1)
 
         def predict(thetas: Array) -> Array:
-            return self.rows(residuals(self.data, [self.at(theta) for theta in thetas]))
+            left = residuals(self.data, batch([self.at(theta) for theta in thetas]))
+            return left.transpose(0, 2, 1, 3).reshape(len(thetas), *shape)
 
-        return EstimationProblem(parameters, predict, weight, block.astype(np.intp), floor, freedom)
+        weight = self.data.weight.transpose(1, 0, 2).reshape(shape) * min(self.data.judged_s / INDEPENDENT_S, 1.0)
+        block = np.broadcast_to(np.arange(self.data.count), (len(self.data.measured), self.data.count)).ravel()
+        return EstimationProblem(parameters, predict, weight, block.astype(np.intp), floor)
 
     def _parameter(self, j: int, name: str, nominal: Point, step: float | None) -> FittedParameter:
         if j < 0:
@@ -147,87 +130,51 @@ class Layout:
             ends, own, usual = (0.0, size / low), PARAMETERS[name].spread, DIFFERENCE
         else:
             ends, own, usual = (low / size, high / size), PARAMETERS[name].spread, DIFFERENCE
-        at = {place: k for k, place in enumerate(self.names)}
-        others = [(j, each) for each in (WITH_TORQUE if name == "kp" else ()) if (j, each) in at]
-        along = tuple((at[p], to_coordinate(p[1], float(self.point[p[1]][j]), self.size(*p))) for p in others)
-        value = to_coordinate(name, float(nominal[name][j]), size)
-        return FittedParameter(name, value, own, *ends, channel=j, step=step or usual, along=along)
+        return FittedParameter(
+            name, to_coordinate(name, float(nominal[name][j]), size), own, *ends, channel=j, step=step or usual
+        )
 
 
-@dataclass(frozen=True, eq=False)
-class LoopSearch:
-    """Data and nominal parameters of a choice of effects."""
+def names_of(fit: LoopFit) -> list[tuple[int, str]]:
+    """Fitted parameters: joint and name, then the whole arm's."""
+    return [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
 
-    data: Windows
-    scales: Scales
-    nominal: dict[str, Array]
-    """Parameters of the nominal model, to which one returns that is taken out, (J,) each."""
-    floor: Array
-    """RMS below which nothing can be seen, per joint (J,) [rad]."""
-    excluded: frozenset[str] = frozenset()
-    """Effects that do not take part."""
-    kept: frozenset[str] = frozenset()
-    """Effects that are not taken out."""
-    resting: frozenset[int] = frozenset()
-    """Joints of which nothing is fitted."""
-    open_controller: bool = False
-    """Whether the nominal model has no controller, so that the fitted one is no cause of a gap."""
-    slopes: Mapping[Place, Array] = field(default_factory=dict)
-    """Derivatives of the residual as they were last found, in the parameters' own coordinates: (N,) of the joint, or
-    (J, N)."""
 
-    @property
-    def samples(self) -> Array:
-        """Independent samples of each joint, (J,)."""
-        return np.asarray(self.data.weight.sum((0, 2)) * min(self.data.judged_s / INDEPENDENT_S, 1.0))
+def jacobian(
+    data: Windows, fit: LoopFit, scales: Scales, names: Sequence[Sequence[str]], shared: Sequence[str] = ()
+) -> tuple[Array, list[Array]]:
+    """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the parameters' own coordinates."""
+    listed = [(j, name) for j, own in enumerate(names) for name in own] + [(-1, name) for name in shared]
+    layout = Layout(data, scales, fit.point, listed)
+    problem, theta = layout.problem(fit.point, {}, np.zeros(data.joints)), layout.theta(layout.point)
+    at = {place: k for k, place in enumerate(listed)}
+    parameters = list(problem.parameters)
+    for (j, name), k in at.items():
+        if name == "kp":
+            others = tuple((at[j, each], float(theta[at[j, each]])) for each in WITH_TORQUE if (j, each) in at)
+            parameters[k] = replace(parameters[k], along=others)
+    about = linearise(replace(problem, parameters=tuple(parameters)), theta, range(len(listed)))
+    shape = (len(data.measured), data.count)
+    now = about.residual.reshape(data.joints, *shape).transpose(1, 0, 2)
+    return now, [x.reshape(len(x), *shape) for x in about.slopes]
 
-    def size_of(self, name: str) -> Array:
-        """Unit of the levels of a limit, (J,): the highest speed, if a joint moves at all, or the usual size."""
-        if name != "slew":
-            return self.scales.of(name)
-        return np.asarray(np.maximum(np.abs(self.data.v).max(axis=(0, 2)), PARAMETERS["slew"].low))
 
-    def layout(self, point: Point, places: Iterable[Place] = ()) -> Layout:
-        return Layout(self.data, self.scales, point, places)
-
-    def looked(self, fit: LoopFit, places: Iterable[Place], steps: Mapping[Place, float] | None = None) -> "LoopSearch":
-        """The same with derivatives by these parameters about a fit."""
-        layout = self.layout(fit.point, places)
-        problem = layout.problem(self.nominal, self.floor, steps)
-        now = layout.rows(residuals(self.data, [fit.point]))[0]
-        about = linearise(problem, layout.theta(layout.point), range(len(layout.names)), now)
-        found = dict(self.slopes) | {place: np.zeros_like(now) for place in layout.names if place[0] < 0}
-        for c, (index, rows) in enumerate(zip(about.acting, about.slopes, strict=True)):
-            for k, row in zip(index.tolist(), rows, strict=True):
-                if layout.names[k][0] < 0:
-                    found[layout.names[k]][c] = row
-                else:
-                    found[layout.names[k]] = row
-        return replace(self, slopes=found)
-
-    def linear(self, fit: LoopFit, places: Sequence[Place]) -> Linearised:
-        """The residual about a fit, with the derivatives that are known; others are found."""
-        missing = [place for place in places if place not in self.slopes]
-        slopes = (self.looked(fit, missing) if missing else self).slopes
-        layout = self.layout(fit.point, places)
-        now = layout.rows(residuals(self.data, [fit.point]))[0]
-        acting = [np.array([k for k, (j, _) in enumerate(places) if j in (c, -1)], np.intp) for c in range(len(now))]
-        rows = [
-            np.array([slopes[places[k]] if places[k][0] >= 0 else slopes[places[k]][c] for k in own]).reshape(
-                len(own), now.shape[1]
-            )
-            for c, own in enumerate(acting)
-        ]
-        return Linearised(layout.theta(layout.point), now, tuple(acting), tuple(rows))
-
-    def improve(self, fit: LoopFit, iterations: int = 5, freedom: float = FREEDOM) -> LoopFit:
-        """The most probable values of what is active, from a fit on, under Student's t of this `freedom`."""
-        places = fit.places
-        if not places:
-            return fit
-        layout = self.layout(fit.point, places)
-        problem = layout.problem(self.nominal, self.floor, freedom=freedom)
-        theta = problem.within(layout.theta(layout.point))
-        known = all(place in self.slopes for place in places)
-        about = self.linear(replace(fit, point=layout.at(theta)), places) if known else None
-        return replace(fit, point=layout.at(solve(problem, theta, range(len(places)), iterations, about)))
+def improve(
+    data: Windows,
+    fit: LoopFit,
+    scales: Scales,
+    floor: Array,
+    nominal: Point,
+    iterations: int = 6,
+    freedom: float = FREEDOM,
+) -> LoopFit:
+    """The most probable values of what is active, from a fit on; `freedom` is that of the residuals' distribution."""
+    names = names_of(fit)
+    if not names:
+        return evaluate(data, fit)
+    layout = Layout(data, scales, fit.point, names)
+    problem = replace(layout.problem(nominal, {}, floor), freedom=freedom)
+    found = solve(problem, layout.theta(layout.point), range(len(names)), iterations)
+    shape = (data.joints, len(data.measured), data.count)
+    left = found.residual.reshape(shape).transpose(1, 0, 2)
+    return replace(fit, point=layout.at(found.theta), rms=root_mean_squares(data, left))

@@ -12,10 +12,20 @@ from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.choice import QUIET, About, groups_of, look_about, select, without_group, worth
-from sim_gap.position_gap.fit import LoopFit, LoopSearch, rms_on
-from sim_gap.position_gap.judge import Stage, stages
-from sim_gap.position_gap.parameters import PARAMETERS, shared_effects
+from sim_gap.position_gap.choice import (
+    QUIET,
+    About,
+    LoopSearch,
+    groups_of,
+    look_about,
+    select,
+    without_group,
+    worth,
+)
+from sim_gap.position_gap.fit import LoopFit, evaluate
+from sim_gap.position_gap.judge import Stage, rms_on, stages
+from sim_gap.position_gap.links import shared_effects
+from sim_gap.position_gap.parameters import PARAMETERS
 from sim_gap.position_gap.plant import MovedModel, held_parts, nominal_point
 from sim_gap.position_gap.sound_arm import SoundGap, split_gap
 from sim_gap.position_gap.start import controller_name, limited_servo_starts, noise_floor, scales_of, starting_fit
@@ -23,7 +33,7 @@ from sim_gap.position_gap.training.bands import Band, band
 from sim_gap.position_gap.training.export import Exported, export_fit, export_with_module, native_fit, widen_ranges
 from sim_gap.position_gap.training.jackknife import gaps_left_out, terms_of
 from sim_gap.position_gap.training.replay import nominal, replay_rms
-from sim_gap.position_gap.training.spread import Covariance, covariance, free_all, known_before, undecided_scale
+from sim_gap.position_gap.training.spread import Covariance, covariance, covariance_within, known_before
 from sim_gap.position_gap.training.unreached_limits import find_unreached
 from sim_gap.position_gap.windows import Windows, thin, thin_moving, windows_of
 from sim_gap.residuals.residual_set import EXPLAINED
@@ -45,7 +55,9 @@ class Identified:
     nominal_has_controller: bool
     stages: tuple[Stage, ...]
     spread: Covariance
-    """Covariance of the parameters within recordings and from one to the next, and limits that none reaches."""
+    """Covariance of the parameters within recordings and from one to the next."""
+    within: Covariance
+    """Covariance within recordings alone: by it an effect is told from none."""
     band: Band
     train_before: Array
     train_after: Array
@@ -119,16 +131,14 @@ def identify(
             for some, gain in ((train, scale[: len(train)]), (heldout, scale[len(train) :]))
         )
     search, fit, about = _fitted(search, own.complete, progress)
-    search = about.search.looked(fit, [place for place in free_all(search, fit).places if place[0] >= 0])
     progress("each effect on held-out data")
     margin = _margin(search, fit)
     split = split_gap(search, judged, margin) if own.complete else None
     matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
-    spread = replace(covariance(search, fit), limits=find_unreached(search, fit))
-    scaled = "actuator.rotor_inertia" in search.excluded or not undecided_scale(fit, spread)
-    found = tuple(stages(search, fit, about, judged, matters, scaled=scaled))
-    before = _bare(search, fit, own.complete)
+    found = tuple(stages(search, fit, about, judged, matters))
+    before = _bare(search, fit, about, own.complete)
     terms = terms_of(search, fit)
+    spread = replace(covariance(search, fit), limits=find_unreached(search, fit))
     left = gaps_left_out(data, terms, known_before(search, fit, terms.names))
     return Identified(
         sim=sim,
@@ -139,6 +149,7 @@ def identify(
         nominal_has_controller=own.complete,
         stages=found,
         spread=spread,
+        within=covariance_within(search, fit, terms),
         band=band(search, fit, spread, left, judged),
         train_before=rms_on(data, before),
         train_after=rms_on(data, fit),
@@ -156,7 +167,7 @@ def identify(
 
 def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None]) -> tuple[LoopSearch, LoopFit, About]:
     """The fit, with the effects that it takes; the nominal model as it is where it leaves nothing."""
-    bare = LoopFit(search.nominal, ((),) * search.data.joints)
+    bare = evaluate(search.data, LoopFit(search.nominal, ((),) * search.data.joints))
     if complete and bool(np.all(rms_on(search.data, bare) < QUIET * search.floor)):
         return search, bare, look_about(search, bare, [])
     search, fit = starting_fit(search, search.data.plant.servos, progress)
@@ -198,14 +209,14 @@ def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
     return [found[i] / found[0] for i in range(len(labels))]
 
 
-def _bare(search: LoopSearch, fit: LoopFit, complete: bool) -> LoopFit:
+def _bare(search: LoopSearch, fit: LoopFit, about: About, complete: bool) -> LoopFit:
     """The nominal model with its own controller, or with that of the fit, fitted again without any effect."""
     if complete:
         own = {name: values.copy() for name, values in search.nominal.items()}
         return LoopFit(own | {"creep": search.data.plant.creep}, ((),) * search.data.joints)
     for group in groups_of(fit, search):
         fit = without_group(search, fit, group)
-    return search.improve(fit, 4)
+    return search.improve(replace(fit, rms=None), 4)
 
 
 def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:

@@ -11,8 +11,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import LoopFit, LoopSearch, rms_on
-from sim_gap.position_gap.parameters import shared_names
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit, jacobian
+from sim_gap.position_gap.judge import rms_on
+from sim_gap.position_gap.links import shared_names
+from sim_gap.position_gap.parameters import step_parameter
 from sim_gap.position_gap.windows import Windows
 
 ERROR = 0.01
@@ -64,27 +67,23 @@ def errors_of(search: LoopSearch) -> list[dict[str, float]]:
 
 def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
     """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
-    data, sizes = search.data, errors_of(search)
-    places = [(j if j < data.joints else -1, name) for j, own in enumerate(sizes) for name in own]
-    deviations = np.array([size for own in sizes for size in own.values()])
+    sizes = errors_of(search)
+    deviations = np.array([size for each in sizes for size in each.values()])
     usually = _correlation(sizes)
-    nominal = LoopFit(search.nominal, ((),) * data.joints)
-    about = search.linear(nominal, places)
-    normal, right, usual = np.linalg.inv(usually), np.zeros(deviations.size), np.zeros(data.joints)
-    count, samples = np.maximum(data.weight.sum((0, 2)), 1.0), search.samples
-    for j, (own, slopes) in enumerate(zip(about.acting, about.slopes, strict=True)):
-        change = slopes * deviations[own, None]
-        usual[j] = np.sqrt((change**2).sum() / count[j])
-        independent = samples[j] / count[j] / margin[j] ** 2
-        normal[np.ix_(own, own)] += independent * change @ change.T
-        right[own] -= independent * change @ about.residual[j]
+    prior = np.linalg.inv(usually)
+    gaps, changes = _weighed(search, _fit(search, sizes, np.zeros(deviations.size)), sizes, deviations)
+    usual = np.array([np.linalg.norm(x) for x in changes])
+    normal, right = prior.copy(), np.zeros(deviations.size)
+    for gap, x, samples, least in zip(gaps, changes, search.samples, margin, strict=True):
+        normal += samples / least**2 * x @ x.T
+        right -= samples / least**2 * x @ gap
     spread = np.asarray(np.linalg.inv(normal))
     errors = spread @ right
-    layout = search.layout(search.nominal, places)
-    found = replace(nominal, point=layout.at(about.theta + deviations * errors))
-    left = [(rms_on(each.data, found) / margin, each.samples) for each in (search, replace(search, data=heldout))]
-    small = all(bool(np.all(gap**2 * number < _rare(number))) for gap, number in left)
-    return SoundGap(usual, np.maximum(left[0][0], left[1][0]) * margin, small and probable(errors, usually, spread))
+    found, other = _fit(search, sizes, errors), replace(search, data=heldout)
+    pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
+    small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
+    explained = all(small) and probable(errors, usually, spread)
+    return SoundGap(usual, np.maximum(pairs[0][0], pairs[1][0]) * margin, explained)
 
 
 def probable(errors: Array, usually: Array, spread: Array) -> bool:
@@ -109,3 +108,33 @@ def _correlation(sizes: list[dict[str, float]]) -> Array:
     late = np.array([name == "delay" for each in sizes for name in each], float)
     share = LATE_S**2 / (LATE_S**2 + APART_S**2)
     return np.asarray(np.diag(1.0 - share * late) + share * np.outer(late, late))
+
+
+def _fit(search: LoopSearch, sizes: list[dict[str, float]], errors: Array) -> LoopFit:
+    """The nominal model with errors, in standard deviations."""
+    point = {name: values.copy() for name, values in search.nominal.items()}
+    left = iter(errors)
+    for j, own in enumerate(sizes[:-1]):
+        for name, size in own.items():
+            point[name][j] = step_parameter(name, point[name][j], size * next(left), search.scales, j)
+    for name, size in sizes[-1].items():
+        point[name] = np.full(search.data.joints, size * next(left))
+    return LoopFit(point, ((),) * search.data.joints)
+
+
+def _weighed(
+    search: LoopSearch, fit: LoopFit, sizes: list[dict[str, float]], deviations: Array
+) -> tuple[list[Array], list[Array]]:
+    """Of each joint the gap of a fit (N,) and its change by one standard deviation of each parameter (K, N), such that
+    their norms are RMS values [rad]."""
+    data = search.data
+    now, slopes = jacobian(data, fit, search.scales, [tuple(own) for own in sizes[:-1]], tuple(sizes[-1]))
+    starts = np.concatenate([[0], np.cumsum([len(own) for own in sizes])])
+    gaps, changes = [], []
+    for j, slope in enumerate(slopes):
+        count = np.sqrt(max(float(data.weight[:, j].sum()), 1.0))
+        change = np.zeros((deviations.size, now[:, j].size))
+        change[[*range(starts[j], starts[j + 1]), *range(starts[-2], starts[-1])]] = slope.reshape(len(slope), -1)
+        gaps.append(now[:, j].ravel() / count)
+        changes.append(change * deviations[:, None] / count)
+    return gaps, changes

@@ -1,6 +1,7 @@
 """Where a fit begins: the natural sizes of the joints, and the best of some gains and frictions at each."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from scipy.stats import qmc
@@ -8,14 +9,18 @@ from scipy.stats import qmc
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
 from gcomp.estimate.problem import NORMAL
-from sim_gap.position_gap.choice import FEW, Progress, costs_of
-from sim_gap.position_gap.fit import LoopFit, LoopSearch, joint_rms, residuals, rms_on
+from sim_gap.position_gap.choice import FEW, LoopSearch, Progress, costs_of
+from sim_gap.position_gap.fit import LoopFit, batch, residuals
 from sim_gap.position_gap.parameters import Scales
 from sim_gap.position_gap.plant import Servos
 from sim_gap.position_gap.windows import Windows, thin_moving
 
-GAINS = np.geomspace(0.003, 30.0, 13)
-"""Gains that are tried, over that of the model, or that of HOLDS_HZ where it has none."""
+GAINS = 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0
+"""Gains that are tried, over that of the model."""
+FREQUENCIES_HZ = 0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0, 16.0
+"""Natural frequencies of the gains that are tried where the model has none [Hz]."""
+FRICTIONS = 0.0, 0.4
+"""Least Coulomb friction that is tried with each gain, as a share of the gain times the RMS error."""
 LEAST_DAMPING = 0.2
 """Least damping that is tried with each gain, over the root of gain times inertia (2 is critical)."""
 SERVOS = 64
@@ -80,9 +85,11 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     if not own.complete:
         search = replace(search, nominal=_holding(search, own), open_controller=True)
         search = replace(search, excluded=search.excluded | {"actuator.gain"})
-    few = replace(search, data=thin_moving(search.data, FEW), slopes={})
+    few = replace(search, data=thin_moving(search.data, FEW))
     points = _points(few, own)
-    best = joint_rms(few.data, np.minimum(np.abs(residuals(few.data, points)), 1.0)).argmin(0)
+    gaps = residuals(few.data, batch(points))
+    costs = np.einsum("ptjw,tjw->pj", np.minimum(np.abs(gaps), 1.0) ** 2, few.data.weight)
+    best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
     names = ("kp", "viscous", "coulomb")
     # a joint that swings with its servo off shows friction and inertia against gravity, and only both together
@@ -99,10 +106,9 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
         rest = {"creep": np.zeros(search.data.joints)}
         at_rest_fit = few.improve(fit.with_values(**rest), 4, NORMAL)
         # gears hold what rests: a model's solver that lets it creep is no statement about the arm
-        left, moving = (np.hypot(rms_on(few.data, each), few.floor) for each in (at_rest_fit, fit))
-        if float((few.samples * np.log(left / moving)).sum()) < PRICE:
+        if float((few.score(at_rest_fit) - few.score(fit)).sum()) < PRICE:
             search, fit = replace(search, nominal={**search.nominal, **rest}), at_rest_fit
-    return search, fit
+    return search, replace(fit, rms=None)
 
 
 def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[LoopFit]:
@@ -110,7 +116,7 @@ def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[
 
     A saturated servo hides its gain and its lag, so that no step from one without limits leads there.
     """
-    few = replace(search, data=thin_moving(search.data, FEW), slopes={})
+    few = replace(search, data=thin_moving(search.data, FEW))
     drawn = _drawn_servos(few, fit, where)
     names = [name for name in SERVO_RANGES if name != "lag" or search.nominal["lag"].any()]
     active = tuple(
@@ -119,7 +125,7 @@ def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[
     starts = []
     for best in costs_of(few, drawn).argsort(axis=0)[:BEST_SERVOS]:
         point = {name: np.array([drawn[b][name][j] for j, b in enumerate(best)]) for name in fit.point}
-        starts.append(few.improve(LoopFit(point, active, fit.shared), 5))
+        starts.append(replace(few.improve(LoopFit(point, active, fit.shared), 5), rms=None))
     return starts
 
 
@@ -145,23 +151,35 @@ def _drawn_servos(search: LoopSearch, fit: LoopFit, where: Mask) -> list[dict[st
 
 
 def _points(search: LoopSearch, own: Servos) -> list[dict[str, Array]]:
-    """Points that are tried: the nominal model, and gains with the friction that each asks for."""
-    nominal = search.nominal
+    """Points that are tried: the nominal model, and gains with least frictions."""
+    nominal, scales = search.nominal, search.scales
+    centre = np.where(np.isfinite(own.kp), nominal["kp"], scales.inertia)
+    tries = np.where(
+        np.isfinite(own.kp),
+        np.array(GAINS)[:, None],
+        (2.0 * np.pi * np.array(FREQUENCIES_HZ)[:, None]) ** 2,
+    )
     points = [nominal] if own.complete else []
-    for factor in GAINS:
-        kp = np.maximum(factor * nominal["kp"], 1e-3)
-        coulomb, viscous = np.transpose([_friction(search, j, float(kp[j])) for j in range(search.data.joints)])
-        points.append({**nominal, "kp": kp, "coulomb": coulomb, "viscous": viscous})
-    resting = np.isin(np.arange(search.data.joints), sorted(search.resting))
-    return [{name: np.where(resting, nominal[name], x) for name, x in point.items()} for point in points]
+    for factor, stuck in product(tries, FRICTIONS):
+        kp = np.maximum(centre * factor, 1e-3)
+        point = {name: values.copy() for name, values in nominal.items()}
+        point["kp"] = kp
+        for j in range(search.data.joints):
+            point["coulomb"][j], point["viscous"][j] = _friction(search, j, float(kp[j]), stuck)
+        points.append(point)
+    for j in search.resting:
+        for point in points:
+            for name in point:
+                point[name][j] = search.nominal[name][j]
+    return points
 
 
-def _friction(search: LoopSearch, j: int, kp: float) -> tuple[float, float]:
+def _friction(search: LoopSearch, j: int, kp: float, stuck: float) -> tuple[float, float]:
     """Coulomb friction and damping that a gain asks for along the recorded motion, by least squares."""
     data, counted = search.data, (search.data.weight[:, j] * search.data.served[:, j]) > 0.0
     v, over = data.v[:, j][counted], (kp * data.error[:, j] - data.torque[:, j])[counted]
     columns = np.column_stack([np.tanh(v / TURNS), v])
-    coulomb = max(float(np.linalg.lstsq(columns, over, rcond=None)[0][0]), 0.0)
+    coulomb = max(float(np.linalg.lstsq(columns, over, rcond=None)[0][0]), stuck * kp * float(search.scales.angle[j]))
     rest = over - coulomb * columns[:, 0]
     viscous = float(v @ rest) / max(float(v @ v), 1e-12)
     return coulomb, max(viscous, LEAST_DAMPING * np.sqrt(kp * float(search.scales.inertia[j])))

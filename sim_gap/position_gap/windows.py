@@ -5,24 +5,25 @@ that begins afresh, as the short roll-outs of a data set do.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording, slice_rows
 from gcomp.arrays import Array
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.plant import MovedModel, Piece
+from sim_gap.position_gap.pieces import Piece
+from sim_gap.position_gap.plant import MovedModel
 from sim_gap.residuals.resampling import low_pass
 
 WINDOW_S, WARM_S = 3.0, 1.0
-"""Judged length of a window, and the simulated time before it that is not judged [s]. A piece that is no longer than a
-window begins as it was recorded, and is judged from there."""
+"""Judged length of a window, and the simulated time before it that is not judged [s]."""
+SHORT_S = 3.0
+"""Length of a piece that begins as it was recorded and is judged from there [s]; longer ones have a time to warm."""
 LEAST_S = 0.2
 """Length of a piece that shows any motion [s]."""
 JUDGED_HZ = 50.0
@@ -35,8 +36,12 @@ STEP_RATIO, STEP_RAD = 6.0, 0.05
 """Step of a position that no motion makes: this many times the larger of the steps beside it, and this much more."""
 BEGINNING_S, BEGINNING_ROWS = 0.02, 5
 """Time between the positions from which the velocity at the start of a short piece follows [s]; rows that it needs."""
+SLOPE_NOISE = np.sqrt(26.0) / 2.0
+"""Noise of the slope at the first of three positions, over that of a position and the time between them."""
 NOISE_SIZES = 3.0
 """Standard deviations of noise that a velocity has to exceed."""
+NORMAL_MEDIAN = 0.6745
+"""Median of the amount of a standard normal value."""
 MOVES, FAST = 0.5, 0.8
 """Shares of a joint's largest RMS speed and largest speed of all windows that it has to have in one that is fitted."""
 
@@ -82,8 +87,6 @@ class Windows:
     """Longest sampling period of the recordings [s]."""
     judged_s: float
     """Time from one comparison to the next [s]."""
-    known: dict[bytes, Array] = field(default_factory=dict, repr=False)
-    """Residuals that were simulated, (To, J, W), by their parameters."""
 
     @property
     def joints(self) -> int:
@@ -155,9 +158,7 @@ def windows_of(
     if not parts:
         raise BadInput(f"{labels[0]}: no part of at least {LEAST_S:g} s without a break in which positions are read")
     longest = max(len(part["at"]) for part in parts)
-    stacked: dict[str, Any] = {
-        name: np.stack([_padded(part[name], longest, name) for part in parts], axis=-1) for name in parts[0]
-    }
+    stacked = {name: np.stack([_padded(part[name], longest, name) for part in parts], axis=-1) for name in parts[0]}
     number_of = stacked.pop("recording").astype(np.intp)
     scale = np.array([*scales] or [1.0] * len(recordings), float)[number_of]
     own = stacked.pop("piece").astype(np.intp)
@@ -214,12 +215,12 @@ def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> tuple[Piece
     error = np.where(served, np.where(served, given, 0.0) - filled, 0.0)
     sums = np.vstack([np.zeros((1, arm.n)), np.cumsum(error[:-1] * np.diff(t)[:, None], axis=0)])
     stride = max(1, round(1.0 / (JUDGED_HZ * period_of(part))))
-    short = t[-1] < WINDOW_S
+    short = t[-1] < SHORT_S
     warm, out, begin = 0.0 if short else WARM_S, [], 0.0
     while begin + warm < t[-1] - min(0.5, 0.5 * t[-1]):
         first = int(np.searchsorted(t, begin - 1e-9))
         rows = np.arange(int(np.searchsorted(t, t[first] + warm - 1e-9)), len(t), stride)
-        rows = rows[t[rows] < t[first] + warm + (WINDOW_S)]
+        rows = rows[t[rows] < t[first] + warm + (SHORT_S if short else WINDOW_S)]
         rows = rows[1:] if short else rows
         if not len(rows):
             break
@@ -242,7 +243,7 @@ def _cut(sim: SimModel, part: Recording, number: int, piece: int) -> tuple[Piece
                 "recording": number,
             }
         )
-        begin = t[first] + (WINDOW_S)
+        begin = t[first] + (SHORT_S if short else WINDOW_S)
     return _piece(sim, part, q0, v0), out
 
 
@@ -251,7 +252,7 @@ def _noise(q: Array) -> Array:
     bent = np.diff(q, 4, axis=0)  # of white noise it has 70 times the variance (the sum of squared binomials)
     if not len(bent):
         return np.zeros(q.shape[1])
-    return np.asarray(np.median(np.abs(bent), axis=0) / np.sqrt(70.0) / norm.ppf(0.75))
+    return np.asarray(np.median(np.abs(bent), axis=0) / np.sqrt(70.0) / NORMAL_MEDIAN)
 
 
 def _smoothed(t: Array, q: Array) -> tuple[Array, Array, Array]:
@@ -274,8 +275,7 @@ def _beginning(t: Array, q: Array, noise: Array) -> tuple[Array, Array]:
     (early, late), (before, after) = np.diff(t[: 2 * apart + 1 : apart]), np.diff(q[: 2 * apart + 1 : apart], axis=0)
     change = after / late - before / early
     v = before / early - change * early / (early + late)
-    noise_of_slope = 0.5 * np.sqrt(26.0) * noise / early  # of (−3 q₀ + 4 q₁ − q₂)/2h
-    doubt = np.maximum(np.abs(change), NOISE_SIZES * noise_of_slope)
+    doubt = np.maximum(np.abs(change), NOISE_SIZES * SLOPE_NOISE * noise / early)
     return q[0], np.where(np.abs(v) > doubt, v, 0.0)
 
 
@@ -326,4 +326,4 @@ def _even(total: int, count: int) -> NDArray[np.intp]:
 
 def choose_windows(data: Windows, chosen: NDArray[np.intp]) -> Windows:
     values: dict[str, Any] = {name: x[..., chosen] for name, x in vars(data).items() if isinstance(x, np.ndarray)}
-    return replace(data, **values, known={})
+    return replace(data, **values)

@@ -8,7 +8,8 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.fit import LoopFit, LoopSearch
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit
 from sim_gap.position_gap.parameters import PARAMETERS
 from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.start import scales_of

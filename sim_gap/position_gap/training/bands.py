@@ -8,12 +8,14 @@ hold more than its share, whichever is true: it is narrowed to what holds its sh
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import LoopFit, LoopSearch, batch, joint_rms
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit, batch, jacobian, root_mean_squares
+from sim_gap.position_gap.judge import joint_rms
 from sim_gap.position_gap.simulation import simulate
 from sim_gap.position_gap.training.jackknife import recordings_or_thirds
 from sim_gap.position_gap.training.spread import Covariance
@@ -53,11 +55,11 @@ def band(search: LoopSearch, fit: LoopFit, spread: Covariance, left: Array, held
     """
     data = search.data
     groups = recordings_or_thirds(data)
-    unexplained = joint_rms(data, left)
+    each = root_mean_squares(data, left)
+    unexplained = joint_rms(data, each)
     size = np.sqrt(_variance(search, fit, spread, data) + unexplained[:, None] ** 2)
     factor = np.array([_quantile(left[:, j], size[:, j], data.weight[:, j]) for j in range(data.joints)])
-    each = (left**2 * data.weight).sum(0) / np.maximum(data.weight.sum(0), 1.0)
-    wider = _uncertainty(np.stack([each[:, groups == g].mean(1) for g in np.unique(groups)]))
+    wider = _uncertainty(np.stack([(each[:, groups == g] ** 2).mean(1) for g in np.unique(groups)]))
     if data.of_one_recording:
         wider *= 1.0 + (OTHER_MOTION - 1.0) * _lasting(left, data.weight) ** 2
     reach = factor * wider * np.sqrt((size**2 * data.weight).sum((0, 2)) / np.maximum(data.weight.sum((0, 2)), 1.0))
@@ -124,10 +126,10 @@ def _variance(search: LoopSearch, fit: LoopFit, spread: Covariance, data: Window
 
     It is linear, so that parameters of which only ratios are known leave nothing open where they move nothing.
     """
-    search = search if data is search.data else replace(search, data=data, slopes={})
-    slopes = search.linear(fit, spread.names).slopes
-    each = [np.einsum("an,ab,bn->n", x, spread.of_joint(j), x) for j, x in enumerate(slopes)]
-    return np.stack(each, axis=1).reshape(len(data.measured), data.count, data.joints).transpose(0, 2, 1)
+    active = tuple(tuple(name for j, name in spread.names if j == joint) for joint in range(data.joints))
+    _, slopes = jacobian(data, fit, search.scales, active, fit.shared)
+    each = [np.einsum("atw,ab,btw->tw", x, spread.of_joint(j), x) for j, x in enumerate(slopes)]
+    return np.stack(each, axis=1)
 
 
 def _quantile(left: Array, size: Array, weight: Array) -> float:

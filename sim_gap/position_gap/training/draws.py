@@ -5,8 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import LoopFit, LoopSearch
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import Layout, LoopFit, jacobian
 from sim_gap.position_gap.parameters import WITH_TORQUE
+from sim_gap.position_gap.training.jackknife import acting
 from sim_gap.position_gap.training.spread import Covariance
 from sim_gap.position_gap.training.unreached_limits import draw_limits
 
@@ -26,8 +28,8 @@ def draw(
     steps = random.standard_normal((count, len(values))) @ root.T
     if reach is not None:
         steps = _within(search, fit, spread, steps, reach)
-    layout = search.layout(fit.point, spread.names)
-    problem = layout.problem(search.nominal, search.floor)
+    layout = Layout(search.data, search.scales, fit.point, spread.names)
+    problem = layout.problem(search.nominal, {}, search.floor)
     about = layout.theta(layout.point)
     points = [layout.at(problem.within(about + step)) for step in _with_gains(spread.names, about, steps)]
     rows = [{_label(search, j, name): float(point[name][max(j, 0)]) for j, name in spread.names} for point in points]
@@ -52,13 +54,16 @@ def _with_gains(names: Sequence[tuple[int, str]], about: Array, steps: Array) ->
 def _within(search: LoopSearch, fit: LoopFit, spread: Covariance, steps: Array, reach: Array) -> Array:
     """The steps (P, K), shorter for each joint that goes further than `reach`; for all, where they share some."""
     data, names = search.data, spread.names
+    own = [[name for j, name in names if j == joint] for joint in range(data.joints)]
+    shared = [name for j, name in names if j < 0]
+    _, slopes = jacobian(data, fit, search.scales, own, shared)
     count = np.maximum(data.weight.sum((0, 2)), 1.0)
     share = np.ones((len(steps), data.joints))
-    about, weight = search.linear(fit, names), search.layout(fit.point).rows(data.weight)
-    for j, (acting, x) in enumerate(zip(about.acting, about.slopes, strict=True)):
-        apart = np.sqrt((steps[:, acting] @ x) ** 2 @ weight[j] / count[j])
+    for j, x in enumerate(slopes):
+        moved = np.einsum("pa,atw->ptw", steps[:, acting(names, j)], x)
+        apart = np.sqrt(np.einsum("ptw,tw->p", moved**2, data.weight[:, j]) / count[j])
         share[:, j] = np.minimum(1.0, reach[j] / np.maximum(apart, 1e-12))
-    if any(j < 0 for j, _ in names):
+    if shared:
         share = np.broadcast_to(share.min(axis=1, keepdims=True), share.shape)
     return np.stack([steps[:, k] * share[:, max(j, 0)] for k, (j, _) in enumerate(names)], axis=1) if names else steps
 

@@ -17,9 +17,10 @@ from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.urdf import xml_comment
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.choice import effect_there, without_group
-from sim_gap.position_gap.fit import LoopFit, LoopSearch
-from sim_gap.position_gap.parameters import EFFECTS, shared_effects
+from sim_gap.position_gap.choice import LoopSearch, effect_there, without_effect, without_group
+from sim_gap.position_gap.fit import LoopFit
+from sim_gap.position_gap.links import shared_effects
+from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.plant import MovedModel
 
 FELT_NM, ALIKE = 1e-3, 0.03
@@ -92,7 +93,7 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
             continue
         for j in range(search.data.joints):
             if effect_there(fit, effect, j):
-                bare = without_group(search, bare, (effect, (j,)))
+                bare = without_effect(search, bare, effect, j)
     for effect in _shared_beside(search, fit, held):
         bare = without_group(search, bare, (effect, ()))
     share = compensation(search, fit)
@@ -115,7 +116,7 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
     changed = changed or bool(np.any(fit.point["kd"] != 0.0) or np.any(fit.point["feed"] != share))
     if not changed:
         return fit
-    return search.improve(replace(bare, active=tuple(wanted)), 3)
+    return search.improve(replace(bare, active=tuple(wanted), rms=None), 3)
 
 
 def needs_pid(fit: LoopFit, held: Collection[str] = NATIVE) -> Mask:

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from gcomp.arrays import Array
-from gcomp.estimate.solve import LONGEST_STEP
-from sim_gap.position_gap.fit import LoopFit, LoopSearch
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit, jacobian, names_of
 from sim_gap.position_gap.windows import Windows
 
+FARTHEST = 1.5
+"""Longest step of a parameter without a group, in its own coordinate."""
 ALONE = 0.03
 """Share of the information about a direction that the others are taken to have at least, without a group."""
 LEAST_INFORMATION = 1e-12
@@ -39,10 +41,8 @@ class WindowTerms:
 
 def terms_of(search: LoopSearch, fit: LoopFit) -> WindowTerms:
     """Normal equations of each window of the search about a fit."""
-    names, shape = fit.places, search.data.measured.shape
-    about = search.linear(fit, names)
-    now = about.residual.reshape(shape[1], shape[0], shape[2]).transpose(1, 0, 2)
-    slopes = [x.reshape(len(x), shape[0], shape[2]) for x in about.slopes]
+    now, slopes = jacobian(search.data, fit, search.scales, fit.active, fit.shared)
+    names = names_of(fit)
     size, count, weight = len(names), search.data.count, search.data.weight
     squares, scores = np.zeros((count, size, size)), np.zeros((count, size))
     weights = search.samples / np.maximum((now**2 * weight).sum((0, 2)), 1e-300)
@@ -59,33 +59,23 @@ def acting(names: Sequence[tuple[int, str]], joint: int) -> NDArray[np.intp]:
     return np.array([k for k, (j, _) in enumerate(names) if j in (joint, -1)], np.intp)
 
 
-def steps_without(terms: WindowTerms, known: Array, groups: NDArray[np.intp]) -> Array:
-    """Way of the parameters where one of G groups of windows is left out after the other, (G, K); `known` is what is
-    known beforehand.
+def jackknifed(terms: WindowTerms, known: Array, groups: NDArray[np.intp]) -> Array:
+    """Covariance (K, K) by leaving out one group of windows after the other; `known` is what is known beforehand.
 
     Where nearly all that is known of a direction is in one group, such as the limit of a speed that is reached in a
     single motion, the step of the others would be noise over nothing.
     """
-    labels = np.unique(groups)
-    if not terms.names:
-        return np.zeros((len(labels), 0))
     squares, scores = terms.squares.sum(0) + known, terms.scores.sum(0)
     scale = 1.0 / np.sqrt(np.diag(squares))
     least = LEAST_INFORMATION * np.eye(len(known))
     whole = squares * scale * scale[:, None] + least
     steps = []
-    for own in (groups == label for label in labels):
+    for own in (groups == label for label in np.unique(groups)):
         others = (squares - terms.squares[own].sum(0)) * scale * scale[:, None] + least
         told, directions = eigh(others, whole)
         step = directions.T @ (scale * (terms.scores[own].sum(0) - scores)) / np.maximum(told, ALONE)
         steps.append(scale * (directions @ step))
-    return np.stack(steps)
-
-
-def jackknifed(terms: WindowTerms, known: Array, groups: NDArray[np.intp]) -> Array:
-    """Covariance (K, K) by leaving out one group of windows after the other."""
-    steps = steps_without(terms, known, groups)
-    apart = steps - np.mean(steps, axis=0)
+    apart = np.stack(steps) - np.mean(steps, axis=0)
     return np.asarray((len(steps) - 1) / len(steps) * apart.T @ apart)
 
 
@@ -99,11 +89,14 @@ def recordings_or_thirds(data: Windows) -> NDArray[np.intp]:
 
 
 def gaps_left_out(data: Windows, terms: WindowTerms, known: Array) -> Array:
-    """Gap that fits leave of each recording, or third of a single one, that they have not seen, (To, J, W) [rad]."""
+    """Gap that a fit without its group leaves of each training window, to first order, (To, J, W) [rad]."""
     groups, out = recordings_or_thirds(data), terms.residual.copy()
-    steps = np.clip(steps_without(terms, known, groups), -LONGEST_STEP, LONGEST_STEP)
-    for group, step in zip(np.unique(groups), steps, strict=True):
+    whole = terms.squares.sum(0) + known
+    for group in np.unique(groups) if len(terms.names) else ():
         own = np.flatnonzero(groups == group)
+        others = whole - terms.squares[own].sum(0)
+        step = np.linalg.lstsq(others, terms.scores[own].sum(0) - terms.scores.sum(0), rcond=1e-9)[0]
+        step = np.clip(step, -FARTHEST, FARTHEST)
         for j, x in enumerate(terms.slopes):
             out[:, j, own] += np.einsum("a,atw->tw", step[acting(terms.names, j)], x[..., own])
     return out

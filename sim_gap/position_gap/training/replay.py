@@ -12,11 +12,11 @@ from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.better_model.native_drives import hold
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.choice import Group, without_group
-from sim_gap.position_gap.fit import LoopSearch
+from sim_gap.position_gap.choice import Group, LoopSearch, without_group
 from sim_gap.position_gap.plant import HeldParts, held_model, silent
 from sim_gap.position_gap.training.export import Exported, export_beside_module
-from sim_gap.position_gap.windows import LEAST_S, WINDOW_S, pieces_of
+from sim_gap.position_gap.windows import LEAST_S, pieces_of
+from sim_gap.position_gap.windows import SHORT_S as SHORT_PIECE_S
 
 OPENING_S = 1.0
 """Time at the start that is not judged [s]."""
@@ -139,7 +139,7 @@ def replay_rms(
 
 def judged_rows(t: Array) -> Mask:
     """Replayed rows that are judged, (K,): those after the opening, or of a short part all but the first."""
-    opening = OPENING_S if t[-1] - t[0] >= WINDOW_S else 0.0
+    opening = OPENING_S if t[-1] - t[0] >= SHORT_PIECE_S else 0.0
     return np.asarray(t - t[0] > opening - 1e-9) & (np.arange(len(t)) > 0)
 
 

@@ -14,10 +14,13 @@ from scipy.stats import norm, t
 
 from gcomp.arrays import Array
 from gcomp.estimate.solve import precision
-from sim_gap.position_gap.fit import LoopFit, LoopSearch, Place, rms_on
-from sim_gap.position_gap.parameters import PARAMETERS, UNIT, range_of, relative_step, shared_names, step_parameter
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import Layout, LoopFit, coordinate
+from sim_gap.position_gap.judge import rms_on
+from sim_gap.position_gap.links import UNIT, range_of, shared_names
+from sim_gap.position_gap.parameters import PARAMETERS, relative_step, step_parameter
 from sim_gap.position_gap.sound_arm import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
-from sim_gap.position_gap.training.jackknife import jackknifed, recordings_or_thirds, terms_of
+from sim_gap.position_gap.training.jackknife import WindowTerms, jackknifed, recordings_or_thirds, terms_of
 from sim_gap.position_gap.training.unreached_limits import Unreached
 
 INSIDE = 0.95
@@ -46,13 +49,15 @@ LEAST_MOMENT = 1e-8
 """Standard deviation of a mass moment of a link without mass [kg·m]."""
 LIGHTEST = 1e-3
 """Mass of a payload [kg] that its moment is divided by at least."""
+SHARE = 0.975
+"""Quantile of Student's distribution that the spread over recordings is widened to, as it rests on few of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
     """Covariance of the parameters in their own coordinates, and the limits that no recording reaches."""
 
-    names: list[Place]
+    names: list[tuple[int, str]]
     """Joint (−1: whole arm) and name."""
     matrix: Array
     limits: tuple[Unreached, ...] = ()
@@ -77,13 +82,13 @@ def covariance(search: LoopSearch, fit: LoopFit) -> Covariance:
     matrix += jackknifed(terms, known, np.arange(search.data.count))
     groups = recordings_or_thirds(search.data)
     if (number := len(np.unique(groups))) > 1:
-        beyond = 0.5 * (1.0 - INSIDE)
-        few = float(t.isf(beyond, max(number - 1, LEAST_FREEDOM)) / norm.isf(beyond))
+        few = float(t.ppf(SHARE, max(number - 1, LEAST_FREEDOM)) / norm.ppf(SHARE))
         matrix += few**2 * jackknifed(terms, known, groups)
     told = [k for k, (j, name) in enumerate(terms.names) if _told(fit, j, name)]
     names = [terms.names[k] for k in told]
     matrix = matrix[np.ix_(told, told)]
-    return Covariance(names, matrix + np.diag(_besides(search, names) + _of_other_motion(search, free, names)))
+    matrix += _systematic(search, free, names) + _besides(search, names) + _of_one_motion(search, free, names)
+    return Covariance(names, matrix)
 
 
 def _told(fit: LoopFit, joint: int, name: str) -> bool:
@@ -94,9 +99,24 @@ def _told(fit: LoopFit, joint: int, name: str) -> bool:
     return name in own or ("kp" in own and name in SCALED and float(fit.point[name][joint]) > 0.0)
 
 
-def known_before(search: LoopSearch, fit: LoopFit, names: list[Place]) -> Array:
+def known_before(search: LoopSearch, fit: LoopFit, names: list[tuple[int, str]]) -> Array:
     """Inverse variance of each fitted parameter before any recording, (K, K)."""
-    return np.diag(precision(search.layout(fit.point, names).problem(search.nominal, search.floor)))
+    layout = Layout(search.data, search.scales, fit.point, names)
+    return np.diag(precision(layout.problem(search.nominal, {}, search.floor)))
+
+
+def covariance_within(search: LoopSearch, fit: LoopFit, terms: WindowTerms) -> Covariance:
+    """Sandwich covariance of the fitted parameters over the windows, all else as it is: what tells an effect from none.
+
+    Directions that the windows hardly show are held.
+    """
+    bread, size, count = terms.squares.sum(0), len(terms.names), search.data.count
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(bread), 1e-300))
+    held = np.diag([1e-4] * size)
+    inverse = np.linalg.inv(bread * scale * scale[:, None] + held) * scale * scale[:, None]
+    meat = terms.scores.T @ terms.scores
+    matrix = inverse @ meat @ inverse * count / max(count - size / max(search.data.joints, 1), 1.0)
+    return Covariance(terms.names, matrix + _systematic(search, fit, terms.names))
 
 
 def free_all(search: LoopSearch, fit: LoopFit) -> LoopFit:
@@ -121,7 +141,7 @@ def _open(search: LoopSearch, fit: LoopFit, joint: int, errors: Mapping[str, flo
     return out
 
 
-def _stated(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
+def _stated(search: LoopSearch, fit: LoopFit, names: Sequence[tuple[int, str]]) -> Array:
     """Inverse covariance of the parameters before any recording, (K, K).
 
     What a model states of the same parameter of several joints is of one source, such as one rotor for all: it is off
@@ -140,33 +160,51 @@ def _stated(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
     return np.linalg.inv(np.outer(sizes, sizes) * np.where(together, ALIKE, 0.0) + np.diag(sizes**2 * (1.0 - ALIKE)))
 
 
-def _of_other_motion(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
-    """Variances by what no recording shows, and where a single one was recorded by what another would, (K,).
+def _systematic(search: LoopSearch, fit: LoopFit, names: Sequence[tuple[int, str]]) -> Array:
+    return np.diag((SYSTEMATIC * _values(search, fit, names)) ** 2)
+
+
+def _of_one_motion(search: LoopSearch, fit: LoopFit, names: Sequence[tuple[int, str]]) -> Array:
+    """Variances by what another motion would show where a single one was recorded, (K, K).
 
     Other motion turns what the fit leaves of the way to the command into other parameters.
     """
-    share = np.zeros(search.data.joints)
-    if search.data.of_one_recording:
-        share = np.minimum(OTHERWISE * rms_on(search.data, fit) / search.scales.angle, STATED)
-    relative = np.array([np.hypot(SYSTEMATIC, share[j] if j >= 0 else share.max()) for j, _ in names])
-    values = [
-        float(fit.point[name][0]) if j < 0 else relative_step(name, fit.point[name][j], search.scales, j)
-        for j, name in names
-    ]
-    return np.square(relative * values)
+    if not search.data.of_one_recording:
+        return np.zeros((len(names), len(names)))
+    left = np.minimum(OTHERWISE * rms_on(search.data, fit) / search.scales.angle, STATED)
+    share = np.array([left[j] if j >= 0 else left.max() for j, _ in names])
+    return np.diag((share * _values(search, fit, names)) ** 2)
 
 
-def _besides(search: LoopSearch, names: Sequence[Place]) -> Array:
-    """Variances by what sound arms have besides of friction and of lateness, (K,)."""
+def _values(search: LoopSearch, fit: LoopFit, names: Sequence[tuple[int, str]]) -> Array:
+    """Change of a parameter's own coordinate per relative change of it, (K,)."""
+    return np.array(
+        [
+            coordinate(fit, search.scales, j, name)
+            if j < 0
+            else relative_step(name, fit.point[name][j], search.scales, j)
+            for j, name in names
+        ]
+    )
+
+
+def _besides(search: LoopSearch, names: Sequence[tuple[int, str]]) -> Array:
+    """Variances by what sound arms have besides of friction and of lateness, (K, K)."""
     friction = np.minimum(FRICTION_NM, FRICTION_SHARE * search.scales.torque)
     sizes = {"coulomb": friction, "delay": np.full_like(friction, np.hypot(LATE_S, APART_S))}
-    return np.square([sizes[name][j] / search.scales.of(name)[j] if name in sizes else 0.0 for j, name in names])
+    own = [sizes[name][j] / search.scales.of(name)[j] if name in sizes else 0.0 for j, name in names]
+    return np.diag(np.square(own))
 
 
 def undecided_scale(fit: LoopFit, spread: Covariance) -> list[int]:
     """Joints of which only ratios of gain, friction and inertia can be told."""
-    gains = [(j, spread.names.index((j, "kp"))) for j, own in enumerate(fit.active) if "kp" in own]
-    return [j for j, at in gains if spread.matrix[at, at] > LOOSE**2]
+    out = []
+    for j, own in enumerate(fit.active):
+        if "kp" in own:
+            within = float(spread.matrix[(at := spread.names.index((j, "kp"))), at])
+            if within > LOOSE**2:
+                out.append(j)
+    return out
 
 
 def interval(
@@ -175,8 +213,8 @@ def interval(
     """Value, ends of its 95 % interval, and unit; of a limit that no motion reaches, where it may lie."""
     for limit in spread.limits:
         if (limit.joint, limit.name) == (joint, name):
-            value = float(fit.point[name][joint])
-            return value, limit.least, max(limit.most, value), PARAMETERS[name].unit
+            value, most = float(fit.point[name][joint]), float(limit.levels[limit.weights > 0.0].max())
+            return value, limit.least, max(most, value), PARAMETERS[name].unit
     deviation = float(np.sqrt(spread.matrix[(at := spread.names.index((joint, name))), at]))
     half = float(norm.isf(0.5 * (1.0 - INSIDE))) * deviation
     below, above = -half, half

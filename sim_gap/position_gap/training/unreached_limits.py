@@ -11,11 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import LoopFit, LoopSearch, Point, joint_rms, residuals
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit, Point, batch, residuals, root_mean_squares
 
 HEADROOM = 10.0
 """Ratio of the highest level of the prior to the least that the training motion admits: recordings use between a tenth
 and all of what a drive can do."""
+COUNT = 20
+"""Levels of the prior."""
 ABOVE = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """Levels that are tried, over what the training motion asks for: commands are held from row to row, so that a limit of
 their speed shows far above it."""
@@ -31,23 +34,26 @@ class Unreached:
 
     joint: int
     name: str
+    levels: Array
+    """Where it may lie, rising by a common factor (L,)."""
+    weights: Array
+    """Probability of each (L,)."""
     least: float
     """Lowest level that the training motion admits."""
-
-    @property
-    def most(self) -> float:
-        return HEADROOM * self.least
 
 
 def find_unreached(search: LoopSearch, fit: LoopFit) -> tuple[Unreached, ...]:
     """The limits that neither the model states nor the fit has. Nothing of joints that rest."""
     out: list[Unreached] = []
+    asked = {"limit": _torques(search, fit), "slew": _command_speeds(search)}
     for name, effect in LIMITS.items():
-        open_at = ~np.isfinite(fit.point[name]) & ~np.isin(np.arange(search.data.joints), sorted(search.resting))
-        if effect in search.excluded or not open_at.any():
-            continue
-        least = _least_admitted(search, fit, name, _torques(search, fit) if name == "limit" else _speeds(search))
-        out += [Unreached(j, name, float(least[j])) for j in np.flatnonzero(open_at & (least > 0.0)).tolist()]
+        admitted = _least_admitted(search, fit, name, asked[name])
+        for j in range(search.data.joints):
+            least = float(admitted[j])
+            if np.isfinite(fit.point[name][j]) or effect in search.excluded or j in search.resting or least <= 0.0:
+                continue
+            levels = np.geomspace(least, HEADROOM * least, COUNT)
+            out.append(Unreached(j, name, levels, np.full(COUNT, 1.0 / COUNT), least))
     return tuple(out)
 
 
@@ -57,14 +63,14 @@ def _least_admitted(search: LoopSearch, fit: LoopFit, name: str, asked: Array) -
     joints = np.arange(len(asked))
 
     def score(point: Point) -> Array:
-        left = joint_rms(search.data, residuals(search.data, [point])[0])
-        return np.asarray(search.samples * np.log(np.hypot(left, search.floor)))
+        left = residuals(search.data, batch([point]))
+        return search.score(LoopFit(dict(point), fit.active, rms=root_mean_squares(search.data, left)[0]))
 
     bare = score(fit.point)
     low, high = np.zeros(len(asked), int), np.full(len(asked), len(ABOVE) - 1)  # the highest is admitted in any case
     while np.any(low < high):
         middle = (low + high) // 2
-        costly = score({**fit.point, name: np.minimum(levels[middle, joints], fit.point[name])}) - bare >= COSTS
+        costly = score({**fit.point, name: levels[middle, joints]}) - bare >= COSTS
         low, high = np.where(costly & (low < high), middle + 1, low), np.where(costly, high, middle)
     return np.where(asked > 0.0, levels[low, joints], 0.0)
 
@@ -72,14 +78,13 @@ def _least_admitted(search: LoopSearch, fit: LoopFit, name: str, asked: Array) -
 def _torques(search: LoopSearch, fit: LoopFit) -> Array:
     """Torque that each servo is asked for along the training motion, (J,) [N·m]."""
     data, point = search.data, fit.point
-    error = data.error - residuals(data, [point])[0]
+    error = data.error - residuals(data, batch([point]))[0]
     kp, inner = (point[name][:, None] for name in ("kp", "kv"))
     damping = np.minimum(inner, point["viscous"][:, None]) + point["kd"][:, None]
-    pulls = np.abs(kp * error * data.scale - damping * data.v) * (data.weight * data.served > 0.0)
-    return np.asarray(pulls.max((0, 2)))
+    return _highest(search, np.abs(kp * error * data.scale - damping * data.v))
 
 
-def _speeds(search: LoopSearch) -> Array:
+def _command_speeds(search: LoopSearch) -> Array:
     """Highest speed of each command along the training motion, (J,) [rad/s]."""
     out = np.zeros(search.data.joints)
     for k in np.unique(search.data.piece):
@@ -91,9 +96,21 @@ def _speeds(search: LoopSearch) -> Array:
     return out
 
 
+def _highest(search: LoopSearch, values: Array) -> Array:
+    counted = search.data.weight * search.data.served > 0.0
+    return np.array(
+        [float(values[:, j][counted[:, j]].max()) if counted[:, j].any() else 0.0 for j in range(search.data.joints)]
+    )
+
+
 def draw_limits(limits: Sequence[Unreached], count: int, random: np.random.Generator) -> list[Array]:
-    """Draws of each limit from its prior, (count,)."""
-    return [each.least * HEADROOM ** random.uniform(0.0, 1.0, count) for each in limits]
+    """Draws of each limit, (count,): levels by their weights, spread evenly over the factor between two."""
+    out = []
+    for each in limits:
+        ratio = float(each.levels[1] / each.levels[0])
+        at = random.choice(each.levels, size=count, p=each.weights)
+        out.append(np.asarray(at * ratio ** random.uniform(-0.5, 0.5, count)))
+    return out
 
 
 def describe(limits: Sequence[Unreached], names: Sequence[str]) -> str:

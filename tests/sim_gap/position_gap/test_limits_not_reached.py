@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from servo_arm import model_text, record, search_on
 
-from sim_gap.position_gap.fit import LoopFit, LoopSearch
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit
 from sim_gap.position_gap.training import bands, unreached_limits
 from sim_gap.position_gap.training.bands import band
 from sim_gap.position_gap.training.draws import draw

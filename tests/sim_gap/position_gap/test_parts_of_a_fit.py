@@ -12,8 +12,9 @@ from armlink.recording.recording import Recording
 from sim_gap.better_model.corrected_model import body_parameters, set_body
 from sim_gap.position_gap import choice as edits
 from sim_gap.position_gap.choice import best_level, look_about, select
-from sim_gap.position_gap.fit import Layout, LoopFit, residuals, rms_on
+from sim_gap.position_gap.fit import LoopFit, batch, coordinate, evaluate, jacobian, residuals
 from sim_gap.position_gap.identify import _frozen
+from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.parameters import PARAMETERS, Scales, step_parameter
 from sim_gap.position_gap.training import export, spread, training_files
 from sim_gap.position_gap.training import replay as replays
@@ -39,11 +40,10 @@ def test_what_nothing_can_show_is_left_out(gravity: float, off: bool, frozen: se
 
 
 def test_a_coefficient_of_the_whole_arm_is_one_and_a_joints_is_in_its_own_scale() -> None:
-    point = {"tilt.x": np.array([0.03, 0.03]), "coulomb": np.array([0.5, 0.8])}
-    scales = SimpleNamespace(of=lambda name: np.array([0.1, 0.2]))
-    assert Layout(SimpleNamespace(joints=2), scales, point, [(-1, "tilt.x"), (1, "coulomb")]).theta(
-        point
-    ) == pytest.approx([0.03, 4.0])
+    fit = SimpleNamespace(point={"tilt.x": np.array([0.03]), "coulomb": np.array([0.5, 0.8])})
+    search = SimpleNamespace(scales=SimpleNamespace(of=lambda name: np.array([0.1, 0.2])))
+    assert coordinate(fit, search.scales, -1, "tilt.x") == 0.03
+    assert coordinate(fit, search.scales, 1, "coulomb") == pytest.approx(4.0)
 
 
 def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -> None:
@@ -68,14 +68,13 @@ def test_of_one_motion_what_is_left_of_the_way_to_the_command_is_what_another_ma
     )
     torque, one = np.full(3, 0.5), np.ones(3)
     scales = Scales(torque, one, one, np.full(3, 0.02))
-    search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True, joints=3), scales=scales)
+    search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True), scales=scales)
     share = 0.05 * spread.OTHERWISE
-    names = [(0, "kp"), (0, "coulomb"), (1, "kp"), (2, "kp")]
-    two = SimpleNamespace(data=SimpleNamespace(of_one_recording=False, joints=3), scales=scales)
-    found = spread._of_other_motion(search, fit, names) - (known := spread._of_other_motion(two, fit, names))
+    found = np.diag(spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp"), (2, "kp")]))
     coulomb = share * 0.3 / scales.of("coulomb")[0]
-    np.testing.assert_allclose(found, [share**2, coulomb**2, 0.0, spread.STATED**2], atol=1e-12)
-    assert known[0] == pytest.approx(spread.SYSTEMATIC**2)
+    np.testing.assert_allclose(found, [share**2, coulomb**2, 0.0, spread.STATED**2])
+    two = SimpleNamespace(data=SimpleNamespace(of_one_recording=False), scales=scales)
+    assert not spread._of_one_motion(two, fit, [(0, "kp")]).any()
 
 
 @pytest.mark.parametrize(("late", "steps"), [(0.4, 0.0), (2.6, 3.0), (-1.0, 0.0)])
@@ -139,20 +138,19 @@ def test_the_opening_of_a_replay_is_not_judged(monkeypatch) -> None:
 def test_slopes_are_those_of_the_residual() -> None:
     search = search_on(TEXT, [record(TEXT, 1, 14.0)])
     fit = LoopFit(search.nominal, (("kp", "viscous"), ("kp", "viscous")))
-    about = search.linear(fit, fit.places)
-    moved = residuals(search.data, [{**fit.point, "kp": fit.point["kp"] * np.exp(0.03)}])
-    change = search.layout(fit.point).rows(moved)[0] - about.residual
+    now, slopes = jacobian(search.data, fit, search.scales, fit.active)
+    change = residuals(search.data, batch([{**fit.point, "kp": fit.point["kp"] * np.exp(0.03)}]))[0] - now
     for j in range(2):
-        expected = 0.03 * about.slopes[j][0]
-        assert np.linalg.norm(change[j] - expected) < 0.2 * np.linalg.norm(expected)
+        expected = 0.03 * slopes[j][0]
+        assert np.linalg.norm(change[:, j] - expected) < 0.2 * np.linalg.norm(expected)
 
 
 def test_a_parameter_at_its_highest_value_has_a_slope_too() -> None:
     """Else a fit that has come there never leaves, and its interval would be nothing."""
     search = search_on(TEXT, [record(TEXT, 1, 8.0)])
     point = {**search.nominal, "load": np.full(2, PARAMETERS["load"].high)}
-    fit = LoopFit(point, (("load",), ("load",)))
-    assert all(np.linalg.norm(slope) > 0.0 for slope in search.linear(fit, fit.places).slopes)
+    _, slopes = jacobian(search.data, LoopFit(point, (("load",), ("load",))), search.scales, (("load",), ("load",)))
+    assert all(np.linalg.norm(slope) > 0.0 for slope in slopes)
 
 
 def test_a_joint_that_moves_in_few_windows_moves_in_one_that_is_fitted() -> None:
@@ -210,7 +208,7 @@ def test_what_differs_alone_is_chosen_alone(change, effects: set[str]) -> None:
     real = change(TEXT)
     search = search_on(TEXT, [record(real, seed, 14.0) for seed in (1, 2)])
     search = replace(search, excluded=frozenset({"actuator.back_emf"}))  # no servo is ever off
-    bare = LoopFit(search.nominal, ((), ()))
+    bare = evaluate(search.data, LoopFit(search.nominal, ((), ())))
     fit, _ = select(search, bare)
     assert (rms_on(search.data, fit) < 1.5e-3).all()
     assert len(edits.chosen_of(search, fit)) == 1
@@ -221,6 +219,6 @@ def test_what_needs_coulomb_friction_needs_it_where_the_model_has_none() -> None
     search = search_on(TEXT, [record(TEXT, 1, 8.0)])
     search = replace(search, nominal={**search.nominal, "coulomb": np.array([0.2, 0.0])})
     names = ["friction.asymmetric#0", "friction.asymmetric#1"]
-    about = look_about(search, LoopFit(search.nominal, ((), ())), names)
+    about = look_about(search, evaluate(search.data, LoopFit(search.nominal, ((), ()))), names)
     assert about.effects[names[0]].needs == ()
     assert about.effects[names[1]].needs == ("friction.coulomb#1",)

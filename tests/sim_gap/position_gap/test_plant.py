@@ -9,7 +9,9 @@ from servo_arm import model_text, record, search_on
 
 from armlink.recording.recording import Recording
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.fit import LoopFit, LoopSearch, rms_on
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit, evaluate
+from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.plant import HeldParts, MovedModel, held_model, held_parts, servos_of
 from sim_gap.position_gap.windows import pieces_of
 
@@ -21,7 +23,7 @@ TEXT = model_text(kp=15.0, friction=0.2)
 def left(search: LoopSearch, **values: object) -> np.ndarray:
     """RMS that the nominal model leaves with other values, (J,) [rad]."""
     point = {**search.nominal, **{name: np.broadcast_to(x, 2).astype(float) for name, x in values.items()}}
-    return rms_on(search.data, LoopFit(point, ((), ())))
+    return rms_on(search.data, evaluate(search.data, LoopFit(point, ((), ()))))
 
 
 def pid(text: str) -> str:

@@ -9,7 +9,8 @@ from servo_arm import search_on, weight_text
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.position_gap.fit import LoopFit, rms_on
+from sim_gap.position_gap.fit import LoopFit
+from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.plant import follow
 
 FILTERED = '<position name="servo" joint="servo" kp="25" kv="{kv}" timeconst="{lag}" forcerange="-{limit} {limit}"/>'

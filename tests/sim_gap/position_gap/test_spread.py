@@ -7,11 +7,12 @@ import pytest
 from servo_arm import JOINTS, fitted
 
 from sim_gap.position_gap import sound_arm
-from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
+from sim_gap.position_gap.choice import LoopSearch
+from sim_gap.position_gap.fit import LoopFit, batch, residuals
 from sim_gap.position_gap.training import spread
 from sim_gap.position_gap.training.draws import draw
 from sim_gap.position_gap.training.jackknife import WindowTerms, jackknifed, terms_of
-from sim_gap.position_gap.training.spread import Covariance, covariance, interval
+from sim_gap.position_gap.training.spread import Covariance, covariance, covariance_within, interval
 
 FRICTION = 0.15, 0.35
 
@@ -27,11 +28,7 @@ def weightless() -> tuple[LoopSearch, LoopFit]:
 
 
 def within(search: LoopSearch, fit: LoopFit) -> Covariance:
-    """What the windows alone leave open, as if they were of one recording."""
-    terms = terms_of(search, fit)
-    known = np.zeros((len(terms.names),) * 2)
-    besides = np.diag(spread._of_other_motion(search, fit, terms.names))
-    return Covariance(terms.names, jackknifed(terms, known, np.arange(search.data.count)) + besides)
+    return covariance_within(search, fit, terms_of(search, fit))
 
 
 def deviations(found: Covariance, name: str) -> np.ndarray:
@@ -101,7 +98,7 @@ def test_draws_of_an_undecided_scale_move_the_arm_as_the_fit_does(weightless) ->
             for name in ("kp", "coulomb", "viscous", "armature")
         }
         points.append({**fit.point, **own})
-    gaps = residuals(search.data, [fit.point, *points])
+    gaps = residuals(search.data, batch([fit.point, *points]))
     moved = np.sqrt(np.mean((gaps[1:] - gaps[0]) ** 2, axis=(1, 2, 3)))
     assert np.median(moved) < 0.001
 
@@ -114,7 +111,7 @@ def test_no_draw_moves_the_arm_further_than_it_may(several) -> None:
 
     def moved(rows: list[dict[str, float]]) -> np.ndarray:
         points = [{**fit.point, "delay": np.array([row["shoulder.delay"], fit.point["delay"][1]])} for row in rows]
-        gaps = residuals(search.data, [fit.point, *points])[:, :, 0]
+        gaps = residuals(search.data, batch([fit.point, *points]))[:, :, 0]
         return np.sqrt(np.mean((gaps[1:] - gaps[0]) ** 2, axis=(1, 2)))
 
     assert np.median(moved(free)) > 0.02
