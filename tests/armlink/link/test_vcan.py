@@ -109,6 +109,7 @@ def all_are(state):
     return lambda states: states == {11: state, 12: state}
 
 
+@pytest.mark.long
 def test_an_arm_that_is_not_there_is_one_line(arm_file):
     scan = armlink("scan", arm_file, "--bus", BUS)
     assert scan.returncode == 3
@@ -150,6 +151,7 @@ def test_the_host_keeps_no_higher_rate_than_it_should(simulated, arm_file):
     assert figures["load"] > 0
 
 
+@pytest.mark.long
 def test_scan_and_monitor_see_the_arm(simulated, arm_file):
     scan = armlink("scan", arm_file, "--json", "-")
     assert scan.returncode == 0, scan.stderr
@@ -159,6 +161,7 @@ def test_scan_and_monitor_see_the_arm(simulated, arm_file):
     assert '"nmt": "operational"' in monitor.stdout
 
 
+@pytest.mark.long
 def test_the_self_test_shows_that_the_joints_stop_without_their_host(simulated, arm_file):
     for _ in range(STARTS):  # on a busy machine replies are late
         check = armlink("check", arm_file, "--yes", "--json", "-")

@@ -194,6 +194,7 @@ def test_a_start_that_parks_first_for_longer_than_a_hang_is_given_may_be_interru
     pendulum.require_parked()
 
 
+@pytest.mark.long
 def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulum) -> None:
     pendulum.hold_out()
     pendulum.send(signal.SIGINT)

@@ -139,7 +139,7 @@ def test_a_day_without_motion_has_none(tmp_path: Path) -> None:
     assert bench.said == []
 
 
-def test_why_there_is_none_is_said_once(tmp_path: Path) -> None:
+def test_why_there_is_none_is_said_once(tmp_path: Path, without_model: None) -> None:
     bench = Bench(tmp_path / "diagnosis")
     for _ in range(2):
         bench.work(30.0)
