@@ -454,6 +454,7 @@ def at_a_job_of_few_poses(tmp_path: Path, **more: object) -> FastDaemon:
     return daemon
 
 
+@pytest.mark.long
 def test_where_watching_cannot_decide_a_sweep_follows_and_decides(tmp_path: Path) -> None:
     daemon = at_a_job_of_few_poses(tmp_path, sweep_when_undecided=True)
     daemon.run(900, until=lambda: daemon.view.status().state is State.SWEEPING)

@@ -117,6 +117,7 @@ def test_a_slow_drift_is_followed(sarcos, sarcos_beta) -> None:
     assert worst < 0.005
 
 
+@pytest.mark.long
 def test_a_step_and_a_ramp_on_two_joints_at_once_are_put_right(sarcos, sarcos_beta) -> None:
     bench = Bench(sarcos, sarcos_beta, 65)
     bench.work(40)

@@ -102,7 +102,7 @@ def test_a_body_of_the_model_that_the_arm_lacks_is_a_payload_of_negative_mass():
     assert any("the arm lacks" in note for note in answer.notes)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("groups", [(), ("loaded=b,c",)])
 def test_a_payload_of_one_training_and_of_the_held_out_recording(groups):
     """Two recordings of three have it, the held-out one among them."""
