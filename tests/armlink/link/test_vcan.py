@@ -116,6 +116,7 @@ def test_an_arm_that_is_not_there_is_one_line(arm_file):
     assert "no answer from joint_1 (node 11), joint_2 (node 12)" in scan.stderr.splitlines()[-1]
 
 
+@pytest.mark.long
 def test_a_killed_host_leaves_every_joint_in_quick_stop(simulated, arm_file, listener):
     process = pushing(arm_file)
     while listener.recv(timeout=0):

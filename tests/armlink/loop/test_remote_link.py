@@ -255,6 +255,7 @@ def dawdle(link: Link, tell: Callable[[str], None], seconds: float) -> int:
     return os.getpid()
 
 
+@pytest.mark.long
 def test_a_function_runs_in_the_loop_until_it_ends_or_ctrl_c(tmp_path: Path) -> None:
     def interrupt(text: str) -> None:
         raise KeyboardInterrupt

@@ -44,7 +44,7 @@ def test_a_sensors_gain_and_a_payload():
     assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(2.0, rel=0.03)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("degrees", [90.0, 30.0, 150.0])
 def test_a_base_that_is_turned_far(degrees):
     angles = np.radians(degrees) * np.array([0.8, -0.6])

@@ -183,6 +183,7 @@ def swing(real: mujoco.MjModel, start: float, random: np.random.Generator, noise
     return Recording(t=0.004 * np.arange(2000), position=np.array(positions)[:, None], motor_torque=torque)
 
 
+@pytest.mark.long
 def test_a_doubtful_unit_leaves_the_answer_open() -> None:
     wrong = Wrong(coulomb=0.5, viscous=0.3)
     made = [record(model(), wrong, seed=k, seconds=20.0, channels=("tau_motor",)) for k in range(2)]

@@ -36,6 +36,7 @@ def drop(text: str, held: float, seconds: float, start: float) -> Recording:
 POSITION = '<position name="servo" joint="servo" kp="30" kv="2"/>'
 
 
+@pytest.mark.long
 def test_drops_show_friction_and_rotor(tmp_path: Path) -> None:
     random = np.random.default_rng(1128)
     friction, armature = random.uniform(0.2, 0.35), random.uniform(0.015, 0.025)

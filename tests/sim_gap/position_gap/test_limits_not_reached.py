@@ -70,6 +70,7 @@ def test_a_limit_that_is_stated_fitted_or_left_out_is_not_drawn(arm) -> None:
     assert {(x.joint, x.name) for x in unreached_limits.find_unreached(withheld, fitted)} == {(0, "slew")}
 
 
+@pytest.mark.long
 def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> None:
     search, fit = arm
     spread = replace(covariance(search, fit), limits=unreached_limits.find_unreached(search, fit))
