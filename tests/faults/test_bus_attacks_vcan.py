@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from bus_attacks import BARE, GUARDED, Scene, link, scene
 
-pytestmark = [pytest.mark.vcan, pytest.mark.long]  # quick: `test_vcan.py` here and of the link
+pytestmark = [pytest.mark.vcan, pytest.mark.long]  # quick: `test_vcan.py`
 
 OWN_WATCHES = "the joints could not be told to stop, which their own watches do"
 CLOSED = {

@@ -15,7 +15,7 @@ from vcan_pair import pair_text
 from armlink.drives.canopen.cia402 import DriveState, state_of
 from armlink.guard import bus_guard
 
-pytestmark = pytest.mark.vcan
+pytestmark = [pytest.mark.vcan, pytest.mark.long]  # quick: `tests/faults/test_vcan.py`, a link on the same bus
 
 ROOT = Path(__file__).parents[3]
 BUS = "socketcan:vcan0"
@@ -109,14 +109,12 @@ def all_are(state):
     return lambda states: states == {11: state, 12: state}
 
 
-@pytest.mark.long
 def test_an_arm_that_is_not_there_is_one_line(arm_file):
     scan = armlink("scan", arm_file, "--bus", BUS)
     assert scan.returncode == 3
     assert "no answer from joint_1 (node 11), joint_2 (node 12)" in scan.stderr.splitlines()[-1]
 
 
-@pytest.mark.long
 def test_a_killed_host_leaves_every_joint_in_quick_stop(simulated, arm_file, listener):
     process = pushing(arm_file)
     while listener.recv(timeout=0):
@@ -130,7 +128,6 @@ def test_a_killed_host_leaves_every_joint_in_quick_stop(simulated, arm_file, lis
     }
 
 
-@pytest.mark.long
 def test_an_interrupted_host_quick_stops_itself(simulated, arm_file, listener):
     process = pushing(arm_file)
     process.send_signal(signal.SIGINT)
@@ -141,7 +138,6 @@ def test_an_interrupted_host_quick_stops_itself(simulated, arm_file, listener):
     }
 
 
-@pytest.mark.long
 def test_the_host_keeps_no_higher_rate_than_it_should(simulated, arm_file):
     process = host(arm_file, 250)
     out, _ = process.communicate(timeout=60)
@@ -152,7 +148,6 @@ def test_the_host_keeps_no_higher_rate_than_it_should(simulated, arm_file):
     assert figures["load"] > 0
 
 
-@pytest.mark.long
 def test_scan_and_monitor_see_the_arm(simulated, arm_file):
     scan = armlink("scan", arm_file, "--json", "-")
     assert scan.returncode == 0, scan.stderr
@@ -162,7 +157,6 @@ def test_scan_and_monitor_see_the_arm(simulated, arm_file):
     assert '"nmt": "operational"' in monitor.stdout
 
 
-@pytest.mark.long
 def test_the_self_test_shows_that_the_joints_stop_without_their_host(simulated, arm_file):
     for _ in range(STARTS):  # on a busy machine replies are late
         check = armlink("check", arm_file, "--yes", "--json", "-")
@@ -177,7 +171,6 @@ def test_the_self_test_shows_that_the_joints_stop_without_their_host(simulated, 
     assert all(0.9 < each["seconds"] < 1.6 for each in alone)
 
 
-@pytest.mark.long
 def test_a_second_host_is_noticed(simulated, arm_file):
     process = pushing(arm_file)
     second = armlink("check", arm_file, "--yes")

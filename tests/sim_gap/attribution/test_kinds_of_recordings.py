@@ -36,6 +36,7 @@ def smooth_step(t: np.ndarray, start: np.ndarray, goal: np.ndarray) -> tuple[np.
     return t, q, v, a
 
 
+@pytest.mark.long
 @pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_efforts_without_gravity_are_known_as_such(seed: int) -> None:

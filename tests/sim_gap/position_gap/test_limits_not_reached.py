@@ -88,7 +88,7 @@ def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> Non
         assert widened or (within < 1.1 * without).all()
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("over", [1.1, 1.6, np.inf])
 def test_the_band_holds_motion_beyond_the_training_whatever_the_limit_is(arm, over) -> None:
     search, fit = arm

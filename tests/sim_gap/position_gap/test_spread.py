@@ -35,6 +35,7 @@ def deviations(found: Covariance, name: str) -> np.ndarray:
     return np.array([np.sqrt(found.matrix[k, k]) for k in (found.names.index((j, name)) for j in (0, 1))])
 
 
+@pytest.mark.long
 def test_an_interval_holds_what_other_recordings_of_the_arm_show(several) -> None:
     """The arm is warm in half of them: noise within a recording says nothing of that."""
     search, fit = several
