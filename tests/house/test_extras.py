@@ -133,7 +133,7 @@ NAMED = {
 """Extra → commands that need it, with the purpose that their error begins with."""
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("extra", EXTRAS)
 def test_a_command_names_the_extra_that_it_needs(folder, extra):
     purposes, commands = zip(*NAMED[extra], strict=True)

@@ -171,6 +171,7 @@ def test_a_question_leaves_standard_output_alone(tmp_path):
     assert (tmp_path / "out").read_text() == "found: one\nverdict: both\n"
 
 
+@pytest.mark.long
 def test_new_asks_on_a_terminal_for_what_the_model_does_not_state(folder, tmp_path):
     shutil.copy(folder / "arm.urdf", tmp_path)
     command = [

@@ -33,7 +33,7 @@ BURSTS = {"store": (14, 28), "journal": (11, 22), "disk": (2, 4), "pipe": (5, 20
 """How many calls in a row fail, of how many; each failure of the pipe is a new bus process."""
 
 
-@pytest.mark.sample(1)  # all five of them fail in the test below
+@pytest.mark.long
 @pytest.mark.parametrize("failing", DEPENDENCIES)
 def test_no_failing_call_ends_it_or_loses_an_event(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: list[tuple[str, str | None]], failing: str

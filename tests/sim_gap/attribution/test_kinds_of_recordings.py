@@ -37,7 +37,6 @@ def smooth_step(t: np.ndarray, start: np.ndarray, goal: np.ndarray) -> tuple[np.
 
 
 @pytest.mark.long
-@pytest.mark.sample(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_efforts_without_gravity_are_known_as_such(seed: int) -> None:
     """As drivers publish them that subtract their own model of gravity: nothing is left at rest."""

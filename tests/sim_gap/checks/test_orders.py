@@ -43,7 +43,7 @@ def test_any_order_is_put_right(arms, channels):
     np.testing.assert_allclose(checked.motor_torque, recording.motor_torque)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("order", [[1, 2, 5, 0, 4, 3], [0, 5, 1, 4, 2, 3]])
 def test_another_order_is_no_angle_in_degrees(arms, order):
     """As degrees, positions of another order hardly move: then friction and a rotor explain most of what is read."""
