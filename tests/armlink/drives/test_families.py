@@ -353,7 +353,7 @@ def lies(name, draw, bench, joint):
 
 
 @every_arm
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(draw=st.data())
 def test_no_frame_leaves_beyond_a_limit(name, draw):
     bench = prepared(name)

@@ -118,6 +118,7 @@ def test_ripple_is_fitted_and_does_not_widen_the_intervals() -> None:
     np.testing.assert_allclose(sizes, 0.1 * 0.6 * coulomb, rtol=0.2)
 
 
+@pytest.mark.long
 def test_the_usual_unevenness_of_friction_is_that_of_all_joints() -> None:
     uneven, *_ = fitted()
     even, *_ = fitted(uneven=0.0)

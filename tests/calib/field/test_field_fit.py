@@ -77,6 +77,7 @@ def rows(
     return StaticReadings(q, reading, np.full(q.shape, SIGMA), direction=side)
 
 
+@pytest.mark.long
 def test_its_intervals_hold_the_truth_by_monte_carlo() -> None:
     """Gravity parameters, position zeros and readings each drawn with the error that the records state: 150 trials."""
     random, inside = np.random.default_rng(0), {"gain": [], "offset": []}

@@ -29,6 +29,7 @@ def arm(tmp_path_factory):
     return folder, diagnose(folder / "arm.xml", [made])
 
 
+@pytest.mark.long
 def test_draws_scatter_about_the_estimate_by_its_intervals(arm):
     answer = arm[1]
     estimate = answer.internals.estimate

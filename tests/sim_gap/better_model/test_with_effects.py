@@ -24,7 +24,7 @@ CASES = {
 }
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_the_written_model_has_no_gap_any_more(tmp_path, name):
     (tmp_path / "arm.xml").write_text(THREE)

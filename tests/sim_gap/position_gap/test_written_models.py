@@ -37,7 +37,7 @@ def made(tmp_path_factory) -> tuple[SimModel, LoopSearch, LoopFit]:
     sim = load_model(written(tmp_path_factory.mktemp("arm"), TEXT))
     search = search_on(TEXT, [record(TEXT, seed, 14.0, load=LOAD) for seed in (1, 2)])
     known = ("kp", "coulomb", "viscous", "load")
-    return sim, search, search.improve(LoopFit({**search.nominal, "load": np.full(2, 0.1)}, (known, known)), 8)
+    return sim, search, search.improve(LoopFit({**search.nominal, "load": np.full(2, 0.1)}, (known, known)), 4)
 
 
 def loaded(sim: SimModel, beside: Exported) -> Simulated:
