@@ -8,9 +8,9 @@ from typing import Any
 from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from armlink.drives.findings import FoundDrives
-from armlink.drives.registry import not_looked_for
 from armlink.errors import BusFault
-from calib.commissioning.drive_match import Ask, Match, moved_node
+from calib.commissioning.drive_match import Ask, Match, moved_drive
+from calib.commissioning.drive_values import assumed_ratings, drive_notes, with_gains
 
 DEFAULT_VELOCITY = 0.5
 """`max_velocity` where nothing says how fast the joint may be [rad/s]; a choice."""
@@ -31,17 +31,32 @@ def arm_of_bus(drives: FoundDrives, channel: str, bus: Mapping[str, str | int], 
     reads the motion, and its stops are what that reads [rad]. Else the drives are taken in the order of their ids.
     """
     if not drives.found:
-        raise BusFault(f"{channel}: no drive answers: check power, wiring and bit rate ({not_looked_for()})")
+        raise BusFault(f"{channel}: no drive answers: check power, wiring and bit rate")
     if ask is None:
         matches = [Match(f"joint_{i}", drive, by_hand=False) for i, drive in enumerate(drives.found, start=1)]
-        stops = [(-pi, pi)] * len(matches)
+        stops = [_turn_about(each) for each in _standing(drives)]
     else:
         matches, stops = _by_hand(drives, channel, ask)
     return BusArm(_text(matches, stops, channel, bus, name), matches)
 
 
+def _standing(drives: FoundDrives) -> list[float]:
+    """Where each drive stands [rad]; 0 where one does not tell."""
+    try:
+        positions = drives.positions()
+    except BusFault:
+        positions = {}
+    return [positions.get(each.address, 0.0) for each in drives.found]
+
+
+def _turn_about(position: float) -> tuple[float, float]:
+    """A turn about zero, or about a position beyond it: that of a drive before a further gear [rad]."""
+    middle = 0.0 if abs(position) < pi else position
+    return middle - pi, middle + pi
+
+
 def _by_hand(drives: FoundDrives, channel: str, ask: Ask) -> tuple[list[Match], list[tuple[float, float]]]:
-    free = {each.node: each for each in drives.found}
+    free = {each.address: each for each in drives.found}
     matches, stops = [], []
     for number in range(1, len(free) + 1):
         joint = f"joint_{number}"
@@ -49,9 +64,9 @@ def _by_hand(drives: FoundDrives, channel: str, ask: Ask) -> tuple[list[Match], 
         before = drives.positions()
         ask(f"{joint}: now to its other stop")
         after = drives.positions()
-        node = moved_node(joint, {each: after[each] - before[each] for each in free}, channel)
-        matches.append(Match(joint, free.pop(node), by_hand=True))
-        stops.append((min(before[node], after[node]), max(before[node], after[node])))
+        moved = moved_drive(joint, {each: after[each] - before[each] for each in free}, channel)
+        matches.append(Match(joint, free.pop(moved), by_hand=True))
+        stops.append((min(before[moved], after[moved]), max(before[moved], after[moved])))
     return matches, stops
 
 
@@ -80,19 +95,20 @@ def _text(
     for match in matches:
         place = "by turning the joint by hand" if known else "assumed: in the order of node ids"
         lines += [yaml_item(_joint(match), 4), yaml_comment(f"node {place}; max_velocity assumed", 6)]
+        lines += [yaml_comment(note, 6) for note in drive_notes(match.drive)]
     if not known:
         lines += ["sweep:", yaml_entry("hold", "servo", 2, "assumed: the stops are not known")]
     return "\n".join(lines) + "\n"
 
 
 def _joint(match: Match) -> dict[str, Any]:
-    drive = match.drive
-    return {
+    drive = assumed_ratings(with_gains(match.drive))
+    row = {
         "name": match.joint,
         **drive.keys,
         "rated_torque": float(f"{drive.rated_torque:g}"),
         "max_torque": float(f"{drive.max_torque:g}"),
         "max_torque_rate": float(f"{2.5 * drive.max_torque:.3g}"),
         "max_velocity": DEFAULT_VELOCITY,
-        "identity": {"vendor": drive.vendor, "product": drive.product},
     }
+    return row if drive.family != "canopen" else {**row, "identity": {"vendor": drive.vendor, "product": drive.product}}
