@@ -237,7 +237,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     return [
         FoundDrive("cubemars", drive, f"id {drive:02X}h", reply=reply, note=note)
         for drive, reply in sorted(heard)
-        if drive != reply and drive in commanded
+        if 0 < drive != reply and drive in commanded
     ]
 
 
