@@ -251,7 +251,13 @@ def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doct
     described = load_arm("real.yaml")
     arm = SimulatedArm(described, Truth.of(described))
     monkeypatch.setattr("calib.commands.setup.bus_setup.open_named", lambda bus: LockStepBus(arm=arm))
-    monkeypatch.setattr("calib.commands.setup.terminal.hand", lambda by_hand, interactive: hands(arm, made))
+    person = hands(arm, made)
+
+    def turn(text: str) -> None:
+        person(text)
+        arm.advance(0.001)  # such a drive reads its encoder once in a while
+
+    monkeypatch.setattr("calib.commands.setup.terminal.hand", lambda by_hand, interactive: turn)
     line = ["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]
     assert cli.run(line) == 0
     drives = [joint.settings for joint in load_arm("found.yaml").require_link().joints]
