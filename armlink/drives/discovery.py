@@ -87,8 +87,8 @@ class Discovery:
     find: Callable[[SearchedBus], Sequence[FoundDrive] | FoundDrives]
     """Sends nothing but frames that read."""
     spares: tuple[str, ...] = ()
-    """Families for whose drives a request of this one, or an answer to it, can be a command, or whose frames look as
-    its drives' do: beside them it is not looked for."""
+    """Families whose drives its requests or answers could command, or whose frames look alike: it is not looked for
+    beside them."""
 
 
 class AskedDrives:

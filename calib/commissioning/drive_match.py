@@ -73,7 +73,7 @@ def match_by_hand(
         moved = moved_drive(joint.name, turned, bus)
         drive, ratio = free.pop(moved), turned[moved] / (joint.upper - joint.lower)
         if drive.family != "canopen":
-            zero = round(before[moved] - ratio * joint.lower, 4)
+            zero = round(float(before[moved] - ratio * joint.lower), 4)
             drive = replace(drive, drive={**(drive.drive or {}), "direction": 1 if ratio > 0 else -1, "zero": zero})
         matches.append(Match(joint.name, drive, by_hand=True))
         findings += _judge(joint, drive, turned[moved])

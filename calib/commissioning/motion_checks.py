@@ -72,7 +72,7 @@ def _strength(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
 
 
 def largest_inertias(arm_file: ArmFile) -> dict[str, float]:
-    """What each joint turns at most, the reference mass of a sweep included [kg·m²]; the arm has a model."""
+    """Largest inertia that each joint turns, the reference mass of a sweep included [kg·m²]; the arm has a model."""
     placed = model_chain(arm_file)
     arm = placed.arm.arm
     low, high = np.nan_to_num([arm.lower, arm.upper], posinf=np.pi, neginf=-np.pi)

@@ -241,11 +241,6 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     ]
 
 
-FAMILY = Family(
-    "cubemars",
-    TRAITS,
-    CubeMarsSettings,
-    CubeMarsDrives,
-    discovery=Discovery("only heard: whatever asks them commands them", find_drives, ("damiao", "odrive")),
-    summary="CubeMars AK (firmware 1 and 2), MIT mode",
-)
+SEARCH = Discovery("only heard: whatever asks them commands them", find_drives, ("damiao", "odrive"))
+SUMMARY = "CubeMars AK (firmware 1 and 2), MIT mode"
+FAMILY = Family("cubemars", TRAITS, CubeMarsSettings, CubeMarsDrives, discovery=SEARCH, summary=SUMMARY)
