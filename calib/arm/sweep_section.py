@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from armlink.arm_file import ArmFile, Positive, Section
-from armlink.drives.registry import family
+from armlink.drives.family import family
 from armlink.errors import BadInput
 from gcomp.identify.motor_model import MotorDoubt
 from gcomp.identify.parameters import Prior

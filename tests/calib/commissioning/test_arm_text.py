@@ -69,7 +69,7 @@ def test_no_text_from_outside_adds_to_the_file(name, other, note):
 @settings(deadline=None, max_examples=100, derandomize=True)
 @given(TEXTS, TEXTS)
 def test_the_file_of_a_bus_alone_has_what_the_bus_is_called(channel, name):
-    drive = FoundDrive(node=3, vendor=1, product=2, rated_torque=10.0, max_torque=20.0, unit=1e-4)
+    drive = FoundDrive("canopen", 3, "node 3", vendor=1, product=2, rated_torque=10.0, max_torque=20.0, unit=1e-4)
     text = bus_text([Match("joint_1", drive, by_hand=False)], [(-1.0, 1.0)], channel, {"channel": channel}, name)
     content = yaml.safe_load(text)
     assert set(content) == {"name", "serial", "kinematics", "link", "sweep"}
