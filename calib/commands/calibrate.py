@@ -41,6 +41,8 @@ def calibrate(
 
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
+    import numpy as np
+
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
@@ -51,9 +53,11 @@ def calibrate(
     from calib.commands.options import load_sweeps
     from calib.dataset import all_creep, drives_of
     from calib.fit.felt_mass import felt_mass
+    from calib.fit.heldout import held_out_steps
     from calib.fit.sensor_fit import SensorFit
-    from calib.install.apply import Apply, apply_calibration
-    from calib.records.records import CalibrationRecord
+    from calib.install.apply import Apply, apply_record
+    from calib.install.plausibility import replaced_record
+    from calib.records.records import CalibrationRecord, GravityRecord, HeldOut
     from calib.records.store import RecordStore
 
     if report is not None:
@@ -77,6 +81,11 @@ def calibrate(
     user = getpass.getuser()
     if apply:
         record = record.model_copy(update={"confirmed_by": user})
+        before = replaced_record(record, arm_file, records)
+        if before is not None:
+            gravity = records.current(GravityRecord, arm_file)
+            proof = HeldOut(against=before.id) if replaced else held_out_steps(record, before, arm_file, data, gravity)
+            record = record.model_copy(update={"held_out": proof})
     if report is not None:
         from calib.report.calibration import Calibrated, write_report
 
@@ -89,7 +98,9 @@ def calibrate(
         again = command_line("calibrate", *map(str, directories), "--apply", arm=arm, bus=bus, store=store)
         with early_end(arm_file, again) as work:
             work.enabled = check
-            written = apply_calibration(record, arm_file, records, data, fit, how)
+            beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
+            broken = {each.joint: each.text for each in reversed(fit.goodness.findings) if each.breaks_model}
+            written = apply_record(record, arm_file, records, how, beta, "sweeps", broken)
         out.print(f"record {record.id} is current, written to {len(written)} controllers and read back")
     else:
         of_host = not isinstance(fit, SensorFit)

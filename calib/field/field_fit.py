@@ -13,8 +13,8 @@ import numpy.typing as npt
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from calib.field.linear_model import UNKNOWN_MOMENT, Belief, Solution, belief_of, field_columns, solve
-from calib.fit.heldout import FEWEST
-from calib.records.records import CalibrationRecord, GravityRecord, Parameter
+from calib.fit.heldout import FEWEST, held_out
+from calib.records.records import CalibrationRecord, GravityRecord, HeldOut, Parameter
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_regressor
@@ -199,6 +199,13 @@ def _no_gain(torque: Array) -> str:
         f"it cannot be separated from the offset: gravity torque varies by only {spread:.2g} N·m (standard deviation)"
         " in these poses: move it, or the joints beyond it, further"
     )
+
+
+def held_out_rows(record: CalibrationRecord, rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> HeldOut:
+    """The proof of a record from slow rows against the one before, which is not judged by what it was fitted to."""
+    if before.is_fitted_to(record.data):
+        return HeldOut(against=before.id)
+    return held_out(before, *heldout_errors(rows, fit, before))
 
 
 def heldout_errors(rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.creep.fit import fit_rows
 from calib.creep.plan import plan_creep
 from calib.creep.record import CreepCalibration
-from calib.daemon.view.event_text import describe
+from calib.daemon.state.events import describe
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
 from calib.observer.evidence import ChangeHypothesis, ResidualTest
