@@ -4,7 +4,7 @@ import contextlib
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
@@ -24,12 +24,12 @@ P = ParamSpec("P")
 class CycleProcess:
     """A process that runs, the channel to it, and its end."""
 
-    def __init__(self, opening: Open) -> None:
-        """Start it; what comes of `opening` it answers."""
+    def __init__(self, opening: Open, inherits: Sequence[int] = ()) -> None:
+        """Start it; what comes of `opening` it answers. It holds the descriptors that it `inherits` until it ends."""
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", "armlink.loop.process", str(theirs.fileno())]
         self._process = subprocess.Popen(
-            command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
+            command, pass_fds=[theirs.fileno(), *inherits], stdin=subprocess.DEVNULL, start_new_session=True
         )
         theirs.close()
         self._channel = Channel(ours)

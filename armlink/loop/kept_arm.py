@@ -3,7 +3,7 @@
 import itertools
 import pickle
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, InvalidStateError
 from typing import Any
 
@@ -70,11 +70,13 @@ class BatchMaker:
 class KeptArm(CycleProcess):
     """Nothing in the daemon can delay a cycle. `pump`, `move` and `close` are for one thread, `ask` for any."""
 
-    def __init__(self, arm: ArmFile, bus: str | None = None, listen_only: bool = False) -> None:
+    def __init__(
+        self, arm: ArmFile, bus: str | None = None, listen_only: bool = False, inherits: Sequence[int] = ()
+    ) -> None:
         """Start the process, which opens the bus as soon as that is there."""
         self._waiting: dict[int, Future[LoopAnswer]] = {}
         self._sending, self._batches = threading.Lock(), BatchMaker()
-        super().__init__(Open(arm, bus, kept=True, listen_only=listen_only))
+        super().__init__(Open(arm, bus, kept=True, listen_only=listen_only), inherits)
 
     def fileno(self) -> int:
         """For the event loop: readable when there are messages."""

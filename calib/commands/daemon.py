@@ -81,8 +81,8 @@ def daemon(
         work=work,
     )
     log_to_stderr()
-    with locked_directory(directory, f"--state {directory}", patience=TAKE_OVER_SECONDS):
-        kept = options.keep(described)
+    with locked_directory(directory, f"--state {directory}", patience=TAKE_OVER_SECONDS) as lock:
+        kept = options.keep(described, lock)  # which holds the lock until it has left the joints safe
         from calib.daemon.main_loop import run_daemon  # takes long to load: the bus is opened meanwhile
 
         run_daemon(options, described, directory, kept)

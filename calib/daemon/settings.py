@@ -125,9 +125,9 @@ class Options:
             given["work"] = True
         return daemon_section(arm).model_copy(update=given)
 
-    def keep(self, arm: ArmFile) -> KeptArm:
-        """Start the process that keeps the arm open."""
-        return KeptArm(arm, self.bus, self.listen_only)
+    def keep(self, arm: ArmFile, *inherits: int) -> KeptArm:
+        """Start the process that keeps the arm open; it inherits these descriptors."""
+        return KeptArm(arm, self.bus, self.listen_only, inherits)
 
 
 def state_directory(given: Path | None, arm: ArmFile) -> Path:

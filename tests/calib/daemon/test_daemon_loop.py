@@ -29,6 +29,7 @@ from armlink.loop.process import UNREAD_SECONDS
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.view import State
 from calib.motion.random_work import work_targets
+from calib.records.file_lock import locked_directory
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 
@@ -288,3 +289,15 @@ def until_down(host: KeptArm) -> Down:
         for message in host.pump():
             if isinstance(message, Down):
                 return message
+
+
+def test_the_bus_process_of_a_daemon_that_is_gone_holds_its_state_directory(tmp_path: Path) -> None:
+    """Until it has left the joints safe: a daemon that is begun meanwhile waits for that."""
+    with locked_directory(tmp_path, "--state") as lock:
+        host = KeptArm(load_arm("sarcos"), NO_BUS, inherits=[lock])
+        until_down(host)
+    with pytest.raises(BadInput, match="in use by"), locked_directory(tmp_path, "--state"):
+        pass
+    host.close()
+    with locked_directory(tmp_path, "--state"):
+        pass
