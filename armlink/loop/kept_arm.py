@@ -71,12 +71,17 @@ class KeptArm(CycleProcess):
     """Nothing in the daemon can delay a cycle. `pump`, `move` and `close` are for one thread, `ask` for any."""
 
     def __init__(
-        self, arm: ArmFile, bus: str | None = None, listen_only: bool = False, inherits: Sequence[int] = ()
+        self,
+        arm: ArmFile,
+        bus: str | None = None,
+        listen_only: bool = False,
+        inherits: Sequence[int] = (),
+        log: Callable[[], None] | None = None,
     ) -> None:
-        """Start the process, which opens the bus as soon as that is there."""
+        """Start the process, which opens the bus as soon as that is there; `log` is called in it first."""
         self._waiting: dict[int, Future[LoopAnswer]] = {}
         self._sending, self._batches = threading.Lock(), BatchMaker()
-        super().__init__(Open(arm, bus, kept=True, listen_only=listen_only), inherits)
+        super().__init__(Open(arm, bus, kept=True, listen_only=listen_only, log=log), inherits)
 
     def fileno(self) -> int:
         """For the event loop: readable when there are messages."""

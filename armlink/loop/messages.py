@@ -33,6 +33,8 @@ class Open:
     """Opened again after each fault (`armlink.loop.kept_arm`); else once."""
     listen_only: bool = False
     """Another controller commands the arm; only where it is kept."""
+    log: Callable[[], None] | None = None
+    """Called first, to have logs written as the job writes its own."""
 
 
 @dataclass(frozen=True)

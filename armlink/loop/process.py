@@ -437,6 +437,8 @@ def main(number: int) -> None:
     channel = Channel(socket.socket(fileno=number))
     with contextlib.suppress(Closed):
         opening = _first(channel)
+        if opening.log is not None:
+            opening.log()
         try:
             loop = _loop(channel, opening)
         except ArmlinkError as error:

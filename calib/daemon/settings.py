@@ -10,6 +10,7 @@ from pydantic import Field, FiniteFloat, field_validator
 
 from armlink.arm_file import ArmFile, Positive, Section
 from armlink.loop.kept_arm import KeptArm
+from calib.daemon.logs import log_to_stderr
 from calib.observer.config import ObserverConfig, ObserverConstants, Policy
 
 log = logging.getLogger("armlink.daemon")
@@ -127,7 +128,7 @@ class Options:
 
     def keep(self, arm: ArmFile, *inherits: int) -> KeptArm:
         """Start the process that keeps the arm open; it inherits these descriptors."""
-        return KeptArm(arm, self.bus, self.listen_only, inherits)
+        return KeptArm(arm, self.bus, self.listen_only, inherits, log_to_stderr)
 
 
 def state_directory(given: Path | None, arm: ArmFile) -> Path:

@@ -1,8 +1,11 @@
 """The daemon's bus loop, with frames, physics and the link: driving, listening, faults, and the process that it has."""
 
+import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections import deque
@@ -301,3 +304,16 @@ def test_the_bus_process_of_a_daemon_that_is_gone_holds_its_state_directory(tmp_
     host.close()
     with locked_directory(tmp_path, "--state"):
         pass
+
+
+def test_the_bus_process_logs_as_the_daemon_does(tmp_path: Path) -> None:
+    """Its warnings are lines of JSON too, for systemd's journal."""
+    program = (
+        "import sys; from armlink.arm_file import load_arm; from calib.daemon.settings import Options\n"
+        "host = Options('openarm', bus=sys.argv[1], listen_only=True).keep(load_arm('openarm'))\n"
+        "while not any(type(each).__name__ == 'Up' for each in host.pump()): host._channel.wait(60.0)\n"
+        "host.close()"
+    )
+    command = [sys.executable, "-c", program, f"udp_multicast:239.74.171.{os.getpid() % 200 + 1}"]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stderr.splitlines()
+    assert any("no calibration record is in force" in json.loads(line)["message"] for line in said)
