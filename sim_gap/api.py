@@ -56,7 +56,7 @@ def diagnose(
         units=_texts(units),
         zero=_texts(zero),
         clock=_texts(clock),
-        effort=effort_is,
+        effort_is=effort_is,
         joints=",".join(joints),
         topic=topic,
     )

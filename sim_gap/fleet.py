@@ -9,13 +9,14 @@ import json
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, FiniteFloat, ValidationError
 
 from armlink.errors import ArmlinkError, BadInput, BusFault
+from armlink.recording.corrections import AS_IT_IS, Corrections
 
 CONNECT_SECONDS = 10.0
 """Longest wait for a scheduler to answer [s]."""
@@ -107,27 +108,58 @@ def _recordings(path: Path) -> list[Path]:
     return sorted(each for each in path.iterdir() if each.is_file() and each.name.endswith(SUFFIXES))
 
 
-def diagnose_case(case: Case) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class CaseOptions:
+    """Statements about the arm and its recordings that all cases share, as of `armlink gap diagnose`."""
+
+    stated: Corrections = AS_IT_IS
+    gains: str = ""
+    """Known gains of the position controllers (`parse_known_gains`)."""
+    base: str | None = None
+    tip: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Those that differ from the default."""
+        every = {**asdict(self.stated), "gains": self.gains, "base": self.base, "tip": self.tip}
+        return {name: value for name, value in every.items() if value}
+
+
+def diagnose_case(case: Case, options: CaseOptions | None = None) -> dict[str, Any]:
     """The JSON result of one case with what is watched, or `{"error": line}` if it cannot be diagnosed."""
     from armlink.recording.files import load_recording
     from sim_gap.attribution.diagnose import diagnose
+    from sim_gap.model.known_gains import parse_known_gains
     from sim_gap.trends import watched_parameters
 
+    options = options or CaseOptions()
     paths = [*case.train, *case.heldout]
     try:
-        recordings = [load_recording(path) for path in paths]
+        recordings = [load_recording(path, options.stated.of_reading()) for path in paths]
         count = len(case.train)
-        answer = diagnose(case.sim, recordings[:count], recordings[count:], labels=[str(path) for path in paths])
+        answer = diagnose(
+            case.sim,
+            recordings[:count],
+            recordings[count:],
+            labels=[str(path) for path in paths],
+            stated=options.stated,
+            known_gains=parse_known_gains(options.gains),
+            base=options.base,
+            tip=options.tip,
+        )
     except ArmlinkError as error:
         return {"error": str(error)}
     return answer.to_json() | {"watched": watched_parameters(answer)}
 
 
-def diagnose_fleet(cases: list[Case], client: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+def diagnose_fleet(
+    cases: list[Case], client: Any, options: CaseOptions | None = None
+) -> Iterator[tuple[str, dict[str, Any]]]:
     """(Case name, result) as they arrive from the cluster of a `distributed.Client`; each case once."""
     from distributed import as_completed
 
-    names = {client.submit(diagnose_case, case, key=f"gap-{case.name}", pure=False): case.name for case in cases}
+    names = {
+        client.submit(diagnose_case, case, options, key=f"gap-{case.name}", pure=False): case.name for case in cases
+    }
     for future in as_completed(list(names)):
         if future.status == "finished":
             yield names[future], future.result()
@@ -172,15 +204,21 @@ class _StoredLine(BaseModel):
 
     case: str
     answer: _StoredAnswer
+    options: dict[str, Any] = {}
 
 
 class Answers:
-    """Results by case in a file of JSON lines, append-only; a line truncated by a kill is ignored."""
+    """Results by case in a file of JSON lines, append-only; a line truncated by a kill is ignored.
 
-    def __init__(self, path: Path) -> None:
+    `found` has those that were made with the same options: others are of data that were read in another way.
+    """
+
+    def __init__(self, path: Path, options: CaseOptions | None = None) -> None:
         """Read the existing lines. Raises BadInput if the file has other contents or cannot be written."""
         self.path = path
+        self.options = json.loads(json.dumps((options or CaseOptions()).to_json()))
         self.found: dict[str, dict[str, Any]] = {}
+        other: set[str] = set()
         try:
             with path.open("a+b") as stream:
                 stream.seek(0)
@@ -199,13 +237,19 @@ class Answers:
                     f"{path}: line {number} is not a result of a fleet: give another file with --out"
                 ) from None
             entry = json.loads(line)
-            self.found[entry["case"]] = entry["answer"]
+            if entry.get("options", {}) == self.options:
+                self.found[entry["case"]] = entry["answer"]
+            else:
+                other.add(entry["case"])
+        self.of_other_options = len(other - self.found.keys())
+        """Number of cases with an answer that was made with other options alone."""
 
     def add(self, case: str, answer: dict[str, Any]) -> None:
         """Append a result; raises BadInput if it cannot be written."""
         try:
             with self.path.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps({"case": case, "answer": answer}, ensure_ascii=False) + "\n")
+                entry = {"case": case, "answer": answer} | ({"options": self.options} if self.options else {})
+                stream.write(json.dumps(entry, ensure_ascii=False) + "\n")
         except OSError as error:
             raise BadInput(f"{self.path}: cannot be written: {error.strerror}") from None
         self.found[case] = answer

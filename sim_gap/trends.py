@@ -163,6 +163,20 @@ def fleet_trends(answers: Mapping[str, Mapping[str, Any]]) -> list[Trend]:
     return sorted(found, key=lambda trend: trend.noticed, reverse=True)
 
 
+def needed_recordings(answers: Mapping[str, Mapping[str, Any]]) -> str:
+    """Why no change of the arm can be found in these answers yet, in one line; empty if one can."""
+    used = [case for case, answer in answers.items() if "error" not in answer]
+    undated = sorted(case for case in used if date_of(case) is None)
+    if undated:
+        return f"{undated[0].partition('/')[2]} has no date in its name, such as 2026-10-02: no change can be dated"
+    needed = FIRST + LAST + 1
+    return (
+        f"a change can be found from {needed} on ({FIRST} at the start, {LAST} at the end)"
+        if len(used) < needed
+        else ""
+    )
+
+
 def fleet_outliers(answers: Mapping[str, Mapping[str, Any]]) -> list[Outlier]:
     """Parameters of one arm that differ from those of the other arms, by the median of its last cases."""
     latest: dict[tuple[str, str, str], dict[str, tuple[float, str]]] = defaultdict(dict)

@@ -1,25 +1,21 @@
 """Writes a recording in another format: CSV, gzipped CSV, Parquet or MCAP, by suffix."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armlink.commands.options import Clock, Columns, EffortIs, Header, Joints, Json, Sign, Topic, Units, Zero
+from armlink.commands.options import Json, reads_recordings
+
+if TYPE_CHECKING:
+    from armlink.recording.corrections import Corrections
 
 
+@reads_recordings
 def convert(
     source: Annotated[Path, typer.Argument(help="Recording: .csv, .csv.gz, .parquet or .mcap (bags of ROS too).")],
     target: Annotated[Path, typer.Argument(help="File to write; its suffix says the format.")],
-    columns: Columns = None,
-    header: Header = "",
-    joints: Joints = "",
-    units: Units = None,
-    sign: Sign = None,
-    zero: Zero = None,
-    clock: Clock = None,
-    effort_is: EffortIs = "",
-    topic: Topic = "",
+    stated: "Corrections",
     json: Json = None,
 ) -> int:
     """Convert a recording, with corrections if any; joint names are kept where the format has them (Parquet, MCAP).
@@ -29,15 +25,13 @@ def convert(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
-    from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import keeps_names, load_recording, save_recording
     from armlink.recording.recording import default_names
 
-    stated = parse_corrections(columns, header, sign, units, zero, clock, effort_is, joints, topic)
     if stated.without_gravity:
         raise BadInput(
-            f"--effort-is {effort_is}: it takes the arm's model to add gravity, which convert does not have: convert "
-            "without it, and give this option with the diagnosis"
+            "--effort-is without-gravity: gravity is added from the arm's model, which convert does not have: convert "
+            "without this option, and give it to the diagnosis"
         )
     recording = load_recording(source, stated)
     try:

@@ -1,5 +1,8 @@
 """Arguments and options that commands share, here and in the packages above, and how their help shows them."""
 
+import inspect
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,21 +19,49 @@ def _of_reading(help_text: str, *names: str) -> Any:
     return typer.Option(*names, help=help_text, rich_help_panel="How to read the recordings")
 
 
-Columns = Annotated[
-    list[str] | None,
-    _of_reading("Column of the file for one of ours: t=time,q_1=pos_a or q_1=q_2,q_2=q_1.", "--map"),
-]
-Header = Annotated[
-    str, _of_reading("Columns of a table without a header row: t,q_1,q_cmd_1; - is one to leave out.", "--columns")
-]
-Joints = Annotated[str, _of_reading("Joints of the recordings to take, base to tip: a,b,c.")]
 UNITS = "q=deg, q=counts:4096 (a turn), q=percent:110 (degrees at 100), t=ms, tau_motor=A:12.5 (N·m/A)"
-Units = Annotated[list[str] | None, _of_reading(f"Unit of a channel: {UNITS}.")]
-Sign = Annotated[list[str] | None, _of_reading("Sign of a channel or column: tau_3=-1.")]
-Zero = Annotated[list[str] | None, _of_reading("Angle to add to a position [rad]: q_2=1.5708.")]
-Clock = Annotated[list[str] | None, _of_reading("Time to add to a channel [s]: tau=-0.02.")]
-EffortIs = Annotated[str, _of_reading("The efforts are: motor, link (sensor), without-gravity (or both).")]
-Topic = Annotated[str, _of_reading("Topic of a bag that holds the joint states.")]
+Many, Text = list[str] | None, str
+OF_READING: dict[str, tuple[Any, Any]] = {
+    "columns": (Many, _of_reading("Column of the file for one of ours: t=time,q_1=pos_a or q_1=q_2,q_2=q_1.", "--map")),
+    "header": (
+        Text, _of_reading("Columns of a table without a header row: t,q_1,q_cmd_1; - is one to leave out.", "--columns")
+    ),
+    "joints": (Text, _of_reading("Joints of the recordings to take, base to tip: a,b,c.")),
+    "units": (Many, _of_reading(f"Unit of a channel: {UNITS}.")),
+    "sign": (Many, _of_reading("Sign of a channel or column: tau_3=-1.")),
+    "zero": (Many, _of_reading("Angle to add to a position [rad]: q_2=1.5708.")),
+    "clock": (Many, _of_reading("Time to add to a channel [s]: tau=-0.02.")),
+    "effort_is": (Text, _of_reading("The efforts are: motor, link (sensor), without-gravity (or both).")),
+    "topic": (Text, _of_reading("Topic of a bag that holds the joint states.")),
+}  # fmt: skip
+"""Options that say how a recording is to be read: type and help of each."""
+
+
+def reads_recordings(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The command with the options OF_READING in place of its parameter `stated`, which gets the `Corrections`."""
+    signature = inspect.signature(command)
+    options = [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.POSITIONAL_OR_KEYWORD,
+            default="" if kind is Text else None,
+            annotation=Annotated[kind, option],
+        )
+        for name, (kind, option) in OF_READING.items()
+    ]
+
+    @wraps(command)
+    def with_options(**given: Any) -> Any:
+        from armlink.recording.corrections import parse_corrections
+
+        return command(stated=parse_corrections(**{name: given.pop(name) for name in OF_READING}), **given)
+
+    parameters = [
+        each for one in signature.parameters.values() for each in (options if one.name == "stated" else [one])
+    ]
+    with_options.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    with_options.__annotations__ = {one.name: one.annotation for one in parameters}
+    return with_options
 
 
 class GroupedCommand(TyperCommand):

@@ -98,7 +98,7 @@ def parse_corrections(
     units: Sequence[str] | None = None,
     zero: Sequence[str] | None = None,
     clock: Sequence[str] | None = None,
-    effort: str = "",
+    effort_is: str = "",
     joints: str = "",
     topic: str = "",
 ) -> Corrections:
@@ -108,10 +108,10 @@ def parse_corrections(
     [N·m/A]), `q=counts:N` (counts a turn) and `q=percent:D` (100 is an angle of D degrees, as LeRobot's normalised
     ranges have it); a unit of one joint goes before that of its channel. Raises BadInput for anything else.
     """
-    stated = effort.split(",") if effort else []
+    stated = effort_is.split(",") if effort_is else []
     source = [each for each in stated if each != WITHOUT_GRAVITY]
     if source not in ([], ["motor"], ["link"]) or len(stated) > len(source) + 1:
-        raise BadInput(f"--effort-is {effort}: expected motor, link, {WITHOUT_GRAVITY}, or motor,{WITHOUT_GRAVITY}")
+        raise BadInput(f"--effort-is {effort_is}: expected motor, link, {WITHOUT_GRAVITY}, or motor,{WITHOUT_GRAVITY}")
     mapped = _pairs("--map", columns)
     return Corrections(
         columns={column: other for column, other in mapped if channel_column(other) is None},

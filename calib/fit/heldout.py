@@ -10,7 +10,7 @@ from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
 from calib.dataset import SweepData
 from calib.fit.gravity_fit import sensor_parameters
-from calib.fit.sweep_readings import SweepReadings, sweep_readings
+from calib.fit.sweep_readings import FEWEST, SweepReadings, sweep_readings
 from calib.records.records import CalibrationRecord, GravityRecord, HeldOut, HeldOutJoint
 from gcomp.arrays import Array
 from gcomp.errors import GcompError
@@ -19,8 +19,6 @@ from gcomp.identify.parameters import Prior
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
-FEWEST = 6
-"""Readings of a joint below which this is not judged: the standard error would be meaningless."""
 REFIT_GAIN_STD = 0.2
 """Prior standard deviation of gains in the refit: without a mass it fixes the scale, which no prediction depends on."""
 

@@ -1,4 +1,4 @@
-"""`--apply`: gates, check motion, write, check motion; for records from sweeps, from slow motion and from earlier."""
+"""Gates, check motion, write, check motion; for records from sweeps, creeps, slow motion and from earlier."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -55,6 +55,32 @@ def apply_record(
     return _write(lambda link: admitted, record, arm, store, beta, how, reason)
 
 
+def apply_creep(
+    record: CalibrationRecord,
+    arm: ArmFile,
+    store: RecordStore,
+    how: Apply,
+    broken: Mapping[str, str],
+    check: Callable[[ArmDriver], str | None] | None,
+) -> None:
+    """Make a record current that was fitted to creep sweeps; the host keeps it. The record is kept in any case.
+
+    With `how.check`, `check` moves the enabled arm and complains if it does not agree with the record; None: no gain to
+    check. `broken` says of joints why the model does not hold there. Raises Refused, BusFault.
+    """
+    _keep(record, arm, store, how)
+    _check_holds(broken, how)
+    admit(record, arm, store, how.replaced)
+    if how.check and check is not None:
+        with open_arm(arm, how.bus) as link:
+            link.start()
+            link.enable()
+            complaint = check(link)
+        if complaint is not None:
+            raise Refused(f"{complaint}; record {record.id} is kept, and not made current")
+    store.activate(record.id, arm, how.by, "creep sweeps")
+
+
 def apply_rollback(
     record: CalibrationRecord, arm: ArmFile, store: RecordStore, how: Apply, reason: str
 ) -> tuple[str, ...]:
@@ -77,13 +103,18 @@ def admit_fitted(
     record: CalibrationRecord, arm: ArmFile, store: RecordStore, how: Apply, broken: Mapping[str, str]
 ) -> Admitted:
     """The gates of a fitted record: the model holds, bounds, change, held-out data; raises Refused."""
-    for joint, why in broken.items():
-        if joint not in how.accepted:
-            raise GateRefused(Refusal.MODEL, joint, why=why.removeprefix(f"{joint}: ").rstrip("."))
+    _check_holds(broken, how)
     admitted = admit(record, arm, store, how.replaced)
     if admitted.before is not None:
         check_held_out(record, admitted.before)
     return admitted
+
+
+def _check_holds(broken: Mapping[str, str], how: Apply) -> None:
+    """Raise GateRefused if the model does not hold on a joint that was not accepted so."""
+    for joint, why in broken.items():
+        if joint not in how.accepted:
+            raise GateRefused(Refusal.MODEL, joint, why=why.removeprefix(f"{joint}: ").rstrip("."))
 
 
 def _keep(record: CalibrationRecord, arm: ArmFile, store: RecordStore, how: Apply) -> None:

@@ -18,9 +18,10 @@ from armlink.loop.driver import ArmDriver
 from armlink.torque_calibration import per_joint
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_motion, sweep_section
-from calib.creep.plan import CreepGround
+from calib.install.check_motion import check_poses
 from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
+from calib.plan.creep_plan import CreepGround
 from calib.plan.poses import nearest_first, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.stalls import OnStall, give_up, repeat_work
@@ -95,11 +96,13 @@ def run_verify(
     *,
     poses: int = 24,
     seed: int = 0,
+    at: Callable[[Array], Array] | None = None,
     progress: Callable[[int, int], None] | None = None,
     on_stall: OnStall = give_up,
 ) -> Verification:
     """Drive, servo-held, to random poses within the joint range and read every torque there.
 
+    `at` chooses other poses (P, n) [rad] by the present one (n,).
     The link must have been enabled. Without a calibration record the controllers' own calibration is used; an arm that
     creeps needs one. A pose whose reading a Stall interrupts is repeated where `on_stall` accepts it. Raises Refused on
     records of another arm, or if no pose can be reached; BadInput, BusFault.
@@ -120,6 +123,8 @@ def run_verify(
         read_at, held_out = _half_sum_at, _creep_poses(CreepGround.of(arm_file), poses, seed, mover.position)
     else:
         read_at, held_out = _rest_at, verify_poses(limits, section, poses, seed, mover.position)
+    if at is not None:
+        held_out = at(mover.position)
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
     for number, pose in enumerate(held_out, start=1):
@@ -142,6 +147,24 @@ def run_verify(
         tolerance = _expected_rms(calibration, model, variance, tolerance, floor * limits.rated)
     std, skipped = np.sqrt(np.maximum(variance, 0.0)), len(held_out) - len(angles)
     return Verification(link.names, q, np.array(torques), model, std, skipped, tolerance)
+
+
+def creep_complaint(
+    link: ArmDriver, arm: ArmFile, gravity: GravityRecord, calibration: CalibrationRecord
+) -> str | None:
+    """A complaint if short creeps about the arm's present pose do not agree with the records, else None.
+
+    The link must have been enabled. Raises Refused, BusFault as `run_verify`.
+    """
+    limits = DriveLimits.of(arm)
+    found = run_verify(link, arm, gravity, calibration, at=lambda begin: check_poses(begin, limits))
+    if found.passed:
+        return None
+    worst = int(np.argmax(found.rms / found.tolerance))
+    return (
+        f"{found.names[worst]}: in the check motion {found.rms[worst]:.3f} N·m RMS against the model, allowed"
+        f" {found.tolerance[worst]:.3f}"
+    )
 
 
 def _expected_rms(calibration: CalibrationRecord, model: Array, variance: Array, fixed: Array, floor: Array) -> Array:

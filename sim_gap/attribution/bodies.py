@@ -12,7 +12,7 @@ from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
-from sim_gap.search.model_selection import golden_section
+from sim_gap.search.model_selection import minimum_between
 from sim_gap.search.term import Term
 
 STARTING_ANGLES = 12
@@ -107,7 +107,7 @@ def _mounted(estimate: EffectEstimate, s: PreparedSignals, layout: ChannelLayout
 
     step = 2.0 * np.pi / STARTING_ANGLES
     start = min((step * k for k in range(STARTING_ANGLES)), key=left)
-    angle = golden_section(left, start - step, start + step)
+    angle = minimum_between(left, start - step, start + step)
     angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
     return left(angle), replace(s, mount=angle)
 

@@ -170,6 +170,6 @@ def _corrected(recording: Recording, finding: RecordingFinding, label: str, arm:
     if value == WITHOUT_GRAVITY:
         return with_gravity(arm, recording, [finding.channel])
     if name == "--effort-is":
-        return parse_corrections(effort=value).apply(recording, label)
+        return parse_corrections(effort_is=value).apply(recording, label)
     made = parse_corrections(**{keys[name]: [value]})  # type: ignore[arg-type]
     return replace(made.apply(recording, label), warning=recording.warning)

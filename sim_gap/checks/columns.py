@@ -147,8 +147,8 @@ def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
 
 def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> list[Hypothesis]:
     """Orders of all joints' columns, of their positions and of their torques that fit best; none of an arm of many
-    joints."""
-    if not 3 < arm.n <= MOST_ORDERED_JOINTS:
+    joints, or where some are not judged."""
+    if not 3 < arm.n <= MOST_ORDERED_JOINTS or not measurements(motion).all():
         return []
     few = motion.rows(slice(None, None, max(1, len(motion.q) // ORDER_ROWS)))
     found = []

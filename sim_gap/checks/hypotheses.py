@@ -11,6 +11,7 @@ from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections
 from gcomp.arrays import Array
 from sim_gap.checks.channel_motion import ChannelMotion
 from sim_gap.checks.finding import Kind
+from sim_gap.checks.sound_arm import measurements
 from sim_gap.model.rigid_body import RigidArm
 
 DEGREE = math.pi / 180.0
@@ -154,8 +155,11 @@ def _delays(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterat
 
 
 def _orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iterator[Hypothesis]:
+    """Exchanged columns; of torques or positions alone only among joints that are all judged, or the readings that
+    count would not be the same before and after."""
     channel, positions = motion.channel, ("q", *follows)
-    for chosen in combinations(range(arm.n), 2):
+    judged = np.flatnonzero(measurements(motion)).tolist()
+    for chosen in combinations(judged, 2):
         order = _cycle(arm.n, chosen)
         whole = put_in_order(arm, order, (channel,), channel)
         for late in (False, True):
@@ -178,7 +182,8 @@ def _orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Ite
     for i, j, k in combinations(range(arm.n), 3):
         cycles += [(i, j, k), (i, k, j)]
     for cycle in cycles:
-        for channels in ((*positions, channel), positions, (channel,)):
+        alone = (positions, (channel,)) if {*cycle} <= {*judged} else ()
+        for channels in ((*positions, channel), *alone):
             yield put_in_order(arm, _cycle(arm.n, cycle), channels, channel)
 
 

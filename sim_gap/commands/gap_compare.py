@@ -1,29 +1,25 @@
 """Compares several models on the same recordings."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armlink.commands.options import Clock, Columns, EffortIs, Header, Joints, Json, Sign, Topic, Units, Zero
+from armlink.commands.options import Json, reads_recordings
 from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip
 
+if TYPE_CHECKING:
+    from armlink.recording.corrections import Corrections
 
+
+@reads_recordings
 def compare(
     sim: Annotated[list[str], typer.Option(help="Model to compare: MJCF, URDF or arm file; two or more.")],
     heldout: Annotated[list[Path], typer.Option(help="Recording that no model was fitted to; may be repeated.")],
-    columns: Columns = None,
-    header: Header = "",
-    joints: Joints = "",
+    stated: "Corrections",
     base: Base = None,
     tip: Tip = None,
     gains: KnownGain = "",
-    units: Units = None,
-    sign: Sign = None,
-    zero: Zero = None,
-    clock: Clock = None,
-    effort_is: EffortIs = "",
-    topic: Topic = "",
     json: Json = None,
 ) -> None:
     """Rank models by the gap that they leave: running free and in windows, joint by joint, with intervals.
@@ -35,14 +31,12 @@ def compare(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
-    from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.compare import compare_models
     from sim_gap.model.known_gains import parse_known_gains
 
     if len(sim) < 2:
         raise BadInput("--sim: give two models or more")
-    stated = parse_corrections(columns, header, sign, units, zero, clock, effort_is, joints, topic)
     with PlainConsole().status("moving the models along the recordings"):
         judged = {name: each for path in heldout for name, each in load_recordings(path, stated.of_reading()).items()}
         found = compare_models(

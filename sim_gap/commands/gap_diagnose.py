@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from armlink.commands.options import Clock, Columns, EffortIs, Header, Joints, Sign, Topic, Units, Zero
+from armlink.commands.options import reads_recordings
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
 
+    from armlink.recording.corrections import Corrections
     from sim_gap.attribution.diagnosis import Diagnosis
 
 
@@ -30,25 +31,18 @@ KnownGain = Annotated[
 ]
 
 
+@reads_recordings
 def diagnose(
     sim: Annotated[str, typer.Option(help="Nominal model: MJCF, URDF or arm file.")],
     train: Annotated[list[Path], typer.Option(help="Recording to fit; may be repeated.")],
+    stated: "Corrections",
     heldout: Annotated[
         list[Path] | None,
         typer.Option(help="Held-out recording to judge on; may be repeated. Default: the end of each --train."),
     ] = None,
-    columns: Columns = None,
-    header: Header = "",
-    joints: Joints = "",
     base: Base = None,
     tip: Tip = None,
     gains: KnownGain = "",
-    units: Units = None,
-    sign: Sign = None,
-    zero: Zero = None,
-    clock: Clock = None,
-    effort_is: EffortIs = "",
-    topic: Topic = "",
     group: Annotated[
         list[str] | None,
         typer.Option(
@@ -114,7 +108,6 @@ def diagnose(
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.errors import BadInput
     from armlink.extras import require_extra
-    from armlink.recording.corrections import parse_corrections
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
     from sim_gap.commands.gap_tables import show
@@ -130,7 +123,6 @@ def diagnose(
         require_extra("--report", "reports")
     if out_samples is not None and out_samples.suffix == ".parquet":
         require_extra("--out-samples", "parquet")
-    stated = parse_corrections(columns, header, sign, units, zero, clock, effort_is, joints, topic)
     reading = stated.of_reading()
     with console.status(f"reading {len(paths)} recordings"):
         fitted = {name: each for path in train for name, each in load_recordings(path, reading).items()}
@@ -197,7 +189,7 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
 
 
 def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
-    from sim_gap.better_model.actuator_entries import write_motor_entries
+    from sim_gap.better_model.training_files import write_motor_entries
     from sim_gap.position_gap.training.training_files import write_actuators
 
     if answer.unit == "rad":
@@ -207,7 +199,7 @@ def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
 
 
 def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
-    from sim_gap.better_model.samples import drawn_parameters, write_rows
+    from sim_gap.better_model.training_files import drawn_parameters, write_rows
     from sim_gap.position_gap.training.training_files import write_samples
 
     target = path or Path("samples.csv")
@@ -224,7 +216,7 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     kind = "URDF" if path.suffix == ".urdf" else "MJCF"
     if answer.unit == "rad":
-        from sim_gap.better_model.effects_module import module_path
+        from sim_gap.better_model.export import module_path
         from sim_gap.position_gap.training.training_files import batch_path, module_model, write_exported
 
         with_actuators = " with its position actuators" if kind == "MJCF" else ""
@@ -237,8 +229,7 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
             console.print(f"with friction that {module_path(path)} applies: {module_model(path)}")
         return
     from sim_gap.attribution.residual_laws import as_effects
-    from sim_gap.better_model.effects_module import module_path
-    from sim_gap.better_model.export import write_model
+    from sim_gap.better_model.export import module_path, write_model
 
     missing = write_model(
         answer.internals.model, answer.internals.estimate, path, as_effects(answer.laws, answer.names)

@@ -2,13 +2,21 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from armlink.commands.options import reads_recordings
+from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip
 
+if TYPE_CHECKING:
+    from armlink.recording.corrections import Corrections
+
+
+@reads_recordings
 def diagnose_fleet(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of cases, or of recordings with --sim.")],
+    stated: "Corrections",
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a dask scheduler; default: workers on this machine.")
     ] = None,
@@ -21,6 +29,9 @@ def diagnose_fleet(
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write all results here; - is standard output.")
     ] = None,
+    base: Base = None,
+    tip: Tip = None,
+    gains: KnownGain = "",
 ) -> int:
     """Run the diagnosis on every case of a fleet; exit status 1 if a case could not be diagnosed.
 
@@ -31,7 +42,7 @@ def diagnose_fleet(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.extras import require_extra
-    from sim_gap.fleet import Answers, cluster, diagnose_fleet, find_cases, open_to_all
+    from sim_gap.fleet import Answers, CaseOptions, cluster, diagnose_fleet, find_cases, open_to_all
     from sim_gap.fleet import table as table_of
     from sim_gap.trends import fleet_outliers, fleet_trends
     from sim_gap.trends import rows as rows_of
@@ -39,19 +50,21 @@ def diagnose_fleet(
     require_extra("diagnose-fleet", "cluster")
     if table is not None:
         require_extra("--table", "parquet")
+    options = CaseOptions(stated, gains, base, tip)
     cases = find_cases(folder, sim)
-    answers = Answers(out or folder / "answers.jsonl")
+    answers = Answers(out or folder / "answers.jsonl", options)
     left = [case for case in cases if case.name not in answers.found]
     console = PlainConsole()
     if len(left) < len(cases):
         console.print(f"{answers.path}: {len(cases) - len(left)} of {len(cases)} cases are done already")
     columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
+    _say_other_options(answers, console)
     if left and open_to_all(scheduler):
         console.print(open_to_all(scheduler), style="yellow")
     if left:
         with cluster(scheduler, min(workers, len(left))) as client, Progress(*columns, console=console) as bars:
             task = bars.add_task("diagnosing", total=len(left))
-            for name, answer in diagnose_fleet(left, client):
+            for name, answer in diagnose_fleet(left, client, options):
                 answers.add(name, answer)
                 bars.advance(task)
     found = {case.name: answers.found[case.name] for case in cases}
@@ -124,15 +137,20 @@ def _write_table(rows: list[dict[str, Any]], path: Path) -> None:
 UNDATED = datetime.min.replace(tzinfo=UTC)
 
 
+@reads_recordings
 def trend(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of recordings, with dates in their names.")],
     sim: Annotated[Path, typer.Option(help="Nominal model: MJCF, URDF or arm file.")],
+    stated: "Corrections",
     out: Annotated[
         Path | None, typer.Option(help="Answers, one JSON line each; recordings already in it are not repeated.")
     ] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write newest answer and changes here; - is standard output.")
     ] = None,
+    base: Base = None,
+    tip: Tip = None,
+    gains: KnownGain = "",
 ) -> int:
     """Diagnose an arm's recordings that are new, and show what changes; exit status 1 if the newest cannot be used.
 
@@ -141,26 +159,40 @@ def trend(
     Example: armlink gap trend recordings/ --sim arm.yaml
     """
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import results
-    from sim_gap.fleet import Answers, diagnose_case, find_cases
+    from armlink.commands.plain_console import PlainConsole, results
+    from sim_gap.fleet import Answers, CaseOptions, diagnose_case, find_cases
     from sim_gap.model.load import load_compiled
-    from sim_gap.trends import date_of, fleet_trends, rows
+    from sim_gap.trends import date_of, fleet_trends, needed_recordings, rows
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
     console = results(json_file)
-    answers = Answers(out or folder / "answers.jsonl")
+    options = CaseOptions(stated, gains, base, tip)
+    answers = Answers(out or folder / "answers.jsonl", options)
+    _say_other_options(answers, PlainConsole())
     newest = ""
     for case in sorted(find_cases(folder, sim), key=lambda case: (date_of(case.name) or UNDATED, case.name)):
         newest = f"{folder.resolve().name}/{case.name}"
         if newest not in answers.found:
-            answers.add(newest, diagnose_case(case))
+            answers.add(newest, diagnose_case(case, options))
         answer = answers.found[newest]
         console.print(f"{case.name}: {answer.get('verdict') or answer['error']}")
     trends = rows(fleet_trends(answers.found))
     show_changes(trends, [], console)
     changes = f"{len(trends)} parameters change" if trends else "no parameter changes"
-    console.print(f"{len(answers.found)} recordings: {changes}")
+    console.print(f"{_count(len(answers.found), 'recording')}: {needed_recordings(answers.found) or changes}")
     newest_answer = answers.found[newest]
     shown = {"case": newest.partition("/")[2], "answer": newest_answer}
     write_json(json_file, {"schema": "armlink.gap-trend/1", "newest": shown, "trends": trends})
     return int("error" in newest_answer)
+
+
+def _say_other_options(answers: Any, console: Any) -> None:
+    if answers.of_other_options:
+        made = "was made" if answers.of_other_options == 1 else "were made"
+        console.print(
+            f"{answers.path}: {_count(answers.of_other_options, 'answer')} {made} with other options: kept, not used"
+        )
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")

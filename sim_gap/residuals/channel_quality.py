@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
+from scipy.signal import detrend
 
 from gcomp.arrays import Array, Mask
 
@@ -24,7 +25,7 @@ def band_noise(t: Array, values: Array, band: float) -> float:
     if len(x) < 64:
         return 0.0
     rate = 1.0 / float(np.median(np.diff(own)))
-    frequency, density = spectrum(x - x.mean(), rate)
+    frequency, density = spectrum(x, rate)
     high = frequency > min(2.0 * band, 0.3 * rate)
     near = (frequency > 1.5 * band) & (frequency < 3.0 * band)
     levels = [float(np.median(density[part])) for part in (high, near) if part.any()]
@@ -32,13 +33,11 @@ def band_noise(t: Array, values: Array, band: float) -> float:
 
 
 def spectrum(x: Array, rate: float) -> tuple[Array, Array]:
-    """Power spectral density (Welch: Hann windows of 512 samples, overlapping by half, each detrended)."""
+    """Frequencies [Hz] and power spectral density (Welch: Hann windows of 512 samples, overlapping by half, each
+    detrended). As `scipy.signal.welch`, which takes the windows one by one and twenty times as long."""
     size = min(len(x), 512)
-    pieces = np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2]
-    line = np.linspace(-1.0, 1.0, size)
-    pieces = pieces - pieces.mean(1, keepdims=True)
-    pieces = pieces - (pieces @ line / (line @ line))[:, None] * line
     window = np.hanning(size)
+    pieces = detrend(np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2], axis=1)
     power = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2
     density = 2.0 * power.mean(0) / (rate * (window @ window))
     return np.asarray(np.fft.rfftfreq(size, 1.0 / rate), float), np.asarray(density)

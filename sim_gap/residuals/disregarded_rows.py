@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import find_peaks, peak_widths
 
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
@@ -18,16 +19,13 @@ AT_REST = 0.05
 """Share of motion in the filter's window below which a joint is at rest; above, and without sliding, it creeps."""
 FEWEST = 25
 """Number of samples from which a regime is judged."""
-ABOVE = 1.5
-"""Multiple of the pass band's end from which lines are looked for."""
-SHARP, ASIDE, BESIDE = 30.0, 3, 20
-"""A line exceeds the median of the bins from ASIDE to BESIDE bins away by this factor."""
-
-HUMP, NEAR, FAR = 8.0, 1.3, 1.8
-"""A resonance exceeds the median on either side, between these multiples of its frequency, by this factor."""
-SMOOTH, FEW_BINS, BROAD = 5, 6, 2.0
-"""Bins over which a spectrum is averaged to look for a resonance; fewest bins on either side to judge it by; multiple
-of a line's power from which it counts before the line."""
+LOWEST_PEAK_HZ = 1.5 * BAND_HZ
+"""Frequency from which peaks are looked for [Hz]."""
+PEAK_HEIGHT = 8.0
+"""Height of a peak of the spectrum over the higher of its two feet. Averages of some twenty spectra over SMOOTHED_BINS
+vary by a tenth, so that noise has no such peaks."""
+SMOOTHED_BINS = 5
+"""Number of bins over which a spectrum is averaged to look for peaks."""
 
 
 def regimes_left_out(data: ResidualSet) -> dict[tuple[Row, str], Mask]:
@@ -121,57 +119,27 @@ def fast_gaps(data: ResidualSet, recordings: Sequence[Recording]) -> list[Locati
 
 
 def _peak(t: Array, values: Array) -> tuple[float, float, float] | None:
-    """Frequency [Hz], RMS and share of the power above the band of the sharpest line there, else of the highest
-    resonance; None without one."""
+    """Frequency [Hz], RMS and share of the power above the band of the strongest line or resonance there, if any."""
     there = np.isfinite(values)
     if there.sum() < 1024:
         return None
     own, x = t[there], values[there]
     step = float(np.median(np.diff(own)))
-    even = np.arange(own[0], own[-1], step)
-    frequency, density = spectrum(np.interp(even, own, x), 1.0 / step)
-    line, hump = _line(frequency, density), _resonance(frequency, density)
-    found = hump if line is None or (hump is not None and hump[1] > BROAD * line[1]) else line
-    if found is None:
-        return None
-    hz, power = found
-    total = float(np.sum(density[frequency > BAND_HZ]) * frequency[1])
-    return hz, float(np.sqrt(max(power, 0.0))), min(power / max(total, 1e-300), 1.0)
-
-
-def _line(frequency: Array, density: Array) -> tuple[float, float] | None:
-    """Frequency and power of the highest bin, if it stands alone."""
-    bins = np.flatnonzero(frequency > ABOVE * BAND_HZ)
-    bins = bins[(bins >= BESIDE) & (bins < len(density) - ASIDE)]
-    if len(bins) < 2 * BESIDE:
-        return None
-    peak = int(bins[np.argmax(density[bins])])
-    around = np.r_[peak - BESIDE : peak - ASIDE, peak + ASIDE + 1 : min(peak + BESIDE + 1, len(density))]
-    level = float(np.median(density[around]))
-    if density[peak] < SHARP * level:
-        return None
-    return float(frequency[peak]), float(np.sum(density[peak - 2 : peak + 3] - level) * frequency[1])
-
-
-def _resonance(frequency: Array, density: Array) -> tuple[float, float] | None:
-    """Frequency and power of the highest hump that falls off on either side, too broad for a line."""
-    smooth = np.convolve(density, np.ones(SMOOTH) / SMOOTH, mode="same")
-    highest = np.r_[False, (smooth[1:-1] >= smooth[:-2]) & (smooth[1:-1] > smooth[2:]), False]
+    frequency, density = spectrum(np.interp(np.arange(own[0], own[-1], step), own, x), 1.0 / step)
+    smooth = np.log(np.convolve(density, np.ones(SMOOTHED_BINS) / SMOOTHED_BINS, mode="same") + 1e-300)
+    peaks, shapes = find_peaks(smooth, prominence=np.log(PEAK_HEIGHT))
+    left, right = peak_widths(smooth, peaks, rel_height=0.9)[2:]
     best: tuple[float, float] | None = None
-    for peak in np.flatnonzero(highest & (frequency > ABOVE * BAND_HZ)).tolist():
-        f = frequency[peak]
-        below = (frequency >= max(f / FAR, BAND_HZ)) & (frequency <= f / NEAR)
-        above = (frequency >= f * NEAR) & (frequency <= f * FAR)
-        if min(below.sum(), above.sum()) < FEW_BINS:
-            continue
-        level = max(float(np.median(density[side])) for side in (below, above))
-        if smooth[peak] < HUMP * level:
-            continue
-        own = (frequency > f / NEAR) & (frequency < f * NEAR)
-        power = float(np.sum(density[own] - level) * frequency[1])
-        if smooth[peak] == smooth[own].max() and (best is None or power > best[1]):
-            best = float(f), power
-    return best
+    for k in np.flatnonzero(frequency[peaks] > LOWEST_PEAK_HZ).tolist():
+        inside = slice(int(np.floor(left[k])), int(np.ceil(right[k])) + 1)
+        foot = float(np.exp(smooth[peaks[k]] - shapes["prominences"][k]))
+        power = float(np.sum(np.maximum(density[inside] - foot, 0.0)) * frequency[1])
+        if best is None or power > best[1]:
+            best = float(frequency[inside][np.argmax(density[inside])]), power
+    if best is None:
+        return None
+    total = float(np.sum(density[frequency > BAND_HZ]) * frequency[1])
+    return best[0], float(np.sqrt(best[1])), min(best[1] / max(total, 1e-300), 1.0)
 
 
 def _known(data: ResidualSet, s: PreparedSignals, row: Row) -> Mask:

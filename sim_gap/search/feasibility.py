@@ -8,6 +8,7 @@ coefficients are fitted to that.
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from scipy.optimize import minimize
 
 from gcomp.arrays import Array
 from sim_gap.effects.link import pseudo_inertia
@@ -16,12 +17,6 @@ from sim_gap.search.estimate_signals import inertial_change
 from sim_gap.search.term import Term
 from sim_gap.search.term_equations import TermEquations
 
-BARRIER_WEIGHTS = (1e-1, 1e-2, 1e-3, 1e-4)
-"""Weights of −log det in turn, in units of the squares that the constraint costs at the start."""
-NEWTON_STEPS = 25
-"""Most Newton steps at each weight."""
-SLOPE_STEP = 1e-6
-"""Step of the differences in a coefficient, as a share of it."""
 LEAST_EIGENVALUE = 1e-6
 """Least eigenvalue of a pseudo-inertia, as a share of its trace."""
 
@@ -85,35 +80,21 @@ def _positive(matrix: Array) -> bool:
 
 
 def _closest(wanted: Array, curvature: Array, matrix: Matrix) -> Array:
-    """The coefficients closest to those wanted for which the matrix is positive, by Newton steps with a barrier."""
-    x = 0.0 * wanted
-    for share in np.linspace(0.95, 0.0, 20):
-        if _positive(matrix(share * wanted)):
-            x = 0.95 * share * wanted
-            break
-    cost = 0.5 * float((x - wanted) @ curvature @ (x - wanted))
+    """The coefficients closest to those wanted, by the increase of the weighted squares, whose matrix is positive."""
+    size = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+    scaled, aim = curvature / size / size[:, None], size * wanted
 
-    def value(at: Array, weight: float) -> float:
-        if not _positive(matrix(at)):
-            return float("inf")
-        barrier = weight * float(np.linalg.slogdet(matrix(at))[1])
-        return 0.5 * float((at - wanted) @ curvature @ (at - wanted)) - barrier
+    def above_least(x: Array) -> Array:
+        now = matrix(x / size)
+        least = 2.0 * LEAST_EIGENVALUE * max(float(np.trace(now)), 0.0)
+        return np.asarray((np.linalg.eigvalsh(now) - least) / np.trace(matrix(0.0 * x)))
 
-    for barrier in BARRIER_WEIGHTS:
-        weight = barrier * max(cost, 1e-12)
-        for _ in range(NEWTON_STEPS):
-            inverse = np.linalg.inv(matrix(x))
-            steps = SLOPE_STEP * np.maximum(np.abs(x), 1e-3)
-            parts = [
-                inverse @ (matrix(x + d) - matrix(x - d)) / (2 * s) for s, d in zip(steps, np.diag(steps), strict=True)
-            ]
-            slope = curvature @ (x - wanted) - weight * np.array([np.trace(part) for part in parts])
-            bend = curvature + weight * np.array([[np.trace(a @ b) for b in parts] for a in parts])
-            move = np.linalg.lstsq(bend, slope, rcond=1e-14)[0]
-            now, length = value(x, weight), 1.0
-            while length > 1e-4 and value(x - length * move, weight) >= now:
-                length *= 0.5
-            if length <= 1e-4:
-                break
-            x = x - length * move
-    return x
+    start = next(share for share in np.linspace(0.95, 0.0, 20) if _positive(matrix(share * wanted)))
+    found = minimize(
+        lambda x: 0.5 * (x - aim) @ scaled @ (x - aim),
+        start * aim,
+        jac=lambda x: scaled @ (x - aim),
+        constraints={"type": "ineq", "fun": above_least},
+        method="SLSQP",
+    )
+    return np.asarray(found.x / size)

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from sim_gap.effects.effect import Key
 from sim_gap.effects.registry import effects
@@ -118,6 +119,8 @@ AGAIN = -0.5 * float(np.log(1.0 - SYSTEMATIC**2))
 row's residual, what no model has can mimic an effect up to the share SYSTEMATIC."""
 SHAPES = 3
 """Number of shapes of an effect at one place that are evaluated about the estimate."""
+SHAPE_ACCURACY = 0.01
+"""Accuracy of a shape, as a share of the distance of its neighbours on the grid."""
 ROUNDS = 3
 """How often the library is searched again about the estimate."""
 
@@ -157,7 +160,7 @@ def first_of_each(terms: Sequence[Term]) -> list[Term]:
 
 
 def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
-    """Move each shape, in its best form, to the best fit between its neighbours on the grid (golden section).
+    """Move each shape, in its best form, to the best fit between its neighbours on the grid.
 
     A shape at which the term cannot exist is left for one at which it can: a limit fits best where too little is cut
     off.
@@ -177,7 +180,7 @@ def refine(store: ColumnStore, active: list[Term]) -> list[Term]:
             return float(0.5 * np.log(squares + equations.linear.floor**2)[equations.seen].sum())
 
         def best(form: Term, low: float, high: float, free: int = free) -> Term:
-            return form.reshaped(free, golden_section(lambda value: fit(form.reshaped(free, value)), low, high))
+            return form.reshaped(free, minimum_between(lambda value: fit(form.reshaped(free, value)), low, high))
 
         size = term.shape[free]
         trials = [term, best(term, low, high), *(best(form, 0.5 * size, 1.5 * size) for form in term.forms)]
@@ -225,18 +228,7 @@ def relinearised_in_place(store: ColumnStore, chosen: list[Term], offered: list[
     return offered
 
 
-def golden_section(function: Callable[[float], float], low: float, high: float, steps: int = 10) -> float:
-    """Minimum of a function between two values by golden-section search."""
-    ratio = 0.5 * (np.sqrt(5.0) - 1.0)
-    a, b = high - ratio * (high - low), low + ratio * (high - low)
-    fa, fb = function(a), function(b)
-    for _ in range(steps):
-        if fa < fb:
-            high, b, fb = b, a, fa
-            a = high - ratio * (high - low)
-            fa = function(a)
-        else:
-            low, a, fa = a, b, fb
-            b = low + ratio * (high - low)
-            fb = function(b)
-    return float(0.5 * (low + high))
+def minimum_between(function: Callable[[float], float], low: float, high: float) -> float:
+    """Where a function is least between two values, to SHAPE_ACCURACY of their distance."""
+    accuracy = SHAPE_ACCURACY * (high - low)
+    return float(minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": accuracy}).x)

@@ -3,9 +3,11 @@
 import json
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import wrong_arms
@@ -14,7 +16,7 @@ from distributed.security import Security
 from typer.testing import CliRunner
 
 from armlink.errors import BadInput
-from armlink.recording.files import save_recording
+from armlink.recording.files import load_recording, save_recording
 from sim_gap.commands.gap import app
 from sim_gap.fleet import Answers, Case, cluster, diagnose_case, diagnose_fleet, find_cases, open_to_all
 
@@ -88,7 +90,27 @@ def test_the_command_gathers_a_table_by_arm_and_effect_and_goes_on_where_it_stop
     assert len(Answers(Path(out)).found) == 3
 
 
-def sleeper(case: Case) -> dict[str, object]:
+def test_recordings_in_degrees_are_followed_with_the_options_of_a_diagnosis(fleet: Path, tmp_path: Path) -> None:
+    recording = load_recording(fleet / "arm_a" / "run_0" / "train.parquet")
+    save_recording(
+        replace(recording, position=np.degrees(recording.position), velocity=None), tmp_path / "2026-10-02.parquet"
+    )
+    command = ["trend", str(tmp_path), "--sim", str(fleet / "arm_a" / "run_0" / "sim.xml"), "--json", "-"]
+    units = ["--units", "q=deg"]
+    first = CliRunner().invoke(app, [*command, *units], standalone_mode=False)
+    assert json.loads(first.stdout)["newest"]["answer"]["causes"][0]["effect"] == "friction.coulomb"
+    assert "1 recording: a change can be found once there are 13" in " ".join(first.stderr.split())
+    (line,) = (tmp_path / "answers.jsonl").read_text(encoding="utf-8").splitlines()
+    assert set(json.loads(line)["options"]["units"]) == {"q"}
+    (tmp_path / "2026-10-02.parquet").write_bytes(b"")  # it is diagnosed, and need not be read again
+    again = CliRunner().invoke(app, [*command, *units], standalone_mode=False)
+    assert again.stdout == first.stdout
+    other = CliRunner().invoke(app, command, standalone_mode=False)
+    assert "1 answer was made with other options" in " ".join(other.stderr.split())
+    assert "error" in json.loads(other.stdout)["newest"]["answer"]
+
+
+def sleeper(case: Case, _options: object) -> dict[str, object]:
     """Dies with its worker the first time, recorded by a file."""
     if not case.sim.exists():
         case.sim.touch()

@@ -6,9 +6,8 @@ import pytest
 from sweep_arms import random_arm
 from synthetic_sweeps import passes
 
-from calib.field import field_fit
-from calib.field.field_fit import held_out_rows
-from calib.fit import heldout
+from calib.fit import field_fit, heldout
+from calib.fit.field_fit import held_out_rows
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.heldout import held_out_steps
 from calib.fit.sensor_fit import fit_sensors

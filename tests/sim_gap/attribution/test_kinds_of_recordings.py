@@ -59,7 +59,7 @@ def test_efforts_without_gravity_are_known_as_such(seed: int) -> None:
     answer = diagnose(model(), parts[:1], parts[1:])
     assert values(answer, "friction.coulomb", "torque") == pytest.approx(coulomb, rel=0.1, abs=0.05)
     assert values(answer, "friction.viscous", "damping") == pytest.approx(viscous, rel=0.15, abs=0.35)
-    stated = parse_corrections(effort="motor,without-gravity")
+    stated = parse_corrections(effort_is="motor,without-gravity")
     again, found = check_recording(arm, parts[0], "r", stated)
     assert found == []
     np.testing.assert_allclose(again.motor_torque, whole[0].motor_torque, atol=1e-9)

@@ -13,8 +13,7 @@ from armlink import cli
 from armlink.errors import BadInput
 from armlink.recording.files import save_recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.better_model.actuator_entries import write_motor_entries
-from sim_gap.better_model.samples import drawn_parameters
+from sim_gap.better_model.training_files import drawn_parameters, write_motor_entries
 
 TRUE = np.array([0.6, 0.4, 0.02])
 

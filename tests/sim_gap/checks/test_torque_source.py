@@ -32,11 +32,11 @@ def test_one_reading_in_both_torque_channels_is_the_motors():
     (finding,) = find_same(recording, AS_IT_IS)
     assert finding.corrected
     assert finding.option == "--effort-is motor"
-    corrected = parse_corrections(effort="motor").apply(recording, "run.csv")
+    corrected = parse_corrections(effort_is="motor").apply(recording, "run.csv")
     assert corrected.torque is None
     np.testing.assert_array_equal(corrected.motor_torque, recording.motor_torque)
     assert not find_same(replace(recording, torque=recording.torque + 1e-6), AS_IT_IS)
-    assert not find_same(recording, parse_corrections(effort="link"))
+    assert not find_same(recording, parse_corrections(effort_is="link"))
 
 
 def test_a_command_that_is_the_law_of_gains_at_the_rows_readings_is_found():

@@ -11,7 +11,7 @@ from servo_arm import model_text, record, search_on, written
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.position_notes import _ranges
-from sim_gap.better_model.effects_module import module_text
+from sim_gap.better_model.export import module_text
 from sim_gap.model.load import SimModel, load_model
 from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import LoopFit

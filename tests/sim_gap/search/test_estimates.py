@@ -17,7 +17,7 @@ from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.estimate_signals import signals_about
 from sim_gap.search.feasibility import _closest, _shapes
-from sim_gap.search.model_selection import golden_section, relinearised_in_place, select_model
+from sim_gap.search.model_selection import relinearised_in_place, select_model
 from sim_gap.search.term import Term
 
 PAYLOAD, SPRING = Term("link.payload", 0), Term("transmission.spring", 1)
@@ -182,11 +182,6 @@ def test_nonlinear_effects_are_offered_at_the_size_that_they_have_in_place_of_a_
     monkeypatch.setattr(model_selection, "TermChoice", choice)
     assert [term.times for term in relinearised_in_place(None, [chosen], [bent])] == [2]
     assert relinearised_in_place(None, [], [bent]) == [bent]
-
-
-def test_golden_sections_end_at_the_minimum() -> None:
-    assert golden_section(lambda x: (x - 0.3) ** 2, -1.0, 2.0, 40) == pytest.approx(0.3, abs=1e-6)
-    assert golden_section(lambda x: (x - 0.3) ** 2, -1.0, 2.0) == pytest.approx(0.3, abs=0.03)
 
 
 @pytest.mark.parametrize(("score", "kept"), [(1.0, "several"), (3.0, "first")])
