@@ -35,8 +35,9 @@ from armlink.bus.port import Port
 from armlink.bus.sockets.socket_port import SocketPort
 from armlink.link.link import Link
 from armlink.link.types import Setpoints
-from armlink.loop import process, remote_link
+from armlink.loop import cycle_process, process
 from armlink.loop.realtime import SIMULATED, prepare
+from armlink.loop.remote_link import RemoteLink
 
 SWAY, TURN = 0.05, 4.0
 """Motion of every joint [rad] and time for it and back [s]."""
@@ -149,8 +150,8 @@ def on_pair(pair: int) -> None:
         own = [sys.executable, __file__, "--keep-cycle", command[-1], str(pair)]
         return subprocess.Popen(own, pass_fds=[*pass_fds, pair], **other)
 
-    names = {"Popen": started, "DEVNULL": subprocess.DEVNULL, "TimeoutExpired": subprocess.TimeoutExpired}
-    remote_link.subprocess = SimpleNamespace(**names)  # type: ignore[assignment]
+    names = {"Popen": started, "DEVNULL": subprocess.DEVNULL}
+    cycle_process.subprocess = SimpleNamespace(**names)  # type: ignore[assignment]
 
 
 def processor_time(pid: int) -> float:
@@ -167,7 +168,7 @@ def wakes(pid: int) -> int:
 
 def measure(arm: ArmFile, bus: str, seconds: float, core: int | None) -> dict[str, Any]:
     """The figures of one run, the loop on this core if one is given."""
-    with remote_link.RemoteLink(arm, bus or None) as link:
+    with RemoteLink(arm, bus or None) as link:
         if core is not None:
             os.sched_setaffinity(link.pid, {core})
         link.start()

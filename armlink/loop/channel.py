@@ -26,7 +26,7 @@ class Channel:
     def __init__(self, end: socket.socket, most: int = MOST_SAMPLES) -> None:
         """Take over a connected stream socket; at most `most` samples wait for the other end."""
         end.setblocking(False)
-        self._socket, self._most = end, most
+        self._socket, self.most = end, most
         self._received = bytearray()
         self._waiting: deque[tuple[bool, bytes]] = deque()
         self._sent = 0
@@ -43,7 +43,7 @@ class Channel:
         content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
         self._waiting.append((sample, _HEADER.pack(len(content)) + content))
         self._samples += sample
-        if self._samples > self._most:
+        if self._samples > self.most:
             self._drop_oldest()
 
     def _drop_oldest(self) -> None:

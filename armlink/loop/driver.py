@@ -12,7 +12,23 @@ R = TypeVar("R")
 P = ParamSpec("P")
 
 
-class ArmDriver(Protocol):
+class Controllers(Protocol):
+    """Access to the calibration of every joint, in its controller or in the host."""
+
+    def read_calibration(self, joint: int) -> Calibration:
+        """The torque sensor record that joint 0 … n−1 works with; raises BusFault."""
+
+    def drive_serial(self, joint: int) -> DriveSerial:
+        """Serial number of the drive of joint 0 … n−1; raises BusFault."""
+
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
+        """Stage, read back and make active in joint 0 … n−1 (`store`: in flash too); returns what is active.
+
+        Raises BadInput, BusFault.
+        """
+
+
+class ArmDriver(Controllers, Protocol):
     """Drives the joints of one arm.
 
     Implemented by `armlink.link.link.Link`, which makes each cycle when it is asked for the next sample, and by
@@ -90,18 +106,9 @@ class ArmDriver(Protocol):
         function's call of it raises.
         """
 
-    def read_calibration(self, joint: int) -> Calibration:
-        """The torque sensor record that joint 0 … n−1 works with; raises BusFault."""
-
-    def drive_serial(self, joint: int) -> DriveSerial:
-        """Serial number of the drive of joint 0 … n−1; raises BusFault."""
-
     @property
     def uncalibrated(self) -> tuple[str, ...]:
         """Joints whose calibration the host is to keep and that have no record in force."""
 
     def read_temperatures(self) -> Array:
         """Temperatures of the drives (n,) [°C]; NaN for a drive that does not report one. Raises BusFault."""
-
-    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
-        """Make a calibration active in joint 0 … n−1 (`store`: in flash too); raises BadInput, BusFault."""

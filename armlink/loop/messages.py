@@ -1,16 +1,26 @@
 """Messages between a job and the process that makes the cycles."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
+from armlink.drives.board import DriveEvent
 from armlink.errors import ArmlinkError
 from armlink.link.ends import EndCause
-from armlink.link.types import Sample, Setpoints
+from armlink.link.types import Calibration, Sample, Setpoints, Stats
+
+BATCH_SECONDS = 0.1
+"""Time between two batches of samples of a kept arm [s]: the stream's 10 Hz (docs/daemon-api.md)."""
+READINGS, COMMANDS = ("position", "velocity", "torque", "motor_torque"), ("torque_command", "position_command")
+CHANNELS = (*READINGS, *COMMANDS)
+"""Channels of a batch."""
+ROWS = (*READINGS, "status", "age", "timely", *COMMANDS)
+"""Values (n,) of a packed sample, in their order, after its time, delay and lateness."""
 
 
 @dataclass(frozen=True)
@@ -19,6 +29,12 @@ class Open:
 
     arm: ArmFile
     bus: str | None
+    kept: bool = False
+    """Opened again after each fault (`armlink.loop.kept_arm`); else once."""
+    listen_only: bool = False
+    """Another controller commands the arm; only where it is kept."""
+    log: Callable[[], None] | None = None
+    """Called first, to have logs written as the job writes its own."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +125,7 @@ def pack(sample: Sample, torque_sent: Array, position_sent: Array) -> bytes:
 def unpack(content: bytes) -> tuple[Sample, Array, Array]:
     """The sample, target torque (n,) [N·m] and target position (n,) [rad] of a cycle."""
     values = np.frombuffer(content).copy()
-    rows = values[3:].reshape(9, -1)
+    rows = values[3:].reshape(len(ROWS), -1)
     timely = rows[6] > 0
     sample = Sample(
         t=float(values[0]),
@@ -124,3 +140,77 @@ def unpack(content: bytes) -> tuple[Sample, Array, Array]:
         late=float(values[2]),
     )
     return sample, rows[7], rows[8]
+
+
+# ---- of a kept arm
+
+
+@dataclass(frozen=True)
+class Health:
+    """How bus and drives are, after the samples of a tenth of a second."""
+
+    stats: Stats
+    emergencies: tuple[DriveEvent, ...] = ()
+    """Events that drives told of themselves while only listening."""
+    temperature: Array | None = None
+    """Of the drives (n,) [°C]; NaN for one that does not tell it."""
+
+    @classmethod
+    def of(cls, stats: Stats, emergencies: tuple[DriveEvent, ...], temperature: Array) -> "Health":
+        """Of counters that go on."""
+        return cls(replace(stats), emergencies, temperature)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The samples of a tenth of a second."""
+
+    t: Array
+    """(K,) by the loop's monotonic clock [s]."""
+    channels: dict[str, Array]
+    """Name of CHANNELS → (K, n), SI units, NaN if missing."""
+    status: NDArray[np.int64]
+    """Newest state codes (n,)."""
+    age: Array
+    """Time since position and torque last arrived (n,) [s]."""
+    stats: Stats
+    emergencies: tuple[DriveEvent, ...] = ()
+    """See Health."""
+    temperature: Array | None = None
+
+    @classmethod
+    def of(cls, packed: Sequence[bytes], begun: float, health: Health) -> "Batch":
+        """From K > 0 packed samples, whose times count from `begun` [s]."""
+        values = np.frombuffer(b"".join(packed)).reshape(len(packed), -1)
+        rows = dict(zip(ROWS, values[:, 3:].reshape(len(packed), len(ROWS), -1).transpose(1, 0, 2), strict=True))
+        channels = {name: rows[name].copy() for name in CHANNELS}
+        status, age = rows["status"][-1].astype(np.int64), rows["age"][-1].copy()
+        told = health.stats, health.emergencies, health.temperature
+        return cls(values[:, 0] + begun, channels, status, age, *told)
+
+
+@dataclass(frozen=True)
+class Up:
+    """The bus is open and the joints answer."""
+
+    held: tuple[Calibration, ...] | None
+    """In each controller; None if the loop only listens."""
+    uncalibrated: tuple[str, ...] = ()
+    """Joints whose calibration the host is to keep and that have no record in force."""
+    begun: float = 0.0
+    """When the samples' times begin, by the loop's monotonic clock [s]."""
+
+
+@dataclass(frozen=True)
+class Down:
+    """The bus or a joint is missing or has failed; the loop retries on its own."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Of a controller that has an end and tells how far it is (`progress`)."""
+
+    done: int
+    total: int

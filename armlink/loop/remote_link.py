@@ -3,8 +3,6 @@
 import contextlib
 import itertools
 import pickle
-import socket
-import subprocess
 import sys
 import time
 from collections import deque
@@ -15,13 +13,14 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from armlink.drives.orders import DriveIdentity
 from armlink.errors import BusFault
 from armlink.link.ends import EndCause, cause_of
 from armlink.link.park import park
-from armlink.link.types import Calibration, Command, Controller, DriveSerial, Sample, Samples, Setpoints, Stats, Tell
-from armlink.loop.channel import Channel, Closed
-from armlink.loop.ending import TOLD_EVERY, see_out
+from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
+from armlink.loop.channel import Closed
+from armlink.loop.cycle_process import CycleProcess, RemoteControllers, remote
+from armlink.loop.driver import ArmDriver
+from armlink.loop.ending import TOLD_EVERY
 from armlink.loop.messages import Alive, Call, Cut, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
 from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, said
@@ -34,7 +33,7 @@ SAMPLE = 5.0
 """Longest wait for a sample of an enabled arm [s]."""
 
 
-class RemoteLink:
+class RemoteLink(CycleProcess, RemoteControllers):
     """An `ArmDriver`; context manager like `Link`. Not for several threads."""
 
     def __init__(self, arm: ArmFile, bus: str | None = None) -> None:
@@ -52,15 +51,8 @@ class RemoteLink:
         self._step = np.full(self.n, np.inf)
         self._told = self._heard = time.monotonic()
         self._tell_on: Tell = lambda text: None
-        ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "armlink.loop.process", str(theirs.fileno())]
-        self._process = subprocess.Popen(
-            command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
-        )
-        theirs.close()
-        self._channel = Channel(ours)
+        super().__init__(Open(arm, bus))
         try:
-            self._put(Open(arm, bus))
             self.realtime: Realtime = self._answer(0)
             """Real-time permissions of the process that makes the cycles."""
         except BaseException:
@@ -73,15 +65,6 @@ class RemoteLink:
     def __exit__(self, kind: object, error: object, tb: object) -> None:
         """As Link: the process brings the arm to its end, whatever the error, and closes the bus."""
         self._end(cause_of(error if isinstance(error, BaseException) else None))
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
-
-    @property
-    def exit_status(self) -> int | None:
-        """How the loop's process ended; None while it runs."""
-        return self._process.poll()
 
     @property
     def position_step(self) -> Array:
@@ -104,10 +87,15 @@ class RemoteLink:
         found: Stats = self._call("stats")
         return found
 
-    def scan(self) -> list[DriveIdentity]:
-        """Identity and state of each joint's controller."""
-        found: list[DriveIdentity] = self._call("scan")
+    @property
+    def uncalibrated(self) -> tuple[str, ...]:
+        found: tuple[str, ...] = self._call("uncalibrated")
         return found
+
+    scan = remote(ArmDriver.scan)
+    disable = remote(ArmDriver.disable)
+    stop = remote(ArmDriver.stop)
+    read_temperatures = remote(ArmDriver.read_temperatures)
 
     def start(self) -> None:
         self._call("start")
@@ -129,33 +117,6 @@ class RemoteLink:
 
     def park(self) -> None:
         self.inside(park, lambda text: None)
-
-    def disable(self) -> None:
-        self._call("disable")
-
-    def stop(self) -> None:
-        self._call("stop")
-
-    def read_calibration(self, joint: int) -> Calibration:
-        found: Calibration = self._call("read_calibration", joint)
-        return found
-
-    @property
-    def uncalibrated(self) -> tuple[str, ...]:
-        found: tuple[str, ...] = self._call("uncalibrated")
-        return found
-
-    def read_temperatures(self) -> Array:
-        found: Array = self._call("read_temperatures")
-        return found
-
-    def drive_serial(self, joint: int) -> DriveSerial:
-        found: DriveSerial = self._call("drive_serial", joint)
-        return found
-
-    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
-        found: Calibration = self._call("write_calibration", joint, calibration, store)
-        return found
 
     def inside(self, function: Callable[..., Any], tell: Tell, *args: Any, **kw: Any) -> Any:
         """Call `function(link, tell, ...)` in the process that makes the cycles."""
@@ -283,17 +244,12 @@ class RemoteLink:
         return answer.value
 
     def _gone(self) -> BusFault:
-        status = self._process.poll()
-        return BusFault(
-            f"the process that drives the arm has ended (status {status}): the joints stop by their own deadline"
-        )
+        ended = f"the process that drives the arm has ended (status {self.exit_status})"
+        return BusFault(f"{ended}: the joints stop by their own deadline")
 
     def _end(self, cause: EndCause) -> None:
         with Presses() as presses:
-            tell = said(self.arm.name, presses)
-            if not see_out(self._channel, lambda: self._process.poll() is None, cause, tell):
-                self._process.kill()
-            self._process.wait()
+            self.end(cause, said(self.arm.name, presses))
 
 
 def _copy(command: Command) -> Command:

@@ -41,6 +41,9 @@ def calibrate(
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
     from dataclasses import replace
+    from functools import partial
+
+    import numpy as np
 
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
@@ -52,10 +55,13 @@ def calibrate(
     from calib.commands.options import load_sweeps
     from calib.dataset import all_creep, drives_of
     from calib.fit.felt_mass import felt_mass
+    from calib.fit.heldout import held_out_steps
     from calib.fit.sensor_fit import SensorFit
-    from calib.install.apply import Apply, apply_calibration, apply_creep
-    from calib.records.records import CalibrationRecord
+    from calib.install.apply import Apply, apply_creep, apply_record
+    from calib.install.plausibility import replaced_record
+    from calib.records.records import CalibrationRecord, GravityRecord, HeldOut
     from calib.records.store import RecordStore
+    from calib.sweep.verify import creep_complaint
 
     if report is not None:
         require_extra("--report", "reports")
@@ -78,6 +84,11 @@ def calibrate(
     user = getpass.getuser()
     if apply:
         record = record.model_copy(update={"confirmed_by": user})
+        before = replaced_record(record, arm_file, records) if isinstance(fit, SensorFit) else None
+        if before is not None:
+            gravity = records.current(GravityRecord, arm_file)
+            proof = HeldOut(against=before.id) if replaced else held_out_steps(record, before, arm_file, data, gravity)
+            record = record.model_copy(update={"held_out": proof})
     if report is not None:
         from calib.report.calibration import Calibrated, write_report
 
@@ -91,12 +102,18 @@ def calibrate(
         with early_end(arm_file, again) as work:
             work.enabled = apply and check
             by = user if apply else "armlink calibrate"
-            apply_creep(record, arm_file, records, fit, replace(how, by=by, check=work.enabled))
+            agrees = None
+            if work.enabled and fit.found_gain.any():
+                gravity = fit.gravity.record(arm_file, record)
+                agrees = partial(creep_complaint, arm=arm_file, gravity=gravity, calibration=record)
+            how = replace(how, by=by, check=work.enabled)
+            apply_creep(record, arm_file, records, how, fit.broken, agrees)
         kept = "it corrects readings and commands when the arm is opened next"
     elif apply:
         with early_end(arm_file, again) as work:
             work.enabled = check
-            written = apply_calibration(record, arm_file, records, data, fit, how)
+            beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
+            written = apply_record(record, arm_file, records, how, beta, "sweeps", fit.broken)
         kept = f"written to {len(written)} controllers and read back"
     else:
         records.put(record, arm_file, by="armlink calibrate", reason="sweeps")

@@ -56,8 +56,7 @@ def daemon(
     from armlink.errors import BadInput
     from armlink.extras import require_extra
     from calib.daemon.logs import log_to_stderr
-    from calib.daemon.loop.loop_process import LoopProcess
-    from calib.daemon.options import Options, state_directory
+    from calib.daemon.settings import Options, state_directory
     from calib.records.file_lock import locked_directory
 
     require_extra("daemon", "daemon")  # they are imported later
@@ -82,11 +81,11 @@ def daemon(
         work=work,
     )
     log_to_stderr()
-    with locked_directory(directory, f"--state {directory}", patience=TAKE_OVER_SECONDS):
-        host = LoopProcess(options.loop(described), fork=True)
-        from calib.daemon.main_loop import run_daemon  # takes long to load: the bus process opens the bus meanwhile
+    with locked_directory(directory, f"--state {directory}", patience=TAKE_OVER_SECONDS) as lock:
+        kept = options.keep(described, lock)  # which holds the lock until it has left the joints safe
+        from calib.daemon.main_loop import run_daemon  # takes long to load: the bus is opened meanwhile
 
-        run_daemon(options, described, directory, host)
+        run_daemon(options, described, directory, kept)
     return 0
 
 

@@ -62,14 +62,19 @@ def recalibrate(
     if apply:
         import numpy as np
 
-        from calib.install.apply import Apply, apply_field
+        from calib.fit.field_fit import held_out_rows
+        from calib.install.apply import Apply, apply_record
+        from calib.install.plausibility import replaced_record
 
         user = getpass.getuser()
         record = record.model_copy(update={"confirmed_by": user})
+        replaces = replaced_record(record, arm_file, records)
+        if replaces is not None:
+            record = record.model_copy(update={"held_out": held_out_rows(record, rows, fit, replaces)})
         how = Apply(by=user, bus=bus, replaced=tuple(replaced or ()), check=check, flash=flash)
         with early_end(arm_file, apply_it) as work:
             work.enabled = check
-            written = apply_field(record, arm_file, records, rows, fit, np.array(gravity.beta), how)
+            written = apply_record(record, arm_file, records, how, np.array(gravity.beta), "slow motion")
         out.print(f"record {record.id} is current, written to {len(written)} controllers and read back")
     else:
         records.add(record)

@@ -14,22 +14,19 @@ from pathlib import Path
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import ArmlinkError, BadInput
 from armlink.link.ends import EndCause
-from armlink.link.types import Tell
-from armlink.loop.messages import LoopAnswer, Told
+from armlink.link.types import Controller, Tell
+from armlink.loop.kept_arm import KeptArm, KeptControllers
+from armlink.loop.messages import BATCH_SECONDS, Down, LoopAnswer, Told
+from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, said
-from calib.daemon.environment import Environment
+from calib.daemon.environment import Environment, Worker
 from calib.daemon.logs import log_in_thread
-from calib.daemon.loop.loop_messages import Down, Started
-from calib.daemon.loop.loop_process import LoopControllers, LoopProcess
 from calib.daemon.notify import Notifier, watchdog_seconds
-from calib.daemon.options import Options
 from calib.daemon.service import CLOSING_SECONDS, Service
 from calib.daemon.service_view import ServiceView
-from calib.daemon.settings import DaemonSection
-from calib.daemon.state.worker import Worker
+from calib.daemon.settings import DaemonSection, Options
 from calib.records.store import RecordStore
 
-SNAPSHOT_SECONDS = 0.1
 SILENT_SECONDS = 15.0
 """A bus process that sends nothing for this time hangs: it is killed and started again [s]."""
 PAUSE_SECONDS = 2.0
@@ -49,7 +46,7 @@ log = logging.getLogger("armlink.daemon")
 class Daemon:
     """Connects the service to process, clock, signals and web server."""
 
-    def __init__(self, options: Options, arm: ArmFile, process: LoopProcess, state: Path) -> None:
+    def __init__(self, options: Options, arm: ArmFile, process: KeptArm, state: Path) -> None:
         self.options, self.arm, self.process = options, arm, process
         self._loop = asyncio.get_running_loop()
         self._ended = asyncio.Event()
@@ -137,7 +134,7 @@ class Daemon:
         while True:
             now = time.monotonic()
             self._turn(now, stood_still=now - due)
-            due = max(due + SNAPSHOT_SECONDS, now)
+            due = max(due + BATCH_SECONDS, now)
             await asyncio.sleep(due - now)
 
     def _turn(self, now: float, stood_still: float) -> None:
@@ -177,12 +174,14 @@ class Daemon:
         if messages:
             self._heard = max(self._heard, time.monotonic())
         for message in messages:
-            if isinstance(message, Started):
-                log.info(f"bus process: {message.realtime}")
-            if isinstance(message, Told):
-                self._notify(f"STATUS={message.text}")
-                continue
-            self.service.take(message)
+            match message:
+                case Told(text=text):
+                    if text:
+                        self._notify(f"STATUS={text}")
+                case LoopAnswer(value=Realtime() as permitted):
+                    log.info(f"bus process: {permitted}")
+                case _:
+                    self.service.take(message)
 
     def _restart(self, why: str) -> None:
         """Replace the bus process; it brings the arm to its end first, if it can."""
@@ -201,7 +200,7 @@ class Daemon:
         if self._ended.is_set():
             return
         try:
-            self.process = LoopProcess(self.options.loop(self.arm))
+            self.process = self.options.keep(self.arm)
         except OSError as error:
             log.error(f"no bus process: {error}")
             self._heard = time.monotonic() - SILENT_SECONDS + AGAIN_SECONDS
@@ -247,15 +246,15 @@ class Daemon:
 class _CurrentProcess:
     """The service's `Port`: whichever bus process is the present one."""
 
-    def __init__(self, process: Callable[[], LoopProcess]) -> None:
-        self.controllers = LoopControllers(lambda call: process().ask(call))
+    def __init__(self, process: Callable[[], KeptArm]) -> None:
+        self.controllers = KeptControllers(lambda call: process().ask(call))
         self._process = process
 
-    def sweep(self, poses: int, seed: int, /) -> LoopAnswer | None:
-        return self._process().sweep(poses, seed)
+    def move(self, controller: Controller, /) -> None:
+        self._process().move(controller)
 
 
-def run_daemon(options: Options, arm: ArmFile, state: Path, process: LoopProcess) -> None:
+def run_daemon(options: Options, arm: ArmFile, state: Path, process: KeptArm) -> None:
     """Run until a signal to stop, with a bus process already started; it has ended when this returns."""
 
     sys.setswitchinterval(SWITCH_SECONDS)

@@ -19,9 +19,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 from armlink.arm_file import ArmFile
-from armlink.loop.messages import LoopAnswer
+from armlink.loop.kept_arm import KeptMessage
+from armlink.loop.messages import Batch, Down, Progress, Stopped, Up
 from calib.daemon.environment import BusJobs, Environment
-from calib.daemon.loop.loop_messages import Batch, Down, Message, Progress, Up
 from calib.daemon.observation.active_records import ActiveRecords
 from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.observation.observation import ActiveObservation, ObserverFeed, ObserverStorage
@@ -29,13 +29,10 @@ from calib.daemon.observation.pose_tours import PoseTours
 from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow
 from calib.daemon.settings import Configuration, DaemonSection
 from calib.daemon.state.arm_state import ArmState
-from calib.daemon.state.busiest_minute import BusiestMinute
-from calib.daemon.state.event_log import EventLog
+from calib.daemon.state.events import EventLog, Hub
 from calib.daemon.state.journal import Journal
-from calib.daemon.state.live_window import LiveWindow
-from calib.daemon.state.recordings import Recordings
-from calib.daemon.view.api_models import State
-from calib.daemon.view.fan_out import Hub
+from calib.daemon.state.samples import BusiestMinute, LiveWindow, Recordings
+from calib.daemon.view import State
 from calib.observer.decision import DriftFinding
 from calib.observer.recalibrator import Recalibrator
 from calib.records.records import CalibrationRecord, GravityRecord
@@ -110,7 +107,7 @@ class Service:
         """Fault of the service itself, the arm apart: of its journal or its record store; empty if there is none."""
         return self.journal.trouble or self.records.store_fault
 
-    def take(self, message: Message) -> None:
+    def take(self, message: KeptMessage) -> None:
         """Route one message of the bus loop."""
         if isinstance(message, Batch):
             self.arm_state.heard(message)
@@ -118,18 +115,20 @@ class Service:
             self.recordings.append(message)
             if self.configuration.settings.diagnosis.enabled:
                 self.busiest.append(message)
+            self.tours.heard(message)
             if self.records.observation is not None:
                 self.records.observation.handle(message)
         elif isinstance(message, Up):
             self.arm_state.up()
             self.arm_state.uncalibrated = message.uncalibrated
+            self.tours.up()
             self.records.held(message.held)
         elif isinstance(message, Down):
             self.tours.stopped()
             self.arm_state.down(message.reason)
         elif isinstance(message, Progress):
             self.tours.advanced(message)
-        elif isinstance(message, LoopAnswer) and message.error is not None:
+        elif isinstance(message, Stopped):
             self.tours.refused(str(message.error))
 
     def tick(self) -> None:

@@ -1,4 +1,4 @@
-"""The service as the web layer sees it: implements `calib.daemon.view.view.DaemonView`."""
+"""The service as the web layer sees it: implements `calib.daemon.view.DaemonView`."""
 
 import math
 from collections.abc import Iterator
@@ -12,13 +12,12 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
 from calib.arm.skeleton import skeleton
+from calib.daemon import view
 from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.service import Service
-from calib.daemon.state.history_reader import HistoryReader
-from calib.daemon.view import api_models
-from calib.daemon.view.api_models import DrawnArm, DrawnJoint
-from calib.daemon.view.fan_out import Client
-from calib.daemon.view.view import Decisions, NoSuch, Window
+from calib.daemon.state.events import Client
+from calib.daemon.state.journal_rows import HistoryReader
+from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
 from gcomp.arrays import Array
 
 
@@ -28,17 +27,17 @@ class ServiceView:
     def __init__(self, service: Service) -> None:
         self._service, self._version = service, version("armlink")
         self._history = HistoryReader(service.journal.path)
-        self._arm: api_models.DrawnArm | None = None
+        self._arm: view.DrawnArm | None = None
         self.decisions: Decisions = service.recalibrations
 
     @property
     def _observation(self) -> ActiveObservation | None:
         return self._service.records.observation
 
-    def status(self) -> api_models.Status:
+    def status(self) -> view.Status:
         service, observation = self._service, self._observation
         arm_state, configuration, now = service.arm_state, service.configuration, service.environment.monotonic()
-        return api_models.Status(
+        return view.Status(
             state=service.state,
             detail=service.trouble or arm_state.fault or service.records.detail or arm_state.silent,
             arm=configuration.arm.name,
@@ -50,7 +49,7 @@ class ServiceView:
             t=now,
             uptime_s=now - service.started,
             bus=self._bus(),
-            records=api_models.RecordsInForce(
+            records=view.RecordsInForce(
                 calibration=None if observation is None else observation.feed.calibration.id,
                 gravity=None if observation is None else observation.feed.gravity.id,
             ),
@@ -64,7 +63,7 @@ class ServiceView:
             report=service.report,
         )
 
-    def joints(self) -> tuple[api_models.JointNow, ...]:
+    def joints(self) -> tuple[view.JointNow, ...]:
         names, arm_state = self._service.configuration.names, self._service.arm_state
         batch = arm_state.batch
         if batch is None:
@@ -93,7 +92,7 @@ class ServiceView:
             channels=channels | {"torque": torque, "model_torque": model},
         )
 
-    def arm(self) -> api_models.DrawnArm:
+    def arm(self) -> view.DrawnArm:
         """The arm's shape; read from its model on the first call. Raises NoSuch."""
         if self._arm is None:
             try:
@@ -112,14 +111,14 @@ class ServiceView:
                 model[known] = self._observation.feed.observer.model_torque(position[known])
         return torque, model
 
-    def estimates(self) -> tuple[api_models.JointEstimate, ...]:
+    def estimates(self) -> tuple[view.JointEstimate, ...]:
         if self._observation is None:
             return ()
         feed, last_accepted = self._observation.feed, self._observation.last_accepted
         estimate, limits = feed.observer.estimate(), feed.observer.limits()
         gain, offset = (feed.calibration.values(name) for name in ("gain", "offset"))
         return tuple(
-            api_models.JointEstimate(
+            view.JointEstimate(
                 joint=name,
                 gain=estimate.gain[j],
                 gain_std=estimate.gain_std[j],
@@ -136,17 +135,12 @@ class ServiceView:
             for j, name in enumerate(feed.names)
         )
 
-    def events(self, after: int = 0, limit: int = 500) -> tuple[api_models.EventRecord, ...]:
+    def events(self, after: int = 0, limit: int = 500) -> tuple[view.EventRecord, ...]:
         return tuple(self._service.journal.events(after, limit))
-
-    def history(
-        self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
-    ) -> tuple[api_models.HistoryPoint, ...]:
-        return tuple(point for page in self.history_pages(joint, since, until, most) for point in page)
 
     def history_pages(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
-    ) -> Iterator[tuple[api_models.HistoryPoint, ...]]:
+    ) -> Iterator[tuple[view.HistoryPoint, ...]]:
         names, reader = self._service.configuration.names, self._history
         if joint is not None and joint not in names:
             raise NoSuch(f"no joint {joint!r}; there are {', '.join(names)}")
@@ -156,7 +150,7 @@ class ServiceView:
                 points = (_point(names[j], j, *row) for row in page)
                 yield tuple(point for point in points if point is not None)
 
-    def proposals(self, limit: int = 200) -> tuple[api_models.Proposal, ...]:
+    def proposals(self, limit: int = 200) -> tuple[view.Proposal, ...]:
         return tuple(row.answer() for row in self._service.journal.proposals(limit))
 
     def subscribe(self) -> Client:
@@ -164,10 +158,10 @@ class ServiceView:
         client.put(self.snapshot())
         return client
 
-    def snapshot(self) -> api_models.JointsItem:
+    def snapshot(self) -> view.JointsItem:
         """The present joints as an item of the stream."""
         environment = self._service.environment
-        return api_models.JointsItem(
+        return view.JointsItem(
             time=environment.wall(),
             t=environment.monotonic(),
             state=self._service.state,
@@ -180,7 +174,7 @@ class ServiceView:
         if self._service.hub.clients:
             self._service.hub.publish(self.snapshot())
 
-    def _bus(self) -> api_models.BusHealth:
+    def _bus(self) -> view.BusHealth:
         arm_state = self._service.arm_state
         counted: dict[str, Any] = {}
         if arm_state.batch is not None:
@@ -189,7 +183,7 @@ class ServiceView:
             if not arm_state.connected:
                 counted |= {"rate_hz": 0.0, "load": 0.0}
         fault = arm_state.fault or arm_state.silent or None
-        return api_models.BusHealth(connected=bool(arm_state.connected), fault=fault, **counted)
+        return view.BusHealth(connected=bool(arm_state.connected), fault=fault, **counted)
 
 
 def _number(value: float) -> float | None:
@@ -199,8 +193,8 @@ def _number(value: float) -> float | None:
 
 def _joint(
     name: str, position: float, torque: float, model: float, temperature: float, state: str, age: float
-) -> api_models.JointNow:
-    return api_models.JointNow(
+) -> view.JointNow:
+    return view.JointNow(
         joint=name,
         position=_number(position),
         torque=_number(torque),
@@ -214,11 +208,11 @@ def _joint(
 
 def _point(
     joint: str, j: int, time: datetime, t: float, record: str | None, estimate: dict[str, list[float]]
-) -> api_models.HistoryPoint | None:
+) -> view.HistoryPoint | None:
     """None for a row of fewer joints, or a damaged one."""
     try:
         values = {name: estimate[name][j] for name in ("gain", "gain_std", "offset", "offset_std")}
-        return api_models.HistoryPoint(time=time, t=t, joint=joint, record=record, **values)
+        return view.HistoryPoint(time=time, t=t, joint=joint, record=record, **values)
     except (LookupError, TypeError, ValueError):
         return None
 

@@ -1,14 +1,23 @@
-"""The arm file's section `daemon`, read again at SIGHUP, and the configuration in use."""
+"""The arm file's section `daemon`, read again at SIGHUP, the command line that overrides it, and what is in use."""
 
+import logging
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field, FiniteFloat, field_validator
 
 from armlink.arm_file import ArmFile, Positive, Section
-from calib.observer.config import ObserverConfig, Policy
+from armlink.loop.kept_arm import KeptArm
+from calib.daemon.logs import log_to_stderr
+from calib.observer.config import ObserverConfig, ObserverConstants, Policy
 
+log = logging.getLogger("armlink.daemon")
+FORMER_THRESHOLDS = {"excitation_std", "excitation_rows", "places"} | {
+    name for name in vars(ObserverConstants) if not name.startswith("_")
+}
+"""Keys that arm files of earlier versions may have: constants by now."""
 _WHOLE = frozenset(field.name for field in fields(ObserverConfig) if field.type == "int" or field.type is int)
 
 
@@ -54,14 +63,17 @@ class DaemonSection(Section):
     recording: RecordingSettings = RecordingSettings()
     diagnosis: DiagnosisSettings = DiagnosisSettings()
     observer: dict[str, FiniteFloat] = Field(default_factory=dict)
-    """Thresholds of the observer (calib/observer/config.py) that differ from their defaults."""
+    """Settings of the observer (calib/observer/config.py) that differ from their defaults."""
 
     @field_validator("observer")
     @classmethod
     def _known(cls, given: dict[str, float]) -> dict[str, float]:
         known = [field.name for field in fields(ObserverConfig)]
-        for name in given:
-            if name not in known:
+        for name in sorted(given):
+            if name in FORMER_THRESHOLDS:
+                log.warning("daemon.observer.%s is no setting any more: left out", name)
+                del given[name]
+            elif name not in known:
                 raise ValueError(f"no threshold {name!r}; there are {', '.join(known)}")
         for name, value in given.items():
             if value < (1 if name in _WHOLE else 0):
@@ -91,3 +103,38 @@ class Configuration:
     @property
     def names(self) -> tuple[str, ...]:
         return self.arm.joint_names
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `armlink daemon`."""
+
+    arm: str
+    bus: str | None = None
+    listen_only: bool = False
+    socket: Path | None = None
+    tcp: tuple[str, int] | None = None
+    token: str | None = None
+    policy: Policy | None = None
+    store: str | None = None
+    work: bool = False
+
+    def settings(self, arm: ArmFile) -> DaemonSection:
+        """The arm file's section, overridden by the command line."""
+        given: dict[str, Any] = {} if self.policy is None else {"policy": self.policy}
+        if self.work:
+            given["work"] = True
+        return daemon_section(arm).model_copy(update=given)
+
+    def keep(self, arm: ArmFile, *inherits: int) -> KeptArm:
+        """Start the process that keeps the arm open; it inherits these descriptors."""
+        return KeptArm(arm, self.bus, self.listen_only, inherits, log_to_stderr)
+
+
+def state_directory(given: Path | None, arm: ArmFile) -> Path:
+    """Directory of journal and recordings: --state, else systemd's STATE_DIRECTORY, else the user's state directory."""
+    if given is not None:
+        return given
+    of_systemd = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    user = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "armlink"
+    return Path(of_systemd or user) / "daemon" / f"{arm.name}-{arm.serial}"

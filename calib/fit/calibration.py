@@ -54,10 +54,18 @@ class FittedCalibration(ABC):
         return ()
 
     @property
+    def broken(self) -> dict[str, str]:
+        """Why the model does not hold at a joint, in a sentence: the first finding of each such joint."""
+        found: dict[str, str] = {}
+        for each in self.findings:
+            if each.breaks_model:
+                found.setdefault(each.joint, each.text)
+        return found
+
+    @property
     def doubtful(self) -> tuple[str, ...]:
         """Joints at which the model does not hold, so that their values must not be used."""
-        broken = {finding.joint for finding in self.findings if finding.breaks_model}
-        return tuple(name for name in self.names if name in broken)
+        return tuple(name for name in self.names if name in self.broken)
 
     def quantile(self, parameter: str) -> Array | float:
         """Of 95 % intervals (n,), in standard deviations."""

@@ -16,10 +16,11 @@ from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_join
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.fit.calibration import FittedCalibration
+from calib.fit.heldout import held_out
 from calib.fit.position_field import PositionField
 from calib.fit.scatter import NOISE_ROUNDS, inflation
 from calib.fit.sweep_readings import FEWEST
-from calib.records.records import CalibrationRecord, GravityRecord, Parameter
+from calib.records.records import CalibrationRecord, GravityRecord, HeldOut, Parameter
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.posterior import PosteriorFit, linear_posterior
@@ -275,6 +276,13 @@ def _no_gain(torque: Array) -> str:
         f"it cannot be separated from the offset: gravity torque varies by only {spread:.2g} N·m (standard deviation)"
         " in these poses: move it, or the joints beyond it, further"
     )
+
+
+def held_out_rows(record: CalibrationRecord, rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> HeldOut:
+    """The proof of a record from slow rows against the one before, which is not judged by what it was fitted to."""
+    if before.is_fitted_to(record.data):
+        return HeldOut(against=before.id)
+    return held_out(before, *heldout_errors(rows, fit, before))
 
 
 def heldout_errors(rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:

@@ -1,5 +1,6 @@
 """Held-out data: how well a calibration predicts the steps of sweeps that were left out of its fit."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,10 @@ import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
+from calib.dataset import SweepData
 from calib.fit.gravity_fit import sensor_parameters
-from calib.fit.sweep_readings import FEWEST, SweepReadings
-from calib.records.records import CalibrationRecord
+from calib.fit.sweep_readings import FEWEST, SweepReadings, sweep_readings
+from calib.records.records import CalibrationRecord, GravityRecord, HeldOut, HeldOutJoint
 from gcomp.arrays import Array
 from gcomp.errors import GcompError
 from gcomp.identify.global_fit import identify_global
@@ -17,29 +19,46 @@ from gcomp.identify.parameters import Prior
 from gcomp.identify.readings import StaticReadings
 from gcomp.identify.sensor_model import predict
 
-NOT_BY_CHANCE = 3.0
-"""Standard errors by which the held-out error must be larger to be called worse: by chance once in 740."""
-WORSE = 1.05
-"""Ratio of held-out RMS, new over old, below which it is not worse."""
 REFIT_GAIN_STD = 0.2
 """Prior standard deviation of gains in the refit: without a mass it fixes the scale, which no prediction depends on."""
 
 
-def worse_joint(new: Array, old: Array) -> tuple[int, float] | None:
-    """First joint whose errors (K, n) are worse than the old ones beyond chance, and their RMS ratio; None if none."""
-    ratios = ((j, worse_by(new[:, j], old[:, j])) for j in range(new.shape[1]))
-    return next(((j, ratio) for j, ratio in ratios if ratio is not None), None)
+def held_out(old: CalibrationRecord, new_errors: Array, old_errors: Array) -> HeldOut:
+    """The proof of a record that replaces `old`, from the errors (K, n) of both; NaN is left out."""
+    found, tiny = [], 1e-30
+    for j, joint in enumerate(old.joints):
+        counted = np.isfinite(new_errors[:, j]) & np.isfinite(old_errors[:, j])
+        if counted.sum() < FEWEST:
+            continue
+        new, before = new_errors[counted, j] ** 2, old_errors[counted, j] ** 2
+        ratio = float(np.sqrt(new.mean() / max(float(before.mean()), tiny)))
+        error = max(float((new - before).std(ddof=1)) / np.sqrt(len(new)), tiny)
+        deviations = float(np.clip((new - before).mean() / error, -1e6, 1e6))  # JSON has no infinity
+        found.append(HeldOutJoint(joint=joint.name, ratio=ratio, deviations=deviations))
+    return HeldOut(against=old.id, joints=tuple(found))
 
 
-def worse_by(new: Array, old: Array) -> float | None:
-    """RMS of new errors (K,) over that of old ones if they are worse beyond chance, else None; NaN is left out."""
-    counted = np.isfinite(new) & np.isfinite(old)
-    if counted.sum() < FEWEST:
-        return None
-    difference = new[counted] ** 2 - old[counted] ** 2
-    ratio = float(np.sqrt(np.mean(new[counted] ** 2) / max(float(np.mean(old[counted] ** 2)), 1e-300)))
-    chance = NOT_BY_CHANCE * float(difference.std(ddof=1)) / np.sqrt(len(difference))
-    return ratio if ratio > WORSE and float(difference.mean()) > chance else None
+def held_out_steps(
+    new: CalibrationRecord,
+    old: CalibrationRecord,
+    arm: ArmFile,
+    data: Sequence[SweepData],
+    gravity: GravityRecord | None = None,
+) -> HeldOut:
+    """The proof of a record from sweeps, by their held-out steps.
+
+    New gains, offsets and mass moments are estimated from the other steps; the old record's gains and offsets are
+    fixed, and so are the mass moments of `gravity`; without it those are estimated too. A record that was fitted to
+    some of these readings is not judged by them.
+    """
+    digests = {each.digest for each in data}
+    if old.is_fitted_to(digests):
+        return HeldOut(against=old.id)
+    rows = sweep_readings([each.require(arm) for each in data])
+    independent = gravity is not None and not gravity.is_fitted_to(digests)
+    beta = np.array(gravity.require(arm).beta) if gravity is not None and independent else None
+    fresh = heldout_scores(new, arm, rows, refit=True)
+    return held_out(old, fresh, heldout_scores(old, arm, rows, refit=False, beta=beta))
 
 
 def heldout_scores(

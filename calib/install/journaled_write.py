@@ -10,33 +10,17 @@ and the journal line ends, both in one transaction. If any step fails, every con
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BusFault, Refused
 from armlink.link.types import Calibration, DriveSerial
+from armlink.loop.driver import Controllers
 from calib.install.own_arm import require_drives_of, require_own_arm
 from calib.install.plausibility import Admitted
 from calib.records.bounds import require_sound
 from calib.records.records import CalibrationRecord
 from calib.records.store import ControllerWrite, RecordStore
-
-
-class Controllers(Protocol):
-    """Access to the calibration of every joint, in its controller or in the host (`armlink.link.link.Link`)."""
-
-    def read_calibration(self, joint: int) -> Calibration:
-        """The active calibration of joint j; raises BusFault."""
-        ...
-
-    def drive_serial(self, joint: int) -> DriveSerial:
-        """Serial number of the drive of joint j; raises BusFault."""
-        ...
-
-    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
-        """Stage, read back and make active, then store to flash; returns what is active. Raises BadInput, BusFault."""
-        ...
-
 
 Check = Callable[[], str | None]
 """Called once the new calibration is active: a complaint if something is worse than before, else None."""

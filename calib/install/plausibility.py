@@ -31,6 +31,10 @@ DEVIATIONS = 5.0
 LARGEST_DRIFT = 0.1
 """Largest change that is a drift and not a broken or exchanged sensor: of a gain as a ratio, of an offset as a share of
 rated torque (docs/theory.md, section 6.6)."""
+NOT_BY_CHANCE = 3.0
+"""Standard errors by which the held-out error must be larger to be called worse: by chance once in 740."""
+WORSE = 1.05
+"""Ratio of held-out RMS, new over old, below which it is not worse."""
 
 
 class Refusal(Enum):
@@ -146,6 +150,19 @@ def check_bounds(record: CalibrationRecord, arm: ArmFile, joints: Sequence[int] 
         limit = LARGEST_OFFSET * float(rated[j])
         if joint.offset is not None and abs(joint.offset) > limit:
             raise GateRefused(Refusal.OFFSET, joint.name, value=joint.offset, limit=limit)
+
+
+def check_held_out(record: CalibrationRecord, before: CalibrationRecord) -> None:
+    """Raise GateRefused where the record's proof says that it predicts held-out data worse than the one before.
+
+    Raises Refused where there is no proof, or one against another record.
+    """
+    proof = record.held_out
+    if proof is None or proof.against != before.id:
+        raise Refused(f"record {record.id} was not compared with record {before.id} by held-out data: calibrate again")
+    for each in proof.joints:
+        if each.ratio > WORSE and each.deviations > NOT_BY_CHANCE:
+            raise GateRefused(Refusal.HELD_OUT, each.joint, ratio=each.ratio, record=before.id)
 
 
 def replaced_record(

@@ -2,9 +2,11 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
+from armlink.link.types import Command, Sample
 from calib.motion.trajectory import trajectory
 from gcomp.arrays import Array
 
@@ -31,6 +33,54 @@ class WorkMotion:
     def of_drives(cls, with_integral: bool) -> "WorkMotion":
         """Work of an arm whose drives have an integral term, or of one whose host adds it: that one settles later."""
         return cls() if with_integral else cls(rest=cls.rest + SLOW_SETTLING)
+
+
+TOUR = WorkMotion(reach=10.0)
+"""A tour's moves may span the whole range of a joint [rad]."""
+
+
+@dataclass(eq=False)
+class RandomMotion:
+    """A `Controller`: a tour of poses over the whole range, then ordinary work or rest."""
+
+    start: Array
+    """Where the arm is held (n,) [rad]."""
+    lower: Array
+    upper: Array
+    max_velocity: Array
+    period: float
+    seed: int
+    poses: int
+    """Of the tour; 0: none."""
+    work: bool
+    done: int = 0
+    _targets: Iterator[Array] | None = None
+
+    @property
+    def progress(self) -> tuple[int, int] | None:
+        """Poses done and in all; None where there is no tour."""
+        return (self.done, self.poses) if self.poses else None
+
+    def command(self, sample: Sample) -> Command:
+        if self._targets is None:
+            self._targets = self._motion()
+        return Command.hold(next(self._targets))
+
+    def _motion(self) -> Iterator[Array]:
+        here = self.start
+        if self.poses:
+            for piece in islice(self._pieces(here, TOUR), self.poses):
+                yield from piece
+                self.done, here = self.done + 1, piece[-1]
+        if self.work:
+            for piece in self._pieces(here, WorkMotion()):
+                yield from piece
+        while True:
+            yield here
+
+    def _pieces(self, here: Array, motion: WorkMotion) -> Iterator[Array]:
+        random = np.random.default_rng([self.seed, 8])
+        return work_pieces(here, self.lower, self.upper, self.max_velocity, self.period, random, motion)
 
 
 def work_targets(

@@ -8,8 +8,9 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from armlink.link.types import Calibration
+from armlink.loop.driver import Controllers
 from armlink.torque_calibration import TorqueCalibration, same_real32
-from calib.install.journaled_write import Controllers, install, recover
+from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, admit, admit_drift, admit_rollback
 from calib.observer.check_at_rests import AfterWrite, Checked
 from calib.observer.config import Policy

@@ -32,15 +32,18 @@ def lock_file(descriptor: int, what: str, patience: float = 0.0) -> None:
 
 
 @contextmanager
-def locked_directory(path: Path, what: str, patience: float = 0.0) -> Iterator[None]:
-    """Exclusive use of a directory, by a file `lock` in it; raises BadInput as `lock_file`."""
+def locked_directory(path: Path, what: str, patience: float = 0.0) -> Iterator[int]:
+    """Exclusive use of a directory, by a file `lock` in it; raises BadInput as `lock_file`.
+
+    Yields its descriptor: a process that inherits it holds the lock as well.
+    """
     try:
         descriptor = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o640)
     except OSError as error:
         raise BadInput(f"{what}: cannot be locked: {error.strerror}") from None
     try:
         lock_file(descriptor, what, patience)
-        yield
+        yield descriptor
     finally:
         os.close(descriptor)
 

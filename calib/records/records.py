@@ -1,7 +1,7 @@
 """Calibration and gravity records of one arm, with their covariance and provenance."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -56,6 +56,15 @@ class ArmRecord(_Frozen):
     note: str = ""
 
     SCHEMA: ClassVar[int] = 1
+
+    @property
+    def data(self) -> set[str]:
+        """Digests of the data that it comes from; other records, such as gravity's, are named by their ids."""
+        return {digest for name, digest in self.sources.items() if not name.endswith(digest)}
+
+    def is_fitted_to(self, digests: Set[str]) -> bool:
+        """Whether it comes from some of these data sets: for it they are not held out."""
+        return not digests.isdisjoint(self.sources.values())
 
     @property
     def id(self) -> str:
@@ -165,6 +174,26 @@ class JointCalibration(_Frozen):
         )
 
 
+class HeldOutJoint(_Frozen):
+    """Errors of held-out readings of one joint, of the new record against the one before."""
+
+    joint: str
+    ratio: FiniteFloat
+    """RMS, new over old."""
+    deviations: FiniteFloat
+    """Standard errors by which the new mean square is larger; negative where it is smaller."""
+
+
+class HeldOut(_Frozen):
+    """How a record predicts readings that were left out of its fit, against the record that it is to replace."""
+
+    against: str
+    """Id of the record before."""
+    joints: tuple[HeldOutJoint, ...] = ()
+    """Those with readings enough; none where the record before was fitted to the same readings, which judge nothing, or
+    where a sensor was exchanged."""
+
+
 class CalibrationRecord(ArmRecord):
     """Sensor gains and offsets of all joints, base to tip."""
 
@@ -176,6 +205,8 @@ class CalibrationRecord(ArmRecord):
     covariance_of: tuple[str, ...] = ()
     """Names of the rows and columns of `covariance`: "joint_1.gain", …; only parameters that were estimated."""
     covariance: Matrix = ()
+    held_out: Annotated[HeldOut | None, Field(exclude_if=lambda value: value is None)] = None
+    """Proof of a record that is to be written to controllers; None, and not written, in others, which keep their id."""
 
     @model_validator(mode="after")
     def _covariance_fits(self) -> Self:

@@ -18,6 +18,7 @@ from armlink.loop.driver import ArmDriver
 from armlink.torque_calibration import per_joint
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_motion, sweep_section
+from calib.install.check_motion import check_poses
 from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
 from calib.plan.creep_plan import CreepGround
@@ -146,6 +147,24 @@ def run_verify(
         tolerance = _expected_rms(calibration, model, variance, tolerance, floor * limits.rated)
     std, skipped = np.sqrt(np.maximum(variance, 0.0)), len(held_out) - len(angles)
     return Verification(link.names, q, np.array(torques), model, std, skipped, tolerance)
+
+
+def creep_complaint(
+    link: ArmDriver, arm: ArmFile, gravity: GravityRecord, calibration: CalibrationRecord
+) -> str | None:
+    """A complaint if short creeps about the arm's present pose do not agree with the records, else None.
+
+    The link must have been enabled. Raises Refused, BusFault as `run_verify`.
+    """
+    limits = DriveLimits.of(arm)
+    found = run_verify(link, arm, gravity, calibration, at=lambda begin: check_poses(begin, limits))
+    if found.passed:
+        return None
+    worst = int(np.argmax(found.rms / found.tolerance))
+    return (
+        f"{found.names[worst]}: in the check motion {found.rms[worst]:.3f} N·m RMS against the model, allowed"
+        f" {found.tolerance[worst]:.3f}"
+    )
 
 
 def _expected_rms(calibration: CalibrationRecord, model: Array, variance: Array, fixed: Array, floor: Array) -> Array:

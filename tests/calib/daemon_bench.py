@@ -1,5 +1,9 @@
 """A whole daemon on an in-process simulated arm, in lock-step: service, bus loop, journal and view, no process."""
 
+import math
+import pickle
+import socket
+import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -8,11 +12,14 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
-from armlink.loop.messages import LoopAnswer
+from armlink.bus.can_bus import CanBus
+from armlink.link.ends import EndCause
+from armlink.link.types import Controller
+from armlink.loop.channel import Channel
+from armlink.loop.kept_arm import BatchMaker, KeptControllers, KeptMessage
+from armlink.loop.messages import Open, RunController
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import LoopOptions, Message
-from calib.daemon.loop.loop_process import LoopControllers, _tour
 from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection
@@ -60,25 +67,41 @@ def run_now(work: Callable[[], Any], done: Callable[[Any], None]) -> None:
 
 
 class InlineLoop:
-    """The loop in this thread: `pump` runs the cycles of a tenth of a second."""
+    """The kept loop in this thread: `pump` runs the cycles of a tenth of a second."""
 
-    def __init__(self, options: LoopOptions) -> None:
-        from calib.daemon.loop.arm_loop import ArmLoop  # not loaded where only the records are wanted
+    def __init__(self, arm: ArmFile, open_bus: Callable[[], CanBus], listen_only: bool = False, pace: bool = False):
+        from armlink.loop.process import KeptLoop  # not loaded where only the records are wanted
 
-        self.loop = ArmLoop(options)
-        self.controllers = LoopControllers(self.loop.handle)
+        ours, theirs = socket.socketpair()
+        for end in (ours, theirs):
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 22)
+        self.channel, self.batches = Channel(ours), BatchMaker()
+        self.loop = KeptLoop(Channel(theirs), Open(arm, None, True, listen_only), open_bus, pace)
+        self.controllers = KeptControllers(self.loop._answer)
+        self.cycles = 1 if listen_only else round(0.1 * arm.require_link().rate)
+        if not pace:
+            self.loop._talked, self.loop.talk_every = time.monotonic(), math.inf
 
-    def sweep(self, poses: int, seed: int) -> LoopAnswer | None:
-        """Ask for a tour of poses."""
-        return self.loop.handle(_tour(poses, seed))
+    def move(self, controller: Controller) -> None:
+        """Run a controller from the next cycle on."""
+        self.loop._handle(RunController(1, pickle.dumps(controller)))
+        if self.loop._unpickled is not None:
+            self.loop._unpickled.result()
 
-    def pump(self) -> list[Message]:
+    def pump(self) -> list[KeptMessage]:
         """Run cycles; returns their messages."""
-        return self.loop.run()
+        for _ in range(self.cycles):
+            there = self.loop.arm is not None
+            self.loop.turn()
+            if not there or self.loop.arm is None:
+                break
+        if self.cycles > 1:
+            self.loop._talk()
+        return [made for message in self.channel.receive() if (made := self.batches.take(message)) is not None]
 
     def close(self) -> None:
         """Leave the joints safe."""
-        self.loop.close()
+        self.loop.close(EndCause.DONE)
 
 
 class DaemonBench:
@@ -112,12 +135,10 @@ class DaemonBench:
 
     def start(self) -> None:
         """A service as the command starts it, on what the directory holds."""
-        options = LoopOptions(
-            self.arm, work=self.work, pace=False, seed=self.seed + int(self.now()), open_bus=self._open
-        )
-        self.host = InlineLoop(options)
+        self.host = InlineLoop(self.arm, self._open)
         environment = Environment(self.now, self.wall, run_now, self.host)
-        self.service = Service(self.arm, self.settings, False, self.directory / "state", self.store, environment)
+        settings = self.settings.model_copy(update={"work": self.work})
+        self.service = Service(self.arm, settings, False, self.directory / "state", self.store, environment)
         self.view = ServiceView(self.service)
 
     def _open(self) -> LockStepBus:
@@ -150,7 +171,7 @@ class DaemonBench:
         while self.now() < end and not until():
             for message in self.host.pump():
                 self.service.take(message)
-            if self.host.loop.source is None:
+            if self.host.loop.arm is None:
                 self.simulated.advance(0.1)
             self.view.publish()
             if self.now() - ticked >= 1.0:
@@ -160,7 +181,7 @@ class DaemonBench:
     def kill(self) -> None:
         """As SIGKILL does: nothing is closed, saved or said."""
         self.service.journal.close()
-        self.host.loop._source = None
+        self.host.loop.arm = None
 
     def kinds(self) -> list[str]:
         return [event.kind for event in self.view.events()]

@@ -5,6 +5,7 @@ The daemon is the real one, from the event loop's turns down; clock, arm, bus pr
 
 import asyncio
 import errno
+import pickle
 import re
 import socket
 import sqlite3
@@ -22,17 +23,15 @@ from fast_daemon import FastDaemon
 from armlink.errors import BusFault
 from armlink.link.types import Calibration
 from armlink.loop.channel import Channel, Closed
-from armlink.loop.messages import Call, LoopAnswer
+from armlink.loop.kept_arm import BatchMaker, KeptArm, KeptMessage
+from armlink.loop.messages import Call, LoopAnswer, Progress, RunController, Up
 from armlink.recording.mcap import RecordingWriter
 from calib.daemon import main_loop, notify
 from calib.daemon.environment import Immediate
-from calib.daemon.loop.loop_messages import Message, Progress, Up
-from calib.daemon.loop.loop_process import LoopProcess
 from calib.daemon.main_loop import Daemon
-from calib.daemon.options import Options
-from calib.daemon.settings import DaemonSection
-from calib.daemon.state.event_log import EventLog
-from calib.daemon.view.api_models import State
+from calib.daemon.settings import DaemonSection, Options
+from calib.daemon.state.events import EventLog
+from calib.daemon.view import State
 
 DEPENDENCIES = ("store", "journal", "disk", "pipe", "notify")
 OF_FAULTS = ("fault", "recovered", "started", "refused", "roll-back")
@@ -136,21 +135,21 @@ class OtherCommit:
         return getattr(self.real, name)
 
 
-class BusProcess(LoopProcess):
+class BusProcess(KeptArm):
     """The bus process without a process: its end of the pipe is served by the arm, in this thread."""
 
     def __init__(self, arm: "FailingDaemon") -> None:
         ours, theirs = socket.socketpair()
         for end in (ours, theirs):
             end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 22)
-        self._process = SimpleNamespace(join=lambda seconds=0.0: None, is_alive=lambda: False, kill=lambda: None, pid=0)  # type: ignore[assignment]
+        self._process = SimpleNamespace(wait=lambda: None, poll=lambda: 0, kill=lambda: None, pid=0)  # type: ignore[assignment]
         self._channel = Channel(FailingSocket(ours, arm.failing))  # type: ignore[arg-type]
         self._waiting: dict[int, Future[LoopAnswer]] = {}
-        self._sending = threading.Lock()
-        self._arm, self._far, self._kept = arm, Channel(theirs), list[Message]()
+        self._sending, self._batches = threading.Lock(), BatchMaker()
+        self._arm, self._far, self._kept = arm, Channel(theirs), list[KeptMessage]()
         self.say(Up(arm.held()))
 
-    def say(self, message: Message) -> None:
+    def say(self, message: KeptMessage) -> None:
         """To the service."""
         try:
             self._far.put(message)
@@ -162,13 +161,14 @@ class BusProcess(LoopProcess):
         """What the service has asked."""
         try:
             for call in self._far.receive():
-                answer = self._arm.answer(call)
-                if answer is not None:
-                    self.say(answer)
+                if isinstance(call, RunController):
+                    self._arm.move(pickle.loads(call.controller))
+                else:
+                    self.say(self._arm.answer(call))
         except Closed:
             return
 
-    def pump(self) -> list[Message]:
+    def pump(self) -> list[KeptMessage]:
         kept, self._kept = self._kept, []
         return kept + super().pump()
 
@@ -214,7 +214,7 @@ class FailingDaemon(FastDaemon):
         readers = SimpleNamespace(add_reader=nothing, remove_reader=nothing)
         patch.setattr(main_loop, "asyncio", SimpleNamespace(get_running_loop=lambda: readers, Event=asyncio.Event))
         patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
-        patch.setattr(main_loop, "LoopProcess", lambda options: BusProcess(self))
+        patch.setattr(Options, "keep", lambda options, arm: BusProcess(self))
         patch.setattr(main_loop, "watchdog_seconds", lambda: WATCHDOG)
         patch.setattr(main_loop, "Notifier", lambda: notify.Notifier("systemd"))
         kinds = {name: getattr(socket, name) for name in ("AF_UNIX", "SOCK_DGRAM", "SOCK_NONBLOCK")}
@@ -255,11 +255,8 @@ class FailingDaemon(FastDaemon):
         patch.setattr(EventLog, "_logged", note)
         self.service.journal._db = FailingDatabase(self.service.journal._db, failing)  # type: ignore[assignment]
 
-    def answer(self, call: Call) -> LoopAnswer | None:
+    def answer(self, call: Call) -> LoopAnswer:
         """What the bus process answers."""
-        if call.what == "sweep":
-            self.touring, self.job_after, self.fast.job = call.args[0], self.fast.job, None
-            return None
         act: Callable[..., Calibration] = getattr(self, str(call.what))
         return LoopAnswer(call.id, act(*call.args))
 

@@ -11,10 +11,9 @@ from fast_arm import PERIOD, FastArm
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import BusFault
-from armlink.link.types import Calibration, DriveSerial, Stats
-from armlink.loop.messages import LoopAnswer
+from armlink.link.types import Calibration, Controller, DriveSerial, Stats
+from armlink.loop.messages import Batch, Progress, Up
 from calib.daemon.environment import Environment, Immediate
-from calib.daemon.loop.loop_messages import Batch, Progress, Up
 from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection
@@ -115,8 +114,9 @@ class FastDaemon:
         if up:
             self.service.take(Up(None if self.listen_only else self.held()))
 
-    def held(self) -> tuple[tuple[float, float, int], ...]:
-        return tuple(zip(self.fast.held_gain, self.fast.held_offset, self.ids, strict=True))
+    def held(self) -> tuple[Calibration, ...]:
+        columns = self.fast.held_gain.tolist(), self.fast.held_offset.tolist(), self.ids, self.dates
+        return tuple(Calibration(*each) for each in zip(*columns, strict=True))
 
     def now(self) -> float:
         return self.fast.t + self.clock_shift
@@ -142,9 +142,11 @@ class FastDaemon:
         self.ids[joint], self.dates[joint] = calibration.record_id, calibration.date
         return self.read_calibration(joint)
 
-    def sweep(self, poses: int, seed: int) -> LoopAnswer | None:
+    def move(self, controller: Controller) -> None:
+        self.tour(controller.poses)
+
+    def tour(self, poses: int) -> None:
         self.touring, self.job_after, self.fast.job = poses, self.fast.job, None
-        return None
 
     # ---- time
 

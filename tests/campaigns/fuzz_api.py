@@ -32,7 +32,7 @@ from small_arm import small_arm
 from test_web_schema import SETTINGS, check_all
 
 from calib.daemon.service_view import ServiceView
-from calib.daemon.web import peer
+from calib.daemon.web import connection
 from calib.daemon.web.guard import RateLimit
 from calib.observer.decision import DriftFinding
 
@@ -207,7 +207,7 @@ def main() -> int:
     told = Tracebacks()
     logging.getLogger().handlers, logging.getLogger().propagate = [told], False
     RateLimit.take = lambda *_: 0.0  # type: ignore[method-assign, assignment]
-    peer.HEAD_SECONDS = 0.5
+    connection.PATIENCE_SECONDS = 0.5
     ways = {"api raw": raw, "api by its description": described}
     folder = tempfile.TemporaryDirectory()
     with folder as name, served(lambda: begin(Path(name)), Path(name) / "api.sock") as server:

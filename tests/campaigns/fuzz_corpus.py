@@ -30,7 +30,7 @@ from fuzz_kinds import KINDS, ROOT, Seed
 from fuzzing import FAMILIES, known_frames, spoilt, take_in
 from served_page import served
 
-from calib.daemon.web import peer
+from calib.daemon.web import connection
 from calib.daemon.web.guard import RateLimit
 
 CORPUS = Path(__file__).parents[1] / "faults" / "corpus"
@@ -114,7 +114,7 @@ def answers(sent: bytes, answer: bytes) -> set[Hashable]:
 def connections(tries: int, draw: random.Random) -> None:
     """What connections send that get answers of a new kind."""
     RateLimit.take = lambda *_: 0.0  # type: ignore[method-assign, assignment]
-    peer.HEAD_SECONDS = 0.5
+    connection.PATIENCE_SECONDS = 0.5
     with tempfile.TemporaryDirectory() as name, served(lambda: begin(Path(name)), Path(name) / "api.sock") as server:
         sent = [hostile(draw) for _ in range(tries)]
         kept = distil(sent, lambda each: answers(each, exchange(server, each, False, draw)), len)

@@ -296,7 +296,7 @@ def start_daemon(folder: Path) -> None:
         return
     bench.run(4.0)
     view = bench.view
-    reads = (view.status, view.events, view.proposals, view.estimates, lambda: view.history(None))
+    reads = (view.status, view.events, view.proposals, view.estimates, lambda: list(view.history_pages(None)))
     for read in reads:
         with suppress(sqlite3.Error):  # 503 of the API, once: a row that is damaged and still a row
             read()

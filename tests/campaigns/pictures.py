@@ -20,7 +20,7 @@ from daemon_bench import DaemonBench  # noqa: E402
 from served_page import open_page, served  # noqa: E402
 
 from calib.daemon.settings import DaemonSection  # noqa: E402
-from calib.daemon.view.view import DaemonView  # noqa: E402
+from calib.daemon.view import DaemonView  # noqa: E402
 
 LEARN, DRIFT = 240.0, 700.0
 """Simulated seconds as installed, and at most until the drift is found."""

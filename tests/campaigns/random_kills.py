@@ -56,7 +56,7 @@ def preload() -> None:
     """Load what the programs need, so that their forks have it."""
     for module in ("calib.commands.daemon", "calib.daemon.main_loop", "calib.daemon.web.server"):
         importlib.import_module(module)
-    for module in ("calib.daemon.loop.arm_loop", "sim_bus.commands.sim", "sim_bus.bus.server"):
+    for module in ("armlink.loop.process", "sim_bus.commands.sim", "sim_bus.bus.server"):
         importlib.import_module(module)
 
 

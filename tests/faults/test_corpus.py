@@ -18,7 +18,7 @@ from fuzz_kinds import KINDS, path_to_give
 from fuzzing import command_too_much, take_in
 from served_page import served
 
-from calib.daemon.web import peer
+from calib.daemon.web import connection
 from calib.daemon.web.guard import RateLimit
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -50,7 +50,7 @@ def test_frames_of_any_content_raise_nothing_and_no_order_leaves_beyond_a_limit(
 
 def test_every_connection_is_answered_by_http_without_5xx(tmp_path, monkeypatch):
     monkeypatch.setattr(RateLimit, "take", lambda *_: 0.0)
-    monkeypatch.setattr(peer, "HEAD_SECONDS", 0.5)
+    monkeypatch.setattr(connection, "PATIENCE_SECONDS", 0.5)
     monkeypatch.setattr(logging.getLogger(), "handlers", [told := Tracebacks()])
     answered = 0
     with served(lambda: begin(tmp_path), tmp_path / "api.sock") as server:

@@ -4,11 +4,12 @@ import logging
 from collections.abc import Callable
 
 from armlink.errors import ArmlinkError
+from armlink.link.types import Calibration
 from calib.daemon.environment import BusJobs, Environment
 from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
-from calib.daemon.state.event_log import EventLog
+from calib.daemon.state.events import EventLog
 from calib.install.journaled_write import recover
 from calib.install.plausibility import GateRefused
 from calib.records.database import StoreFault, first_line
@@ -17,17 +18,14 @@ from calib.records.store import ControllerWrite, RecordStore, way_to
 
 _LOG = logging.getLogger("armlink.daemon")
 RECORDS_SECONDS = 5.0
-"""Time between two looks at the record store, where other commands may have made another record current [s]."""
+"""Time between two looks at the record store, where other commands may have made another record current [s]. A look
+that takes longer shows as a fault: a new connection to a PostgreSQL may take as long (`database.py`)."""
 
 STORE_SECONDS = 1.0
 """Likewise while it fails [s]."""
-
-STORE_SILENT_SECONDS = 5.0
-"""A look that takes longer shows as a fault [s]: what a new connection to a PostgreSQL may take (`database.py`)."""
-
 Found = tuple[CalibrationRecord | None, GravityRecord | None]
-Held = tuple[tuple[float, float, int], ...] | None
-"""Gain, offset [N·m] and record id of every controller; None if the daemon only listens."""
+Held = tuple[Calibration, ...] | None
+"""In every controller; None if the daemon only listens."""
 
 
 class ActiveRecords:
@@ -59,7 +57,7 @@ class ActiveRecords:
     def store_fault(self) -> str:
         """Why the record store cannot be read; empty while it can."""
         waited = self._environment.monotonic() - self._looked if self._looking else 0.0
-        if self._store_fault or waited <= STORE_SILENT_SECONDS:
+        if self._store_fault or waited <= RECORDS_SECONDS:
             return self._store_fault
         return f"record store {self._store.url}: has not answered for {waited:.0f} s"
 
@@ -186,8 +184,7 @@ class ActiveRecords:
 
         def work() -> tuple[bool, Held]:
             undone = recover(arm, self._store, controllers) is not None
-            held = [controllers.read_calibration(joint) for joint in range(len(arm.joint_names))]
-            return undone, tuple((each.gain, each.offset, each.record_id) for each in held)
+            return undone, tuple(controllers.read_calibration(joint) for joint in range(len(arm.joint_names)))
 
         def done(outcome: tuple[bool, Held] | ArmlinkError) -> None:
             if isinstance(outcome, ArmlinkError):

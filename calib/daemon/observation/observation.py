@@ -6,14 +6,13 @@ from datetime import datetime, timedelta
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
+from armlink.loop.messages import Batch
+from armlink.torque_calibration import UNCALIBRATED, Calibration, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.environment import BusJobs, Environment
-from calib.daemon.loop.loop_messages import Batch
-from calib.daemon.observation.recalibration_workflow import RecalibrationWorkflow, Samples
-from calib.daemon.state.event_log import EventLog
+from calib.daemon.observation.recalibration_workflow import DAY, RecalibrationWorkflow, Samples
+from calib.daemon.state.events import EventLog, describe, one_alarm_a_joint
 from calib.daemon.state.journal import Journal
-from calib.daemon.view.event_text import describe, one_alarm_a_joint
 from calib.observer.config import ObserverConfig
 from calib.observer.decision import DriftFinding
 from calib.observer.events import Event
@@ -32,8 +31,6 @@ HISTORY_WHOLE = timedelta(days=30)
 """Points of history older than this are thinned."""
 THINNING_FACTOR = 10
 """One of this many older points is kept."""
-THINNING_SECONDS = 86400.0
-"""Time between two thinnings [s]."""
 
 
 class ObserverFeed:
@@ -61,15 +58,15 @@ class ObserverFeed:
         self.controllers_hold(None)
         self.observer.install(finding)
 
-    def controllers_hold(self, held: tuple[tuple[float, float, int], ...] | None) -> list[str]:
-        """Convert readings from what the controllers hold (gain, offset, record id) to the record in force.
+    def controllers_hold(self, held: tuple[Calibration, ...] | None) -> list[str]:
+        """Convert readings from what the controllers hold to the record in force.
 
         Returns the joints that hold another pair than the record's; none if it is not known (None).
         """
         if held is None:
             self._change = per_joint([UNCALIBRATED] * len(self.names))
             return []
-        installed = per_joint(TorqueCalibration(gain, offset) for gain, offset, _ in held)
+        installed = per_joint(held)
         wanted = self.calibration.torque_calibration(installed)
         same = np.isclose(installed.gain, wanted.gain, rtol=1e-6, atol=0)
         differ = ~(same & np.isclose(installed.offset, wanted.offset, atol=1e-6))
@@ -128,7 +125,7 @@ class ObserverStorage:
 
     def tick(self, feed: ObserverFeed | None) -> None:
         now = self._environment.monotonic()
-        if now - self._thinned_at >= THINNING_SECONDS:
+        if now - self._thinned_at >= DAY:
             self._journal.thin_history(self._environment.wall() - HISTORY_WHOLE, THINNING_FACTOR)
             self._thinned_at = now
         if feed is None or feed.observer.rows == self._rows or self._journal.waiting:

@@ -1,12 +1,20 @@
-"""Tours of poses over the joints' whole range: by schedule, on request, or if watching cannot decide."""
+"""Motion of an arm that the daemon drives: tours of poses over the joints' whole range, and ordinary work.
+
+A tour is made by schedule, on request, or if watching cannot decide.
+"""
 
 from collections.abc import Callable
 
+import numpy as np
+
+from armlink.loop.messages import Batch, Progress
+from calib.arm.kinematics import gcomp_arm
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import Progress
 from calib.daemon.settings import Configuration
-from calib.daemon.state.event_log import EventLog
-from calib.daemon.view.api_models import State
+from calib.daemon.state.events import EventLog
+from calib.daemon.view import State
+from calib.motion.random_work import RandomMotion
+from gcomp.arrays import Array
 
 TOUR_POSES = 60
 """As many as the observer's longest window (`ObserverConfig.longest_window`)."""
@@ -24,6 +32,9 @@ class PoseTours:
         self._configuration, self._events, self._environment = configuration, events, environment
         self._state = state
         self._last = -float("inf")
+        self._seed = int(environment.wall().timestamp())
+        self._here: Array | None = None
+        """Newest target positions (n,) [rad]; None until there are some since the bus is open."""
         self.progress: Progress | None = None
         """Of the tour under way."""
 
@@ -36,9 +47,26 @@ class PoseTours:
             return
         self.progress, self._last = Progress(0, TOUR_POSES), self._environment.monotonic()
         self._events.say("sweep", None, f"sweeping {TOUR_POSES} poses: {why}", {"poses": TOUR_POSES})
-        answer = self._environment.port.sweep(TOUR_POSES, int(self._last))
-        if answer is not None and answer.error is not None:
-            self.refused(str(answer.error))
+        self._move(TOUR_POSES, int(self._last))
+
+    def up(self) -> None:
+        """The bus is open."""
+        self._here = None
+
+    def heard(self, batch: Batch) -> None:
+        """Note where the arm is, and begin to work where it is to and the bus has been opened."""
+        begins, self._here = self._here is None, batch.channels["position_command"][-1]
+        if begins and self._configuration.settings.work and not self._configuration.listen_only:
+            self._move(0, self._seed)
+
+    def _move(self, poses: int, seed: int) -> None:
+        arm, section = gcomp_arm(self._configuration.arm), self._configuration.arm.require_link()
+        speed = np.array([joint.max_velocity for joint in section.joints])
+        here = self._here if self._here is not None else np.full(arm.n, np.nan)
+        work = self._configuration.settings.work
+        self._environment.port.move(
+            RandomMotion(here, arm.lower, arm.upper, speed, 1.0 / section.rate, seed, poses, work)
+        )
 
     def wish(self, why: str) -> None:
         """Begin a tour if the configuration lets the daemon decide on one."""
@@ -66,8 +94,9 @@ class PoseTours:
 
     def refused(self, error: str) -> None:
         """The bus loop could not begin or finish the tour."""
-        self.progress = None
-        self._events.say("refused", None, f"sweep: {error}", {})
+        if self.progress is not None:
+            self.progress = None
+            self._events.say("refused", None, f"sweep: {error}", {})
 
     def stopped(self) -> None:
         """The bus is gone, and the tour with it."""

@@ -9,11 +9,10 @@ from armlink.errors import ArmlinkError, BusFault, Refused
 from calib.daemon.environment import BusJobs
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
-from calib.daemon.state.event_log import EventLog
+from calib.daemon.state.events import EventLog
 from calib.daemon.state.journal import Journal
-from calib.daemon.state.proposal_row import ProposalRow
-from calib.daemon.view.api_models import Proposal
-from calib.daemon.view.view import NoSuch, NotPossible
+from calib.daemon.state.journal_rows import ProposalRow
+from calib.daemon.view import NoSuch, NotPossible, Proposal
 from calib.observer.check_at_rests import Checked
 from calib.observer.decision import DriftFinding
 from calib.observer.recalibrator import APPLIED_BY, Recalibration, Recalibrator

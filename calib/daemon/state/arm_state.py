@@ -5,8 +5,8 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 from armlink.arm_file import ArmFile
-from calib.daemon.loop.loop_messages import Batch
-from calib.daemon.state.event_log import EventLog
+from armlink.loop.messages import Batch
+from calib.daemon.state.events import EventLog
 
 STALE = 1.0
 """A joint that is silent for longer is a fault [s]: ten batches."""

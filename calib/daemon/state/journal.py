@@ -23,9 +23,8 @@ from typing import Any, TypeVar, cast
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
 from calib.daemon.environment import Immediate, RunAside
-from calib.daemon.state.history_reader import HistoryReader
-from calib.daemon.state.proposal_row import PROPOSALS, ProposalRow, proposal_of
-from calib.daemon.view.api_models import EventRecord
+from calib.daemon.state.journal_rows import PROPOSALS, HistoryReader, ProposalRow, proposal_of
+from calib.daemon.view import EventRecord
 from calib.observer.decision import DriftFinding
 
 R = TypeVar("R")

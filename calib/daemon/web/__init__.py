@@ -1,1 +1,1 @@
-"""The daemon's API and page: read through `calib.daemon.view.view.DaemonView`, command nothing."""
+"""The daemon's API and page: read through `calib.daemon.view.DaemonView`, command nothing."""

@@ -10,20 +10,18 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 MOST_LOCAL = 256
-"""Connections on the Unix socket that are answered."""
+"""Connections on the Unix socket that are answered; as many on TCP that have shown the token."""
 MOST_QUEUED = 512
 """Connections on the Unix socket that wait for their turn; beyond it the oldest goes of the process that has most."""
 FIRST_SECONDS = 1.0
 """Time for a connection's first request; one that has sent none by then gives way [s]."""
-MOST_TRUSTED = 256
-"""TCP connections that have shown the token."""
 MOST_STRANGERS, MOST_OF_AN_ADDRESS = 64, 32
 """TCP connections that have not, in all and of one address; a further one takes the place of the oldest."""
 MOST_UNSENT = 16 * 1024 * 1024
 """Bytes of answers that clients have not taken; beyond it whoever has waited longest is cut."""
 
 
-class Connection(Protocol):
+class HeldConnection(Protocol):
     """One connection, as far as it matters here."""
 
     address: str
@@ -49,15 +47,15 @@ class Admission:
 
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._monotonic = monotonic
-        self._local: set[Connection] = set()
-        self._idle: OrderedDict[Connection, float] = OrderedDict()
+        self._local: set[HeldConnection] = set()
+        self._idle: OrderedDict[HeldConnection, float] = OrderedDict()
         """Those on the Unix socket that wait for a request, the longest first: from when on they may have to go [s]."""
-        self._queued: OrderedDict[Connection, None] = OrderedDict()
-        self._trusted: set[Connection] = set()
-        self._strangers: OrderedDict[Connection, None] = OrderedDict()
-        self._stuck: OrderedDict[Connection, None] = OrderedDict()
+        self._queued: OrderedDict[HeldConnection, None] = OrderedDict()
+        self._trusted: set[HeldConnection] = set()
+        self._strangers: OrderedDict[HeldConnection, None] = OrderedDict()
+        self._stuck: OrderedDict[HeldConnection, None] = OrderedDict()
 
-    def enter(self, connection: Connection) -> None:
+    def enter(self, connection: HeldConnection) -> None:
         """Take a new connection in; it is told to `begin`, now or later."""
         if not connection.address:
             self._queued[connection] = None
@@ -94,37 +92,37 @@ class Admission:
             self._idle[first] = self._monotonic() + FIRST_SECONDS
             first.begin()
 
-    def asked(self, connection: Connection) -> None:
+    def asked(self, connection: HeldConnection) -> None:
         """Its client has sent a request."""
         self._idle.pop(connection, None)
 
-    def answered(self, connection: Connection) -> None:
+    def answered(self, connection: HeldConnection) -> None:
         """Its client has got the answer, and asks for nothing else yet."""
         if connection in self._local:
             self._idle[connection] = self._monotonic()
             self.admit()
 
-    def trust(self, connection: Connection) -> bool:
+    def trust(self, connection: HeldConnection) -> bool:
         """A TCP connection has shown the token; False where there is no room for one more."""
         if connection in self._strangers:
-            if len(self._trusted) >= MOST_TRUSTED:
+            if len(self._trusted) >= MOST_LOCAL:
                 return False
             del self._strangers[connection]
             self._trusted.add(connection)
         return True
 
-    def stuck(self, connection: Connection) -> None:
+    def stuck(self, connection: HeldConnection) -> None:
         """Its client does not take what is sent; where too much is unsent in all, who has waited longest is cut."""
         self._stuck[connection] = None
         while sum(each.unsent() for each in self._stuck) > MOST_UNSENT:
             longest, _ = self._stuck.popitem(last=False)
             longest.cut()
 
-    def moves(self, connection: Connection) -> None:
+    def moves(self, connection: HeldConnection) -> None:
         """Its client takes what is sent again."""
         self._stuck.pop(connection, None)
 
-    def leave(self, connection: Connection) -> None:
+    def leave(self, connection: HeldConnection) -> None:
         self._local.discard(connection)
         self._idle.pop(connection, None)
         self._queued.pop(connection, None)
@@ -133,18 +131,18 @@ class Admission:
         self._stuck.pop(connection, None)
         self.admit()
 
-    def _let_go(self, connection: Connection) -> None:
+    def _let_go(self, connection: HeldConnection) -> None:
         self._local.discard(connection)
         self._idle.pop(connection, None)
         connection.give_way()
 
-    def _turn_away(self, connection: Connection) -> None:
+    def _turn_away(self, connection: HeldConnection) -> None:
         self._strangers.pop(connection, None)
         self._queued.pop(connection, None)
         connection.cut()
 
 
-def _of_most(candidates: Iterable[Connection], all_of_them: Iterable[Connection]) -> Connection:
+def _of_most(candidates: Iterable[HeldConnection], all_of_them: Iterable[HeldConnection]) -> HeldConnection:
     """The first of the candidates whose owner holds most."""
     held = Counter(each.owner for each in all_of_them)
     return max(candidates, key=lambda each: held[each.owner])

@@ -12,12 +12,11 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import TypeAdapter
 from starlette.exceptions import HTTPException
 
-from calib.daemon.view.api_models import StreamItem
-from calib.daemon.view.view import DaemonView
+from calib.daemon.view import DaemonView, StreamItem
+from calib.daemon.web.connection import App
 from calib.daemon.web.guard import Access, RequestGuard
 from calib.daemon.web.metrics import metrics_text
 from calib.daemon.web.page import PageFile, page_files
-from calib.daemon.web.peer import App
 from calib.daemon.web.routes import ERRORS, api_router
 from calib.daemon.web.stream import Streams
 

@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from calib.daemon.web.peer import App, Message, Peer, Receive, Scope, Send, peer_of
+from calib.daemon.web.connection import PATIENCE_SECONDS, App, Message, Peer, Receive, Scope, Send, peer_of
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,6 @@ BODY_LIMIT = 4096
 """Largest body [bytes]; the only bodies are names."""
 HEAD_LIMIT = 16384
 """Largest request line and headers together [bytes]."""
-BODY_SECONDS = 10.0
-"""A body that has not arrived within this time is refused [s]."""
 REQUESTS = Rate(burst=60, per_second=20)
 """Per TCP address; the page needs three requests to load, then four in two seconds."""
 WRONG_TOKENS = Rate(burst=5, per_second=0.2)
@@ -101,12 +99,22 @@ class RequestGuard:
         """Pass a request on to the application, or refuse it."""
         if scope["type"] != "http":
             return
+        peer = peer_of(scope)
+        if peer.connection is not None:
+            peer.connection.request_begins()
+        try:
+            await self._pass(scope, peer, receive, send)
+        finally:
+            if peer.connection is not None:
+                peer.connection.request_ends()
+
+    async def _pass(self, scope: Scope, peer: Peer, receive: Receive, send: Send) -> None:
         headers = _headers(scope)
         try:
-            self._check(scope, peer_of(scope))
+            self._check(scope, peer)
             body = await _read_body(headers, receive)
         except Denied as denied:
-            if _has_body(headers):  # the rest of it is discarded, within the bounds of `linger`
+            if _has_body(headers):  # the connection discards the rest of it, within bounds
                 denied.headers["connection"] = "close"
             await _answer(denied, send)
             return
@@ -128,7 +136,7 @@ class RequestGuard:
                 raise Denied(403, f"a page of {origin[:100]!r} may not decide anything here")
         if peer.tcp and scope["path"] not in self.access.open_paths:
             self._check_token(headers.get("authorization", ""), peer)
-            if not peer.trust():
+            if peer.connection is not None and not peer.connection.trust():
                 raise Denied(503, "too many clients over TCP: try again later", {"connection": "close"})
 
     def _is_ours(self, host: str, peer: Peer) -> bool:
@@ -194,7 +202,7 @@ async def _read_body(headers: dict[str, str], receive: Receive) -> bytes:
         return b""
     body = b""
     try:
-        async with asyncio.timeout(BODY_SECONDS):
+        async with asyncio.timeout(PATIENCE_SECONDS):
             while True:
                 message = await receive()
                 if message["type"] == "http.disconnect":
@@ -205,7 +213,7 @@ async def _read_body(headers: dict[str, str], receive: Receive) -> bytes:
                 if not message.get("more_body", False):
                     return body
     except TimeoutError:
-        raise Denied(408, f"the body did not come within {BODY_SECONDS:.0f} s") from None
+        raise Denied(408, f"the body did not come within {PATIENCE_SECONDS:.0f} s") from None
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:

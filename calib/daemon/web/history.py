@@ -10,14 +10,14 @@ from typing import TypeVar
 from fastapi.responses import StreamingResponse
 from pydantic import TypeAdapter
 
-from calib.daemon.view.api_models import HistoryPoint
-from calib.daemon.view.view import DaemonView
+from calib.daemon.view import DaemonView, HistoryPoint
 from calib.daemon.web.parameters import HistoryQuery
 
 MOST_ANSWERS, MOST_OF_AN_OWNER = 16, 12
 """Long answers under way, in all and of one process or address; each has one page in memory."""
-READ_SECONDS = 5.0
-"""A short answer that the disk has not given within this time is given up [s]."""
+DISK_SECONDS = 5.0
+"""A short answer that the disk has not given within this time is given up; a decision that is not on it by then is
+answered with "not yet" [s]."""
 _POINTS = TypeAdapter(tuple[HistoryPoint, ...])
 T = TypeVar("T")
 
@@ -37,10 +37,10 @@ class Histories:
     async def short(self, work: Callable[[], T]) -> T:
         """The value of `work`, which reads little, not behind long answers; raises sqlite3.Error, also if it waits."""
         try:
-            async with asyncio.timeout(READ_SECONDS):
+            async with asyncio.timeout(DISK_SECONDS):
                 return await asyncio.get_running_loop().run_in_executor(self._short, work)
         except TimeoutError:
-            raise sqlite3.OperationalError(f"the disk has not answered for {READ_SECONDS:.0f} s") from None
+            raise sqlite3.OperationalError(f"the disk has not answered for {DISK_SECONDS:.0f} s") from None
 
     async def aside(self, owner: str, work: Callable[[], T]) -> T:
         """The value of `work`, which reads history, from the thread; raises TooMany and what `work` raises."""

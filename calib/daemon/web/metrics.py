@@ -6,8 +6,7 @@ from prometheus_client import CollectorRegistry, ProcessCollector, generate_late
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from calib.daemon.view.api_models import Answer, State, Status
-from calib.daemon.view.view import DaemonView
+from calib.daemon.view import Answer, DaemonView, State, Status
 from calib.daemon.web.stream import Streams
 
 PREFIX = "armlink_"

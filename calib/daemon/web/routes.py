@@ -5,23 +5,28 @@ import sqlite3
 from collections.abc import Callable
 from concurrent.futures import Future
 from datetime import timedelta
+from itertools import chain
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Header, Path, Query, Request
 from fastapi.responses import FileResponse, Response
 
-from calib.daemon.view.api_models import (
+from calib.daemon.view import (
+    DaemonView,
     DrawnArm,
     EventRecord,
     HistoryPoint,
     JointEstimate,
     JointNow,
+    NoSuch,
+    NotPossible,
+    NotYet,
     Overview,
     Proposal,
     Status,
 )
-from calib.daemon.view.view import DaemonView, NoSuch, NotPossible, NotYet
-from calib.daemon.web.history import Histories, TooMany
+from calib.daemon.web.connection import Owner, peer_of
+from calib.daemon.web.history import DISK_SECONDS, Histories, TooMany
 from calib.daemon.web.parameters import (
     LARGEST_ID,
     ApiError,
@@ -32,7 +37,6 @@ from calib.daemon.web.parameters import (
     OverviewQuery,
     StreamQuery,
 )
-from calib.daemon.web.peer import Owner, peer_of
 from calib.daemon.web.stream import StreamResponse, Streams
 from calib.daemon.web.window import add_window
 
@@ -62,8 +66,6 @@ REPORT_CSP = (
     " style-src 'unsafe-inline'; img-src data: blob:"
 )
 """The report is one file with its scripts inside; it may not send requests to this daemon or anyone else."""
-DECISION_SECONDS = 5.0
-"""Wait for a decision to be on disk; after it the answer is "not yet" [s]."""
 
 ProposalId = Annotated[int, Path(ge=1, le=LARGEST_ID)]
 OptionalDecision = Annotated[Decision | None, Body()]
@@ -131,7 +133,7 @@ def _add_now(router: APIRouter, view: DaemonView, histories: Histories) -> None:
 
         def encoded() -> str:
             events = view.events(after=max(0, status.last_event - query.events))
-            history = view.history(None, since, None, query.limit)
+            history = tuple(chain.from_iterable(view.history_pages(None, since, None, query.limit)))
             return answer.model_copy(update={"events": events, "history": history}).model_dump_json()
 
         return Response(await histories.aside(owner, encoded), media_type="application/json")
@@ -184,12 +186,12 @@ async def _decided(
     decision, peer = given or Decision(), peer_of(request.scope)
     answer = decide(number, peer.name if decision.by is None else f"{decision.by} ({peer.name})", decision.hash)
     try:
-        async with asyncio.timeout(DECISION_SECONDS):
+        async with asyncio.timeout(DISK_SECONDS):
             return await asyncio.shield(asyncio.wrap_future(answer))
     except TimeoutError:
         raise NotYet(
             f"not yet: the decision on proposal {number} waits for the disk, which has not answered for "
-            f"{DECISION_SECONDS:.0f} s, and is carried out once it does: do not repeat it, see /api/proposals"
+            f"{DISK_SECONDS:.0f} s, and is carried out once it does: do not repeat it, see /api/proposals"
         ) from None
 
 

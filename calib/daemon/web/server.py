@@ -15,11 +15,11 @@ import uvicorn
 
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
-from calib.daemon.view.view import DaemonView
+from calib.daemon.view import DaemonView
 from calib.daemon.web.admission import Admission
 from calib.daemon.web.app import make_app
+from calib.daemon.web.connection import protocol_of
 from calib.daemon.web.guard import Access, names_of_host
-from calib.daemon.web.peer import protocol_of
 
 log = logging.getLogger(__name__)
 SOCKET_MODE = 0o660

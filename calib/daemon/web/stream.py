@@ -8,15 +8,13 @@ from contextlib import suppress
 
 from fastapi.responses import StreamingResponse
 
-from calib.daemon.view.api_models import EventItem, EventRecord, JointsItem
-from calib.daemon.view.view import DaemonView
+from calib.daemon.view import DaemonView, EventItem, EventRecord, JointsItem
+from calib.daemon.web.connection import Message, Receive, Scope, Send, peer_of
 from calib.daemon.web.history import Histories
-from calib.daemon.web.peer import Message, Receive, Scope, Send, peer_of
 
 SEND_SECONDS = 5.0
-"""A client that accepts nothing for this time is cut off [s]."""
-IDLE_SECONDS = 5.0
-"""After this time without an item a comment is sent, to find out whether the client is still there [s]."""
+"""A client that accepts nothing for this time is cut off; after as long without an item a comment is sent, to find out
+whether it is still there [s]."""
 MOST_CLIENTS = 200
 RETRY = b"retry: 2000\n\n"
 """Browsers reconnect after two seconds."""
@@ -66,6 +64,8 @@ class Streams:
 
     async def run(self, scope: Scope, receive: Receive, send: Send, after: int | None) -> None:
         """Serve one client until it leaves: all events after id `after` (None: only new ones), then new items."""
+        if (connection := peer_of(scope).connection) is not None:
+            connection.never_ends()
         client = asyncio.create_task(self._send_all(send, after))
         self._tasks[client] = peer_of(scope).owner
         if self._closed:
@@ -80,9 +80,9 @@ class Streams:
             results = await asyncio.gather(client, gone, return_exceptions=True)
         if isinstance(results[0], TimeoutError):
             self.cut_off += 1
-            peer = peer_of(scope)
-            _log.warning("stream: %s took nothing for %.0f s and was cut off", peer.name, SEND_SECONDS)
-            peer.abort()
+            _log.warning("stream: %s took nothing for %.0f s and was cut off", peer_of(scope).name, SEND_SECONDS)
+            if connection is not None:
+                connection.cut()
             return
         if isinstance(results[0], Exception):
             raise results[0]
@@ -99,7 +99,7 @@ class Streams:
             while True:
                 item: JointsItem | EventItem | None = None
                 with suppress(TimeoutError):
-                    async with asyncio.timeout(IDLE_SECONDS):
+                    async with asyncio.timeout(SEND_SECONDS):
                         item = await subscription.get()
                 if item is None:
                     await _send(send, b": nothing new\n\n")

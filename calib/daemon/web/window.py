@@ -12,11 +12,10 @@ from fastapi.responses import Response
 
 from armlink.recording.joint_messages import TOPICS
 from armlink.recording.mcap import RecordingWriter
-from calib.daemon.view.api_models import WindowRows
-from calib.daemon.view.view import DaemonView, Window
+from calib.daemon.view import DaemonView, Window, WindowRows
+from calib.daemon.web.connection import Owner
 from calib.daemon.web.history import Histories
 from calib.daemon.web.parameters import WindowQuery
-from calib.daemon.web.peer import Owner
 from gcomp.arrays import Array
 
 COLUMNS = {"position": "q", "torque": "tau", "temperature": "temp", "model_torque": "model"}

@@ -39,7 +39,7 @@ class PoseMemory:
 
     def add(self, position: Array, residual: Array) -> None:
         """Take a row without alarm: pose (n,) [rad], reading less model (n,) [N·m]."""
-        at, most = self._find(position), self._config.places
+        at, most = self._find(position), self._config.longest_window
         if at is None:
             self._position = np.vstack([self._position, position])[-most:]
             self._mean = np.vstack([self._mean, residual])[-most:]

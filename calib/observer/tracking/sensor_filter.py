@@ -41,14 +41,14 @@ class SensorFilter:
         """Rows that went into each joint's estimate (n,)."""
         self.rejected = np.zeros(n, dtype=int)
         """Consecutive rows rejected as outliers (n,)."""
-        self._recent: deque[Array] = deque(maxlen=config.excitation_rows)
+        self._recent: deque[Array] = deque(maxlen=config.longest_window)
 
     def handle(self, reading: Array, torque: Array, variance: Array) -> None:
         """Update with one row: reading and model torque (n,) [N·m], variance of their difference (n,) [N²·m²]."""
         config = self._config
         self._recent.append(torque)
         spread = len(self._recent) * np.var(np.array(self._recent), axis=0)
-        excited = spread * config.excitation_std**2 >= variance
+        excited = spread * config.gain_std**2 >= variance
         for j in range(len(self.state)):
             self._update(j, reading[j], np.array([torque[j], 1.0]), variance[j], bool(excited[j]))
 

@@ -2,7 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,6 +22,7 @@ from calib.plan.creep_plan import plan_creep
 from calib.plan.types import SweepPlan
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
+from calib.sweep.verify import creep_complaint
 from gcomp.gravity.torque import gravity_torque
 from gcomp.identify.motor_model import MotorModel
 
@@ -185,9 +186,9 @@ def test_a_cable_that_pulls_in_every_sweep_is_named_and_no_constant_is_given(tmp
     store, how = RecordStore(str(tmp_path / "records.db")), Apply(by="ann", check=False)
     record = fit.record(arm())
     with pytest.raises(GateRefused, match=r"cable under tension.*--accept openarm_right_joint4"):
-        apply_creep(record, arm(), store, fit, how)
+        apply_creep(record, arm(), store, how, fit.broken, None)
     assert store.current(CalibrationRecord, arm()) is None
-    apply_creep(record, arm(), store, fit, replace(how, accepted=("openarm_right_joint4",)))
+    apply_creep(record, arm(), store, replace(how, accepted=("openarm_right_joint4",)), fit.broken, None)
     assert store.current(CalibrationRecord, arm()) == record
     assert not fitted(made).findings
 
@@ -197,6 +198,8 @@ def test_a_check_motion_decides_whether_a_record_comes_into_force(tmp_path: Path
     fit, store, asked = fitted(drawn(8)), RecordStore(str(tmp_path / "records.db")), []
     how = Apply(by="ann", bus="socketcan:vcan7")
     record, ones = fit.record(arm()), np.ones(7)
+    gravity = fit.gravity.record(arm(), record)
+    check = partial(creep_complaint, arm=arm(), gravity=gravity, calibration=record)
 
     def opened(_: ArmFile, bus: str | None) -> object:
         asked.append(bus)
@@ -206,12 +209,12 @@ def test_a_check_motion_decides_whether_a_record_comes_into_force(tmp_path: Path
     monkeypatch.setattr("calib.install.apply.open_arm", opened)
     for rms, fine in ((2 * ones, False), (0.5 * ones, True)):
         found = SimpleNamespace(names=arm().joint_names, rms=rms, tolerance=ones, passed=fine)
-        monkeypatch.setattr("calib.install.apply.run_verify", lambda *_, found=found, **__: found)
+        monkeypatch.setattr("calib.sweep.verify.run_verify", lambda *_, found=found, **__: found)
         if fine:
-            apply_creep(record, arm(), store, fit, how)
+            apply_creep(record, arm(), store, how, fit.broken, check)
         else:
             with pytest.raises(Refused, match=r"in the check motion 2.000 N·m RMS"):
-                apply_creep(record, arm(), store, fit, how)
+                apply_creep(record, arm(), store, how, fit.broken, check)
             assert store.current(CalibrationRecord, arm()) is None
     assert store.current(CalibrationRecord, arm()) == record
     assert asked == ["socketcan:vcan7"] * 2
@@ -219,5 +222,5 @@ def test_a_check_motion_decides_whether_a_record_comes_into_force(tmp_path: Path
         update={"joints": tuple(each.model_copy(update={"gain": 1.3 * (each.gain or 1.0)}) for each in record.joints)}
     )
     with pytest.raises(GateRefused, match="--replaced"):
-        apply_creep(other, arm(), store, fit, replace(how, check=False))
-    apply_creep(other, arm(), store, fit, replace(how, check=False, replaced=arm().joint_names))
+        apply_creep(other, arm(), store, replace(how, check=False), fit.broken, check)
+    apply_creep(other, arm(), store, replace(how, check=False, replaced=arm().joint_names), fit.broken, check)

@@ -3,6 +3,7 @@
 import contextlib
 import shutil
 import sqlite3
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from postgres import NoServer, stoppable_server
 
 from armlink.errors import BadInput, BusFault
 from calib.daemon.state.journal import Journal
-from calib.daemon.view.api_models import EventItem, State
+from calib.daemon.view import EventItem, HistoryPoint, State
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 
@@ -282,12 +283,16 @@ def test_a_damaged_row_of_history_is_left_out(tmp_path: Path, spoil: str) -> Non
     for _ in range(3):
         daemon.service.save(history=True)
         daemon.run(1)
-    _, second, *others = whole = [point.time for point in daemon.view.history(daemon.arm.joint_names[0])]
+
+    def pages() -> Iterator[tuple[HistoryPoint, ...]]:
+        return daemon.view.history_pages(daemon.arm.joint_names[0])
+
+    _, second, *others = whole = [point.time for page in pages() for point in page]
     daemon.service.close("end")
     spoiled(tmp_path / "state" / "journal.db", f"UPDATE history SET {spoil} WHERE id = 2")
     daemon.start()
     daemon.run(3)
-    left = {point.time for point in daemon.view.history(daemon.arm.joint_names[0])}
+    left = {point.time for page in pages() for point in page}
     assert left >= {whole[0], *others}
     assert second not in left
 

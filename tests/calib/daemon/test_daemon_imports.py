@@ -110,7 +110,7 @@ def test_a_record_that_makes_readings_worse_is_rolled_back(tmp_path: Path) -> No
     (back,) = daemon.of_kind("roll-back")
     assert back.joint == "joint_3"
     assert daemon.store.current(CalibrationRecord, daemon.arm) == good
-    assert daemon.held()[2][:2] == (good.joints[2].gain, good.joints[2].offset)
+    assert (daemon.held()[2].gain, daemon.held()[2].offset) == (good.joints[2].gain, good.joints[2].offset)
     assert daemon.ids == [good.number] * daemon.fast.n
     stages = [(line.record, line.stage) for line in daemon.store.writes(daemon.arm)]
     assert stages == [(each, stage) for each in (record.id, good.id) for stage in ("begun", "finished")]

@@ -1,8 +1,11 @@
 """The daemon's bus loop, with frames, physics and the link: driving, listening, faults, and the process that it has."""
 
+import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections import deque
@@ -11,7 +14,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from daemon_bench import DaemonBench
+from daemon_bench import DaemonBench, InlineLoop
 from fast_daemon import settings
 
 from armlink.arm_file import load_arm
@@ -20,15 +23,16 @@ from armlink.bus.open import open_link_bus
 from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
 from armlink.link.listener import Listener
-from armlink.link.types import Calibration, Command, Stats
+from armlink.link.types import Calibration, Command, Sample, Stats
+from armlink.loop import process
 from armlink.loop.channel import Channel
-from armlink.loop.messages import Call, LoopAnswer
+from armlink.loop.kept_arm import BatchMaker, KeptArm
+from armlink.loop.messages import Batch, Call, Down, Health, LoopAnswer, Told, Up, pack
+from armlink.loop.process import UNREAD_SECONDS
 from calib.arm.kinematics import gcomp_arm
-from calib.daemon.loop.arm_loop import ArmLoop
-from calib.daemon.loop.loop_messages import CHANNELS, Batch, Down, LoopOptions, Message, Up
-from calib.daemon.loop.loop_process import BATCHES, LoopProcess
-from calib.daemon.view.api_models import State
+from calib.daemon.view import State
 from calib.motion.random_work import work_targets
+from calib.records.file_lock import locked_directory
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 
@@ -55,9 +59,10 @@ def test_on_the_simulated_arm_with_its_bus(tmp_path: Path) -> None:
 def test_a_fault_of_a_joint_is_a_message_and_the_bus_is_opened_again(tmp_path: Path) -> None:
     bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
     bench.run(1)
-    bench.host.loop.source.stop()
-    reply = bench.host.loop.run()
-    assert isinstance(reply[0], Down)
+    bench.host.loop.arm.stop()
+    reply = bench.host.pump()
+    assert isinstance(reply[-1], Down | Told)
+    assert any(isinstance(message, Down) for message in reply)
     bench.run(1)
     assert bench.view.status().state is State.OBSERVING
 
@@ -65,27 +70,29 @@ def test_a_fault_of_a_joint_is_a_message_and_the_bus_is_opened_again(tmp_path: P
 def test_no_state_is_lost_at_20_joints_and_1_khz_whatever_the_service_does(tmp_path: Path) -> None:
     """A minute of samples that the service does not read, between states: they arrive, and the newest samples do."""
     ours, theirs = socket.socketpair()
-    loop, service, n = Channel(theirs, BATCHES), Channel(ours), 20
-    channels = {name: np.zeros((100, n)) for name in CHANNELS}
-    for tenth in range(600):
-        batch = Batch(tenth / 10 + np.arange(100) * 1e-3, channels, np.zeros(n, dtype=int), np.zeros(n), Stats())
-        loop.put(batch, sample=True)
-        if tenth in (100, 300):
-            loop.put(Down("gone") if tenth == 100 else Up(None))
-        loop.flush()
-    heard: list[Message] = []
+    loop, service, n = Channel(theirs, round(UNREAD_SECONDS * 1000)), Channel(ours), 20
+    nothing, batches = np.zeros(n), BatchMaker()
+    for cycle in range(60_000):
+        sample = Sample(cycle * 1e-3, nothing, nothing, nothing, nothing, np.zeros(n, dtype=int), nothing)
+        loop.put((0, -1, pack(sample, nothing, nothing)), sample=True)
+        if cycle % 100 == 99:
+            loop.put(Health(Stats()), sample=True)
+            loop.flush()
+        if cycle in (10_000, 30_000):
+            loop.put(Down("gone") if cycle == 10_000 else Up(None))
+    heard = []
     while not loop.flush():
         heard += service.receive()
     heard += service.receive()
-    assert [type(message) for message in heard if not isinstance(message, Batch)] == [Down, Up]
-    assert isinstance(heard[-1], Batch)
-    assert heard[-1].t[-1] == pytest.approx(60.0, abs=2e-3)
-    assert loop.dropped == 600 - sum(isinstance(message, Batch) for message in heard) > 300
+    came = [made for message in heard if (made := batches.take(message)) is not None]
+    assert [type(message) for message in came if not isinstance(message, Batch)] == [Down, Up]
+    assert isinstance(came[-1], Batch)
+    assert came[-1].t[-1] == pytest.approx(60.0, abs=2e-3)
+    assert sum(len(each.t) for each in came if isinstance(each, Batch)) < 30_000
+    assert loop.dropped > 30_000
 
 
 def test_through_a_fault_no_other_program_may_take_the_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from calib.daemon.loop import arm_loop
-
     holds = []
 
     class Hold:
@@ -95,12 +102,12 @@ def test_through_a_fault_no_other_program_may_take_the_arm(tmp_path: Path, monke
         def release(self) -> None:
             holds.remove(self)
 
-    monkeypatch.setattr(arm_loop, "ArmHold", Hold)
+    monkeypatch.setattr(process, "ArmHold", Hold)
     bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
     bench.run(0.5)
-    bench.host.loop.source.stop()
-    bench.host.loop.run()
-    assert bench.host.loop.source is None
+    bench.host.loop.arm.stop()
+    bench.host.pump()
+    assert bench.host.loop.arm is None
     assert len(holds) == 1
     bench.run(0.5)
     assert len(holds) == 1
@@ -162,8 +169,8 @@ def test_listening_on_a_lock_step_bus_where_nobody_sends_sync_goes_on_for_ever(t
     bench = DaemonBench(tmp_path, settings=settings("observe"), work=False)
     bench.host.close()
     bus = LockStepBus(arm=bench.simulated)
-    loop = ArmLoop(LoopOptions(bench.arm, listen_only=True, open_bus=lambda: bus, pace=False))
-    messages = [message for _ in range(600) for message in loop.run()]  # a rounding of its time held it up before
+    loop = InlineLoop(bench.arm, lambda: bus, listen_only=True)
+    messages = [message for _ in range(600) for message in loop.pump()]  # a rounding of its time held it up before
     loop.close()
     assert isinstance(messages[0], Up)
     (silent,) = (message for message in messages if isinstance(message, Down))
@@ -179,15 +186,15 @@ def test_an_arm_in_this_process_keeps_the_machines_pace_and_does_not_catch_up(
     monkeypatch.setattr(time, "monotonic", lambda: real[0])
     monkeypatch.setattr(time, "sleep", lambda seconds: real.__setitem__(0, real[0] + seconds))
     bus = LockStepBus(arm=bench.simulated)
-    loop = ArmLoop(LoopOptions(bench.arm, open_bus=lambda: bus))
+    loop = InlineLoop(bench.arm, lambda: bus, pace=True)
 
     def passed() -> tuple[float, float]:
         arm, machine = bus.clock.now(), real[0]
         for _ in range(20):
-            loop.run()
+            loop.pump()
         return bus.clock.now() - arm, real[0] - machine
 
-    loop.run()
+    loop.pump()
     passed()
     assert passed() == pytest.approx((2.0, 2.0), abs=0.01)
     real[0] += 5.0  # the machine stood still
@@ -207,17 +214,17 @@ def test_beside_another_controller_it_hears_all_and_sends_nothing(tmp_path: Path
         targets = work_targets(link.position_sent, described.lower, described.upper, np.ones(7), 0.004, random)
         for _ in range(1200):
             truth = link.cycle(Command.hold(next(targets)))
-    loop = ArmLoop(LoopOptions(arm, listen_only=True, open_bus=lambda: Tap(bus.frames)))
+    loop = InlineLoop(arm, lambda: Tap(bus.frames), listen_only=True)
     service = bench.service
     service.configuration.listen_only = True
-    messages = [message for _ in range(100) for message in loop.run()]
+    messages = [message for _ in range(100) for message in loop.pump()]
     for message in messages:
         service.take(message)
     batches = [message for message in messages if isinstance(message, Batch)]
     assert sum(len(batch.t) for batch in batches) >= 1190
     assert isinstance(messages[0], Up)
     assert messages[0].held is None
-    assert "no SYNC" in messages[-1].reason
+    assert "no SYNC" in [message for message in messages if isinstance(message, Down)][-1].reason
     position = np.vstack([batch.channels["position"] for batch in batches])
     assert np.isfinite(position).all()
     assert np.abs(position - truth.position).max(axis=1).min() < 1e-3
@@ -251,14 +258,13 @@ def test_a_sync_on_each_of_two_buses_is_one_cycle() -> None:
     assert np.isfinite(samples[0].position).all()
 
 
-def no_bus() -> None:
-    raise BusFault("bus socketcan:can9: cannot open it: No such device")
+NO_BUS = "udp_multicast:1.2.3.4"
+"""That is no group."""
 
 
 def test_sigterm_to_the_whole_group_is_left_to_the_service() -> None:
-    host = LoopProcess(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
-    host._channel.wait(60.0)
-    assert host.pid is not None
+    host = KeptArm(load_arm("sarcos"), NO_BUS)
+    heard = until_down(host)
     os.kill(host.pid, signal.SIGTERM)
     answer: list[LoopAnswer] = []
     asking = threading.Thread(target=lambda: answer.append(host.ask(Call(1, "read_calibration", (0,)))))
@@ -267,15 +273,47 @@ def test_sigterm_to_the_whole_group_is_left_to_the_service() -> None:
     while asking.is_alive() and time.monotonic() < end:
         host._channel.wait(0.1)
         host.pump()  # the process is there: this does not raise
-    assert "can9" in str(answer[0].error)
+    assert str(answer[0].error) == heard.reason
     host.close()
-    assert host._process.exitcode == 0
+    assert host.exit_status == 0
 
 
 def test_the_bus_process_ends_when_the_service_is_gone() -> None:
-    host = LoopProcess(LoopOptions(load_arm("sarcos"), open_bus=no_bus), fork=True)
-    host._channel.wait(60.0)
-    assert isinstance(host.pump()[0], Down)
+    host = KeptArm(load_arm("sarcos"), NO_BUS)
+    until_down(host)
     host._channel.close()  # as the kernel does where the service is killed
-    host._process.join(60.0)
-    assert host._process.exitcode == 0
+    assert host._process.wait(60.0) == 0
+
+
+def until_down(host: KeptArm) -> Down:
+    """The first message that the bus is not there."""
+    while True:
+        host._channel.wait(60.0)
+        for message in host.pump():
+            if isinstance(message, Down):
+                return message
+
+
+def test_the_bus_process_of_a_daemon_that_is_gone_holds_its_state_directory(tmp_path: Path) -> None:
+    """Until it has left the joints safe: a daemon that is begun meanwhile waits for that."""
+    with locked_directory(tmp_path, "--state") as lock:
+        host = KeptArm(load_arm("sarcos"), NO_BUS, inherits=[lock])
+        until_down(host)
+    with pytest.raises(BadInput, match="in use by"), locked_directory(tmp_path, "--state"):
+        pass
+    host.close()
+    with locked_directory(tmp_path, "--state"):
+        pass
+
+
+def test_the_bus_process_logs_as_the_daemon_does(tmp_path: Path) -> None:
+    """Its warnings are lines of JSON too, for systemd's journal."""
+    program = (
+        "import sys; from armlink.arm_file import load_arm; from calib.daemon.settings import Options\n"
+        "host = Options('openarm', bus=sys.argv[1], listen_only=True).keep(load_arm('openarm'))\n"
+        "while not any(type(each).__name__ == 'Up' for each in host.pump()): host._channel.wait(60.0)\n"
+        "host.close()"
+    )
+    command = [sys.executable, "-c", program, f"udp_multicast:239.74.171.{os.getpid() % 200 + 1}"]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stderr.splitlines()
+    assert any("no calibration record is in force" in json.loads(line)["message"] for line in said)

@@ -16,15 +16,14 @@ from fast_daemon import FastDaemon, settings
 
 from armlink.arm_file import load_arm
 from armlink.errors import BadInput
+from armlink.loop.messages import Down, Up
 from armlink.recording.files import load_recording
 from calib.daemon.logs import JsonFormatter, LineLimit
-from calib.daemon.loop.loop_messages import Down, Up
 from calib.daemon.notify import Notifier, watchdog_seconds
 from calib.daemon.settings import DaemonSection
-from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.state.journal import Journal
-from calib.daemon.view.api_models import State
-from calib.daemon.view.view import NoSuch, NotPossible
+from calib.daemon.state.journal_rows import HistoryReader
+from calib.daemon.view import HistoryPoint, NoSuch, NotPossible, State
 from calib.observer.recalibrator import Recalibrator
 from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord
@@ -506,18 +505,22 @@ def keep_history(daemon: FastDaemon) -> None:
         daemon.service.save(history=True)
 
 
+def history(daemon: FastDaemon, *asked: Any, **more: Any) -> tuple[HistoryPoint, ...]:
+    return tuple(point for page in daemon.view.history_pages(*asked, **more) for point in page)
+
+
 def test_history_is_thinned_evenly_and_ends_with_the_newest(tmp_path: Path) -> None:
     daemon = FastDaemon(tmp_path, 1, settings("apply"))
     keep_history(daemon)
-    points = daemon.view.history("joint_3")
+    points = history(daemon, "joint_3")
     assert len(points) >= 6
-    few = daemon.view.history("joint_3", most=3)
+    few = history(daemon, "joint_3", most=3)
     assert len(few) <= 3
     assert few[-1] == points[-1]
-    assert daemon.view.history("joint_3", since=points[-2].time) == points[-2:]
+    assert history(daemon, "joint_3", since=points[-2].time) == points[-2:]
     with pytest.raises(NoSuch, match="joint_9"):
-        daemon.view.history("joint_9")
-    everything = daemon.view.history(None, most=3)
+        history(daemon, "joint_9")
+    everything = history(daemon, None, most=3)
     assert [point for point in everything if point.joint == "joint_3"] == list(few)
 
 
@@ -530,7 +533,7 @@ def test_history_older_than_a_month_is_thinned_the_rest_stays_whole(tmp_path: Pa
     reader = HistoryReader(journal.path)
     times = [point[0] for page in reader.pages(reader.chosen(None, None, 1000)) for point in page]
     assert sum(time < daemon.wall() - timedelta(days=30) for time in times) == 10
-    assert len(daemon.view.history("joint_3")) >= 6
+    assert len(history(daemon, "joint_3")) >= 6
 
 
 def test_recordings_are_rotated_within_their_quota_and_load(tmp_path: Path) -> None:
@@ -610,3 +613,11 @@ def test_a_slow_client_loses_the_oldest_and_holds_nobody_up(tmp_path: Path) -> N
     daemon.view.publish()
     assert len(client._items) < 100
     assert last.joints[0].joint == "joint_1"
+
+
+def test_thresholds_of_earlier_arm_files_are_left_out_and_said_so(caplog: pytest.LogCaptureFixture) -> None:
+    given = {"place_size": 0.3, "excitation_rows": 40, "window": 16}
+    assert settings("apply", observer=given).observer == {"window": 16}
+    assert [record.args for record in caplog.records] == [("excitation_rows",), ("place_size",)]
+    with pytest.raises(ValueError, match="no threshold 'windows'"):
+        settings("apply", observer={"windows": 16})

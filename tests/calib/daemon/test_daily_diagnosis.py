@@ -13,13 +13,13 @@ from fast_daemon import FastDaemon
 
 from armlink.arm_file import load_arm
 from armlink.link.types import Stats
+from armlink.loop.messages import CHANNELS, Batch
 from armlink.recording.files import load_recording
 from calib.daemon.environment import Environment
-from calib.daemon.loop.loop_messages import CHANNELS, Batch
 from calib.daemon.observation import daily_diagnosis
 from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.settings import Configuration, DaemonSection, DiagnosisSettings
-from calib.daemon.state.busiest_minute import SECONDS, BusiestMinute
+from calib.daemon.state.samples import BusiestMinute
 
 PATIENCE = 3600.0
 """A process of low priority is given this time on a busy machine [s]."""
@@ -42,7 +42,7 @@ class Bench:
 
     def work(self, travel: float) -> None:
         """A minute in which the first joint goes `travel` [rad]."""
-        for seconds, angle in ((SECONDS, 0.0), (0.1, travel)):
+        for seconds, angle in ((60.0, 0.0), (0.1, travel)):
             t = self.now + np.arange(0.0, seconds, 0.004)
             position = np.zeros((len(t), self.joints))
             position[:, 0] = angle

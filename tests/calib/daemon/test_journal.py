@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.daemon.state.history_reader import HistoryReader
 from calib.daemon.state.journal import Journal
+from calib.daemon.state.journal_rows import HistoryReader
 from calib.observer.decision import DriftFinding
 
 NOW = datetime(2026, 5, 1, tzinfo=UTC)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from armlink.link.types import Stats
-from calib.daemon.loop.loop_messages import CHANNELS, Batch
-from calib.daemon.state.live_window import WINDOW_SECONDS, LiveWindow
+from armlink.loop.messages import CHANNELS, Batch
+from calib.daemon.state.samples import WINDOW_SECONDS, LiveWindow
 
 
 def batch(t: float, temperature: float | None = 30.0) -> Batch:

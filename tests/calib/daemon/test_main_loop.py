@@ -15,29 +15,29 @@ from armlink import cli
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.link.ends import EndCause
 from armlink.link.types import Tell
-from armlink.loop.messages import Alive
+from armlink.loop.kept_arm import KeptMessage
+from armlink.loop.messages import Told
 from calib.daemon import main_loop
 from calib.daemon.environment import Immediate
-from calib.daemon.loop.loop_messages import Message
 from calib.daemon.main_loop import BEGIN_SECONDS, SILENT_SECONDS, Daemon
 from calib.daemon.notify import Notifier
-from calib.daemon.options import Options
+from calib.daemon.settings import Options
 from calib.records.file_lock import locked_directory
 
 
 class NoProcess:
     """Stands for the bus process: a pipe that nothing comes through."""
 
-    def __init__(self, options: Any = None) -> None:
-        self.options, self.closed, self.killed = options, False, False
-        self.waiting: list[Message] = []
+    def __init__(self, arm: Any = None) -> None:
+        self.arm, self.closed, self.killed = arm, False, False
+        self.waiting: list[KeptMessage] = []
         self.pumped = 0
         self._ends = os.pipe()
 
     def fileno(self) -> int:
         return -1 if self.closed else self._ends[0]
 
-    def pump(self) -> list[Message]:
+    def pump(self) -> list[KeptMessage]:
         self.pumped += 1
         return self.waiting
 
@@ -56,14 +56,14 @@ class Running:
         self.content = yaml.safe_load(bundled_arms()["sarcos"].read_text())
         self.write(lambda content: None)
         self.started: list[NoProcess] = []
-        patch.setattr(main_loop, "LoopProcess", self._start)
+        patch.setattr(Options, "keep", lambda options, arm: self._start(arm))
         patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
         options = Options(arm=str(self.arm_file), store=str(folder / "records.db"))
         self.process = NoProcess()
         self.daemon = Daemon(options, load_arm(self.arm_file), self.process, folder / "state")  # type: ignore[arg-type]
 
-    def _start(self, options: Any) -> NoProcess:
-        self.started.append(NoProcess(options))
+    def _start(self, arm: Any) -> NoProcess:
+        self.started.append(NoProcess(arm))
         return self.started[-1]
 
     def write(self, change: Callable[[dict[str, Any]], None]) -> None:
@@ -156,7 +156,7 @@ def test_other_limits_reach_a_new_bus_process(tmp_path: Path, monkeypatch: pytes
         running.daemon._reload()
         assert running.kinds()[-1] in ("configuration", "fault")
         assert running.process.closed
-        assert [process.options.arm.link.joints[2].max_velocity for process in running.started] == [0.3]
+        assert [process.arm.link.joints[2].max_velocity for process in running.started] == [0.3]
 
     with_daemon(tmp_path, monkeypatch, act)
 
@@ -211,9 +211,9 @@ def test_what_systemd_s_socket_did_not_take_is_sent_later_and_only_the_newest_of
             receiver.recv(200)
 
 
-@pytest.mark.parametrize(("waiting", "stood_still"), [([Alive()], 0.0), ([], 20.0)])
+@pytest.mark.parametrize(("waiting", "stood_still"), [([Told(0, "")], 0.0), ([], 20.0)])
 def test_a_service_that_stood_still_does_not_judge_its_bus_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waiting: list[Message], stood_still: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waiting: list[KeptMessage], stood_still: float
 ) -> None:
     def act(running: Running) -> None:
         daemon, now = running.daemon, time.monotonic()
@@ -251,11 +251,11 @@ def test_a_bus_process_that_hangs_is_replaced_and_again_where_there_is_no_proces
     def act(running: Running) -> None:
         daemon = running.daemon
 
-        def none_left(options: object) -> None:
+        def none_left(options: object, arm: object) -> None:
             raise BlockingIOError("Resource temporarily unavailable")
 
         with monkeypatch.context() as patch:
-            patch.setattr(main_loop, "LoopProcess", none_left)
+            patch.setattr(Options, "keep", none_left)
             daemon._heard = time.monotonic() - SILENT_SECONDS - 5.0
             daemon._judge(time.monotonic(), 0.0)
             assert running.process.killed
@@ -276,7 +276,7 @@ def test_a_second_daemon_on_a_state_directory_does_not_start(
     begun: list[object] = []
     monkeypatch.setattr("calib.commands.daemon.TAKE_OVER_SECONDS", 0.0)
     monkeypatch.setattr("calib.daemon.logs.log_to_stderr", lambda: None)
-    monkeypatch.setattr("calib.daemon.loop.loop_process.LoopProcess", lambda *given, **options: begun.append(given))
+    monkeypatch.setattr(Options, "keep", lambda *given: begun.append(given))
     with locked_directory(tmp_path, "--state of the first"):
         status = cli.run(["daemon", "sarcos", "--bus", "armlink_sim:sarcos", "--state", str(tmp_path)])
     error = capsys.readouterr().err

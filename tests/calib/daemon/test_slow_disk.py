@@ -14,16 +14,14 @@ from failing_calls import OtherCommit
 from fast_daemon import START, FastDaemon, drifted, metric, settings
 
 from armlink.arm_file import load_arm
-from calib.daemon.loop.loop_messages import Up
+from armlink.loop.messages import Up
+from calib.daemon.environment import Worker
 from calib.daemon.main_loop import Daemon
-from calib.daemon.options import Options
-from calib.daemon.settings import DaemonSection
+from calib.daemon.settings import DaemonSection, Options
 from calib.daemon.state import journal as journal_of
-from calib.daemon.state import recordings
+from calib.daemon.state import samples
 from calib.daemon.state.journal import SILENT_SECONDS, Journal
-from calib.daemon.state.worker import Worker
-from calib.daemon.view.api_models import EventItem, State
-from calib.daemon.view.view import NotPossible
+from calib.daemon.view import EventItem, NotPossible, State
 from calib.records.records import CalibrationRecord, provenance
 
 PATIENCE = 60.0
@@ -212,7 +210,7 @@ def test_a_row_that_the_schema_refuses_holds_no_other_up(tmp_path: Path) -> None
 def test_recordings_that_the_disk_does_not_take_are_left_out_and_begin_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(recordings, "MOST_WAITING", 5)
+    monkeypatch.setattr(samples, "MOST_WAITING", 5)
     daemon = FastDaemon(tmp_path, 1, DaemonSection.model_validate({"recording": {"rate": 25.0}}))
     daemon.run(2)
     daemon.disk.held = True

@@ -7,7 +7,7 @@ import pytest
 
 from armlink.errors import BadInput, Refused
 from calib.install import apply
-from calib.install.apply import Apply, apply_calibration
+from calib.install.apply import Apply, apply_record
 
 ARM = SimpleNamespace(joint_names=("joint_1", "joint_2"))
 
@@ -16,12 +16,6 @@ def record(*offsets: float | None) -> SimpleNamespace:
     made = SimpleNamespace(joints=[SimpleNamespace(offset=offset) for offset in offsets])
     made.require = lambda arm: made
     return made
-
-
-def fitted(*gains: float) -> SimpleNamespace:
-    values = {"gain": np.array(gains)}
-    beta = SimpleNamespace(complete=SimpleNamespace(beta=np.array([1.0, 2.0])))
-    return SimpleNamespace(goodness=SimpleNamespace(findings=()), value=values.__getitem__, fit=beta)
 
 
 @pytest.fixture
@@ -33,7 +27,7 @@ def written(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
         calls.append((gate(None), beta))
         return ("joint_1",)
 
-    monkeypatch.setattr(apply, "admit_sweeps", lambda *given: "admitted")
+    monkeypatch.setattr(apply, "admit_fitted", lambda *given: "admitted")
     monkeypatch.setattr(apply, "_write", write)
     return calls
 
@@ -42,25 +36,22 @@ def test_what_the_gates_admit_is_written_and_kept_in_any_case(written: list[tupl
     kept: list[object] = []
     store = SimpleNamespace(add=kept.append)
     some = record(0.1, None)
-    assert apply_calibration(some, ARM, store, [], fitted(1.01, np.nan), Apply("me")) == ("joint_1",)
-    admitted, beta = written[0]
-    assert admitted == "admitted"
-    assert beta.tolist() == [1.0, 2.0]
+    beta = np.array([1.0, 2.0])
+    assert apply_record(some, ARM, store, Apply("me"), beta, "sweeps") == ("joint_1",)
+    assert written == [("admitted", beta)]
     assert kept == [some]
-    apply_calibration(some, ARM, store, [], fitted(np.nan, np.nan), Apply("me"))
-    assert written[1] == ("admitted", None)
 
 
 def test_a_record_without_anything_to_write_is_kept_and_refused(written: list[tuple]) -> None:
     kept: list[object] = []
     nothing = record(None, None)
     with pytest.raises(Refused, match="nothing is written"):
-        apply_calibration(nothing, ARM, SimpleNamespace(add=kept.append), [], fitted(np.nan), Apply("me"))
+        apply_record(nothing, ARM, SimpleNamespace(add=kept.append), Apply("me"), None, "sweeps")
     assert kept == [nothing]
     assert written == []
 
 
 def test_joints_that_the_arm_has_not_are_named(written: list[tuple]) -> None:
     with pytest.raises(BadInput, match="--replaced elbow: no such joint"):
-        apply_calibration(record(0.1), ARM, None, [], fitted(1.0), Apply("me", replaced=("elbow",)))
+        apply_record(record(0.1), ARM, None, Apply("me", replaced=("elbow",)), None, "sweeps")
     assert written == []

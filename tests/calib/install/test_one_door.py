@@ -23,15 +23,17 @@ from calib.records.store import RecordStore
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("armlink", "calib", "gcomp", "sim_bus", "sim_gap")
 DOOR, GATES = "calib/install/journaled_write.py", "calib/install/plausibility.py"
-LOOP, ASKS = "calib/daemon/loop/arm_loop.py", ("calib/daemon/loop/loop_process.py", "armlink/loop/remote_link.py")
-"""What answers the service's calls of the bus process, and where each of the two bus processes is called."""
+ASKS = "armlink/loop/cycle_process.py"
+"""Where the process that makes the cycles is asked to write."""
+LINKS = ("armlink/loop/kept_arm.py", "armlink/loop/remote_link.py")
+"""That of a daemon, and that of a command."""
 WIRE = "armlink/drives/canopen/torque_sensor_record.py"
 DRIVES = "armlink/drives/canopen/drives.py"
 OBJECTS = ("STAGED_GAIN", "STAGED_OFFSET", "ACTIVATE")
 """Of 2100h, without which no calibration becomes active."""
 
 
-ASKED_FOR = re.compile(rf"\b(write_calibration|write_record|Call|_call|_enabled|Admitted|{'|'.join(OBJECTS)})\b")
+ASKED_FOR = re.compile(rf"\b(write_calibration|write_record|Call|_call|_enabled|remote|Admitted|{'|'.join(OBJECTS)})\b")
 """Names that the tests look for; a file without one says nothing to them."""
 
 
@@ -89,28 +91,29 @@ def calls(*names: str) -> Iterator[tuple[str, str, ast.expr | None]]:
 
 
 def test_only_the_door_calls_write_calibration() -> None:
-    """Beside it there are only forwarders: methods of that name, and the bus process, which answers their requests."""
+    """Beside it there are only forwarders: methods of that name."""
     callers = users("write_calibration")
     assert {function for path, function in callers if path == DOOR} == {"_write", "_restore"}
-    others = {(path, function) for path, function in callers if path != DOOR and function != "write_calibration"}
-    assert others <= {(LOOP, "_do")}
+    assert all(function == "write_calibration" for path, function in callers if path != DOOR)
 
 
 def test_only_a_forwarder_asks_the_bus_process_to_write() -> None:
     """By name, in a `Call`; functions in a `Call` (`RemoteLink.inside`) are subject to the test above."""
     said = {(path, function) for path, function, kind in uses()["write_calibration"] if kind is ast.Constant}
-    assert said == {(LOOP, "_do"), *((path, "write_calibration") for path in ASKS)}
+    assert said == {(ASKS, "write_calibration")}
 
 
 def test_a_call_of_the_bus_process_spells_its_name_out() -> None:
     """Otherwise a name put together at run time would pass the test above."""
-    service, job = ASKS
     made = {(path, function) for path, function, _ in calls("Call")}
-    assert made == {(service, "_tour"), (service, "_call"), (job, "_call")}
-    asked = [call for call in calls("_call", "_enabled") if call[0] in ASKS]
-    assert {what.value for _, _, what in asked if isinstance(what, ast.Constant)} >= {"write_calibration", "enable"}
-    passed_on = {(path, function) for path, function, what in asked if not isinstance(what, ast.Constant)}
-    assert passed_on == {(job, "inside"), (job, "_enabled")}
+    assert made == {(link, "_call") for link in LINKS}
+    requests = [call for call in calls("_call", "_enabled") if call[0] in (ASKS, *LINKS)]
+    assert {what.value for _, _, what in requests if isinstance(what, ast.Constant)} >= {"write_calibration", "enable"}
+    passed_on = {(path, function) for path, function, what in requests if not isinstance(what, ast.Constant)}
+    assert passed_on == {(LINKS[1], "inside"), (LINKS[1], "_enabled"), (ASKS, "ask")}
+    methods = [what.attr for path, _, what in calls("remote") if isinstance(what, ast.Attribute)]
+    assert len(methods) == len(list(calls("remote")))  # of a protocol, by its name
+    assert "write_calibration" not in methods
 
 
 NAMED = ("armlink/drives/canopen/check/guard_rules.py", "_record_writes")

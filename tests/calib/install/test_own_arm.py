@@ -11,7 +11,7 @@ from fast_daemon import FastDaemon, settings
 from armlink.arm_file import ArmFile, load_arm
 from armlink.errors import Refused
 from armlink.link.link import Link
-from calib.daemon.view.api_models import State
+from calib.daemon.view import State
 from calib.dataset import Manifest, SweepData, drives_of
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted

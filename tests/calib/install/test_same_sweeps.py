@@ -6,11 +6,12 @@ import pytest
 from sweep_arms import random_arm
 from synthetic_sweeps import passes
 
+from calib.fit import field_fit, heldout
+from calib.fit.field_fit import held_out_rows
 from calib.fit.gravity_fit import identify_gravity
+from calib.fit.heldout import held_out_steps
 from calib.fit.sensor_fit import fit_sensors
-from calib.install import apply
-from calib.install.apply import check_heldout, data_of, fitted_to
-from calib.install.plausibility import Admitted
+from calib.records.records import HeldOut
 
 
 def test_a_record_is_not_judged_by_its_own_readings(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,10 +20,10 @@ def test_a_record_is_not_judged_by_its_own_readings(monkeypatch: pytest.MonkeyPa
     fit = fit_sensors(arm, data)
     record = fit.record(arm)
     gravity = identify_gravity(arm, data, fit).record(arm, record)
-    assert fitted_to(record, data_of(record))
-    assert fitted_to(gravity, data_of(record))
+    assert record.is_fitted_to(record.data)
+    assert gravity.is_fitted_to(record.data)
     others = [replace(each, digest=f"{index}" * 64) for index, each in enumerate(data, start=1)]
-    assert not fitted_to(record, {each.digest for each in others})
+    assert not record.is_fitted_to({each.digest for each in others})
 
     judged: list[bool] = []
 
@@ -31,13 +32,14 @@ def test_a_record_is_not_judged_by_its_own_readings(monkeypatch: pytest.MonkeyPa
             judged.append(beta is not None)
         return "errors"
 
-    monkeypatch.setattr(apply, "heldout_scores", scores)
-    monkeypatch.setattr(apply, "worse_joint", lambda new, old: None)
-    check_heldout(record, record, arm, data, gravity)
+    proof = HeldOut(against=record.id)
+    monkeypatch.setattr(heldout, "heldout_scores", scores)
+    monkeypatch.setattr(heldout, "held_out", lambda old, *errors: proof)
+    assert held_out_steps(record, record, arm, data, gravity) == proof
     assert judged == []
-    check_heldout(record, record, arm, others, gravity)
+    held_out_steps(record, record, arm, others, gravity)
     assert judged == [True]
-    check_heldout(record, record.model_copy(update={"sources": {}}), arm, data, gravity)
+    held_out_steps(record, record.model_copy(update={"sources": {}}), arm, data, gravity)
     assert judged == [True, False], "mass moments fitted to the same readings are estimated anew"
 
 
@@ -50,15 +52,12 @@ def test_nor_is_one_from_slow_motion_by_the_readings_of_the_record_before(monkey
     same = before.model_copy(update={"sources": {"unloaded": data[0].digest, **from_gravity}})
     other = before.model_copy(update={"sources": {"work.mcap": "f" * 64, **from_gravity}})
     after = before.model_copy(update={"sources": {**before.sources, **from_gravity}})
-    assert fitted_to(after, data_of(same))
-    assert not fitted_to(after, data_of(other)), "the same gravity record is no data"
+    assert after.is_fitted_to(same.data)
+    assert not after.is_fitted_to(other.data), "the same gravity record is no data"
 
     judged: list[str] = []
-    monkeypatch.setattr(apply, "_keep", lambda *args: None)
-    monkeypatch.setattr(apply, "admit", lambda record, *args: Admitted(record, arm, "all", after))
-    monkeypatch.setattr(apply, "heldout_errors", lambda *args: (judged.append("judged"), "errors"))
-    monkeypatch.setattr(apply, "worse_joint", lambda new, old: None)
-    monkeypatch.setattr(apply, "_write", lambda *args: ())
+    monkeypatch.setattr(field_fit, "heldout_errors", lambda *args: (judged.append("judged"), "errors"))
+    monkeypatch.setattr(field_fit, "held_out", lambda old, *errors: HeldOut(against=old.id))
     for record in (same, other):
-        apply.apply_field(record, arm, None, None, None, None, apply.Apply("me"))  # type: ignore[arg-type]
+        assert held_out_rows(record, None, None, after) == HeldOut(against=after.id)  # type: ignore[arg-type]
         assert len(judged) == (record is other)

@@ -54,10 +54,10 @@ def test_a_pose_that_is_known_well_does_not_follow_a_drift():
 
 def test_the_latest_poses_are_remembered_until_all_are_forgotten():
     memory = PoseMemory(2, CONFIG)
-    poses = np.column_stack([np.arange(CONFIG.places + 2), np.zeros(CONFIG.places + 2)])
+    poses = np.column_stack([np.arange(CONFIG.longest_window + 2), np.zeros(CONFIG.longest_window + 2)])
     for pose in poses:
         memory.add(pose, pose)
-    assert [memory.seen(pose) for pose in poses] == [0, 0] + [1] * CONFIG.places
+    assert [memory.seen(pose) for pose in poses] == [0, 0] + [1] * CONFIG.longest_window
     memory.forget()
     assert not any(memory.seen(pose) for pose in poses)
 

@@ -1,5 +1,6 @@
 """The report to file, the held-out gate and recalibration from sweeps: on one made-up arm of three joints."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +10,14 @@ from sweep_arms import random_arm
 from synthetic_sweeps import passes
 
 from armlink.errors import Refused
-from calib.fit.field_fit import fit_field, heldout_errors
-from calib.fit.findings import FitFinding
+from calib.dataset import SweepData
+from calib.fit.field_fit import fit_field, held_out_rows
 from calib.fit.gravity_fit import identify_gravity
-from calib.fit.heldout import heldout_scores, worse_joint
+from calib.fit.heldout import held_out_steps, heldout_scores
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.fit.slow_windows import rows_of_sweeps
-from calib.install.apply import Apply, admit_sweeps, check_heldout, check_holds
+from calib.install.apply import Apply, admit_fitted
+from calib.install.plausibility import check_held_out, replaced_record
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, JointCalibration
 from calib.records.store import RecordStore
@@ -93,21 +95,25 @@ def test_held_out_steps_are_as_far_off_as_their_noise(fit, record) -> None:
 
 def test_the_gates_let_a_right_calibration_pass_and_name_what_is_wrong(record, tmp_path) -> None:
     store = RecordStore(str(tmp_path / "records.db"))
-    admit_sweeps(record, ARM, store, DATA, (), Apply("ann"))  # the first of this arm
+    admit_fitted(record, ARM, store, Apply("ann"), {})  # the first of this arm
     store.put(changed(record, 2, gain=1.03, offset=0.2), ARM, by="ann", reason="sweeps")
-    admit_sweeps(record, ARM, store, DATA, (), Apply("ann"))
+    with pytest.raises(Refused, match=r"was not compared with record .* by held-out data"):
+        admit_fitted(record, ARM, store, Apply("ann"), {})
+    before = replaced_record(record, ARM, store)
+    assert before is not None
+    proved = record.model_copy(update={"held_out": held_out_steps(record, before, ARM, DATA)})
+    admit_fitted(proved, ARM, store, Apply("ann"), {})
     jumped = changed(record, 0, gain=1.3)
     with pytest.raises(Refused, match=f"{ARM.joint_names[0]}: gain .* covariance and history allow"):
-        admit_sweeps(jumped, ARM, store, DATA, (), Apply("ann"))
+        admit_fitted(jumped, ARM, store, Apply("ann"), {})
 
 
-def test_a_joint_on_which_the_model_does_not_hold_is_not_written() -> None:
-    cable = FitFinding("j2", "spring", 0.8, "N·m/rad", "a spring of 0.8 N·m/rad pulls on it: is a cable caught?")
-    outlier = FitFinding("j1", "outliers", 2.0, "1", "2 readings were left out")
-    check_holds([outlier])
-    check_holds([outlier, cable], accepted=["j2"])
-    with pytest.raises(Refused, match="j2: the sensor model does not hold: a spring of"):
-        check_holds([outlier, cable])
+def test_a_joint_on_which_the_model_does_not_hold_is_not_written(record, tmp_path) -> None:
+    store, name = RecordStore(str(tmp_path / "records.db")), ARM.joint_names[1]
+    cable = {name: f"{name}: a spring of 0.8 N·m/rad pulls on it: is a cable caught?"}
+    admit_fitted(record, ARM, store, Apply("ann", accepted=[name]), cable)
+    with pytest.raises(Refused, match=f"^{name}: the sensor model does not hold: a spring of"):
+        admit_fitted(record, ARM, store, Apply("ann"), cable)
 
 
 def test_sweeps_that_disagree_with_one_another_do_not_replace_a_good_record(fit, record) -> None:
@@ -124,9 +130,15 @@ def test_sweeps_that_disagree_with_one_another_do_not_replace_a_good_record(fit,
             readings.append(replace(reading, torque=torque))
         spoilt.append(replace(data, readings=tuple(readings), digest="f" * 64))
     gravity = identify_gravity(ARM, DATA, fit).record(ARM, record)
-    check_heldout(record.model_copy(update={"note": "new"}), record, ARM, DATA, gravity)
+
+    def judged(sweeps: Sequence[SweepData]) -> None:
+        new = record.model_copy(update={"note": "new"})
+        proof = held_out_steps(new, record, ARM, sweeps, gravity)
+        check_held_out(new.model_copy(update={"held_out": proof}), record)
+
+    judged(DATA)
     with pytest.raises(Refused, match=f"{ARM.joint_names[1]}: held-out data is predicted with"):
-        check_heldout(record.model_copy(update={"note": "new"}), record, ARM, spoilt, gravity)
+        judged(spoilt)
 
 
 def test_sweeps_without_a_mass_recalibrate_against_the_gravity_record(fit, record) -> None:
@@ -145,7 +157,7 @@ def test_sweeps_without_a_mass_recalibrate_against_the_gravity_record(fit, recor
     assert new.joints[1].gain == pytest.approx(TRUTH.gain[1], rel=0.01)
     for joint, parameter in found.reasons:
         assert f"{joint} {parameter}" in new.note  # carried over, and said so
-    assert worse_joint(*heldout_errors(rows, found, later)) is None
+    check_held_out(new.model_copy(update={"held_out": held_out_rows(new, rows, found, later)}), later)
 
 
 def test_a_pass_with_a_mass_is_not_taken_for_the_bare_arm() -> None:

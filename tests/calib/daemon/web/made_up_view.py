@@ -7,10 +7,10 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from armlink.arm_file import load_arm
+from calib.daemon import view
 from calib.daemon.service_view import drawn_arm
-from calib.daemon.view import api_models
-from calib.daemon.view.fan_out import Client, Hub
-from calib.daemon.view.view import NoSuch, NotPossible, Window
+from calib.daemon.state.events import Client, Hub
+from calib.daemon.view import NoSuch, NotPossible, Window
 
 NOW = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
 NAMES = tuple(f"joint_{i}" for i in range(1, 8))
@@ -26,12 +26,12 @@ class MadeUpView:
 
     def begin(self) -> None:
         """As it is at the start."""
-        self.state, self.fault, self.t = api_models.State.OBSERVING, None, 0.0
+        self.state, self.fault, self.t = view.State.OBSERVING, None, 0.0
         self.report = None
         self.disk_hangs = False
-        self.log: list[api_models.EventRecord] = []
-        self.points: list[api_models.HistoryPoint] = []
-        self.offered: list[api_models.Proposal] = []
+        self.log: list[view.EventRecord] = []
+        self.points: list[view.HistoryPoint] = []
+        self.offered: list[view.Proposal] = []
         self.shift = 0.0
         self.moves = True
 
@@ -39,16 +39,16 @@ class MadeUpView:
         self.t += seconds
         self.hub.publish(self.item())
 
-    def happen(self, kind: str, joint: str | None = None, text: str = "", **evidence: object) -> api_models.EventRecord:
-        record = api_models.EventRecord(
+    def happen(self, kind: str, joint: str | None = None, text: str = "", **evidence: object) -> view.EventRecord:
+        record = view.EventRecord(
             id=len(self.log) + 1, time=self.time(), t=self.t, kind=kind, joint=joint, text=text, evidence=evidence
         )
         self.log.append(record)
-        self.hub.publish(api_models.EventItem(event=record))
+        self.hub.publish(view.EventItem(event=record))
         return record
 
-    def propose(self, joint: str = "joint_2") -> api_models.Proposal:
-        proposal = api_models.Proposal(
+    def propose(self, joint: str = "joint_2") -> view.Proposal:
+        proposal = view.Proposal(
             id=len(self.offered) + 1,
             hash=f"{len(self.offered) + 1:064x}",
             time=self.time(),
@@ -70,18 +70,16 @@ class MadeUpView:
     def time(self) -> datetime:
         return NOW + timedelta(seconds=self.t)
 
-    def item(self) -> api_models.JointsItem:
-        return api_models.JointsItem(time=self.time(), t=self.t, state=self.state, bus=self.bus(), joints=self.joints())
+    def item(self) -> view.JointsItem:
+        return view.JointsItem(time=self.time(), t=self.t, state=self.state, bus=self.bus(), joints=self.joints())
 
-    def bus(self) -> api_models.BusHealth:
+    def bus(self) -> view.BusHealth:
         if self.fault:
-            return api_models.BusHealth(connected=False, fault=self.fault)
-        return api_models.BusHealth(
-            connected=True, rate_hz=250.0, load=0.42, frames=1200 + int(self.t * 4000), missed=0
-        )
+            return view.BusHealth(connected=False, fault=self.fault)
+        return view.BusHealth(connected=True, rate_hz=250.0, load=0.42, frames=1200 + int(self.t * 4000), missed=0)
 
-    def status(self) -> api_models.Status:
-        return api_models.Status(
+    def status(self) -> view.Status:
+        return view.Status(
             state=self.state,
             detail=self.fault or "",
             arm="sarcos",
@@ -93,16 +91,16 @@ class MadeUpView:
             t=self.t,
             uptime_s=self.t,
             bus=self.bus(),
-            records=api_models.RecordsInForce(calibration="77aa01cd", gravity="0b5c11ee"),
+            records=view.RecordsInForce(calibration="77aa01cd", gravity="0b5c11ee"),
             rows=120,
             pending_proposals=sum(each.state == "pending" for each in self.offered),
             last_event=len(self.log),
             report=self.report,
         )
 
-    def joints(self) -> tuple[api_models.JointNow, ...]:
+    def joints(self) -> tuple[view.JointNow, ...]:
         return tuple(
-            api_models.JointNow(
+            view.JointNow(
                 joint=name,
                 position=0.3 * math.sin(self.t * self.moves + k),
                 torque=5.0 * math.cos(self.t + k) + 0.02 + self.shift * (k == 1),
@@ -130,12 +128,12 @@ class MadeUpView:
         channels["temperature"][:, 0] = np.nan
         return Window(NAMES, self.time(), t - t[0], channels)
 
-    def arm(self) -> api_models.DrawnArm:
+    def arm(self) -> view.DrawnArm:
         return drawn_arm(load_arm("sarcos"))
 
-    def estimates(self) -> tuple[api_models.JointEstimate, ...]:
+    def estimates(self) -> tuple[view.JointEstimate, ...]:
         return tuple(
-            api_models.JointEstimate(
+            view.JointEstimate(
                 joint=name,
                 gain=1.0 + 0.012 * (k == 1),
                 gain_std=0.001,
@@ -149,12 +147,12 @@ class MadeUpView:
             for k, name in enumerate(NAMES)
         )
 
-    def events(self, after: int = 0, limit: int = 500) -> tuple[api_models.EventRecord, ...]:
+    def events(self, after: int = 0, limit: int = 500) -> tuple[view.EventRecord, ...]:
         return tuple(event for event in self.log if event.id > after)[:limit]
 
     def history(
         self, joint: str | None, since: datetime | None = None, until: datetime | None = None, most: int = 2000
-    ) -> tuple[api_models.HistoryPoint, ...]:
+    ) -> tuple[view.HistoryPoint, ...]:
         if joint is None:
             return tuple(point for name in NAMES for point in self.history(name, since, until, most))
         if joint not in NAMES:
@@ -166,13 +164,13 @@ class MadeUpView:
     def history_pages(self, *query):
         yield self.history(*query)
 
-    def proposals(self, limit: int = 200) -> tuple[api_models.Proposal, ...]:
+    def proposals(self, limit: int = 200) -> tuple[view.Proposal, ...]:
         return tuple(self.offered[:limit])
 
-    def approve(self, proposal: int, by: str, digest: str | None = None) -> Future[api_models.Proposal]:
+    def approve(self, proposal: int, by: str, digest: str | None = None) -> Future[view.Proposal]:
         return self._decide(proposal, "approved", by, digest)
 
-    def reject(self, proposal: int, by: str, digest: str | None = None) -> Future[api_models.Proposal]:
+    def reject(self, proposal: int, by: str, digest: str | None = None) -> Future[view.Proposal]:
         return self._decide(proposal, "rejected", by, digest)
 
     def subscribe(self) -> Client:
@@ -180,8 +178,8 @@ class MadeUpView:
         client.put(self.item())
         return client
 
-    def _decide(self, number: int, state: str, by: str, digest: str | None) -> Future[api_models.Proposal]:
-        answer: Future[api_models.Proposal] = Future()
+    def _decide(self, number: int, state: str, by: str, digest: str | None) -> Future[view.Proposal]:
+        answer: Future[view.Proposal] = Future()
         for place, proposal in enumerate(self.offered):
             if proposal.id == number:
                 if digest not in (None, proposal.hash):

@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 from playwright.sync_api import Browser, Page
 
-from calib.daemon.view.view import DaemonView
+from calib.daemon.view import DaemonView
 from calib.daemon.web.server import serve
 
 TOKEN = "a-token-for-tests-only"

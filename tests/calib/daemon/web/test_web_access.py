@@ -6,7 +6,7 @@ from made_up_view import NAMES, MadeUpView
 from playwright.sync_api import Browser, Page, expect
 from served_page import Served, open_page
 
-from calib.daemon.view.api_models import State
+from calib.daemon.view import State
 
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]}
 

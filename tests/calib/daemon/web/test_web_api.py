@@ -15,7 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from pydantic import TypeAdapter, ValidationError
 from served_page import Served
 
-from calib.daemon.view.api_models import HistoryPoint
+from calib.daemon.view import HistoryPoint
 from calib.daemon.web import history, routes
 from calib.daemon.web import page as page_module
 from calib.daemon.web.page import page_files
@@ -110,7 +110,7 @@ def test_a_decision_may_name_the_content_and_is_then_of_that_alone(server: Serve
 def test_a_decision_that_is_not_on_disk_in_time_is_not_yet_and_stands(
     server: Served, view: MadeUpView, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(routes, "DECISION_SECONDS", 0.05)
+    monkeypatch.setattr(routes, "DISK_SECONDS", 0.05)
     server.do(view.propose)
     view.disk_hangs = True
     answer = server.client().post("/api/proposals/1/approve")
@@ -123,7 +123,7 @@ def test_events_that_the_disk_does_not_give_are_given_up(
     server: Served, view: MadeUpView, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     may = threading.Event()
-    monkeypatch.setattr(history, "READ_SECONDS", 0.05)
+    monkeypatch.setattr(history, "DISK_SECONDS", 0.05)
     monkeypatch.setattr(view, "events", lambda after=0, limit=500: may.wait(60) and ())
     answer = server.client().get("/api/events")
     assert (answer.status_code, server.client().get("/api/status").status_code) == (503, 200)
@@ -197,7 +197,7 @@ def test_a_failure_inside_shows_no_traceback(server: Served, view: MadeUpView, m
 
 def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> None:
     """Read is separate from control: by the description, by the routes there are, and by what the view offers."""
-    from calib.daemon.view.view import DaemonView, Decisions
+    from calib.daemon.view import DaemonView, Decisions
     from calib.daemon.web.app import open_app
 
     described = server.client().get("/openapi.json").json()["paths"]
@@ -209,7 +209,7 @@ def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> 
     known = {*described, "/openapi.json", *page_files()}
     assert all(path in known for path in route_paths(app.routes))
     offered, decided = ({name for name in vars(seen) if not name.startswith("_")} for seen in (DaemonView, Decisions))
-    reading = {"status", "joints", "estimates", "events", "history", "history_pages", "proposals", "subscribe"}
+    reading = {"status", "joints", "estimates", "events", "history_pages", "proposals", "subscribe"}
     assert offered == reading | {"decisions", "arm", "window"}
     assert decided == {"approve", "reject"}
 

@@ -13,11 +13,11 @@ import pytest
 from made_up_view import MadeUpView
 from served_page import TOKEN, Served, served
 
+from calib.daemon.web import connection as connection_module
 from calib.daemon.web import guard as guard_module
-from calib.daemon.web import linger as linger_module
 from calib.daemon.web import server as server_module
+from calib.daemon.web.connection import LINGER_BYTES, Connection
 from calib.daemon.web.guard import HEAD_LIMIT, RateLimit
-from calib.daemon.web.linger import LINGER_BYTES, LingeringTransport
 from calib.daemon.web.server import CLOSING_SECONDS
 
 MUCH = 100_000
@@ -57,7 +57,7 @@ def _no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """However slow this machine is, the time of a drain is enough."""
-    monkeypatch.setattr(linger_module, "LINGER_SECONDS", PATIENCE)
+    monkeypatch.setattr(connection_module, "LINGER_SECONDS", PATIENCE)
 
 
 def connect(server: Served, tcp: bool) -> socket.socket:
@@ -123,7 +123,7 @@ def test_a_refusal_for_a_missing_token_is_not_lost_either(server: Served) -> Non
 @pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("tcp", [False, True], ids=["unix", "tcp"])
 def test_a_body_that_came_too_slowly_may_come_after_the_answer(server: Served, monkeypatch, tcp: bool) -> None:
-    monkeypatch.setattr(guard_module, "BODY_SECONDS", 0.05)
+    monkeypatch.setattr(guard_module, "PATIENCE_SECONDS", 0.05)
     request = POST + TO_TCP + b"Content-Length: 4096\r\n\r\n" + b"x" * 4096
     for _ in range(5):
         assert is_refusal(send_on_after_the_answer(server, tcp, request, begin=len(request) - 3000), 408)
@@ -162,7 +162,7 @@ def bytes_until_cut(raw: socket.socket, piece: bytes, pause: float) -> int:
 @pytest.mark.parametrize("tcp", [False, True], ids=["unix", "tcp"])
 @pytest.mark.parametrize("name", ["long request line", "large body"])
 def test_a_client_that_never_stops_is_cut_after_its_bytes(server: Served, monkeypatch, name: str, tcp: bool) -> None:
-    monkeypatch.setattr(linger_module, "LINGER_SECONDS", 10 * PATIENCE)
+    monkeypatch.setattr(connection_module, "LINGER_SECONDS", 10 * PATIENCE)
     with connect(server, tcp) as raw:
         raw.sendall(REFUSED[name][1][:BEGIN])
         between = 16 * 1024 * 1024  # what the kernel may hold of it
@@ -172,7 +172,7 @@ def test_a_client_that_never_stops_is_cut_after_its_bytes(server: Served, monkey
 @pytest.mark.parametrize("tcp", [False, True], ids=["unix", "tcp"])
 @pytest.mark.parametrize("name", ["long request line", "large body"])
 def test_a_client_that_never_stops_is_cut_after_its_time(server: Served, monkeypatch, name: str, tcp: bool) -> None:
-    monkeypatch.setattr(linger_module, "LINGER_SECONDS", 0.2)
+    monkeypatch.setattr(connection_module, "LINGER_SECONDS", 0.2)
     with connect(server, tcp) as raw:
         raw.sendall(REFUSED[name][1][:BEGIN])
         bytes_until_cut(raw, b"x", 0.01)
@@ -180,7 +180,7 @@ def test_a_client_that_never_stops_is_cut_after_its_time(server: Served, monkeyp
 
 def test_clients_that_stay_after_their_answer_hold_no_place_for_long(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(server_module, "MOST_CONNECTIONS", 5)
-    monkeypatch.setattr(linger_module, "LINGER_SECONDS", 0.2)
+    monkeypatch.setattr(connection_module, "LINGER_SECONDS", 0.2)
     with served(MadeUpView, tmp_path / "api.sock") as server:
         staying = [connect(server, False) for _ in range(4)]
         for raw in staying:
@@ -194,7 +194,7 @@ def test_clients_that_stay_after_their_answer_hold_no_place_for_long(tmp_path: P
 
 
 def test_the_server_ends_before_a_client_that_stays_has_to(tmp_path: Path) -> None:
-    assert linger_module.LINGER_SECONDS < CLOSING_SECONDS
+    assert connection_module.LINGER_SECONDS < CLOSING_SECONDS
     with served(MadeUpView, tmp_path / "api.sock") as server:
         idle, staying = connect(server, False), connect(server, False)
         staying.sendall(REFUSED["large body"][1])
@@ -217,11 +217,12 @@ class Noting(asyncio.Protocol):
         self.ended.set()
 
 
-async def closed_after(answer: bytes, ours: socket.socket) -> tuple[Noting, LingeringTransport]:
+async def closed_after(answer: bytes, ours: socket.socket) -> tuple[Noting, Connection]:
     """A connection with a long answer, just closed."""
-    loop, protocol = asyncio.get_running_loop(), Noting()
-    plain, _ = await loop.connect_accepted_socket(lambda: protocol, ours)
-    transport = LingeringTransport(plain)
+    protocol = Noting()
+    transport = Connection(lambda **_: protocol)
+    await asyncio.get_running_loop().connect_accepted_socket(lambda: transport, ours)
+    transport.data_received(b"request")
     transport.write(answer)
     transport.close()
     assert transport.is_closing()
@@ -239,7 +240,7 @@ def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
 
 
 def test_a_slow_reader_gets_the_whole_answer(pair, monkeypatch) -> None:
-    monkeypatch.setattr(linger_module, "LINGER_SECONDS", 0.05)
+    monkeypatch.setattr(connection_module, "LINGER_SECONDS", 0.05)
     ours, theirs = pair
     answer = b"0123456789" * 500_000
 
@@ -257,7 +258,7 @@ def test_a_slow_reader_gets_the_whole_answer(pair, monkeypatch) -> None:
 
 
 def test_a_client_that_never_reads_is_cut(pair, monkeypatch) -> None:
-    monkeypatch.setattr(linger_module, "FLUSH_SECONDS", 0.1)
+    monkeypatch.setattr(connection_module, "FLUSH_SECONDS", 0.1)
     ours, theirs = pair
     answer = b"0123456789" * 500_000
 

@@ -19,7 +19,7 @@ from made_up_view import MadeUpView
 from served_page import Served, served
 
 from calib.daemon import service_view
-from calib.daemon.web import admission, peer, stream
+from calib.daemon.web import admission, connection, stream
 from calib.daemon.web.stream import Streams
 
 ROWS = 3000
@@ -126,7 +126,7 @@ def test_of_one_address_only_the_newest_strangers_stay() -> None:
 
 @pytest.mark.long
 def test_a_long_history_nobody_reads_is_neither_made_nor_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peer, "TAKE_SECONDS", 1.0)
+    monkeypatch.setattr(connection, "PATIENCE_SECONDS", 1.0)
     made = []
     real = service_view._point
     monkeypatch.setattr(service_view, "_point", lambda *values: made.append(1) or real(*values))
@@ -160,7 +160,7 @@ def test_a_long_history_nobody_reads_is_neither_made_nor_kept(tmp_path: Path, mo
 def test_a_reader_that_does_not_read_is_cut_on_every_route(
     server: Served, view: MadeUpView, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(peer, "TAKE_SECONDS", 0.3)
+    monkeypatch.setattr(connection, "PATIENCE_SECONDS", 0.3)
     view.report = tmp_path / "report.html"
     view.report.write_bytes(b"x" * 20_000_000)
     reader = asks(server, "/api/report")

@@ -16,7 +16,7 @@ from small_arm import small_arm
 
 from armlink.recording.files import load_recording
 from calib.daemon.settings import DaemonSection
-from calib.daemon.view.api_models import HistoryPoint, State
+from calib.daemon.view import HistoryPoint, State
 from calib.records.records import CalibrationRecord
 
 PATIENCE = 60_000

@@ -11,10 +11,10 @@ from made_up_view import MadeUpView
 from served_page import TOKEN, Served, served
 
 from armlink.errors import BadInput
+from calib.daemon.web import connection as connection_module
 from calib.daemon.web import guard as guard_module
-from calib.daemon.web import peer as peer_module
+from calib.daemon.web.connection import PEER, Peer
 from calib.daemon.web.guard import BODY_LIMIT, REQUESTS, WRONG_TOKENS, Access, Rate, RateLimit, RequestGuard
-from calib.daemon.web.peer import PEER, Peer
 from calib.daemon.web.server import serve, unix_socket
 
 
@@ -209,7 +209,7 @@ def test_a_request_whose_body_ends_early_decides_nothing(server: Served, view: M
 def test_a_connection_that_sends_no_whole_request_is_cut(
     server: Served, monkeypatch: pytest.MonkeyPatch, before: bytes, part: bytes
 ) -> None:
-    monkeypatch.setattr(peer_module, "HEAD_SECONDS", 0.2)
+    monkeypatch.setattr(connection_module, "PATIENCE_SECONDS", 0.2)
     with socket.socket(socket.AF_UNIX) as raw:
         raw.settimeout(60)
         raw.connect(str(server.path))
@@ -256,7 +256,7 @@ def guarded(peer: Peer, times: int, headers: list[tuple[bytes, bytes]]) -> list[
             "path": "/api/status",
             "query_string": b"",
             "headers": headers,
-            PEER: peer,
+            "state": {PEER: peer},
         }
         for _ in range(times):
             await guard(scope, nothing, note)

@@ -12,7 +12,7 @@ from drawn_work import NOTHING, Change, work
 from judged_creeps import creep_arm
 
 from calib.arm.kinematics import gcomp_arm
-from calib.daemon.view.event_text import describe
+from calib.daemon.state.events import describe
 from calib.fit.creep_fit import fit_rows
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event

@@ -1,0 +1,88 @@
+"""The process that makes an arm's cycles (`armlink.loop.process`), as whoever has started it sees it."""
+
+import contextlib
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
+
+from armlink.link.ends import EndCause
+from armlink.link.types import Calibration, Tell
+from armlink.loop.channel import Channel, Closed
+from armlink.loop.driver import Controllers
+from armlink.loop.ending import see_out
+from armlink.loop.messages import Open
+
+HANG_SECONDS = 10.0
+"""A process that takes nothing, or answers nothing, for this time hangs [s]."""
+R = TypeVar("R")
+P = ParamSpec("P")
+
+
+class CycleProcess:
+    """A process that runs, the channel to it, and its end."""
+
+    def __init__(self, opening: Open, inherits: Sequence[int] = ()) -> None:
+        """Start it; what comes of `opening` it answers. It holds the descriptors that it `inherits` until it ends."""
+        ours, theirs = socket.socketpair()
+        command = [sys.executable, "-m", "armlink.loop.process", str(theirs.fileno())]
+        self._process = subprocess.Popen(
+            command, pass_fds=[theirs.fileno(), *inherits], stdin=subprocess.DEVNULL, start_new_session=True
+        )
+        theirs.close()
+        self._channel = Channel(ours)
+        self._channel.put(opening)
+        with contextlib.suppress(Closed):  # whoever receives next learns that
+            self._channel.flush(HANG_SECONDS)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def exit_status(self) -> int | None:
+        """How the process ended; None while it runs."""
+        return self._process.poll()
+
+    def kill(self) -> None:
+        """End a process that hangs: the drives' own deadlines decide. `end` comes after it."""
+        self._process.kill()
+
+    def end(self, cause: EndCause, tell: Tell) -> None:
+        """Have it bring the arm to its end, and wait for it; one that hangs is killed.
+
+        `tell` is told what it does, and may raise Dropped.
+        """
+        if not see_out(self._channel, lambda: self._process.poll() is None, cause, tell):
+            self._process.kill()
+        self._process.wait()
+
+
+class Remote:
+    """Whatever asks the process to call a method of its link."""
+
+    def _call(self, what: str | Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError
+
+
+def remote(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Remote, P], R]:
+    """A method of the link's protocol, as a request to the process."""
+
+    @wraps(method)
+    def ask(self: Remote, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        return cast(R, self._call(method.__name__, *args, **kwargs))
+
+    return ask
+
+
+class RemoteControllers(Remote):
+    """`Controllers` through the process; waits for the answers."""
+
+    read_calibration = remote(Controllers.read_calibration)
+    drive_serial = remote(Controllers.drive_serial)
+
+    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
+        found: Calibration = self._call("write_calibration", joint, calibration, store)
+        return found
