@@ -70,10 +70,10 @@ def _no_command(name: str, points: dict[str, EntryPoint]) -> str:
     import difflib
 
     if name.lower().endswith((".urdf", ".xml", ".mjcf")):
-        return f"no command {name!r}; an arm file of a model is made by armlink new {name}"
+        return f"there is no command {name!r}; to make an arm file from a model, use `armlink new {name}`"
     close = difflib.get_close_matches(name, [*points, "--help", "--version", "completion"], n=1)
     hint = f"did you mean {close[0]}? " if close else ""
-    return f"no command {name!r}; {hint}there are {', '.join(sorted(points))}"
+    return f"there is no command {name!r}; {hint}there are {', '.join(sorted(points))}"
 
 
 def _call(point: EntryPoint, arguments: list[str]) -> int:

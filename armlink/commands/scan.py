@@ -15,7 +15,9 @@ SEARCHED = "canopen"
 
 
 def scan(
-    arm: Annotated[str | None, typer.Argument(help="Bundled arm or path of an arm file; without: all nodes.")] = None,
+    arm: Annotated[
+        str | None, typer.Argument(help="Bundled arm or path of an arm file; without an arm, all nodes are listed.")
+    ] = None,
     bus: OtherBus = None,
     json: Json = None,
 ) -> int:
@@ -89,6 +91,8 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
         raise BusFault(f"no answer from {', '.join(missing)} on {channel}")
     wrong = [f"{link.names[each.joint]} ({each.address}): {each.mismatch}" for each in found if each.mismatch]
     if wrong:
-        raise Refused(f"{wrong[0]}: connect the right arm, or correct its drive under link.joints")
+        raise Refused(
+            f"{wrong[0]}: connect the right arm, or correct the entry of this joint under link.joints of the arm file"
+        )
     out.print(f"all {len(found)} joints answer")
     return 0

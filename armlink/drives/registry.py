@@ -20,7 +20,7 @@ def family(name: str) -> Family:
     """The family of this name; raises BadInput."""
     found: Family | None = named(GROUP, name)
     if found is None:
-        raise BadInput(f"no drive family {name!r}; there are {', '.join(family_names())}")
+        raise BadInput(f"drive family {name!r} is unknown; there are {', '.join(family_names())}")
     return found
 
 
@@ -31,7 +31,7 @@ def found_drives(bus: CanBus) -> FoundDrives:
         if find is not None:
             return find(bus)
     raise BadInput(
-        f"drives of the families {', '.join(family_names())} can only be found by an arm file with their ids"
+        f"drives of the families {', '.join(family_names())} can only be found with an arm file that gives their ids"
     )
 
 
@@ -40,6 +40,6 @@ def not_looked_for() -> str:
     by_search = {name: family(name).find is not None for name in family_names()}
     asked, others = ([name for name in by_search if by_search[name] is found] for found in (True, False))
     return (
-        f"only {', '.join(asked)} drives were looked for; {', '.join(others)} are found by the ids of an arm file: "
-        "armlink scan ARM.yaml --bus …"
+        f"only {', '.join(asked)} drives were looked for; to find {', '.join(others)} drives, give an arm "
+        "file with their ids: armlink scan ARM.yaml --bus …"
     )

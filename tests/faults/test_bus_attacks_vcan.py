@@ -11,26 +11,26 @@ from bus_attacks import BARE, GUARDED, Scene, link, scene
 
 pytestmark = pytest.mark.vcan
 
-OWN_WATCHES = "the joints could not be told to stop, which their own watches do"
+OWN_WATCHES = "the joints could not be told to stop, so they stop by their own watch of the bus"
 CLOSED = {
     "killed": "",
-    "command on the wire": "20Bh on the wire, which this guard did not send: another host commands the drives there",
-    "suspended": "it fell behind: frames",
-    "a second guard": "on the wire, which this guard did not send: another host|which only a drive may send|"
+    "command on the wire": "20Bh came on the wire and is not from this guard: another host commands the drives there",
+    "suspended": "it is late: frames",
+    "a second guard": "came on the wire and is not from this guard: another host|which only a drive may send|"
     "which the policy does not name",
     "wire down and up": f"an interface failed: Network is down; {OWN_WATCHES}|the wire takes no frames",
     "killed and started again at once": "",
-    "its terminal is closed": "it was told to end; the joints were told to stop",
+    "its terminal is closed": "the guard was told to end; the joints were told to stop",
     "flood of SYNCs by a program": "80h: more often than 100 times a second",
-    "SYNC as CAN FD by a program": "80h as CAN FD, which these drives do not speak",
+    "SYNC as CAN FD by a program": "80h as CAN FD, which these drives do not understand",
 }
 """Attack → what the guard says of it; empty where a killed one says nothing."""
 SAID = {
-    "flood: readings of a drive": "joint_1: two readings in every cycle: a second node has its id",
+    "flood: readings of a drive": "joint_1: two readings come in every cycle, so a second node has the same id",
     "flood: bus-off": "bus-off: check wiring, termination and bit rate",
     "interface down and up": "Network is down",
     "flood: extended": "",
-    "flood while the host does not read": "the host was .* ms late|frames lost: this host reads too slowly",
+    "flood while the host does not read": "the host was .* ms late|frames were lost because this host reads too slowly",
 }
 """Attack → what the host says of it; empty where it may go on."""
 LATE = r"the host was \d+ ms late"

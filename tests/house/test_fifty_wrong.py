@@ -77,11 +77,11 @@ WRONG = [
     (edited("mass: 8.0", "mass: 0.0"), ARM, ["sim.links.0.mass", "greater than 0"]),
     (edited("lower: -0.8726646260", "lower: 2.5"), ARM, ["joint_1", "lower 2.5 must be less"]),
     # arm files: missing parts
-    (edited("name: joint_1, node: 1", "name: joint_1"), ARM, ["link.joints.0", "joint_1: give node or drive"]),
+    (edited("name: joint_1, node: 1", "name: joint_1"), ARM, ["link.joints.0", "joint_1: give `node` or `drive"]),
     (edited("name: sarcos\n", ""), ARM, ["key name", "add it"]),
     (edited("interface: armlink_sim, channel: sarcos", "interface: armlink_sim, channel: nobody"), ARM, ["nobody"]),
-    (edited("name: joint_2, node: 2", "name: joint_2, node: 1"), ARM, ["stands twice", "unique"]),
-    (edited("name: joint_2, node", "name: shoulder, node"), ARM, ["shoulder", "same names, same order"]),
+    (edited("name: joint_2, node: 2", "name: joint_2, node: 1"), ARM, ["is given twice", "unique"]),
+    (edited("name: joint_2, node", "name: shoulder, node"), ARM, ["shoulder", "give both the same names in the same order"]),
     (edited("kinematics:", "kinematics: ["), ARM, ["not YAML"]),
     (lambda folder: (folder / "arm.yaml").write_text(""), ARM, ["expected a mapping", "name, kinematics, link"]),
     (lambda folder: (folder / "arm.yaml").mkdir(), ARM, ["arm.yaml", "folder"]),
@@ -99,7 +99,7 @@ WRONG = [
     # buses
     (nothing, ["scan", "--bus", "can0"], ["can0", "INTERFACE:CHANNEL"]),
     (nothing, ["scan", "--bus", "socketcan:nosuch0"], ["nosuch0"]),
-    (nothing, ["scan", "--bus", "sokcetcan:can0"], ["sokcetcan", "unknown interface"]),
+    (nothing, ["scan", "--bus", "sokcetcan:can0"], ["sokcetcan", "does not know this interface"]),
     (nothing, ["scan", "sarcos", "--bus", "armlink_sim:parallel6"], ["no answer from joint_1 (node 1)"]),
     (nothing, ["check", "sarcos", "--bus", "armlink_sim:parallel6"], ["no answer"]),
     (nothing, ["sim", "sarcos", "--bus", "armlink_sim:sarcos"], ["choose another"]),

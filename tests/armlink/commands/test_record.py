@@ -9,7 +9,7 @@ from armlink.cli import run
 def test_another_format_is_converted_to_afterwards(name, tmp_path, capsys):
     assert run(["record", "sarcos", str(tmp_path / name), "--bus", "virtual:test-record", "--seconds", "0.01"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "recordings are written as .mcap: record " in line
+    assert "record writes .mcap files: record " in line
     assert not list(tmp_path.iterdir())
 
 

@@ -158,8 +158,8 @@ def test_readings_that_a_flood_keeps_away_are_put_down_to_it() -> None:
         wire.advance = crowded  # type: ignore[method-assign]
         said = fault_of(link, 60)
     assert "reading for 1" in said
-    assert "others fill the bus meanwhile with " in said
-    assert "most of them 001h: a node babbles: disconnect it" in said
+    assert "meanwhile other nodes fill the bus with " in said
+    assert "most of them 001h: a node babbles, disconnect this node" in said
 
 
 def test_another_host_is_named_and_not_the_drive_that_it_stopped(enabled: Link, bus: Any) -> None:

@@ -190,7 +190,7 @@ def test_a_start_that_parks_first_for_longer_than_a_hang_is_given_may_be_interru
     pendulum.send(signal.SIGINT)
     assert pendulum.job is not None
     _, told = pendulum.job.communicate(timeout=60)
-    assert "parked, the power is off" in told
+    assert "in its parking pose, and its power is off" in told
     pendulum.require_parked()
 
 
@@ -202,7 +202,7 @@ def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulu
     told = next(line for line in pendulum.job.stderr if "parking, " in line)
     assert "Ctrl-C" in told
     pendulum.send(signal.SIGINT)
-    assert "Ctrl-C once more within 2 s lets the arm fall" in pendulum.job.stderr.readline()
+    assert "pressing Ctrl-C again within 2 s lets the arm fall" in pendulum.job.stderr.readline()
     assert pendulum.powered
     pendulum.send(signal.SIGINT)
     assert serving.wait_for(lambda: not pendulum.powered, 10.0)

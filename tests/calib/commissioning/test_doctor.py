@@ -189,7 +189,7 @@ def test_a_drive_that_lost_a_turn_is_named_with_the_zero_that_puts_it_right(tmp_
     assert named.where == "elbow (node 2)"
     if turns == "auto":
         assert named.level == "hint"
-        assert "zero 6.2832 is used in place of 0, a whole turn more (turns: auto)" in named.remedy
+        assert "zero 6.2832 is used instead of 0, a whole turn more (`turns: auto`)" in named.remedy
     else:
         assert named.level == "error"
         assert "set zero: 6.2832" in named.remedy

@@ -312,7 +312,7 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
         1:
     ] == marks
     assert cli.run(["new", "arm4.urdf", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
-    assert "nobody to ask" in capsys.readouterr().err
+    assert "no terminal to ask" in capsys.readouterr().err
 
 
 def test_drives_that_are_known_by_ids_must_all_answer_and_are_not_found_by_hand(tmp_path, monkeypatch, capsys):

@@ -389,7 +389,7 @@ def test_a_host_near_the_deadline_is_said_once_and_not_of_few_cycles(tmp_path: P
     for _ in range(3):
         daemon.service.tick()
     (event,) = daemon.of_kind("late")
-    assert "60 ms late in 99.9 % of the cycles, near link.deadline (100 ms)" in event.text
+    assert "60 ms late in 99.9 % of the cycles, which comes near link.deadline (100 ms)" in event.text
     assert event.evidence["late_ms"]["p50"] < 0.2
     assert daemon.view.status().state is State.OBSERVING
 

@@ -37,7 +37,7 @@ def test_a_mass_that_comes_from_an_absent_mesh_is_one_line(tmp_path):
         '<mujoco><asset><mesh name="m" file="link.stl"/></asset><worldbody><body name="link"><joint name="j"/>'
         '<geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
     )
-    with pytest.raises(BadInput, match=r"mesh link.stl is not found, and body 'link' has its mass from it alone"):
+    with pytest.raises(BadInput, match=r"mesh link.stl is not found, and body 'link' has its mass from this mesh alone"):
         load_model(model)
 
 
