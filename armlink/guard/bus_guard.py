@@ -514,7 +514,7 @@ def main(words: list[str]) -> int:
             signal.signal(number, lambda *_: ended.append(True))
     for number in (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU):  # a terminal must not suspend it
         signal.signal(number, signal.SIG_IGN)
-    _say(f"guard: programs on {program} may now command {wire}, as {path} allows")
+    _say(f"guard: {program} may command {wire} as {path} allows")
     while not ended:
         try:
             guard.step(0.2)

@@ -101,7 +101,7 @@ def test_what_is_wrong_is_named_in_one_line(tmp_path, keys, value, says):
 
 @pytest.mark.parametrize("text", ["- a\n- b\n", "", "just words"])
 def test_a_file_that_is_no_mapping(tmp_path, text):
-    with pytest.raises(BadInput, match="expected a mapping with keys name, kinematics, link"):
+    with pytest.raises(BadInput, match="an arm file is a mapping with the keys `name`, `kinematics` and `link`"):
         load_arm(written(tmp_path, text))
 
 

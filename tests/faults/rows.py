@@ -115,7 +115,7 @@ ROWS = (
         "frames a cycle, ten cycles running",
         11,
         QUICK_STOP,
-        "more frames than these joints send, most of them 001h: a node babbles, disconnect this node",
+        "the bus carries more frames than these joints send, most of them 001h: a node babbles, disconnect this node",
     ),
     Row(
         "corrupted frames",
@@ -178,8 +178,8 @@ ROWS = (
         "mode display 6061h",
         26,
         QUICK_STOP,
-        "joint_2: refuses mode 10 (cyclic synchronous torque): its mode display 6061h is 0; look at its error code "
-        "603Fh and at what 6502h says it supports",
+        "joint_2: refuses mode 10 (cyclic synchronous torque): its mode display 6061h is 0; read its error code 603Fh and "
+        "its supported modes 6502h",
     ),
     Row(
         "clock jump",

@@ -158,7 +158,7 @@ def test_a_position_range_that_ends_before_the_gates_window_is_refused():
     link, sim = started("six-damiao")
     window = link.values.limits(1, link.limits[1])
     sim.drive_at[1].registers[21] = max(-window.lower, window.upper) + 0.05
-    with pytest.raises(Refused, match=r"register 21 \(PMAX\) ends position readings at .* correct zero and direction"):
+    with pytest.raises(Refused, match=r"register 21 \(PMAX\) limits the position readings to .* correct zero and direction"):
         link.start()
 
 

@@ -83,7 +83,7 @@ WRONG = [
     (edited("name: joint_2, node: 2", "name: joint_2, node: 1"), ARM, ["is given twice", "unique"]),
     (edited("name: joint_2, node", "name: shoulder, node"), ARM, ["shoulder", "give both the same names in the same order"]),
     (edited("kinematics:", "kinematics: ["), ARM, ["not YAML"]),
-    (lambda folder: (folder / "arm.yaml").write_text(""), ARM, ["expected a mapping", "name, kinematics, link"]),
+    (lambda folder: (folder / "arm.yaml").write_text(""), ARM, ["is a mapping", "`name`, `kinematics` and `link`"]),
     (lambda folder: (folder / "arm.yaml").mkdir(), ARM, ["arm.yaml", "folder"]),
     (nothing, ["scan", "amr.yaml"], ["no arm file amr.yaml", "give a path"]),
     (nothing, ["scan", "sarcso"], ["did you mean sarcos?"]),

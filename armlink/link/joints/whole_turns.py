@@ -59,7 +59,7 @@ class Misplacement:
                 "stops or the scale of the reading are wrong: correct the arm file (`armlink check --scales "
                 "hand` judges the scale)"
             )
-        zeros = [f"zero: {self.zero_after(turns)} ({_in_words(turns)})" for turns in self.turns]
+        zeros = [f"`zero: {self.zero_after(turns)}` ({_in_words(turns)})" for turns in self.turns]
         if len(self.turns) == 1:
             automatic = "" if self.automatic else " or `turns: auto`"
             return (
@@ -69,7 +69,7 @@ class Misplacement:
             )
         listed = " or ".join(zeros)
         if len(zeros) > MOST_NAMED:
-            ends = " to ".join(f"zero: {self.zero_after(turns)}" for turns in (min(self.turns), max(self.turns)))
+            ends = " to ".join(f"`zero: {self.zero_after(turns)}`" for turns in (min(self.turns), max(self.turns)))
             listed = f"{zeros[0]} or another value of {ends}, in steps of {TURN:.4f},"
         chosen = ", so `turns: auto` cannot choose" if self.automatic else ""
         return (

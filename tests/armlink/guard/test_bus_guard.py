@@ -110,7 +110,7 @@ def test_torque_and_position_are_bounded_in_size_and_rate():
             return policy.refusal(0x201, struct.pack("<Hhi", 15, torque, position), now + after)
 
         most, step = round(MAX_TORQUE / RATED * 1000), SPEED / UNIT
-        assert "target torque of joint_1 751, allowed -750 to 750" in refused(751, 0)
+        assert "target torque of joint_1 is 751, allowed are -750 to 750" in refused(751, 0)
         assert "at once" in refused(most, 0)
         assert "target position of joint_1" in refused(50, int(WINDOW) + 2)
         assert "at once" in refused(50, int(0.1 * step))
@@ -174,7 +174,7 @@ def test_a_request_that_is_cut_short_is_refused(length):
 
 def test_a_refused_frame_is_named_with_its_bytes():
     policy = Policy(CONTENT)
-    assert policy.refusal(0x201, b"", 10.0).startswith("201h with no data: ")
+    assert policy.refusal(0x201, b"", 10.0).startswith("the program sent 201h with no data, ")
     assert policy.refusal(0x201, b"\x0f\x01", 10.0).startswith("201h with 0f 01: ")
 
 
@@ -335,7 +335,7 @@ def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
     guard._to_wire(0x123, b"\x01", False)
     guard._to_wire(0x80, b"", False)
     assert wire.sent == [(0x80, b""), *((0x600 + node, bytes.fromhex("2b40600002000000")) for node in (1, 2))]
-    assert lines == ["guard: closed: identifier 123h, which the policy does not name; the joints were told to stop, "
+    assert lines == ["guard: closed, it passes no more frames: the program sent identifier 123h, which the policy does not name; the joints were told to stop; "
                      "start the guard again to open it"]  # fmt: skip
     guard._to_program(0x181, bytes(8), False)
     assert program.sent == [(0x181, bytes(8))]
@@ -344,9 +344,9 @@ def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
 @pytest.mark.parametrize(
     ("flag", "said"),
     [
-        (bus_guard.REMOTE, "a remote or error frame"),
-        (bus_guard.ERROR, "a remote or error frame"),
-        (bus_guard.EXTENDED, "identifier 80000080h, which the policy does not name"),
+        (bus_guard.REMOTE, "the program sent a remote or error frame"),
+        (bus_guard.ERROR, "the program sent a remote or error frame"),
+        (bus_guard.EXTENDED, "the program sent identifier 80000080h, which the policy does not name"),
     ],
 )
 def test_remote_error_and_extended_frames_do_not_pass(flag, said):
@@ -475,18 +475,18 @@ def broken(change):
     [
         ([], "TypeError"),
         ({}, "KeyError: 'schema'"),
-        ({"schema": "armlink.guard/9", "frames": {}, "stop": []}, "schema 'armlink.guard/9', expected armlink.guard/1"),
+        ({"schema": "armlink.guard/9", "frames": {}, "stop": []}, "`schema` is 'armlink.guard/9', expected armlink.guard/1"),
         (broken(lambda c: c["frames"]["513"].pop("lengths")), "KeyError: 'lengths'"),
         (broken(lambda c: c["frames"]["513"].update(lengths=[4])), "beyond the 4 bytes of its frame"),
-        (broken(lambda c: c["frames"]["513"]["fields"][0].update(code="q9")), "code 'q9', expected one of b, B"),
+        (broken(lambda c: c["frames"]["513"]["fields"][0].update(code="q9")), "number code 'q9' is unknown, expected one of b, B"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].pop("most")), "the field needs `values`, or `least` and `most`"),
-        (broken(lambda c: c["frames"]["513"]["fields"][0].update(least=math.nan)), "least is no number"),
+        (broken(lambda c: c["frames"]["513"]["fields"][0].update(least=math.nan)), "`least` is not a number"),
         (broken(lambda c: c.update(stop=[[1, "xy"]])), "ValueError"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(at=math.inf)), "OverflowError"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(most=10**400)), "OverflowError"),
-        (broken(lambda c: c.update(deadline=math.nan)), "policy: deadline is no number"),
+        (broken(lambda c: c.update(deadline=math.nan)), "policy: `deadline` is not a number"),
         (broken(lambda c: c.update(deadline="soon")), "ValueError"),
-        (broken(lambda c: c["frames"]["128"].update(per_second=math.nan)), "frame: per_second is no number"),
+        (broken(lambda c: c["frames"]["128"].update(per_second=math.nan)), "frame: `per_second` is not a number"),
     ],
 )
 def test_a_wrong_policy_is_refused_in_one_line(content, said):
@@ -577,7 +577,7 @@ def test_main_passes_frames_until_it_is_told_to_end_and_stops_the_joints(wires, 
     assert all_heard(wire) == [(0x80, b"", 0, 16), *STOP]
     assert all_heard(program) == [(0x181, b"12345678", 0, 16)]
     first, second = capfd.readouterr().err.splitlines()
-    assert first == f"guard: arm0 may command can0 by {tmp_path / 'policy.json'}"
+    assert first == f"guard: arm0 may command can0 as {tmp_path / 'policy.json'} allows"
     assert second.startswith("guard: closed, it passes no more frames: the guard was told to end; ")
 
 
@@ -594,7 +594,7 @@ def test_main_closes_when_an_interface_fails_and_stays(wires, monkeypatch, tmp_p
     assert run_main(wires, monkeypatch, tmp_path, [*failures, None]) == 0
     assert all_heard(wires[1]) == STOP
     _, line = capfd.readouterr().err.splitlines()
-    assert line.startswith("guard: closed: an interface failed: Network is down; ")
+    assert line.startswith("guard: closed, it passes no more frames: an interface failed (Network is down); ")
 
 
 def opened(content=CONTENT):
@@ -691,13 +691,13 @@ def test_a_drives_frame_from_the_program_is_named_as_one():
 def test_frames_of_the_other_kind_close_it():
     guard, _, wire, _ = opened()
     guard._to_wire(0x80, b"", True)
-    assert guard.closed == "80h as CAN FD, which these drives do not understand"
+    assert guard.closed == "the program sent 80h as CAN FD, which these drives do not understand"
     assert (0x80, b"") not in wire.sent
     guard, _, wire, _ = opened({**CONTENT, "fd": True})
     guard._to_wire(0x80, b"", True)
     assert not guard.closed
     guard._to_wire(0x80, b"", False)
-    assert guard.closed == "80h as classical CAN, which these drives do not understand"
+    assert guard.closed == "the program sent 80h as classical CAN, which these drives do not understand"
 
 
 def test_a_policy_of_before_says_nothing_of_deadline_and_kind():
@@ -715,7 +715,7 @@ def test_syncs_that_no_cycle_needs_close_it():
     now += 1000 * PERIOD
     answers = [policy.refusal(0x80, b"", now + 1e-4 * number) for number in range(50)]
     assert answers[:5] == [""] * 5
-    assert "80h: more often than 500 times a second" in answers
+    assert "80h: is sent more often than 500 times a second" in answers
 
 
 @pytest.mark.parametrize(("side", "name"), [("wire", "wire"), ("program", "program")])
@@ -725,7 +725,7 @@ def test_lost_frames_close_it(wires, side, name):
     (wire if side == "wire" else program).port.lost = 7
     wire.say(0x181, bytes(8))
     guard.step(1.0)
-    assert guard.closed == f"7 frames of the {name} were lost: too many frames were sent, or this guard gets too little processor time"
+    assert guard.closed == f"7 frames from the {name} were lost: too many frames were sent, or this guard gets too little processor time"
 
 
 def test_a_stop_that_did_not_leave_is_not_told_as_one():

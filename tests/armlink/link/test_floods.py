@@ -119,7 +119,7 @@ def test_what_a_flood_is_made_of_is_named(kind: str, named: str, count: int) -> 
     if kind == "the drives' own" and count == 200:
         assert "a second node" in said
     else:
-        assert said.startswith("more frames than these joints send, most of them " + named)
+        assert said.startswith("the bus carries more frames than these joints send, most of them " + named)
 
 
 def fault_of(link: Link, cycles: int = 3) -> str:

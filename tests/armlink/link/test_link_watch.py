@@ -343,7 +343,7 @@ def test_a_node_that_babbles_is_found(enabled, bus):
 
     cycle, says = cycles_until_fault(enabled, command(POSITION), babble)
     assert cycle <= 11
-    assert says == "more frames than these joints send, most of them 555h: a node babbles, disconnect this node"
+    assert says == "the bus carries more frames than these joints send, most of them 555h: a node babbles, disconnect this node"
     assert all_stopped(bus)
 
 

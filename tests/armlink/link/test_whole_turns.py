@@ -184,7 +184,7 @@ def test_a_drive_that_wakes_anew_between_start_and_enable_gets_no_power(name):
         link.start()
         bus.arm.drive_at[2].motor._zero += TURN
         bus.clock.sleep_until(bus.clock.now() + 1.0)
-        with pytest.raises(Refused, match=r"elbow: reads .* set zero: 6\.6832"):
+        with pytest.raises(Refused, match=r"elbow: reads .* write `zero: 6\.6832`"):
             link.enable()
         assert Power.ON not in power_of(link)
 
@@ -220,7 +220,7 @@ def test_who_only_listens_is_told_and_goes_on(arm_of, caplog):
         assert told[0]["misplaced"] is None
         assert (told[1]["misplaced"] is not None) == (turns == "refuse")
         if turns == "refuse":
-            assert "set zero: 0.0000" in told[1]["misplaced"]
+            assert "write `zero: 0.0000`" in told[1]["misplaced"]
             assert not caplog.records
         else:
             assert "zero 0.0000 is used instead of 6.28319" in caplog.text

@@ -192,7 +192,7 @@ def test_a_drive_that_lost_a_turn_is_named_with_the_zero_that_puts_it_right(tmp_
         assert "zero 6.2832 is used instead of 0, a whole turn more (`turns: auto`)" in named.remedy
     else:
         assert named.level == "error"
-        assert "set zero: 6.2832" in named.remedy
+        assert "write `zero: 6.2832`" in named.remedy
 
 
 def test_joints_of_which_no_reading_shows_a_lost_turn_are_listed(tmp_path):

@@ -149,5 +149,5 @@ def test_rows_have_nothing_to_lock(tmp_path: Path) -> None:
     path.write_text(
         "name: a\nkinematics:\n  joints: [{name: j, a: 0.2, alpha: 0, d: 0, lower: -1, upper: 1}]\n  locked: {j: 0.1}\n"
     )
-    with pytest.raises(BadInput, match="locked is for a model"):
+    with pytest.raises(BadInput, match="`locked` belongs to a model"):
         load_arm(str(path))

@@ -171,7 +171,7 @@ def test_a_small_arm_has_drives_of_its_own_strength(tmp_path, monkeypatch):
     [
         ('name="j2" type="revolute"', 'name="j2" type="prismatic"', "j2 is prismatic and lies between the base"),
         ('<joint name="j1" type="revolute">', '<joint name="" type="revolute">', "joint 1 of the chain"),
-        ('<mass value="2"/>', '<mass value="two"/>', "MuJoCo refuses it"),
+        ('<mass value="2"/>', '<mass value="two"/>', "MuJoCo refuses this file"),
     ],
 )
 def test_a_model_that_cannot_be_used_names_the_joint(old, new, says, tmp_path):
