@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def calibrate(
     directories: Sweeps,
     arm: SweepsArm = None,
-    apply: Annotated[bool, typer.Option("--apply", help="Also write gains and offsets to the controllers.")] = False,
+    apply: Annotated[bool, typer.Option("--apply", help="Also write gains and offsets to the drives.")] = False,
     bus: Bus = None,
     check: Check = True,
     flash: Flash = False,
@@ -29,11 +29,13 @@ def calibrate(
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            help="Joint to write although the sensor model does not hold there; may be repeated.",
+            help="Write this joint although the sensor model does not hold for it; may be repeated.",
             rich_help_panel=APPLY,
         ),
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Also write a report: one self-contained HTML file.")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Also write a report to this file: one self-contained HTML page.")
+    ] = None,
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -60,7 +62,9 @@ def calibrate(
         require_extra("--report", "reports")
     data, arm_file = load_sweeps("calibrate", directories, arm)
     if apply and all_creep(data):
-        raise BadInput("--apply: the host keeps the calibration of these drives: the record is in force without it")
+        raise BadInput(
+            "--apply: these drives store no calibration, the host does: the record is in force without `--apply`"
+        )
     fit = calibrated(arm_file, data)
     records = RecordStore(store)
     current = records.current(CalibrationRecord, arm_file)
@@ -71,7 +75,7 @@ def calibrate(
         if felt is not None and felt.contradicts:
             records.add(record.model_copy(update={"note": f"not made current: {felt}"}))
             write_json(json_file, _answer(fit, data, record, False))
-            raise Refused(f"{felt} Record {record.id} is kept, and not made current")
+            raise Refused(f"{felt} Record {record.id} is stored, but not made current")
     out = results(json_file)
     _show(fit, data, out)
     user = getpass.getuser()
@@ -90,12 +94,14 @@ def calibrate(
         with early_end(arm_file, again) as work:
             work.enabled = check
             written = apply_calibration(record, arm_file, records, data, fit, how)
-        out.print(f"record {record.id} is current, written to {len(written)} controllers and read back")
+        out.print(f"record {record.id} is current; it was written to {len(written)} drives and read back")
     else:
         of_host = not isinstance(fit, SensorFit)
         records.put(record, arm_file, by="armlink calibrate", reason="creep sweeps" if of_host else "sweeps")
-        kept = "the controllers keep what they hold until --apply writes it to them"
-        in_host = f"record {record.id} is current: it corrects readings and commands when the arm is opened next"
+        kept = "the drives keep their old calibration until `--apply` writes this record to them"
+        in_host = (
+            f"record {record.id} is current: it corrects readings and commands from the next opening of the arm on"
+        )
         out.print(in_host if of_host else f"record {record.id} is current; {kept}")
     suggest(command_line("identify", *map(str, directories), arm=arm, store=store))
     write_json(json_file, _answer(fit, data, record, apply))
@@ -191,14 +197,14 @@ def _show(fit: "Calibrated", data: "list[SweepData]", console: "PlainConsole") -
     columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
     print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns, console)
     doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
-    lines = [*reasons, f"at new poses, sensors and gravity model still disagree by [N·m]: {', '.join(doubts)}"]
+    lines = [*reasons, f"at new poses, sensors and gravity model still differ by [N·m]: {', '.join(doubts)}"]
     lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
     if fit.gain_ratio is not None:
         ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
-        lines.append(f"gains relative to the last joint's: {ratios}")
+        lines.append(f"gains relative to the gain of the last joint: {ratios}")
     print_lines(lines, console=console)
     print_lines([finding.text for finding in fit.findings], "yellow", console)
     worst = max(fit.goodness.left_out, key=lambda each: each.ratio, default=None)
     if worst is not None:
-        worst_sweep = f"worst sweep ({worst.sweep}) at {worst.ratio:.1f} times its expected error"
+        worst_sweep = f"the worst sweep is {worst.sweep}, with {worst.ratio:.1f} times its expected error"
         console.print(f"cross-validation: {worst_sweep}")

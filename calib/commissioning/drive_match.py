@@ -13,7 +13,7 @@ LEAST_MOTION_RATIO = 3.0
 """The turned joint's drive must read so many times the motion of any other; a choice."""
 SCALE_TOLERANCE = 0.1
 """Share by which the angle between the stops may read differently: calibration corrects a few per cent; a choice."""
-POLARITY_REMEDY = "turn the direction round in the drive (its polarity), or the axis in the model"
+POLARITY_REMEDY = "reverse the direction in the drive (its polarity), or the axis in the model"
 
 Ask = Callable[[str], None]
 """Shows a person what to do and returns when it is done."""
@@ -46,8 +46,8 @@ def match_in_order(names: Sequence[str], drives: FoundDrives, bus: str) -> list[
     if len(found) > len(names):
         ids = ", ".join(str(each.node) for each in found)
         raise BadInput(
-            f"{bus}: {len(found)} drives answer (nodes {ids}), the arm has {len(names)} joints: turn each joint by hand"
-            " with --by-hand, or disconnect the others"
+            f"{bus}: {len(found)} drives answer (nodes {ids}), but the arm has {len(names)} joints: turn "
+            "each joint by hand with `--by-hand`, or disconnect the other drives"
         )
     return [Match(name, drive, by_hand=False) for name, drive in zip(names, found, strict=True)]
 
@@ -64,9 +64,9 @@ def match_by_hand(
     free = {each.node: each for each in drives.found}
     matches, findings = [], []
     for joint in joints:
-        ask(f"{joint.name}: turn it by hand to its lower stop ({joint.lower:+.2f} rad)")
+        ask(f"{joint.name}: turn this joint by hand to its lower stop ({joint.lower:+.2f} rad)")
         before = drives.positions()
-        ask(f"{joint.name}: now to its upper stop ({joint.upper:+.2f} rad)")
+        ask(f"{joint.name}: now turn it to its upper stop ({joint.upper:+.2f} rad)")
         after = drives.positions()
         turned = {node: after[node] - before[node] for node in free}
         node = moved_node(joint.name, turned, bus)
@@ -79,8 +79,8 @@ def _require(names: Sequence[str], found: Sequence[FoundDrive], bus: str) -> Non
     if len(found) < len(names):
         ids = ", ".join(str(each.node) for each in found) or "none"
         raise BusFault(
-            f"{bus}: {len(found)} drives answer (nodes {ids}), the arm has {len(names)} joints: check power, wiring,"
-            f" bit rate and that every node id is different ({not_looked_for()})"
+            f"{bus}: {len(found)} drives answer (nodes {ids}), but the arm has {len(names)} joints: check "
+            f"power, wiring, bit rate, and that every drive has its own node id ({not_looked_for()})"
         )
 
 
@@ -89,8 +89,8 @@ def moved_node(joint: str, turned: dict[int, float], bus: str) -> int:
     order = sorted(turned, key=lambda node: -abs(turned[node]))
     if abs(turned[order[0]]) < LEAST_TURN:
         raise BusFault(
-            f"{bus}: no drive read the motion of {joint}: release its brake and turn it further, or look for its"
-            " drive on another bus"
+            f"{bus}: no drive read the motion of {joint}: release the brake of this joint and turn it "
+            "further, or look for its drive on another bus"
         )
     if len(order) > 1 and abs(turned[order[0]]) < LEAST_MOTION_RATIO * abs(turned[order[1]]):
         raise BusFault(
@@ -105,10 +105,13 @@ def _judge(joint: TurnedJoint, node: int, turned: float) -> list[SetupFinding]:
     ratio, where = turned / expected, f"{joint.name} (node {node})"
     findings = []
     if ratio < 0:
-        what = f"its position counts the other way: from lower to upper stop it read {turned:+.2f} rad"
+        what = f"its position counts in the wrong direction: from the lower to the upper stop it read {turned:+.2f} rad"
         findings.append(SetupFinding("error", what, where, POLARITY_REMEDY))
     if abs(abs(ratio) - 1) > SCALE_TOLERANCE:
-        what = f"from stop to stop it read {abs(turned):.2f} rad, the model has {expected:.2f} ({abs(ratio):.3g} times)"
+        what = (
+            f"from stop to stop it read {abs(turned):.2f} rad, but the model has {expected:.2f} rad (factor "
+            f"{abs(ratio):.3g})"
+        )
         remedy = f"correct the drive's gear ratio by the factor {abs(ratio):.3g}, or the stops in the arm file"
         findings.append(SetupFinding("error", what, where, remedy))
     return findings

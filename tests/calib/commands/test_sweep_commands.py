@@ -181,7 +181,7 @@ def test_history_says_why_a_record_was_not_made_current(
     (other / "manifest.json").write_text(json.dumps(manifest))
     store = ["--store", str(tmp_path / "records.db")]
     assert run(["calibrate", str(swept), str(other), *store]) == 1
-    assert "is kept, and not made current" in capsys.readouterr().err
+    assert "is stored, but not made current" in capsys.readouterr().err
     assert run(["history", str(arm_path), *store, "--json", "-"]) == 0
     (record,) = json.loads(capsys.readouterr().out)["records"]
     assert record["note"].startswith("not made current: ")

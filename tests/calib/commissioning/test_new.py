@@ -140,7 +140,7 @@ def test_a_lift_and_a_waist_before_the_arm(tmp_path, monkeypatch):
         assert ("lift", "is prismatic") in made.draft.aside
     made = new_arm(Path("m.xml"), Path("a.yaml"))
     assert (list(made.parsed().joint_names), made.parsed().kinematics.base) == (["waist", "shoulder"], "column")
-    with pytest.raises(BadInput, match="--base shoulder: no such body carries a joint; there are world, column, torso"):
+    with pytest.raises(BadInput, match="--base shoulder: there is no such body that carries a joint; there are world, column, torso"):
         new_arm(Path("m.xml"), Path("a.yaml"), base="shoulder")
 
 
@@ -257,7 +257,7 @@ def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_b
     assert json.loads(capsys.readouterr().out)["next"] == "armlink check arm.yaml"
     assert cli.run(["check", "arm.yaml", "--passive"]) == 0
     assert cli.run(["doctor", "arm.yaml"]) == 1
-    assert "geometry is not known" in capsys.readouterr().out
+    assert "geometry of the arm is not known" in capsys.readouterr().out
     assert cli.run(["new"]) == 2
     assert "--bus" in capsys.readouterr().err
 

@@ -89,5 +89,5 @@ def test_a_joint_that_the_parked_arm_does_not_have_and_an_arm_without_geometry_a
     with pytest.raises(BadInput, match="joint 'elbow' is not in"):
         Geometry(arm(ParkedArm(model=OTHER, pose={"elbow": 1.0})))
     rows = load_arm("sarcos").model_copy(update={"sweep": SweepSection(beside=(ParkedArm(),))})
-    with pytest.raises(BadInput, match=r"sweep\.beside: collisions need geometry"):
+    with pytest.raises(BadInput, match=r"sweep\.beside: checking for collisions needs geometry"):
         plan_creep(rows)

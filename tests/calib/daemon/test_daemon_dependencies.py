@@ -350,9 +350,9 @@ def test_while_the_store_s_file_is_gone_nothing_is_written(tmp_path: Path) -> No
     daemon, path = drifted(tmp_path), tmp_path / "records.db"
     path.rename(tmp_path / "away.db")
     daemon.run(7)
-    assert "its file is gone" in (daemon.view.status().store_fault or "")
+    assert "the file is gone" in (daemon.view.status().store_fault or "")
     answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
-    assert (answer.state, "its file is gone" in answer.note) == ("failed", True)
+    assert (answer.state, "the file is gone" in answer.note) == ("failed", True)
     assert not any(call.startswith("write") for call in daemon.sdo)
     assert not path.exists()
     (tmp_path / "away.db").rename(path)

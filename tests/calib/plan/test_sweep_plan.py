@@ -84,7 +84,7 @@ def test_joints_are_servo_held_where_the_bias_allowed_cannot_press_them() -> Non
     arm = with_section(random_arm(4, 4), bias_torque=(0.5, 0.5, 0.5, 0.5))
     plan = scouted_plan(arm, Truth.draw(arm, 4))
     assert any(any(sweep.servo) for sweep in plan.sweeps)
-    assert any("servo-held instead" in note for note in plan.notes)
+    assert any("their position loops hold them" in note for note in plan.notes)
     assert all(abs(torque) <= 0.5 for sweep in plan.sweeps for torque in sweep.bias or ())
 
 

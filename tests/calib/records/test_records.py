@@ -224,5 +224,5 @@ def test_a_kind_that_is_none_is_refused_in_one_line(kind: object) -> None:
     from armlink.errors import BadInput
     from calib.records.records import parse_record
 
-    with pytest.raises(BadInput, match="key kind: expected calibration or gravity"):
+    with pytest.raises(BadInput, match="expected calibration or gravity"):
         parse_record({"kind": kind}, "record.yaml")

@@ -142,5 +142,5 @@ def test_a_stuck_encoder_bit_is_named_before_any_stop_is_pressed() -> None:
     stick(simulated, 6)
     with enabled(simulated) as link:
         found = listen(link, ARM)
-        with pytest.raises(EncoderFault, match=r"^j2: its position reading .*bit 6 of its encoder, which is stuck"):
+        with pytest.raises(EncoderFault, match=r"^j2: its position reading .*the encoder, since its bit 6 is stuck"):
             find_stops(link, ARM, found)

@@ -215,7 +215,7 @@ def test_a_full_disk_is_said_in_one_line_and_loses_one_reading(tmp_path: Path) -
         size = (folder / "readings.jsonl").stat().st_size
         resource.setrlimit(resource.RLIMIT_FSIZE, (size + 40, unlimited[1]))
         try:
-            with pytest.raises(BadInput, match=r"readings\.jsonl: .*the last reading is not kept.*--resume"):
+            with pytest.raises(BadInput, match=r"readings\.jsonl: .*the last reading was not saved.*--resume"):
                 writer.append(readings[1])
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
@@ -235,7 +235,7 @@ def test_a_data_set_whose_beginning_was_cut_off_can_be_begun_again(tmp_path: Pat
 
 def test_a_data_set_that_another_process_writes_is_not_resumed(tmp_path: Path) -> None:
     arm = random_arm(1, 3)
-    says = r"set: in use by .*\(process \d+\): stop that, or choose another"
+    says = r"set: in use by .*\(process \d+\): stop that process, or choose another one"
     with DataWriter(tmp_path / "set", Manifest.of(arm, 0.0)), pytest.raises(BadInput, match=says):
         DataWriter(tmp_path / "set", Manifest.of(arm, 0.0), resume=True)
     DataWriter(tmp_path / "set", Manifest.of(arm, 0.0), resume=True).__exit__()
@@ -284,7 +284,7 @@ def test_a_reading_of_the_wrong_width_is_refused(tmp_path: Path) -> None:
     reading = synthetic_pass(large, Truth.of(large), plan_sweep(large), 0.0, np.random.default_rng(0)).readings[0]
     with DataWriter(tmp_path / "set", Manifest.of(small, 0.0)) as writer:
         writer.append(reading)
-    with pytest.raises(BadInput, match="not one per joint"):
+    with pytest.raises(BadInput, match="must have one value for each joint"):
         load_data(tmp_path / "set")
 
 
@@ -300,5 +300,5 @@ def test_how_far_a_stop_may_be_from_its_place(side: int) -> None:
         Mover._check_stop(mover, 0, side)  # type: ignore[arg-type]
     furthest = 2 * STOP_TOLERANCE + 0.03 * 2.0
     Mover._check_creep(mover, 0, side, place + side * (furthest - 1e-6))  # type: ignore[arg-type]
-    with pytest.raises(Refused, match=f"no stop found at {place:.3f} rad"):
+    with pytest.raises(Refused, match=f"no stop was found at {place:.3f} rad"):
         Mover._check_creep(mover, 0, side, place + side * (furthest + 1e-6))  # type: ignore[arg-type]
