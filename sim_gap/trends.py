@@ -168,10 +168,13 @@ def needed_recordings(answers: Mapping[str, Mapping[str, Any]]) -> str:
     used = [case for case, answer in answers.items() if "error" not in answer]
     undated = sorted(case for case in used if date_of(case) is None)
     if undated:
-        return f"{undated[0].partition('/')[2]} has no date in its name, such as 2026-10-02: no change can be dated"
+        return f"{undated[0].partition('/')[2]} has no date in its name, such as 2026-10-02, so no change can be dated"
     needed = FIRST + LAST + 1
     return (
-        f"a change can be found from {needed} on ({FIRST} at the start, {LAST} at the end)"
+        (
+            f"a change can be found from {needed} recordings on (the last {LAST} are compared with the first "
+            f"{FIRST}, twice in a row)"
+        )
         if len(used) < needed
         else ""
     )

@@ -69,11 +69,11 @@ def test_gains_beside_torques_are_refused_and_what_was_corrected_is_told(tmp_pat
     save_recording(replace(made, torque=made.torque * np.array([1.0, -1.0, 1.0])), tmp_path / "run.csv")
     command = ["gap", "compare", f"--sim={path}", f"--sim={path}", f"--heldout={tmp_path / 'run.csv'}"]
     assert run([*command, "--gains=kp=20"]) == 2
-    assert "--gains: the recordings have a torque channel" in capsys.readouterr().err
+    assert "--gains: leave this option out, since the recordings have a torque channel" in capsys.readouterr().err
     assert run([*command, f"--json={tmp_path / 'a.json'}"]) == 0
     checks = json.loads((tmp_path / "a.json").read_text())["checks"]
     assert [(each["model"], each["option"]) for each in checks] == 2 * [(str(path), "--sign tau_2=-1")]
-    assert "has the opposite sign" in " ".join(capsys.readouterr().out.split())
+    assert "the sign is opposite" in " ".join(capsys.readouterr().out.split())
 
 
 def test_models_of_other_joints_are_refused(models: list[str], tmp_path: Path) -> None:

@@ -194,7 +194,7 @@ def export_fit(
             spec.bodies[body].gravcomp = share
     _set_friction(spec, sim, search, native)
     spec.compile()
-    head = "Left out, MJCF has no field for them (the rest was fitted without them):"
+    head = "These effects are left out, since MJCF has no field for them (the other effects were fitted without them):"
     comment = xml_comment([head, *left]) if left else ""
     return Exported(comment + spec.to_xml(), tuple(left), native)
 
