@@ -285,7 +285,8 @@ class RemoteLink:
     def _gone(self) -> BusFault:
         status = self._process.poll()
         return BusFault(
-            f"the process that drives the arm has ended (status {status}): the joints stop by their own deadline"
+            f"the process that drives the arm has ended (status {status}): each drive stops its joint at its "
+            "own deadline"
         )
 
     def _end(self, cause: EndCause) -> None:

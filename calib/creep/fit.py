@@ -117,7 +117,7 @@ def fit_creep(arm_file: ArmFile, passes: Sequence[SweepData]) -> CreepFit:
     """Fit passes of creep sweeps, with and without a reference mass; raises BadInput where there is no such data."""
     rows = CreepRows.of(passes)
     if not len(rows):
-        raise BadInput(f"{passes[0].path}: no creep sweeps: sweep with sweep.motion: creep")
+        raise BadInput(f"{passes[0].path} holds no creep sweeps: sweep with `sweep.motion: creep`")
     doubt, sources = Doubt.of(sweep_section(arm_file)), digests(passes)
     return fit_rows(gcomp_arm(arm_file), rows, DriveLimits.of(arm_file).rated, doubt, sources)
 

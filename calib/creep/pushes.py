@@ -48,8 +48,9 @@ class Disturbed:
 
     def __str__(self) -> str:
         return (
-            f"{self.joint}: {self.name}: something pushed by {self.torque:+.2f} N·m at {self.position:.2f} rad: contact"
-            " with the surroundings or the arm itself, or a cable under tension; the sweep is left out"
+            f"{self.joint}: {self.name}: something pushed by {self.torque:+.2f} N·m at {self.position:.2f} "
+            "rad: the arm touched itself or its surroundings, or a cable was under tension; this sweep is "
+            "left out"
         )
 
 
@@ -92,8 +93,8 @@ class Spring:
 
     def __str__(self) -> str:
         return (
-            f"{self.joint}: something pulls by {self.stiffness:+.2f} N·m/rad of its position in all its sweeps: a cable"
-            " under tension or a spring; free it and sweep again"
+            f"{self.joint}: in all its sweeps something pulls by {self.stiffness:+.2f} N·m for each rad of "
+            "its position: a cable under tension or a spring; free it and sweep again"
         )
 
 

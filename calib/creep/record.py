@@ -26,7 +26,7 @@ RECORDED: tuple[Literal["gain", "offset", "position_offset"], ...] = ("gain", "o
 def family_of(parameter: Value) -> str:
     """Family of the fit that a value is of; raises BadInput where there is none."""
     if parameter not in VALUES:
-        raise BadInput(f"no value {parameter!r} of creep sweeps; there are {', '.join(VALUES)}")
+        raise BadInput(f"creep sweeps give no value {parameter!r}; there are {', '.join(VALUES)}")
     return "zero" if parameter == "position_offset" else parameter
 
 
@@ -135,19 +135,22 @@ def _missing(fit: CreepFit) -> dict[tuple[str, Parameter], str]:
         elif not found["gain"][joint]:
             reasons[name, "gain"] = VERTICAL if upright else _no_gain(fit, joint, loaded)
         if not found["offset"][joint]:
-            reasons[name, "offset"] = "no sweep of this joint shows it"
+            reasons[name, "offset"] = "no sweep of this joint determines it"
         if joint == fit.arm.n - 1 and fit.prior_std[fit.slices["zero"]][joint] <= LAST_ZERO:
             reasons[name, "position_offset"] = "turning the last link's frame is the same as turning its centre of mass"
         elif not zero[joint]:
-            reasons[name, "position_offset"] = "the sweeps add nothing to what was known before"
+            reasons[name, "position_offset"] = "the sweeps add nothing to what was known before about this value"
     return reasons
 
 
 def _no_gain(fit: CreepFit, joint: int, loaded: bool) -> str:
     if not (fit.rows.joint == joint).any():
-        return "no sweep of this joint was free of disturbance"
+        return "every sweep of this joint was disturbed"
     if not loaded:
-        return "without a reference mass only the product of torque constant and mass shows: sweep again with one"
+        return (
+            "without a reference mass only the product of torque constant and mass is determined: sweep again "
+            "with a reference mass"
+        )
     if not fit.found("gain").any() and known_lever(fit.arm) < SHORTEST:
         return NO_LEVER
     return "gravity loads this joint too little in these sweeps: attach the mass further out, or add poses"

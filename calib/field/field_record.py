@@ -17,7 +17,7 @@ def field_record(
     """The record of a fit; `before` is the current one. Raises Refused if no value was identified."""
     if np.isnan(fit.gain).all() and np.isnan(fit.offset).all():
         first = next(iter(fit.reasons.items()))
-        raise Refused(f"no gain and no offset is identifiable; {first[0][0]} {first[0][1]}: {first[1]}")
+        raise Refused(f"no gain and no offset can be determined; for example {first[0][0]} {first[0][1]}: {first[1]}")
     joints = tuple(_joint(name, j, fit, before) for j, name in enumerate(fit.names))
     names, covariance = _covariance(fit, before)
     carried = [f"{name} {parameter}" for name, parameter in fit.reasons]

@@ -106,7 +106,9 @@ class ArmLoop:
     def _sweep(self, source: Link | Listener, poses: int, seed: int) -> int:
         """Begin a tour of `poses` poses over the whole range, then hold; `run` reports the progress."""
         if not isinstance(source, Link):
-            raise Refused("a sweep moves the arm, and this daemon only listens: move the arm with its own controller")
+            raise Refused(
+                "a sweep moves the arm, but this daemon only listens: move the arm with the program that commands it"
+            )
         self._tour = [0, poses]
         self._targets = self._touring(source, poses, seed)
         return poses
@@ -193,7 +195,7 @@ class ArmLoop:
             return []
         if now - self._heard <= SILENCE_SECONDS or self._reason is not None:
             return []
-        return self._down(f"no SYNC on {listener.bus.channel_info}: is the arm's controller running?")
+        return self._down(f"no SYNC on {listener.bus.channel_info}: is the program that commands the arm running?")
 
     def _motion(self, link: Link) -> Iterator[Array]:
         """Targets, one per cycle: the present position, or ordinary work if configured."""

@@ -130,7 +130,9 @@ class LoopProcess:
             return answer.result(ANSWER_SECONDS)
         except TimeoutError:
             self._waiting.pop(call.id, None)
-            return LoopAnswer(call.id, error=BusFault(f"no answer of the bus loop within {ANSWER_SECONDS:g} s"))
+            return LoopAnswer(
+                call.id, error=BusFault(f"the process of the bus loop has not answered for {ANSWER_SECONDS:g} s")
+            )
 
     def _send(self, call: Call) -> bool:
         try:

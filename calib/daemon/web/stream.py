@@ -81,7 +81,7 @@ class Streams:
         if isinstance(results[0], TimeoutError):
             self.cut_off += 1
             peer = peer_of(scope)
-            _log.warning("stream: %s took nothing for %.0f s and was cut off", peer.name, SEND_SECONDS)
+            _log.warning("stream: %s has read nothing for %.0f s and was cut off", peer.name, SEND_SECONDS)
             peer.abort()
             return
         if isinstance(results[0], Exception):

@@ -130,7 +130,7 @@ def test_where_the_model_does_not_hold_nothing_is_written_unless_accepted(
     store, bus = ["--store", str(tmp_path / "records.db")], ["--bus", f"armlink_sim:{arm_path}"]
     assert run(["calibrate", *bent, *store, *bus, "--apply"]) == 1
     error = capsys.readouterr().err
-    assert "j2: the sensor model does not hold: torque linear in position" in error
+    assert "j2: the sensor model does not hold: part of the torque is linear in position" in error
     assert "nothing was written" in error
     assert "--accept j2" in error
     assert run(["calibrate", *bent, *store, *bus, "--apply", "--accept", "j9"]) == 2

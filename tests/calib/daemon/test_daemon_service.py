@@ -128,10 +128,10 @@ def test_a_wall_clock_that_is_set_grants_no_further_write_and_neither_does_a_res
     daemon.service.tick()
     drift_again(daemon, 1)
     assert daemon.view.proposals()[0].state == "pending"
-    assert "1 recalibrations within a day are the limit" in daemon.of_kind("undecided")[-1].text
+    assert "only 1 recalibrations are allowed within a day" in daemon.of_kind("undecided")[-1].text
     assert len(daemon.of_kind("recalibration")) == 1
     limit = daemon.service.recalibrations._limit("joint_5")
-    assert limit.startswith("1 recalibrations within a day")
+    assert limit.startswith("only 1 recalibrations are allowed within a day")
     for hours, back in ((50, 0.0), (-50, daemon.now())):  # the machine has restarted: its monotonic clock begins anew
         daemon.kill()
         daemon.wall_shift, daemon.clock_shift = timedelta(hours=hours), -back
@@ -162,7 +162,7 @@ def test_a_decision_that_names_another_content_is_refused(tmp_path: Path) -> Non
     daemon = drifted(tmp_path, "propose")
     (proposal,) = daemon.view.proposals()
     for decide in (daemon.view.decisions.approve, daemon.view.decisions.reject):
-        with pytest.raises(NotPossible, match=f"proposal {proposal.id} is not that of hash 000000000000…: look at"):
+        with pytest.raises(NotPossible, match=f"proposal {proposal.id} does not have the hash 000000000000…: look at"):
             decide(proposal.id, "ann", "0" * 64)
     assert not any(call.startswith("write") for call in daemon.sdo)
     daemon.kill()
@@ -176,7 +176,7 @@ def test_after_a_damaged_journal_nothing_is_written_automatically_for_a_day(tmp_
     (tmp_path / "state" / "journal.db").write_bytes(b"damaged" * 1000)
     for _ in range(2):  # by its own finding, then by the event that it kept of it
         daemon.start()
-        assert "a damaged journal was set aside within a day" in daemon.service.recalibrations._limit("joint_1")
+        assert "a damaged journal was set aside less than a day ago" in daemon.service.recalibrations._limit("joint_1")
         daemon.kill()
     daemon.start()
     daemon.clock_shift = 86_400.0
@@ -190,7 +190,7 @@ def test_a_record_that_is_not_current_in_the_store_any_more_is_not_followed(tmp_
     other = daemon.store.put(calibration.model_copy(update={"note": "other"}), daemon.arm, by="ann", reason="sweep")
     answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
     assert answer.state == "failed"
-    assert f"is not current in {daemon.store.url} any more ({other} is): superseded" in answer.note
+    assert f"is superseded: it is not current in {daemon.store.url} any more ({other} is)" in answer.note
     assert not any(call.startswith("write") for call in daemon.sdo)
 
 

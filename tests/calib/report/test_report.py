@@ -126,7 +126,7 @@ def test_sweeps_that_disagree_with_one_another_do_not_replace_a_good_record(fit,
         spoilt.append(replace(data, readings=tuple(readings), digest="f" * 64))
     gravity = identify_gravity(ARM, DATA, fit).record(ARM, record)
     check_heldout(record.model_copy(update={"note": "new"}), record, ARM, DATA, gravity)
-    with pytest.raises(Refused, match=f"{ARM.joint_names[1]}: held-out data is predicted with"):
+    with pytest.raises(Refused, match=f"{ARM.joint_names[1]}: the error on held-out data is"):
         check_heldout(record.model_copy(update={"note": "new"}), record, ARM, spoilt, gravity)
 
 

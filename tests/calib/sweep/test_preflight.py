@@ -77,7 +77,7 @@ def test_a_loud_sensor_is_named() -> None:
     loud = ARM.model_copy(update={"sim": ARM.sim.model_copy(update={"sensors": sensors})})
     with (
         enabled(SimulatedArm(loud, Truth.of(loud), 1)) as link,
-        pytest.raises(Refused, match="j2: its torque sensor's noise is"),
+        pytest.raises(Refused, match="j2: the noise of its torque sensor is"),
     ):
         listen(link, ARM)
 
