@@ -56,14 +56,14 @@ def check(
 ) -> int:
     """Check identity, objects, PDO mapping, limits, calibration; then, with power, quick stop, deadline and heartbeat.
 
-    It shows that each controller stops by itself when its host falls silent, and how long it takes. It says what it
-    does to the joints and asks first, unless --yes or on a simulated arm in this process. Exit status 1 where a check
-    fails; the joints are left in quick stop, holding.
+    The command shows that each drive stops by itself when its host falls silent, and how long that takes. It first says
+    what it will do to the joints and asks, except with --yes or on a simulated arm in this process. Exit status 1 if a
+    check fails; the joints are left in quick stop, holding.
 
-    With --host nothing is sent anywhere: cycles are made at the arm's rate while a job computes and writes beside them;
-    exit status 1 if this machine is too late for the arm's deadline or rate.
+    With --host nothing is sent: this machine makes cycles at the rate of the arm while a job computes and writes. Exit
+    status 1 if the machine is too slow for the deadline or the rate of the arm.
 
-    With --scales readings are judged while the arm moves: exit status 1 if a scale of a drive is off by a tenth.
+    With --scales the readings are judged while the arm moves. Exit status 1 if a scale of a drive is wrong by a tenth.
 
     Example: armlink check sarcos --bus socketcan:vcan0 --yes --json -
     """

@@ -18,7 +18,7 @@ def convert(
     stated: "Corrections",
     json: Json = None,
 ) -> int:
-    """Convert a recording, with corrections if any; joint names are kept where the format has them (Parquet, MCAP).
+    """Convert a recording, with corrections if any; joint names are stored if the format has them (Parquet, MCAP).
 
     Example: armlink convert run.mcap run.csv.gz
     """

@@ -14,10 +14,10 @@ def guard(
     path: Annotated[bool, typer.Option("--path", help="Print only the path of the guard's Python file.")] = False,
     bus: OtherBus = None,
 ) -> int:
-    """Write what a guard of this arm's bus may pass: identifiers, and bounds of torque, position and their rates.
+    """Write the policy of a guard of this arm's bus: which frames may pass, with bounds of torque and position.
 
     The drives are read for their scales and objects; nothing is set. The guard itself is one file without dependencies:
-    it has the wire for itself and gives programs another interface, whose frames it checks one by one.
+    it has the bus of the arm for itself and gives programs another interface, whose frames it checks one by one.
 
     Example: armlink guard sarcos --bus socketcan:vcan0 --out sarcos.guard.json
     """

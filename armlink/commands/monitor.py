@@ -48,13 +48,13 @@ def monitor(
         Path | None, typer.Option(help="Write the last state as JSON to this file; - is standard output.")
     ] = None,
 ) -> int:
-    """Show what an arm's joints send; exit status 3 where no joint is heard.
+    """Show what an arm's joints send; exit status 3 if no joint is heard.
 
     It listens beside the host that runs the arm. Scales are the arm file's rated torques and 2^20 units a turn. With
-    --stats every frame's time stamp counts (the interface's own; the monitor's clock with --sync): latency is from SYNC
-    to the last joint's reading, and the load has its stuff bits. With --foxglove 8765 open ws://localhost:8765 in
-    Foxglove: /joint_states and /motor_states as in a recording, 50 times a second. With --rerun 9876 the same readings
-    go to the viewer that the command rerun starts.
+    --stats the time stamps of the interface are used (with --sync, the clock of the monitor); latency is the time from
+    SYNC to the reading of the last joint, and the load includes stuff bits. With --foxglove 8765 open
+    ws://localhost:8765 in Foxglove: /joint_states and /motor_states as in a recording, 50 times a second. With --rerun
+    9876 the same readings go to the viewer that the command rerun starts.
 
     Example: armlink monitor sarcos --bus socketcan:vcan0 --stats
     """

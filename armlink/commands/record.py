@@ -27,9 +27,9 @@ def record(
 ) -> int:
     """Record to MCAP, which opens in Foxglove, PlotJuggler and ROS 2; a kill loses at most the last second.
 
-    Raw frames (--frames) go through python-can's own loggers: Vector ASC, BLF, or candump's log. Times are then those
-    that the interface stamped, to the microsecond, and armlink replay makes the same samples of the log, bit for bit.
-    Ctrl-C ends the recording properly (exit status 0). Exit status 3 where no SYNC was heard.
+    Raw frames (--frames) are written by the loggers of python-can: Vector ASC, BLF, or the log of candump. Their times
+    are the time stamps of the interface, to the microsecond, and armlink replay makes the same samples from the log,
+    bit for bit. Ctrl-C ends the recording properly (exit status 0). Exit status 3 if no SYNC was heard.
 
     Example: armlink record sarcos run.mcap --frames run.blf --bus socketcan:vcan0 --seconds 60
     """

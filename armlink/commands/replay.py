@@ -30,9 +30,9 @@ def replay(
     """Decode a raw log or a recording again; with neither TARGET nor --bus, show it as a live table at --speed.
 
     A raw log goes through the same decoding as live frames: its samples are those that armlink record --frames wrote,
-    bit for bit. One that was cut off is read up to there, with a warning. On a bus go only the joints' own
-    frames and SYNC, never a command, an SDO or NMT, and only on a virtual bus: for a listener such as
-    armlink daemon --listen-only or armlink monitor. Nothing is ever replayed as torque or motion.
+    bit for bit. A log that was cut off is read up to its end, with a warning. With --bus, only the frames of the joints
+    and SYNC are sent, never a command, an SDO or NMT, and only to a virtual bus: for a listener such as armlink daemon
+    --listen-only or armlink monitor. Nothing is ever replayed as torque or motion.
 
     Example: armlink replay sarcos run.blf run.csv
     """

@@ -21,9 +21,9 @@ def scan(
     bus: OtherBus = None,
     json: Json = None,
 ) -> int:
-    """List the nodes that answer on a bus; with an arm file also those of its joints that do not (exit status 3).
+    """List the nodes that answer on a bus; with an arm file also its joints that do not answer (exit status 3).
 
-    Exit status 1 where a joint has another controller than the arm file states (link.joints, key identity).
+    Exit status 1 if a joint has another drive than the arm file states (link.joints, key identity).
 
     Example: armlink scan sarcos --bus socketcan:vcan0
     """

@@ -39,7 +39,7 @@ def calibrate(
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Fit all sensors to sweeps, all directories in one problem, and keep the result as a calibration record.
+    """Fit all sensors to the sweeps of all directories together, and store the result as a calibration record.
 
     Example: armlink calibrate unloaded loaded --json calibration.json
     """

@@ -26,7 +26,7 @@ def history(
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """List the records of an arm, oldest first, what became current and what was written to controllers.
+    """List the records of an arm, oldest first, what became current and what was written to drives.
 
     Example: armlink history sarcos --json -
     """

@@ -21,7 +21,7 @@ def identify(
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Identify the mass moments that gravity compensation needs, and keep them as a gravity record.
+    """Identify the mass moments that gravity compensation needs, and store them as a gravity record.
 
     Example: armlink identify unloaded loaded --json gravity.json
     """

@@ -37,7 +37,7 @@ def recalibrate(
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Find gains and offsets from the current gravity record, and keep them; --apply also makes them current.
+    """Find gains and offsets from the current gravity record, and store them; --apply also makes them current.
 
     The arm must carry nothing, and every joint must move slowly (below 0.1 rad/s), in both directions, or rest.
 

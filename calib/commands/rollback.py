@@ -26,7 +26,7 @@ def rollback(
     replaced: Replaced = None,
     store: Store = None,
 ) -> None:
-    """Return to an earlier record: a new line of the log, nothing is deleted.
+    """Make an earlier record current again; this adds a line to the log, and nothing is deleted.
 
     Example: armlink rollback sarcos --to 1f0c9a2b --reason "sensor exchanged" --apply
     """

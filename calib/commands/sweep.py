@@ -59,7 +59,7 @@ def sweep(
     ] = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Sweep every joint, tip to base, and write each reading to disk before the next.
+    """Sweep every joint, from tip to base, and write each reading to disk before the next reading.
 
     One pass without a load, one with a reference mass attached: two directories for `armlink calibrate`.
 

@@ -28,7 +28,7 @@ def torque(
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Holding torque against gravity at each pose of a file, one row per pose [N·m].
+    """Compute the holding torque against gravity at each pose of a file, one row for each pose [N·m].
 
     Example: armlink torque arm.urdf --q poses.csv --json -
     """

@@ -30,7 +30,7 @@ def verify(
     ] = None,
     json_file: JsonFile = None,
 ) -> int:
-    """Drive to random poses and compare; exit status 1 where a joint's RMS exceeds its tolerance.
+    """Drive to random poses and compare model and sensor; exit status 1 if the RMS of a joint is too large.
 
     Example: armlink verify sarcos --bus socketcan:vcan0 --poses 40 --json -
     """

@@ -77,7 +77,9 @@ def _percent(arm: RigidArm, recording: Recording) -> str:
     units = ",".join(f"{channel}=percent:{angles}" for channel in channels)
     ends = [f"{channel}_{j + 1}={low[j]:.4g}" for channel in channels for j in np.flatnonzero(one_sided)]
     zero = f" --zero {','.join(ends)}" if ends else ""
-    return f'or for per cent of the ranges, which LeRobot records unless use_degrees is set, --units "{units}"{zero}, or '
+    return (
+        f'or for per cent of the ranges, which LeRobot records unless use_degrees is set, --units "{units}"{zero}, or '
+    )
 
 
 def beyond_range(arm: RigidArm, position: Array) -> Mask:

@@ -30,7 +30,7 @@ def demo(
 ) -> None:
     """Run the whole job on a simulated arm on an in-process CAN bus and write report.html and summary.json.
 
-    Of a model (armlink demo --arm my-arm.urdf) an arm file is made first, as armlink new does; it lies in the folder.
+    For a model (armlink demo --arm my-arm.urdf), an arm file is made first in the folder, as armlink new makes it.
 
     Example: armlink demo --arm sarcos --seed 1 --out armlink-demo
     """

@@ -105,7 +105,7 @@ def diagnose(
         ),
     ] = None,
 ) -> None:
-    """Find where the gap is, which effects cause it, and how far they close it on held-out data.
+    """Find where the gap is, which effects cause it, and how much of it they explain on held-out data.
 
     Example: armlink gap diagnose --sim arm.xml --train slow.csv --train fast.csv --heldout other.csv --json -
     """

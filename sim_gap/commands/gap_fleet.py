@@ -161,9 +161,9 @@ def trend(
     tip: Tip = None,
     gains: KnownGain = "",
 ) -> int:
-    """Diagnose an arm's recordings that are new, and show what changes; exit status 1 if the newest cannot be used.
+    """Diagnose the new recordings of an arm, and show what changes; exit status 1 if the newest one cannot be used.
 
-    A recording that was diagnosed may be deleted: its answer is kept.
+    A recording that was diagnosed may be deleted, since its answer is stored.
 
     Example: armlink gap trend recordings/ --sim arm.yaml
     """

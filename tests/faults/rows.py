@@ -105,7 +105,8 @@ ROWS = (
         "frames lost by the receive queue",
         1,
         QUICK_STOP,
-        "… frames were lost because this host reads too slowly: stop other programs on this host, or give the job less to do in each cycle",
+        "… frames were lost because this host reads too slowly: stop other programs on this host, or give "
+        "the job less to do in each cycle",
         vcan="the kernel's own count is in tests/armlink",
     ),
     Row(
@@ -178,7 +179,8 @@ ROWS = (
         "mode display 6061h",
         26,
         QUICK_STOP,
-        "joint_2: refuses mode 10 (cyclic synchronous torque): its mode display 6061h is 0; read its error code 603Fh and "
+        "joint_2: refuses mode 10 (cyclic synchronous torque): its mode display 6061h is 0; read its error "
+        "code 603Fh and "
         "its supported modes 6502h",
     ),
     Row(

@@ -142,8 +142,18 @@ def started(name, **joint):
 @pytest.mark.parametrize(
     ("register", "value", "says"),
     [
-        (22, 2.0, r"shoulder: register 22 \(VMAX\) limits the velocity readings to 2 rad/s, but the gate must be able to read 3 rad/s: "),
-        (23, 20.0, r"shoulder: register 23 \(TMAX\) limits the torque readings to 20 N·m, but the gate must be able to read 36 N·m: "),
+        (
+            22,
+            2.0,
+            r"shoulder: register 22 \(VMAX\) limits the velocity readings to 2 rad/s, but the gate must "
+            r"be able to read 3 rad/s: ",
+        ),
+        (
+            23,
+            20.0,
+            r"shoulder: register 23 \(TMAX\) limits the torque readings to 20 N·m, but the gate must be "
+            r"able to read 36 N·m: ",
+        ),
     ],
 )
 def test_a_damiao_range_below_the_gates_limits_is_refused(register, value, says):
@@ -158,7 +168,9 @@ def test_a_position_range_that_ends_before_the_gates_window_is_refused():
     link, sim = started("six-damiao")
     window = link.values.limits(1, link.limits[1])
     sim.drive_at[1].registers[21] = max(-window.lower, window.upper) + 0.05
-    with pytest.raises(Refused, match=r"register 21 \(PMAX\) limits the position readings to .* correct zero and direction"):
+    with pytest.raises(
+        Refused, match=r"register 21 \(PMAX\) limits the position readings to .* correct zero and direction"
+    ):
         link.start()
 
 
@@ -170,7 +182,9 @@ def test_ranges_that_the_arm_file_states_are_held_to_the_gates_limits_too():
 
 def test_a_model_that_cannot_show_its_limits_is_refused():
     link, _ = started("six-robstride", max_torque=70.0)
-    with pytest.raises(Refused, match="shoulder: the range of an RS03 limits the torque readings to 60 N·m, but the gate"):
+    with pytest.raises(
+        Refused, match="shoulder: the range of an RS03 limits the torque readings to 60 N·m, but the gate"
+    ):
         link.start()
 
 

@@ -81,7 +81,11 @@ WRONG = [
     (edited("name: sarcos\n", ""), ARM, ["key name", "add it"]),
     (edited("interface: armlink_sim, channel: sarcos", "interface: armlink_sim, channel: nobody"), ARM, ["nobody"]),
     (edited("name: joint_2, node: 2", "name: joint_2, node: 1"), ARM, ["is given twice", "unique"]),
-    (edited("name: joint_2, node", "name: shoulder, node"), ARM, ["shoulder", "give both the same names in the same order"]),
+    (
+        edited("name: joint_2, node", "name: shoulder, node"),
+        ARM,
+        ["shoulder", "give both the same names in the same order"],
+    ),
     (edited("kinematics:", "kinematics: ["), ARM, ["not YAML"]),
     (lambda folder: (folder / "arm.yaml").write_text(""), ARM, ["is a mapping", "`name`, `kinematics` and `link`"]),
     (lambda folder: (folder / "arm.yaml").mkdir(), ARM, ["arm.yaml", "folder"]),

@@ -19,7 +19,7 @@ def doctor(
 ) -> int:
     """Examine an arm file, its model, the sweeps that it allows, and the drives on its bus, which are only read.
 
-    Findings come in the order in which to deal with them; each names its remedy. Exit status 1 where there is an error.
+    Findings come in the order in which to deal with them; each names its remedy. Exit status 1 if there is an error.
 
     Example: armlink doctor sarcos --json -
     """

@@ -79,11 +79,12 @@ def new(
 ) -> int:
     """Write an arm file that demo, sweep and check take as it is.
 
-    The arm is the longest chain of revolute joints; gripper, mimic and prismatic joints at its end are set aside, as
-    are those that carry --base or that --lock names. Limits and torques are the model's. What the model does not state
-    is asked on a terminal, else assumed; every assumed value says so in a comment. Drives on the bus are only read.
-    Exit status 1 where a joint turns the other way or has another gear than the model. Without a model, the drives on
-    --bus make an arm file of which only the geometry is missing: enough to check, monitor and record.
+    The arm is the longest chain of revolute joints. Gripper, mimic and prismatic joints at its end are not part of it,
+    nor are joints that carry --base or that --lock names. Limits and torques are taken from the model. What the model
+    does not state is asked on a terminal, or else assumed; a comment marks every assumed value. Drives on the bus are
+    only read. Exit status 1 if a joint turns in the other direction or has another gear than the model. Without a
+    model, the arm file is made from the drives on --bus; only its geometry is missing, so it is enough for check,
+    monitor and record.
 
     Example: armlink new arm.urdf --out arm.yaml
     """

@@ -335,8 +335,10 @@ def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
     guard._to_wire(0x123, b"\x01", False)
     guard._to_wire(0x80, b"", False)
     assert wire.sent == [(0x80, b""), *((0x600 + node, bytes.fromhex("2b40600002000000")) for node in (1, 2))]
-    assert lines == ["guard: closed, it passes no more frames: the program sent identifier 123h, which the policy does not name; the joints were told to stop; "
-                     "start the guard again to open it"]  # fmt: skip
+    assert lines == [
+        "guard: closed, it passes no more frames: the program sent identifier 123h, which the policy does not name; "
+        "the joints were told to stop; start the guard again to open it"
+    ]
     guard._to_program(0x181, bytes(8), False)
     assert program.sent == [(0x181, bytes(8))]
 
@@ -475,11 +477,20 @@ def broken(change):
     [
         ([], "TypeError"),
         ({}, "KeyError: 'schema'"),
-        ({"schema": "armlink.guard/9", "frames": {}, "stop": []}, "`schema` is 'armlink.guard/9', expected armlink.guard/1"),
+        (
+            {"schema": "armlink.guard/9", "frames": {}, "stop": []},
+            "`schema` is 'armlink.guard/9', expected armlink.guard/1",
+        ),
         (broken(lambda c: c["frames"]["513"].pop("lengths")), "KeyError: 'lengths'"),
         (broken(lambda c: c["frames"]["513"].update(lengths=[4])), "beyond the 4 bytes of its frame"),
-        (broken(lambda c: c["frames"]["513"]["fields"][0].update(code="q9")), "number code 'q9' is unknown, expected one of b, B"),
-        (broken(lambda c: c["frames"]["513"]["fields"][0].pop("most")), "the field needs `values`, or `least` and `most`"),
+        (
+            broken(lambda c: c["frames"]["513"]["fields"][0].update(code="q9")),
+            "number code 'q9' is unknown, expected one of b, B",
+        ),
+        (
+            broken(lambda c: c["frames"]["513"]["fields"][0].pop("most")),
+            "the field needs `values`, or `least` and `most`",
+        ),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(least=math.nan)), "`least` is not a number"),
         (broken(lambda c: c.update(stop=[[1, "xy"]])), "ValueError"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(at=math.inf)), "OverflowError"),
@@ -683,8 +694,9 @@ def test_two_guards_of_one_wire_pass_no_frame_around_for_ever():
 def test_a_drives_frame_from_the_program_is_named_as_one():
     guard, _, _, _ = opened()
     guard._to_wire(0x181, bytes(8), False)
-    assert (
-        guard.closed == "the program sent identifier 181h, which only a drive may send: stop a second guard, or a program that plays a drive"
+    assert guard.closed == (
+        "the program sent identifier 181h, which only a drive may send: stop a second guard, or a "
+        "program that plays a drive"
     )
 
 
@@ -725,7 +737,9 @@ def test_lost_frames_close_it(wires, side, name):
     (wire if side == "wire" else program).port.lost = 7
     wire.say(0x181, bytes(8))
     guard.step(1.0)
-    assert guard.closed == f"7 frames from the {name} were lost: too many frames were sent, or this guard gets too little processor time"
+    assert guard.closed == (
+        f"7 frames from the {name} were lost: too many frames were sent, or this guard gets too little processor time"
+    )
 
 
 def test_a_stop_that_did_not_leave_is_not_told_as_one():
@@ -751,7 +765,8 @@ def test_one_interface_for_both_sides_is_refused(capfd, tmp_path):
     path.write_text(json.dumps(CONTENT))
     assert bus_guard.main([str(path), "can0", "can0"]) == 2
     assert capfd.readouterr().err == (
-        "guard: can0 is given as both interfaces: give first an interface for programs alone (such as a vcan), then the interface of the arm\n"
+        "guard: can0 is given as both interfaces: give first an interface for programs alone (such as a "
+        "vcan), then the interface of the arm\n"
     )
 
 

@@ -63,7 +63,9 @@ def test_a_window_that_no_frame_carries_is_refused(side):
     units = Units(0.04, 0.5, 0.5, 1e-6)
     assert tried(joint(), window, units).lower == window[0]
     beyond = (window[0] + min(side, 0) * 0.5, window[1] + max(side, 0) * 0.5)  # one user unit more
-    with pytest.raises(BadInput, match=r"elbow: 607Ah cannot carry the range of this joint, since one user unit is only 0\.5 rad"):
+    with pytest.raises(
+        BadInput, match=r"elbow: 607Ah cannot carry the range of this joint, since one user unit is only 0\.5 rad"
+    ):
         tried(joint(), beyond, units)
 
 

@@ -88,7 +88,9 @@ def test_a_device_that_holds_another_mapping_is_refused(link, bus):
 
 def test_another_rated_torque_than_the_arm_file_is_refused(link, bus):
     bus.nodes[1].values[0x6076, 0] = struct.pack("<I", 38_000)
-    with pytest.raises(BadInput, match=r"joint_1 \(node 1\): rated torque 6076h is 38.0 N·m, but the arm file has 40.0"):
+    with pytest.raises(
+        BadInput, match=r"joint_1 \(node 1\): rated torque 6076h is 38.0 N·m, but the arm file has 40.0"
+    ):
         link.start()
 
 

@@ -57,7 +57,10 @@ def test_a_node_that_leaves_operational_is_named(enabled, bus):
 def test_a_drive_fault_is_named(enabled, bus):
     bus.nodes[1].status = FAULT
     bus.out.append((0x381, struct.pack("<Hb", FAULT, 8)))
-    assert cycles_until_fault(enabled)[1] == "joint_1: is in state \"fault\" (status word 0x0008), expected \"operation enabled\""
+    assert (
+        cycles_until_fault(enabled)[1]
+        == 'joint_1: is in state "fault" (status word 0x0008), expected "operation enabled"'
+    )
 
 
 def test_lost_readings_are_nan_with_their_age_then_a_fault(enabled, bus):

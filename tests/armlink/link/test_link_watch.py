@@ -58,7 +58,9 @@ def test_another_controller_than_the_arm_file_states_is_refused(arm_of, bus, key
             Refused, match=rf"joint_1 \(node 1\): .*1018h:0{sub} .* is {found}, expected 0x1234"
         ) as caught:
             link.start()
-        assert "connect the right arm, or correct `identity` or `eds` of this joint under link.joints" in str(caught.value)
+        assert "connect the right arm, or correct `identity` or `eds` of this joint under link.joints" in str(
+            caught.value
+        )
     assert not [data for can_id, data in bus.sent if can_id == 0x601 and data[0] & 0xE0 == 0x20]  # nothing was written
 
 
@@ -121,7 +123,9 @@ def test_a_joint_that_does_not_display_position_control_is_not_enabled(link, bus
 
 def test_a_mode_that_a_controller_does_not_have_is_refused_before_it_is_sent(enabled, bus):
     bus.sent.clear()
-    with pytest.raises(Refused, match=r"gate: joint_1: mode 4 is not supported: the drive of this joint has the modes 8, 10"):
+    with pytest.raises(
+        Refused, match=r"gate: joint_1: mode 4 is not supported: the drive of this joint has the modes 8, 10"
+    ):
         enabled.cycle(command(PROFILE_TORQUE))
     assert not [data for can_id, data in bus.sent if can_id & 0x780 == 0x300]
     assert all_stopped(bus)
@@ -224,7 +228,9 @@ def test_a_second_host_stops_all_in_the_cycle_in_which_it_is_heard(enabled, bus,
     bus.sent.clear()
     cycle, says = cycles_until_fault(enabled, command(POSITION))
     assert cycle == 0
-    assert says == f"another host is on this bus: it sends {what}: stop that program, since only one program may command an arm"
+    assert says == (
+        f"another host is on this bus: it sends {what}: stop that program, since only one program may command an arm"
+    )
     words = [struct.unpack("<Hhi", data)[0] for can_id, data in bus.sent if can_id & 0x780 == 0x200]
     assert set(words) == {0x02}
 
@@ -283,7 +289,9 @@ def test_a_command_that_ages_between_gate_and_bus_does_not_leave(enabled, bus, a
     given.t = None if age is None else bus.clock.time - age
     drives.frames = slow
     bus.sent.clear()
-    with pytest.raises(HostLate, match=r"the host was \d+ ms late .*; the command became too old before its frames were sent"):
+    with pytest.raises(
+        HostLate, match=r"the host was \d+ ms late .*; the command became too old before its frames were sent"
+    ):
         enabled.cycle(given)
     words = [struct.unpack("<Hhi", data)[0] for can_id, data in bus.sent if can_id & 0x780 == 0x200]
     assert set(words) == {0x02}
@@ -300,7 +308,9 @@ def test_a_node_id_given_twice_is_found_after_three_cycles(enabled, bus):
     bus._sync = twin
     cycle, says = cycles_until_fault(enabled, command(POSITION))
     assert cycle == 3
-    assert says == "joint_2: two readings come in every cycle, so a second node has the same id: give every node an id of its own"
+    assert says == (
+        "joint_2: two readings come in every cycle, so a second node has the same id: give every node an id of its own"
+    )
     assert all_stopped(bus)
 
 
@@ -343,7 +353,9 @@ def test_a_node_that_babbles_is_found(enabled, bus):
 
     cycle, says = cycles_until_fault(enabled, command(POSITION), babble)
     assert cycle <= 11
-    assert says == "the bus carries more frames than these joints send, most of them 555h: a node babbles, disconnect this node"
+    assert says == (
+        "the bus carries more frames than these joints send, most of them 555h: a node babbles, disconnect this node"
+    )
     assert all_stopped(bus)
 
 

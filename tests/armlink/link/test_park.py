@@ -82,7 +82,9 @@ def test_without_a_pose_the_arm_is_let_down_and_it_says_so(caplog, monkeypatch):
         link.enable()
         with pytest.raises(BadInput, match=r"key `link\.park` is missing"):
             link.park()
-    assert "the arm is being lowered, which takes 3 s at most, since it could not be parked: the arm file has no link.park" in caplog.text
+    assert (
+        "the arm is being lowered, which takes 3 s at most, since it could not be parked: the arm file has no link.park"
+    ) in caplog.text
 
 
 def test_drives_that_hold_are_left_holding():

@@ -165,7 +165,13 @@ def test_a_joint_that_leans_on_its_stop_by_a_sensor_that_reads_too_much_is_not_r
 def test_a_reading_that_no_turn_explains_is_refused_in_other_words():
     start = [0.0, -1.4, 0.0, 0.0, 0.0, 0.0]
     link = Link(host_of("six-damiao", {1: 2.0}, start), bus_of("six-damiao", start))
-    with link, pytest.raises(Refused, match=r"shoulder: reads .* No number of whole turns of its drive explains this reading, so zero, dir"):
+    with (
+        link,
+        pytest.raises(
+            Refused,
+            match=r"shoulder: reads .* No number of whole turns of its drive explains this reading, so zero, dir",
+        ),
+    ):
         link.start()
 
 

@@ -190,7 +190,10 @@ def test_the_command_answers_for_machines(tmp_path, capsys):
 def test_on_another_bus_it_asks_first(capsys):
     assert run(["check", "sarcos", "--bus", "virtual:nobody"]) == 2
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "armlink: check: there is no terminal to ask for confirmation: give `--yes`, or `--passive` for the checks without power"
+    assert last == (
+        "armlink: check: there is no terminal to ask for confirmation: give `--yes`, or `--passive` for "
+        "the checks without power"
+    )
 
 
 def test_an_arm_that_is_not_there_is_a_bus_fault(capsys):

@@ -196,7 +196,9 @@ def test_a_drive_that_lost_a_turn_is_named_with_the_zero_that_puts_it_right(tmp_
 
 
 def test_joints_of_which_no_reading_shows_a_lost_turn_are_listed(tmp_path):
-    (named,) = [each for each in examine("six-odrive", offline=True) if "may count one turn too many or too few" in each.what]
+    (named,) = [
+        each for each in examine("six-odrive", offline=True) if "may count one turn too many or too few" in each.what
+    ]
     assert named.level == "hint"
     assert "base (0.524 rad), shoulder (0.524 rad), elbow (0.628 rad)" in named.what
     wide = written(tmp_path, (("kinematics", "joints", 0, "upper"), 4.4))

@@ -32,7 +32,11 @@ def write(store: RecordStore, controllers: Controllers, new: CalibrationRecord =
 @pytest.mark.parametrize("serial", ["unknown", "Unknown ", "FILL-IN"])
 def test_nothing_is_written_to_an_arm_without_a_serial_number(store: RecordStore, serial: str) -> None:
     arm, controllers = ARM.model_copy(update={"serial": serial}), Controllers()
-    with pytest.raises(Refused, match=r"bench: its serial is .*, so the calibration may belong to another arm .* give this arm a serial in bench.yaml \(`serial: …"):
+    with pytest.raises(
+        Refused,
+        match=r"bench: its serial is .*, so the calibration may belong to another arm .* give this arm a "
+        r"serial in bench.yaml \(`serial: …",
+    ):
         write(store, controllers, NEW.model_copy(update={"serial": serial}), arm)
     assert controllers.held == Controllers().held
     assert store.writes(arm) == []
@@ -55,7 +59,11 @@ def test_an_arm_that_shares_name_and_serial_with_one_written_before_is_refused(s
     other = Controllers()
     other.drives = OTHER
     for new in (NEW, record()):
-        with pytest.raises(Refused, match="another arm has the same name and serial, and nothing was written: give each arm a serial of its own"):
+        with pytest.raises(
+            Refused,
+            match="another arm has the same name and serial, and nothing was written: give each arm a serial "
+            "of its own",
+        ):
             write(store, other, new)
     assert other.held == Controllers().held
     write(store, Controllers(), record(note="the arm itself goes on"))

@@ -164,7 +164,9 @@ def test_a_record_of_the_future_does_not_become_current_and_one_in_force_stays_w
         if sound:
             require_sound(record, ARM, now)
         else:
-            with pytest.raises(Refused, match=r"was created on 2026-11-29 03:00 UTC, but the clock of this machine says"):
+            with pytest.raises(
+                Refused, match=r"was created on 2026-11-29 03:00 UTC, but the clock of this machine says"
+            ):
                 require_sound(record, ARM, now)
 
 

@@ -245,7 +245,7 @@ def test_a_store_that_was_replaced_by_rename_is_noticed_before_anything_is_writt
     path = tmp_path / "records.db"
     store = filled(path)
     copied(path, tmp_path / "backup.db").rename(path)
-    with pytest.raises(StoreFault, match="was replaced by another file while it was in use. Nothing was written"):
+    with pytest.raises(StoreFault, match=r"was replaced by another file while it was in use\. Nothing was written"):
         store.put(calibration(1.05), ARM, by="ann", reason="sweep")
     store.put(calibration(1.06), ARM, by="ann", reason="sweep")
     assert {record.id for record in RecordStore(str(path)).history(ARM)} == {calibration().id, calibration(1.06).id}

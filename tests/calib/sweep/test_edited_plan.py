@@ -100,7 +100,10 @@ EDITS: dict[str, tuple[Edit, str]] = {
     "another joint": (_set(joint=7), "joint 7, expected 0 to 1"),
     "fewer joints": (_set(rest=[0.0]), "rest has 1 values"),
     "steps that fall": (lambda p: p["sweeps"][0]["steps"].reverse(), "steps do not increase"),
-    "a joint that hangs loose": (_set(stops=[0, 0], servo=[False, False]), "neither on a stop nor by its position loop"),
+    "a joint that hangs loose": (
+        _set(stops=[0, 0], servo=[False, False]),
+        "neither on a stop nor by its position loop",
+    ),
     "twice the same sweep": (lambda p: p["sweeps"].append(p["sweeps"][0]), "two sweeps are called"),
     "no accuracy": (lambda p: p.update(standard_error=0.0), "standard_error is 0"),
     "a creep": (_set(speed=0.2), "creeps"),

@@ -186,7 +186,11 @@ def test_a_joint_beyond_its_range_is_refused_unless_the_user_says_that_it_is_the
     assert check(with_range(least - 0.01, most + 0.01), motor)[1] == []
     assert check(with_range(least - 0.01, most - 0.1), motor)[1] == []
     narrow = with_range(least - 0.01, most - 0.3)
-    with pytest.raises(BadInput, match=r"q of joint_2: the recorded position goes from .* the joint of the model can only go from .*--zero q_2=0"):
+    with pytest.raises(
+        BadInput,
+        match=r"q of joint_2: the recorded position goes from .* the joint of the model can only go from "
+        r".*--zero q_2=0",
+    ):
         check(narrow, motor)
     assert check(narrow, motor, parse_corrections(zero=["q_2=0"]))[1] == []
 
@@ -350,7 +354,9 @@ def test_amperes_of_one_joint_are_asked_about(arm, motor, joint, constant):
     torque = motor.motor_torque.copy()
     torque[:, joint] /= constant
     column = f"tau_motor_{joint + 1}"
-    error = doubt(check(arm, replace(motor, motor_torque=torque)), rf"amperes, or in another unit.*--units {column}=A:K")
+    error = doubt(
+        check(arm, replace(motor, motor_torque=torque)), rf"amperes, or in another unit.*--units {column}=A:K"
+    )
     assert f"{column}=N·m" in error
     assert check(arm, replace(motor, motor_torque=torque), parse_corrections(units=[f"{column}=N·m"]))[1] == []
     assert check(arm, motor, parse_corrections(units=[f"{column}=N·m"]))[1] == []

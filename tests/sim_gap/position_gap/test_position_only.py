@@ -127,8 +127,8 @@ def test_joints_that_swing_with_the_servo_off_in_the_held_out_motion_alone_are_n
     found = SimpleNamespace(sim=SimpleNamespace(arm=arm), search=SimpleNamespace(data=fitted), heldout=other)
     (note,) = _released(found)
     assert (
-        "never in training, so the fit may not hold there: shoulder for 25 % of the time: add such a recording, with the servo off, to --train"
-        in note
+        "never in training, so the fit may not hold there: shoulder for 25 % of the time: add such a "
+        "recording, with the servo off, to --train" in note
     )
     assert _released(SimpleNamespace(sim=found.sim, search=found.search, heldout=fitted)) == []
     assert _released(SimpleNamespace(sim=found.sim, search=SimpleNamespace(data=other), heldout=other)) == []

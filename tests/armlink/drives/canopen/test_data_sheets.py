@@ -98,7 +98,10 @@ def test_the_sample_of_cia_passes_without_power_and_is_not_driven(written, capsy
     status, checked = told(capsys, "check", path)
     assert status == 1
     assert [each["check"] for each in checked["checks"] if each["outcome"] == "failed"] == ["heartbeat of the host"]
-    assert "the device watches neither the commands (1400h:05) nor the heartbeat (1016h) of its host: do not drive this joint" in str(checked)
+    assert (
+        "the device watches neither the commands (1400h:05) nor the heartbeat (1016h) of its host: do "
+        "not drive this joint"
+    ) in str(checked)
 
 
 def test_a_device_with_cyclic_velocity_alone_passes_the_check(written, capsys):

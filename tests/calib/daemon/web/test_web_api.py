@@ -142,7 +142,12 @@ def test_events_that_the_disk_does_not_give_are_given_up(
         ("GET", "/api/history?from=yesterday", 422, "from"),
         ("GET", "/api/history?from=2026-05-01T08:00:00", 422, "timezone"),
         ("GET", "/api/history?from=0001-01-01T00:00:00%2B14:00", 422, "between 1970 and 2999"),
-        ("GET", "/api/history?from=2026-05-02T00:00:00Z&to=2026-05-01T00:00:00Z", 422, "parameter `from` must not be later than parameter `to`"),
+        (
+            "GET",
+            "/api/history?from=2026-05-02T00:00:00Z&to=2026-05-01T00:00:00Z",
+            422,
+            "parameter `from` must not be later than parameter `to`",
+        ),
         ("GET", "/api/proposals/0/approve", 405, "GET is not allowed"),
         ("POST", "/api/proposals/0/approve", 422, "id"),
         ("POST", "/api/proposals/one/approve", 422, "id"),
