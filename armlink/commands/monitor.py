@@ -45,7 +45,7 @@ def monitor(
         typer.Option(min=1, max=65535, metavar="PORT", help="Send readings to a Rerun viewer on this machine."),
     ] = None,
     json: Annotated[
-        Path | None, typer.Option(help="Write the last state as JSON to this file; - is standard output.")
+        Path | None, typer.Option(help="Write the last state as JSON to this file; for standard output give `-`.")
     ] = None,
 ) -> int:
     """Show what an arm's joints send; exit status 3 if no joint is heard.

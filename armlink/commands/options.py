@@ -11,7 +11,7 @@ from typer.core import TyperCommand
 
 Arm = Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")]
 OtherBus = Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")]
-Json = Annotated[Path | None, typer.Option(help="Write the answer as JSON to this file; - is standard output.")]
+Json = Annotated[Path | None, typer.Option(help="Write the answer as JSON to this file; for standard output give `-`.")]
 
 
 def _of_reading(help_text: str, *names: str) -> Any:

@@ -24,7 +24,7 @@ def replay(
         float, typer.Option(min=0.0, help="Speed relative to the recording; 0: as fast as possible.")
     ] = 1.0,
     json: Annotated[
-        Path | None, typer.Option(help="Write as JSON to this file what was replayed; - is standard output.")
+        Path | None, typer.Option(help="Write as JSON to this file what was replayed; for standard output give `-`.")
     ] = None,
 ) -> int:
     """Decode a raw log or a recording again; with neither TARGET nor --bus, show it as a live table at --speed.

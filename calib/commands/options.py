@@ -60,13 +60,13 @@ KeepGoing = Annotated[
     int,
     typer.Option(
         min=0,
-        help="Enable the joints again without asking after up to this many stalls of the cycle.",
+        help="Number of stalls of the cycle after which the joints are enabled again without asking.",
         rich_help_panel="Run",
     ),
 ]
 WithoutAsking = Annotated[bool, typer.Option("--yes", help="Move the arm without asking first.", rich_help_panel="Run")]
 JsonFile = Annotated[
-    Path | None, typer.Option("--json", help="Write the answer as JSON to this file; - is standard output.")
+    Path | None, typer.Option("--json", help="Write the answer as JSON to this file; for standard output give `-`.")
 ]
 
 

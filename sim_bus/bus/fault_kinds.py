@@ -74,5 +74,7 @@ def parse_fault(text: str, joints: Sequence[str]) -> Fault:
         if amount < 0 or math.isinf(amount) or not math.isfinite(instant) or (value and not kind.value):
             raise ValueError
     except ValueError:
-        raise BadInput(f"fault {text!r}: its value must be: {kind.value or 'none'}; expected {FORM}") from None
+        raise BadInput(
+            f"fault {text!r}: its value is wrong (expected: {kind.value or 'none'}); expected {FORM}"
+        ) from None
     return Fault(kind.id, joint, amount, instant)

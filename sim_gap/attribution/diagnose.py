@@ -131,7 +131,9 @@ def diagnose(
         other, again = _fitted(more, library)
         if body_of(again) is not None:
             search, estimate, judge, heldout = other, again, _placed(again, rest), recordings
-            heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} only the second half, {LENT}"
+            heldout_is += (
+                f"; of {', '.join(judge.signals[k].label for k in lent)} only the second half is held out, {LENT}"
+            )
     fit = estimate.store.data
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     within = is_within(judge) and is_within(fit)

@@ -35,7 +35,7 @@ class RecordingFinding:
         kind = self.finding.replace("_", " ")
         if not self.corrected:
             return f"{self.evidence_at} ({kind}; diagnosed as recorded; to change this: {self.option})"
-        other = f"its option is {self.option}" if self.option.startswith("--") else f"next time, {self.option}"
+        other = f"option: {self.option}" if self.option.startswith("--") else f"next time, {self.option}"
         return f"{self.evidence_at} ({kind}; this was corrected; {other})"
 
     def refusal(self) -> str:

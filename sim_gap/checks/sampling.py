@@ -46,7 +46,12 @@ def find_time_unit(recording: Recording, stated: Corrections) -> list[RecordingF
     )
     return [
         RecordingFinding(
-            "clock", "t", "all", f"{what}: are the times in {unit}?", f"--units t={unit}, or t=s if it is right", False
+            "clock",
+            "t",
+            "all",
+            f"{what}: are the times in {unit}?",
+            f"--units t={unit}, or t=s if this is right",
+            False,
         )
     ]
 

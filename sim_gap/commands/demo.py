@@ -25,7 +25,7 @@ def demo(
         "armlink-demo"
     ),
     json: Annotated[
-        Path | None, typer.Option(help="Also write the summary as JSON to this file; - is standard output.")
+        Path | None, typer.Option(help="Also write the summary as JSON to this file; for standard output give `-`.")
     ] = None,
 ) -> None:
     """Run the whole job on a simulated arm on an in-process CAN bus and write report.html and summary.json.

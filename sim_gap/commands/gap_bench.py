@@ -40,7 +40,7 @@ def bench(
         ),
     ] = None,
     json: Annotated[
-        Path | None, typer.Option(help="Write the score as JSON to this file; - is standard output.")
+        Path | None, typer.Option(help="Write the score as JSON to this file; for standard output give `-`.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Store cases, answers and labels in this new folder.")] = None,
     workers: Annotated[int, typer.Option(help="Number of processes.")] = 2,

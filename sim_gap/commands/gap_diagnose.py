@@ -56,7 +56,7 @@ def diagnose(
         ),
     ] = None,
     json: Annotated[
-        Path | None, typer.Option(help="Write the result as JSON to this file; - is standard output.")
+        Path | None, typer.Option(help="Write the result as JSON to this file; for standard output give `-`.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report to this file.")] = None,
     gain: Annotated[

@@ -30,7 +30,8 @@ def diagnose_fleet(
         Path | None, typer.Option(help="Also write a table by case and effect to this file (.parquet).")
     ] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write all results as JSON to this file; - is standard output.")
+        Path | None,
+        typer.Option("--json", help="Write all results as JSON to this file; for standard output give `-`."),
     ] = None,
     base: Base = None,
     tip: Tip = None,
@@ -154,7 +155,7 @@ def trend(
     json_file: Annotated[
         Path | None,
         typer.Option(
-            "--json", help="Write the newest answer and the changes as JSON to this file; - is standard output."
+            "--json", help="Write the newest answer and the changes as JSON to this file; for standard output give `-`."
         ),
     ] = None,
     base: Base = None,

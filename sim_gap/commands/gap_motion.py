@@ -24,7 +24,8 @@ def plan(
         int, typer.Option(min=0, help="Seed of poses and sines; another seed gives a held-out motion.")
     ] = 0,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write length and pieces as JSON to this file; - is standard output.")
+        Path | None,
+        typer.Option("--json", help="Write length and pieces as JSON to this file; for standard output give `-`."),
     ] = None,
 ) -> int:
     """Plan motion within the arm's limits that separates effects; nothing moves.
@@ -58,7 +59,8 @@ def collect(
     out: Annotated[Path, typer.Option(help="Recording to write (.mcap).")],
     bus: OtherBus = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write rows and seconds as JSON to this file; - is standard output.")
+        Path | None,
+        typer.Option("--json", help="Write rows and seconds as JSON to this file; for standard output give `-`."),
     ] = None,
 ) -> int:
     """Move the arm along a planned motion under position control and record every cycle; Ctrl-C stops it safely.

@@ -76,10 +76,10 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
         arm = with_realism(arm, realism, seed)
     refuse_impossible_model(arm)
     bench, data = Bench(quick(arm), seed), _fresh(out)
-    account.say(f"arm {arm.name}, hidden truth of seed {seed}, results in {out}")
+    account.say(f"arm {arm.name} with the hidden true values of seed {seed}; the results are in {out}")
     account.note(arm=arm.name, seed=seed, joints=arm.joint_names)
     Demo(bench, seed, data, account).run()
-    account.write(out, f"simulated arm {arm.name}, hidden truth of seed {seed}")
+    account.write(out, f"simulated arm {arm.name} with the hidden true values of seed {seed}")
     suggest(command_line("check", arm_name) if Path(arm_name).suffix else "armlink new MODEL.urdf --out my-arm.yaml")
 
 

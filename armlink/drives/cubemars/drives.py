@@ -226,7 +226,7 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
 def _watched(settings: CubeMarsSettings) -> str:
     if not settings.can_timeout:
         return (
-            "`can_timeout` is not given in the `drive:` section: the drive is taken to keep on with its last "
+            "`can_timeout` is not given in the `drive:` section: the drive may keep on with its last "
             "command after its host died"
         )
     return (
