@@ -18,10 +18,10 @@ CLOSED = {
     "suspended": "it is late: frames",
     "a second guard": "came on the wire and is not from this guard: another host|which only a drive may send|"
     "which the policy does not name",
-    "wire down and up": f"an interface failed: Network is down; {OWN_WATCHES}|the wire takes no frames",
+    "wire down and up": rf"an interface failed \(Network is down\); {OWN_WATCHES}|the wire takes no frames",
     "killed and started again at once": "",
     "its terminal is closed": "the guard was told to end; the joints were told to stop",
-    "flood of SYNCs by a program": "80h: more often than 100 times a second",
+    "flood of SYNCs by a program": "80h: is sent more often than 100 times a second",
     "SYNC as CAN FD by a program": "the program sent 80h as CAN FD, which these drives do not understand",
 }
 """Attack → what the guard says of it; empty where a killed one says nothing."""
@@ -81,5 +81,5 @@ def test_an_interface_that_is_removed_during_work_is_one_line(place: Scene) -> N
     found = place.attack(remove, guarded=True)
     assert not found.wrong, found
     assert re.search("No such device|Network is down", found.host), found.host
-    assert "guard: closed: an interface failed: " in found.guard
+    assert "guard: closed, it passes no more frames: an interface failed (" in found.guard
     assert "the joints were told to stop" in found.guard

@@ -49,7 +49,7 @@ def test_the_true_model_is_first_in_windows_and_running_free(models: list[str], 
         assert here["free"] < there["free"]
         low, high = there["windows"]["ci95"]
         assert low < there["windows"]["value"] < high
-    assert "true.xml leaves the least" in " ".join(capsys.readouterr().out.split())
+    assert "true.xml leaves the smallest gap" in " ".join(capsys.readouterr().out.split())
 
 
 def test_known_gains_stand_in_for_actuators(models: list[str], tmp_path: Path) -> None:

@@ -17,4 +17,4 @@ def test_the_format_of_its_own_is_taken(tmp_path, capsys):
     assert (
         run(["record", "sarcos", str(tmp_path / "run.mcap"), "--bus", "virtual:test-record", "--seconds", "0.01"]) == 3
     )
-    assert "recordings are written as" not in capsys.readouterr().err
+    assert "record writes .mcap files" not in capsys.readouterr().err

@@ -141,7 +141,7 @@ def test_a_signal_to_the_job_s_group_parks_the_arm(pendulum: Pendulum, number: s
     assert pendulum.job is not None
     _, told = pendulum.job.communicate(timeout=60)
     pendulum.require_parked()
-    assert number is signal.SIGKILL or "parking, " in told
+    assert number is signal.SIGKILL or "its parking pose, " in told
 
 
 @pytest.mark.long
@@ -199,7 +199,7 @@ def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulu
     pendulum.send(signal.SIGINT)
     assert pendulum.job is not None
     assert pendulum.job.stderr is not None
-    told = next(line for line in pendulum.job.stderr if "parking, " in line)
+    told = next(line for line in pendulum.job.stderr if "its parking pose, " in line)
     assert "Ctrl-C" in told
     pendulum.send(signal.SIGINT)
     assert "pressing Ctrl-C again within 2 s lets the arm fall" in pendulum.job.stderr.readline()

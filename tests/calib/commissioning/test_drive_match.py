@@ -17,9 +17,9 @@ def test_in_the_order_of_their_ids_there_must_be_as_many_drives_as_joints():
         ("j2", 5, False),
         ("j3", 8, False),
     ]
-    with pytest.raises(BadInput, match=r"3 drives answer \(nodes 3, 5, 8\), the arm has 2 joints.*--by-hand"):
+    with pytest.raises(BadInput, match=r"3 drives answer \(nodes 3, 5, 8\), but the arm has 2 joints.*--by-hand"):
         match_in_order(["j1", "j2"], SimpleNamespace(found=drives), "the bus")
-    with pytest.raises(BusFault, match=r"3 drives answer \(nodes 3, 5, 8\), the arm has 4 joints: check power"):
+    with pytest.raises(BusFault, match=r"3 drives answer \(nodes 3, 5, 8\), but the arm has 4 joints: check power"):
         match_in_order(["j1", "j2", "j3", "j4"], SimpleNamespace(found=drives), "the bus")
 
 

@@ -277,7 +277,7 @@ def test_a_joint_that_nobody_turned_and_a_drive_that_is_missing(made, tmp_path):
     with pytest.raises(BusFault, match="no drive read the motion of j1"):
         match_drives(made, drives, "the bus", lambda text: None)
     drives.found.pop()
-    with pytest.raises(BusFault, match=r"3 drives answer \(nodes 1, 2, 3\), the arm has 4 joints"):
+    with pytest.raises(BusFault, match=r"3 drives answer \(nodes 1, 2, 3\), but the arm has 4 joints"):
         match_drives(made, drives, "the bus", None)
 
 

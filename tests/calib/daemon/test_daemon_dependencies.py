@@ -116,7 +116,7 @@ def test_a_store_that_does_not_answer_holds_nobody_up(tmp_path: Path) -> None:
     daemon.run(30)
     assert len(later) == 1
     assert daemon.view.status().state is State.OBSERVING
-    assert "records.db: has not answered for 2" in (daemon.view.status().store_fault or "")
+    assert "records.db has not answered for 2" in (daemon.view.status().store_fault or "")
     assert metric(daemon, "record_store_up") == "0.0"
     daemon.run_aside = lambda work, done: done(work())
     work, done = later.pop()

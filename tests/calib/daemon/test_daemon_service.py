@@ -227,7 +227,7 @@ def test_a_roll_back_that_fails_is_tried_again_and_said_once(tmp_path: Path, mon
         patch.setattr(daemon.store, "get", lambda record: (_ for _ in ()).throw(StoreFault("store failed")))
         daemon.run(60)
     (refused,) = daemon.of_kind("refused")
-    assert refused.text == "joint_3: roll-back failed: store failed"
+    assert refused.text == "joint_3: the roll-back failed: store failed"
     daemon.run(3)
     assert daemon.of_kind("roll-back")[0].joint == "joint_3"
     assert abs(daemon.fast.error()[1][2]) < 0.01
@@ -370,7 +370,7 @@ def test_a_joint_that_falls_silent_is_a_fault(tmp_path: Path) -> None:
     batch = daemon.service.arm_state.batch
     batch.age[3] = 1.7
     assert daemon.view.status().state is State.FAULT
-    assert daemon.view.status().detail == "joint_4: no reading for 1.7 s"
+    assert daemon.view.status().detail == "joint_4: no reading has come for 1.7 s"
     assert daemon.view.joints()[3].sample_age_s == pytest.approx(1.7)
 
 

@@ -173,7 +173,7 @@ def test_a_record_of_the_future_does_not_become_current_and_one_in_force_stays_w
 def test_a_record_of_other_joints_is_refused() -> None:
     (first, _) = calibration().joints
     record = calibration().model_copy(update={"joints": (first,), "covariance_of": (), "covariance": ()})
-    with pytest.raises(Refused, match="it has 1 joints, the arm 2"):
+    with pytest.raises(Refused, match="it has 1 joints, but the arm has 2"):
         require_sound(record, arm_file())
 
 

@@ -215,7 +215,7 @@ def test_the_default_store_is_in_the_state_directory(monkeypatch: pytest.MonkeyP
 
 
 def test_parse_record_takes_only_mappings() -> None:
-    with pytest.raises(BadInput, match="key kind"):
+    with pytest.raises(BadInput, match="`kind` is"):
         parse_record(["calibration"], "x.yaml")
 
 
