@@ -68,8 +68,8 @@ def test_defaults_are_those_of_the_contract(tmp_path):
         (("kinematics", "joints", 0, "a"), float("nan"), "key kinematics.joints.0.a: Input should be a finite number"),
         (("kinematics", "gravity"), [0.0, -9.8], "key kinematics.gravity: "),
         (("kinematics", "model"), "arm.xml", "give either `joints`"),
-        (("kinematics", "joints", 1, "name"), "joint_1", "'joint_1' stands twice"),
-        (("link", "joints", 1, "node"), 1, "'node 1' stands twice"),
+        (("kinematics", "joints", 1, "name"), "joint_1", "'joint_1' is given twice"),
+        (("link", "joints", 1, "node"), 1, "'node 1' is given twice"),
         (
             ("link", "joints", 1, "node"),
             128,

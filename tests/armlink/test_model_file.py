@@ -187,6 +187,6 @@ def test_a_xacro_file_is_expanded(tmp_path, monkeypatch):
         expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")
     monkeypatch.setitem(sys.modules, "xacro", None)
     with pytest.raises(
-        BadInput, match=r"is a xacro file: install xacro (pip install xacro), or expand the file yourself"
+        BadInput, match=r"is a xacro file: install xacro \(pip install xacro\), or expand the file yourself"
     ):
         expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")

@@ -250,8 +250,8 @@ def test_what_a_log_lacks_of_the_arm_is_named(arm_of, tmp_path, text):
         recording_of_log(load_arm("six-damiao"), tmp_path / "other.log")
     said = str(refused.value)
     if "7FF" in text:
-        assert "none is of base (id 01h), shoulder (id 02h)" in said
-        assert "there are frames 7FFh" in said
+        assert "no frame comes from base (id 01h), shoulder (id 02h)" in said
+        assert "the log has the frames 7FFh" in said
     else:
         assert "no frame could be read" in said
     assert "SYNC" not in said

@@ -106,6 +106,6 @@ def test_convert_says_which_names_the_format_drops(tmp_path, capsys):
     )
     save_recording(recording, tmp_path / "run.parquet")
     assert run(["convert", str(tmp_path / "run.parquet"), str(tmp_path / "run.csv")]) == 0
-    assert "left/elbow is joint_1, left/wrist is joint_2 there" in " ".join(capsys.readouterr().out.split())
+    assert "left/elbow is called joint_1, left/wrist is called joint_2" in " ".join(capsys.readouterr().out.split())
     assert run(["convert", str(tmp_path / "run.parquet"), str(tmp_path / "two.parquet")]) == 0
     assert "stores no joint names" not in capsys.readouterr().out

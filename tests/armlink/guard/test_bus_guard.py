@@ -175,7 +175,7 @@ def test_a_request_that_is_cut_short_is_refused(length):
 def test_a_refused_frame_is_named_with_its_bytes():
     policy = Policy(CONTENT)
     assert policy.refusal(0x201, b"", 10.0).startswith("the program sent 201h with no data, ")
-    assert policy.refusal(0x201, b"\x0f\x01", 10.0).startswith("201h with 0f 01: ")
+    assert policy.refusal(0x201, b"\x0f\x01", 10.0).startswith("the program sent 201h with 0f 01, ")
 
 
 hostile = st.one_of(
