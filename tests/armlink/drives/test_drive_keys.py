@@ -52,7 +52,7 @@ def test_a_torque_sensor_at_an_input_of_the_device(tmp_path):
         (drive(family="canopen", node=1, torque="motor", calibration="controller"), "`calibration: controller` needs"),
         (lambda joints: joints[0].update(drive={"family": "canopen", "node": 1}), "give `node` or `drive"),
         (lambda joints: joints[0].pop("node"), "give `node` or `drive"),
-        (drive(family="canopen", node=2), "'node 2' stands twice"),
+        (drive(family="canopen", node=2), "'node 2' is given twice"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(tmp_path, change, says):

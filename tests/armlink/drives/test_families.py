@@ -594,7 +594,7 @@ def test_a_drive_that_restarted_and_makes_no_torque_is_a_fault():
         bench.cycle([bench.order(j, mode=Mode.TORQUE, torque=2.0 if j == 1 else 0.1) for j in range(6)])
         fault = bench.drives.fault([Mode.TORQUE] * 6, bench.arm.time)
     assert 0.1 < bench.arm.time - began < 0.15
-    assert "shoulder (id 02h): makes no torque although its commands ask for some" in str(fault)
+    assert "shoulder (id 02h): makes no torque although its commands ask for torque" in str(fault)
     bench.drives.forget()
     assert bench.walk()
 

@@ -121,7 +121,7 @@ def test_the_joint_in_the_way_is_named_with_the_way_round_it(model: Path, tmp_pa
     [
         ("lift:0.5", "joint 'lift' cannot be locked at 0.5: its range is 0 to 0.3"),
         ("lift:high", "--lock lift:high: expected JOINT:POSITION in rad or m, such as lift:0.2"),
-        ("left:0.1", "--lock left: no joint in"),
+        ("left:0.1", "--lock left: there is no such joint in"),
     ],
 )
 def test_a_lock_that_cannot_be_is_one_line(model: Path, tmp_path: Path, lock: str, said: str) -> None:
