@@ -14,7 +14,7 @@ def record(
     arm: Arm,
     out: Annotated[
         Path | None,
-        typer.Argument(help="File to write (.mcap); armlink convert makes other formats from it.", show_default=False),
+        typer.Argument(help="File to write (.mcap); convert makes other formats from this file.", show_default=False),
     ] = None,
     frames: Annotated[
         Path | None, typer.Option(help="Write every frame unchanged to this file: .asc, .blf or .log.")

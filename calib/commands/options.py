@@ -94,6 +94,6 @@ def load_sweeps(command: str, directories: list[Path], arm: str | None) -> "tupl
     from calib.dataset import data_sets
 
     if not directories:
-        raise BadInput(f"{command}: give the directories that `armlink sweep` wrote")
+        raise BadInput(f"{command}: give the directories that sweep wrote")
     data = data_sets(directories)
     return data, data[0].load_arm(arm)

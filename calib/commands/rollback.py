@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def rollback(
     arm: Arm,
-    to: Annotated[str, typer.Option(help="Id of a record that was current before; `armlink history` lists them.")],
+    to: Annotated[str, typer.Option(help="Id of a record that was current before; `history` lists them.")],
     reason: Annotated[str, typer.Option(help="Reason for the roll-back, written to the log.")] = "rollback",
     apply: Annotated[
         bool, typer.Option("--apply", help="Also write gains and offsets of the record to the drives.")

@@ -36,7 +36,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
         return
     except ArmlinkError as error:
         yield SetupFinding(
-            "error", str(error), arm, "correct the arm file, or make a new one from a model: armlink new --help"
+            "error", str(error), arm, "correct the arm file, or make a new one from a model (see new --help)"
         )
         return
     impossible = list[SetupFinding]()

@@ -76,7 +76,7 @@ class RecordStore:
             body = connection.execute(sa.select(RECORDS.c.body).where(RECORDS.c.id == record_id)).scalar()
         if body is None:
             raise Refused(
-                f"there is no record {record_id} in {self.url}; `armlink history` lists the records of an arm"
+                f"there is no record {record_id} in {self.url}; `history` lists the records of an arm"
             )
         return self._record(record_id, body)
 

@@ -17,7 +17,7 @@ def advice(answer: Diagnosis) -> str:
     if answer.doubts:
         return "First answer the questions about the recordings; each question names the option that answers it."
     if answer.verdict == "ambiguous":
-        return "Record one more motion that separates the candidates; armlink gap plan plans it from the JSON answer."
+        return "Record one more motion that separates the candidates; gap plan plans it from the JSON answer."
     return "Add these effects to the simulation: with --out-model the diagnosis writes the corrected model."
 
 

@@ -134,6 +134,6 @@ def test_a_user_s_script_passes_mypy_strict(tmp_path):
 
 
 def test_a_sweep_with_a_mass_that_no_drive_holds_is_refused_before_anything_is_opened(tmp_path):
-    with pytest.raises(BadInput, match=r"attach at most 13 kg; is it 5 kg\?"):
+    with pytest.raises(BadInput, match=r"attach at most 13 kg; or do you mean 5 kg\?"):
         armlink.sweep("sarcos", tmp_path / "loaded", simulated=True, reference_mass=5000.0)
     assert not (tmp_path / "loaded").exists()

@@ -158,7 +158,7 @@ def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None
         if path is None or not await histories.short(path.is_file):
             raise NoSuch(
                 "there is no report yet: this page shows the newest HTML file of the state directory, and "
-                "`armlink calibrate --report` writes one there"
+                "`calibrate --report` writes one there"
             )
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
 

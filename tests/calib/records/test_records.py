@@ -70,7 +70,7 @@ def test_sizes_are_checked() -> None:
     content = gravity().model_dump()
     with pytest.raises(ValidationError, match="expected 4 × 4"):
         GravityRecord.model_validate(content | {"covariance": ((1.0,),)})
-    with pytest.raises(ValidationError, match="beta: 2 values, expected 4"):
+    with pytest.raises(ValidationError, match="beta has 2 values, expected 4"):
         GravityRecord.model_validate(content | {"beta": (1.0, 2.0)})
 
 
