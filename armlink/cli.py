@@ -144,11 +144,9 @@ def _help(points: dict[str, EntryPoint]) -> str:
     width = max(map(len, points), default=0)
     rows = "\n".join(f"  {name:<{width}}  {_summary(points[name])}" for name in sorted(points))
     return (
-        f"Usage: armlink COMMAND [OPTIONS]\n\n{PURPOSE}\n\nCommands:\n{rows}\n\n"
-        "Options:\n  --help     Shows this, and armlink COMMAND --help says more.\n"
-        f"  --version  Shows the version, {version('armlink')}.\n\n"
-        "armlink completion bash|zsh|fish prints the script for completion in the shell.\n\n"
-        "Example: armlink demo --seed 1\n"
+        f"Usage: armlink COMMAND [OPTIONS]\n\n{PURPOSE}\n\nCommands:\n{rows}\n\nOptions:\n  --help     Shows this, and "
+        f"armlink COMMAND --help says more.\n  --version  Shows the version, {version('armlink')}.\n\narmlink "
+        "completion bash|zsh|fish prints the script for completion in the shell.\n\nExample: armlink demo --seed 1\n"
     )
 
 

@@ -177,16 +177,14 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
     ):
         if column.min() < low or column.max() > high:
             raise BadInput(
-                f"{path}: {name} goes from {column.min():.3f} to {column.max():.3f} rad, beyond its range "
-                f"{low:.3f} to {high:.3f} rad: plan the motion for this arm with armlink gap plan "
-                f"{arm.argument} --out {path}"
+                f"{path}: {name} goes from {column.min():.3f} to {column.max():.3f} rad, beyond its range {low:.3f} to "
+                f"{high:.3f} rad: plan the motion for this arm with armlink gap plan {arm.argument} --out {path}"
             )
         fastest = float(np.abs(np.diff(column)).max()) * section.rate
         if fastest > SPEED_TOLERANCE * limits.max_velocity:
             raise BadInput(
-                f"{path}: {name} turns at {fastest:.3f} rad/s, but its max_velocity is "
-                f"{limits.max_velocity:.3f} rad/s: plan the motion for this arm with armlink gap plan "
-                f"{arm.argument} --out {path}"
+                f"{path}: {name} turns at {fastest:.3f} rad/s, but its max_velocity is {limits.max_velocity:.3f} "
+                f"rad/s: plan the motion for this arm with armlink gap plan {arm.argument} --out {path}"
             )
     return rows
 

@@ -220,17 +220,15 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     write_json(json, answer)
     out = results(json)
     out.print(
-        f"cycles began late by {late['p50']:.2f} ms (median), {late['p99']:.2f} (99 %), {late['p99_9']:.2f} "
-        f"(99.9 %), {late['max']:.2f} (longest); each cycle took {report.busy * 1e3:.2f} ms of processor "
-        f"time; {report.realtime}",
+        f"cycles began late by {late['p50']:.2f} ms (median), {late['p99']:.2f} (99 %), {late['p99_9']:.2f} (99.9 %), "
+        f"{late['max']:.2f} (longest); each cycle took {report.busy * 1e3:.2f} ms of processor time; {report.realtime}",
     )
     out.print(f"this machine can keep {report.holds_hz:g} Hz; the arm file asks for {section.rate:g} Hz")
     limit = WARN_SHARE * section.deadline * 1e3
     if late["p99_9"] > limit:
         raise Refused(
-            f"check --host: 99.9 % of the cycles begin at most {late['p99_9']:.1f} ms late, but the limit is "
-            f"{limit:g} ms (half of link.deadline): lower link.rate, raise link.deadline, or stop other "
-            "programs on this machine"
+            f"check --host: 99.9 % of the cycles begin at most {late['p99_9']:.1f} ms late, but the limit is {limit:g} "
+            "ms (half of link.deadline): lower link.rate, raise link.deadline, or stop other programs on this machine"
         )
     if report.holds_hz < section.rate:
         raise Refused(

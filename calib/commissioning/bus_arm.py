@@ -72,10 +72,8 @@ def _text(
         yaml_entry("serial", "unknown", note="assumed"),
         "kinematics:",
         yaml_entry("gravity", list(STANDARD_GRAVITY), 2, "m/s² in the base frame; assumed: the arm stands upright"),
-        (
-            "  joints:  # a, alpha, d are not known (assumed 0): give them, or make the arm file from the arm's "
-            "URDF or MJCF"
-        ),
+        "  joints:  # a, alpha, d are not known (assumed 0): give them, or make the arm file from the arm's URDF or "
+        "MJCF",
     ]
     for match, (lower, upper) in zip(matches, stops, strict=True):
         stop = "stops found by hand" if known else "stops assumed: one full turn"

@@ -95,9 +95,8 @@ def _chain(joints: Sequence[ModelJoint], way: list[int], path: Path, base: str |
     for number, joint in enumerate(chain, start=1):
         if joint.kind != "revolute":
             raise BadInput(
-                f"{path}: joint {joint.name or number} is {joint.kind} and lies between the base and the "
-                f"arm: begin the arm after this joint (--base {joint.body}), or lock the joint (--lock "
-                f"{joint.name}:POSITION)"
+                f"{path}: joint {joint.name or number} is {joint.kind} and lies between the base and the arm: begin "
+                f"the arm after this joint (--base {joint.body}), or lock the joint (--lock {joint.name}:POSITION)"
             )
         if not joint.name:
             raise BadInput(

@@ -94,9 +94,8 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         elif lever[joint] < SMALL_LEVER:
             yield SetupFinding(
                 "hint",
-                "gravity loads this joint only a little (Γ/g, the share of gravity that it feels, is at "
-                f"most {lever[joint]:.2f}), so its torque "
-                "gain will be imprecise",
+                "gravity loads this joint only a little (Γ/g, the share of gravity that it feels, is at most "
+                f"{lever[joint]:.2f}), so its torque gain will be imprecise",
                 name,
                 "incline the base for the sweeps, or widen the ranges of the joints before it",
             )

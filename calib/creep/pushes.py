@@ -48,9 +48,8 @@ class Disturbed:
 
     def __str__(self) -> str:
         return (
-            f"{self.joint}: {self.name}: something pushed by {self.torque:+.2f} N·m at {self.position:.2f} "
-            "rad: the arm touched itself or its surroundings, or a cable was under tension; this sweep is "
-            "left out"
+            f"{self.joint}: {self.name}: something pushed by {self.torque:+.2f} N·m at {self.position:.2f} rad: the "
+            "arm touched itself or its surroundings, or a cable was under tension; this sweep is left out"
         )
 
 

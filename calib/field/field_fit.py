@@ -167,9 +167,8 @@ def _report(belief: Belief, rows: StaticReadings, columns: Array, solved: Soluti
             )
         elif len(here) and np.sqrt(pairs[j, 1, 1]) > OFFSET_STD * belief.rated[j]:
             reasons[name, "offset"] = (
-                "it cannot be separated from the gain: it is known only to ± "
-                f"{2 * np.sqrt(pairs[j, 1, 1]):.2g} N·m, since the torque stays between {here.min():.2f} and "
-                f"{here.max():.2f} N·m"
+                f"it cannot be separated from the gain: it is known only to ± {2 * np.sqrt(pairs[j, 1, 1]):.2g} N·m, "
+                f"since the torque stays between {here.min():.2f} and {here.max():.2f} N·m"
             )
     for place, (parameter, value) in enumerate((("gain", gain), ("offset", offset))):
         for j, name in enumerate(names):

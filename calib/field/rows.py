@@ -51,9 +51,8 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
     slow = (np.abs(slopes).max(axis=1) <= SLOW) & steady
     if slow.sum() < FEWEST_ROWS:
         raise BadInput(
-            f"{source}: only {int(slow.sum())} windows of {WINDOW} s are slow enough, at least {FEWEST_ROWS} "
-            f"are needed: record an arm that stands still in several poses, or moves smoothly below {SLOW} "
-            "rad/s"
+            f"{source}: only {int(slow.sum())} windows of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are "
+            f"needed: record an arm that stands still in several poses, or moves smoothly below {SLOW} rad/s"
         )
     means = np.array([position[each].mean(axis=0) for each in windows])
     chosen = [each for each, fine in zip(windows, slow, strict=True) if fine]
@@ -72,9 +71,8 @@ def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
     """The unloaded readings of a sweep data set; raises BadInput if a reference mass was attached."""
     if data.manifest.reference_mass > 0:
         raise BadInput(
-            f"{data.path} was swept with a reference mass of {data.manifest.reference_mass:g} kg, but the "
-            "field calibration needs the arm without a mass; sweeps with a mass are for armlink calibrate "
-            f"{data.path}"
+            f"{data.path} was swept with a reference mass of {data.manifest.reference_mass:g} kg, but the field "
+            f"calibration needs the arm without a mass; sweeps with a mass are for armlink calibrate {data.path}"
         )
     readings = sweep_readings([data]).readings
     return replace(readings, series=np.full(len(readings), number))

@@ -128,9 +128,8 @@ def scatter_findings(names: tuple[str, ...], refined: Refined, rated: Array, nam
         rms = float(np.sqrt(np.mean(rest[here] ** 2)))
         if refined.factor[joint] > SCATTER and rms > MATERIAL_SCATTER * rated[joint]:
             text = (
-                f"{name}: readings scatter by {rms:.3g} N·m, which is {refined.factor[joint]:.0f} times what "
-                "their noise explains, and no known effect explains the rest: the model does not hold for "
-                "this joint"
+                f"{name}: readings scatter by {rms:.3g} N·m, which is {refined.factor[joint]:.0f} times what their "
+                "noise explains, and no known effect explains the rest: the model does not hold for this joint"
             )
             found.append(FitFinding(name, "scatter", rms, "N·m", text))
     return found

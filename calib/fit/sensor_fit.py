@@ -25,9 +25,8 @@ WIDE = 0.005
 """Half width of a gain's 95 % interval, as a share of it, from which it is listed as imprecise: the error that
 tests/campaigns/random_arms.py allows a gain."""
 COMMON = (
-    "the common scale of the gains comes from the levers between the axes before the last axis, which are "
-    "too short on this arm; measure where the reference mass hangs (sweep.reference_point), or use a "
-    "heavier mass"
+    "the common scale of the gains comes from the levers between the axes before the last axis, which are too short on "
+    "this arm; measure where the reference mass hangs (sweep.reference_point), or use a heavier mass"
 )
 """Reason for a low precision of all gains together."""
 

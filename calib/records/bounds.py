@@ -99,9 +99,8 @@ def _require_date(record: R, now: datetime | None) -> None:
         raise _unsound(record, f"created is {record.created:%Y-%m-%d}, not {EARLIEST:%Y} to {LATEST:%Y}")
     if now is not None and record.created > now + CLOCK_TOLERANCE:
         raise Refused(
-            f"record {record.id} was created on {record.created:%Y-%m-%d %H:%M %Z}, but the clock of this "
-            f"machine says {now:%Y-%m-%d %H:%M %Z}, and a record from the future is not put into force: set "
-            "the clock that is wrong"
+            f"record {record.id} was created on {record.created:%Y-%m-%d %H:%M %Z}, but the clock of this machine says "
+            f"{now:%Y-%m-%d %H:%M %Z}, and a record from the future is not put into force: set the clock that is wrong"
         )
 
 

@@ -75,9 +75,7 @@ class RecordStore:
         with reading(self._engine) as connection:
             body = connection.execute(sa.select(RECORDS.c.body).where(RECORDS.c.id == record_id)).scalar()
         if body is None:
-            raise Refused(
-                f"there is no record {record_id} in {self.url}; `history` lists the records of an arm"
-            )
+            raise Refused(f"there is no record {record_id} in {self.url}; `history` lists the records of an arm")
         return self._record(record_id, body)
 
     def usable(self, record_id: str, arm: ArmFile, now: datetime | None = None) -> AnyRecord:

@@ -74,9 +74,8 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
         noise = _noise(torque[:, joint])
         if noise > LOUD * limits.rated[joint]:
             raise Refused(
-                f"{name}: the noise of its torque sensor is {noise:.3g} N·m, expected below {LOUD:.0%} of "
-                f"rated torque ({LOUD * limits.rated[joint]:.3g} N·m): check shielding and mounting, and "
-                "that the arm stands still"
+                f"{name}: the noise of its torque sensor is {noise:.3g} N·m, expected below {LOUD:.0%} of rated torque "
+                f"({LOUD * limits.rated[joint]:.3g} N·m): check shielding and mounting, and that the arm stands still"
             )
     nowhere = np.full((link.n, 2), np.nan)
     expected = np.column_stack([limits.lower, limits.upper])
@@ -106,9 +105,8 @@ def _check_readings(
                     raise Refused(f"{name}: {count} of {of} {what} readings are missing: check its drive and cable")
             if (~here).sum() > LATE * len(here):
                 raise Refused(
-                    f"{name}: {(~here).sum()} of {len(here)} {what} readings came after the end of their "
-                    "cycle, so the arm or this machine is too slow: lower link.rate, or stop other programs "
-                    "on this machine"
+                    f"{name}: {(~here).sum()} of {len(here)} {what} readings came after the end of their cycle, so the "
+                    "arm or this machine is too slow: lower link.rate, or stop other programs on this machine"
                 )
 
 

@@ -114,21 +114,17 @@ def _common_factor(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[s
     """A note for torque constants, or masses, that motor torque alone tells: only their products are known."""
     if estimate is not None and masses_may_be_constants(fit.layout, estimate.terms):
         return (
-            (
-                f"{MASSES}: {fit.layout.motor} alone shows only the products of masses and torque constants: if "
-                "all constants were wrong by one factor, the recordings would look the same; creep sweeps with "
-                "a weighed mass show whether the masses or the constants are wrong"
-            ),
+            f"{MASSES}: {fit.layout.motor} alone shows only the products of masses and torque constants: if all "
+            "constants were wrong by one factor, the recordings would look the same; creep sweeps with a weighed mass "
+            "show whether the masses or the constants are wrong",
         )
     if estimate is None or not shares_a_factor(fit.layout, estimate.terms):
         return ()
     return (
-        (
-            f"{CONSTANT}: {fit.layout.motor} alone does not determine the common scale of masses and torque "
-            "constants: if all links are 1 % heavier than in the model, then all constants, friction and rotor "
-            f"inertias are 1 % larger; the intervals allow for masses that are wrong by {2 * NOMINAL:.0%}; creep "
-            "sweeps with a weighed mass determine the scale"
-        ),
+        f"{CONSTANT}: {fit.layout.motor} alone does not determine the common scale of masses and torque constants: if "
+        "all links are 1 % heavier than in the model, then all constants, friction and rotor inertias are 1 % larger; "
+        f"the intervals allow for masses that are wrong by {2 * NOMINAL:.0%}; creep sweeps with a weighed mass "
+        "determine the scale",
     )
 
 

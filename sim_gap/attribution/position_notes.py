@@ -26,25 +26,19 @@ def notes(found: Identified) -> list[str]:
     names = found.sim.arm.names
     kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
     out = [
-        (
-            f"there is no torque channel, so controller ({kind}) and effects are fitted to q_cmd and q, and the gap "
-            "is in rad"
-        )
+        f"there is no torque channel, so controller ({kind}) and effects are fitted to q_cmd and q, and the gap is in "
+        "rad"
     ]
     if loose := undecided_scale(found.fit, found.spread):
         listed = ", ".join(names[j] for j in loose)
         out.append(
-            f"{listed}: positions show only the ratios of gain, friction and inertia of these joints; the "
-            "scale is taken from the inertia of the model: to measure the scale, hold a known load or "
-            "record the current"
+            f"{listed}: positions show only the ratios of gain, friction and inertia of these joints; the scale is "
+            "taken from the inertia of the model: to measure the scale, hold a known load or record the current"
         )
     if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
         out.append(
-            (
-                "viscous friction, back-EMF and velocity feedback have the same effect on positions, so only "
-                "their sum is given"
-            )
-            + (", as part of the controller" if found.search.open_controller else "")
+            "viscous friction, back-EMF and velocity feedback have the same effect on positions, so only their sum is "
+            "given" + (", as part of the controller" if found.search.open_controller else "")
         )
     if found.search.resting:
         listed = ", ".join(names[j] for j in sorted(found.search.resting))
@@ -77,10 +71,8 @@ def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> li
     if rollout.worse:
         before, after = (float(np.sqrt(np.mean(x**2))) for x in (rollout.before, rollout.after))
         out.append(
-            (
-                f"running free, the corrected model leaves a larger gap ({after:.3g} rad) than the nominal model "
-                f"({before:.3g} rad): "
-            )
+            f"running free, the corrected model leaves a larger gap ({after:.3g} rad) than the nominal model "
+            f"({before:.3g} rad): "
             + ("do not train with the corrected model, and record other motion" if gap else "use the nominal model")
         )
     left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
@@ -108,11 +100,8 @@ def _early(found: Identified) -> list[str]:
     time = rows * period if rows and abs(time / period - rows) < NEAR_A_ROW else time
     listed = ", ".join(f"{name} {value:.3g} s" for name, value in early.items())
     return [
-        (
-            f"commands take effect before the time of their rows ({listed}), which no controller can do: the "
-            "rows hold the position of a later time, or two clocks differ; correct the time with --clock "
-            f"q_cmd={time:.3g}"
-        )
+        f"commands take effect before the time of their rows ({listed}), which no controller can do: the rows hold the "
+        f"position of a later time, or two clocks differ; correct the time with --clock q_cmd={time:.3g}"
     ]
 
 

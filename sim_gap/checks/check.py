@@ -71,10 +71,8 @@ def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
     if not all(goes_one_way(recording) for recording in recordings):
         return ()
     return (
-        (
-            "order, signs, zeros, units and clocks of the columns could not be checked, since the joints move "
-            "in one direction only, or hardly at all: record motion in both directions"
-        ),
+        "order, signs, zeros, units and clocks of the columns could not be checked, since the joints move in one "
+        "direction only, or hardly at all: record motion in both directions",
     )
 
 

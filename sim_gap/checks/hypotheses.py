@@ -133,10 +133,8 @@ def _sources(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Itera
     every, channel = tuple(range(arm.n)), motion.channel
     if not stated.without_gravity and arm.n > 1:
         what, option = (
-            (
-                "the torque contains no gravity, so the program that recorded it has probably subtracted the "
-                "gravity of the model"
-            ),
+            "the torque contains no gravity, so the program that recorded it has probably subtracted the gravity of "
+            "the model",
             f"--effort-is {WITHOUT_GRAVITY}",
         )
         yield Hypothesis("effort_source", (channel,), every, what, option, _weighed(arm))

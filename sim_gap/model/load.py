@@ -318,10 +318,9 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
             worst = int(np.argmax(np.abs(ours - data.qfrc_inverse[dof])))
             if abs(ours[worst] - data.qfrc_inverse[dof][worst]) > 1e-6 * (1.0 + np.abs(ours).max()):
                 raise BadInput(
-                    f"{label}: joint {arm.names[worst]}: the model's torque is "
-                    f"{data.qfrc_inverse[dof][worst]:.6g} N·m, but the torque of its rigid chain is "
-                    f"{ours[worst]:.6g} N·m: expected a plain chain of hinges (no springs between joints, "
-                    "fluid forces or joint equalities)"
+                    f"{label}: joint {arm.names[worst]}: the model's torque is {data.qfrc_inverse[dof][worst]:.6g} "
+                    f"N·m, but the torque of its rigid chain is {ours[worst]:.6g} N·m: expected a plain chain of "
+                    "hinges (no springs between joints, fluid forces or joint equalities)"
                 )
     finally:
         model.opt.disableflags = flags

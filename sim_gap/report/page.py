@@ -114,9 +114,8 @@ def _over_time(answer: Diagnosis) -> list[Section]:
             else "the prediction from the readings of the torque sensor"
         )
         text = (
-            f"The {CHANNEL_WORDS[channel]} of every joint on held-out data: the measurement, {nominal}, and "
-            "the prediction with the causes added. Click a name to hide or show its curve; “without” leaves "
-            "one effect out."
+            f"The {CHANNEL_WORDS[channel]} of every joint on held-out data: the measurement, {nominal}, and the "
+            "prediction with the causes added. Click a name to hide or show its curve; “without” leaves one effect out."
         )
         figure = torque_over_time(answer, channel)
         if figure is not None:
@@ -130,9 +129,8 @@ def _causes(answer: Diagnosis) -> list[Section]:
     if not shown:
         return []
     text = (
-        "Each cause at the joint and channel where it explains most, on held-out data: grey is the residual "
-        "minus all other causes, orange is the contribution of this cause. A correct cause follows the "
-        "centre of the grey points."
+        "Each cause at the joint and channel where it explains most, on held-out data: grey is the residual minus all "
+        "other causes, orange is the contribution of this cause. A correct cause follows the centre of the grey points."
     )
     return [Section("The causes one by one", paragraph(text), shown)]
 

@@ -90,8 +90,7 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
     if object_dictionary.TORQUE_READING.index not in sheet:
         raise BadInput(
             f"{where}: the device has no torque sensor record 2100h: write `drive: {{family: canopen, node: "
-            f"{joint.settings.node}, torque: motor}}`, which reads the torque estimate of the drive "
-            "(docs/drives.md)"
+            f"{joint.settings.node}, torque: motor}}`, which reads the torque estimate of the drive (docs/drives.md)"
         )
     for entry in used_objects():
         found = sheet.get_variable(entry.index, entry.sub)

@@ -90,10 +90,8 @@ class Profile:
         if self.by_velocity:
             told = (
                 *told,
-                (
-                    "only mode 9 (cyclic velocity) can be used: the host controls positions, and there is no "
-                    "torque control"
-                ),
+                "only mode 9 (cyclic velocity) can be used: the host controls positions, and there is no torque "
+                "control",
             )
         return (
             told

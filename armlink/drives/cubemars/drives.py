@@ -63,9 +63,8 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
             other = self._joint_of.get(settings.reply)
             if other is not None:
                 raise BadInput(
-                    f"{arm.path}: {self.names[joint]}: drive.reply {settings.reply:#04x} is also the id of "
-                    f"commands to {self.names[other]}: set a reply id that no drive has (master id, usually "
-                    "0)"
+                    f"{arm.path}: {self.names[joint]}: drive.reply {settings.reply:#04x} is also the id of commands to "
+                    f"{self.names[other]}: set a reply id that no drive has (master id, usually 0)"
                 )
         self._replies = {(each.reply, each.id): joint for joint, each in enumerate(self.settings)}
         self._spare_canopen(arm)
@@ -76,9 +75,8 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         for joint in arm.require_link().joints:
             if joint.settings.family == "canopen" and joint.bus in buses:
                 raise BadInput(
-                    f"{arm.path}: {joint.name}: a CANopen node takes CubeMars replies on id 0 for NMT "
-                    "commands: put the CANopen node on another bus, or set another master id in the "
-                    "CubeMars drives (drive.reply)"
+                    f"{arm.path}: {joint.name}: a CANopen node takes CubeMars replies on id 0 for NMT commands: put "
+                    "the CANopen node on another bus, or set another master id in the CubeMars drives (drive.reply)"
                 )
 
     # ---- before the cycle

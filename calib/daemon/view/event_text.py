@@ -24,10 +24,7 @@ _OF_MOTORS = {
     ),
     "offset": (
         "drift",
-        (
-            "its drive reads {change:+.3f} ± {std:.3f} N·m where there is no torque: measure this offset with creep "
-            "sweeps"
-        ),
+        "its drive reads {change:+.3f} ± {std:.3f} N·m where there is no torque: measure this offset with creep sweeps",
     ),
     "friction": ("effect", "its friction has changed by {change:+.0%} ± {std:.0%}"),
 }

@@ -194,9 +194,8 @@ async def _decided(
             return await asyncio.shield(asyncio.wrap_future(answer))
     except TimeoutError:
         raise NotYet(
-            f"the decision on proposal {number} waits for the disk, which has not answered for "
-            f"{DECISION_SECONDS:.0f} s, and will be carried out when the disk answers: do not repeat it, "
-            "look at /api/proposals"
+            f"the decision on proposal {number} waits for the disk, which has not answered for {DECISION_SECONDS:.0f} "
+            "s, and will be carried out when the disk answers: do not repeat it, look at /api/proposals"
         ) from None
 
 

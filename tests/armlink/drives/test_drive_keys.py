@@ -47,7 +47,10 @@ def test_a_torque_sensor_at_an_input_of_the_device(tmp_path):
     [
         (drive(family="canopen", node=1, colour="red"), "key link.joints.0.drive.colour: unknown key"),
         (drive(family="canopen", node=200), "key link.joints.0.drive.node: Input should be less than or equal to 127"),
-        (drive(family="stepper", node=1), "key link.joints.0.drive: drive family 'stepper' is unknown; there are canopen"),
+        (
+            drive(family="stepper", node=1),
+            "key link.joints.0.drive: drive family 'stepper' is unknown; there are canopen",
+        ),
         (drive(node=1), "key link.joints.0.drive: expected a mapping with the key `family`"),
         (drive(family="canopen", node=1, torque="motor", calibration="controller"), "`calibration: controller` needs"),
         (lambda joints: joints[0].update(drive={"family": "canopen", "node": 1}), "give `node` or `drive"),

@@ -91,7 +91,9 @@ def values_in(file: Path) -> dict[str, float]:
 @installed
 def test_no_viewer_is_one_line() -> None:
     port = free_port()
-    with pytest.raises(BadInput, match=f"--rerun {port}: there is no viewer on this port .*: start a viewer with rerun --port {port}"):
+    with pytest.raises(
+        BadInput, match=f"--rerun {port}: there is no viewer on this port .*: start a viewer with rerun --port {port}"
+    ):
         RerunStream("pair", NAMES, port)
 
 

@@ -98,4 +98,7 @@ def test_without_a_can_timeout_it_is_scanned_and_checked_and_not_driven(tmp_path
     assert checks["hinge_1", "answers"]["outcome"] == "passed"
     assert checks["hinge_1", "silence"]["outcome"] == "failed"
     assert "`can_timeout` is not given in the `drive:` section" in checks["hinge_1", "set-up"]["found"]
-    assert "if its host died, its drive would keep on with the last command" in checks["hinge_1", "enables and holds"]["found"]
+    assert (
+        "if its host died, its drive would keep on with the last command"
+        in checks["hinge_1", "enables and holds"]["found"]
+    )
