@@ -127,7 +127,9 @@ def test_enable_resets_a_fault_by_a_rising_edge(link, bus):
 def test_a_joint_that_will_not_enable_is_named(link, bus):
     link.start()
     bus.nodes[3].apply = lambda: False
-    with pytest.raises(BusFault, match=r"joint_3: stays in switch on disabled, expected operation enabled within 3"):
+    with pytest.raises(
+        BusFault, match=r'joint_3: stays in state "switch on disabled" and does not reach "operation enabled" within 3'
+    ):
         link.enable()
 
 

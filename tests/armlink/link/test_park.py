@@ -68,7 +68,7 @@ def test_a_joint_that_is_blocked_on_the_way_holds(caplog, monkeypatch):
         at = float(sim.plant.position[1])
         sim.plant.model.jnt_range[1] = (at - 0.02, at + 0.02)  # something is in the way
         sim.plant.model.jnt_limited[1] = 1
-        with pytest.raises(Refused, match=r"park: shoulder: .* stopped following its target .* all joints hold"):
+        with pytest.raises(Refused, match=r"park: shoulder is at .* stopped following its target .* all joints hold"):
             link.park()
         assert link.enabled
     assert "the arm is being lowered" in caplog.text
@@ -103,7 +103,9 @@ def test_the_pose_must_fit_the_joints():
     with pytest.raises(BadInput, match=r"park\.pose has 2 positions, expected 6"):
         parse_arm(content, path)
     content["link"]["park"] = {"pose": [0.0, 1.0, 0.0, 0.0, 0.0, 0.0]}
-    with pytest.raises(BadInput, match=r"link\.park\.pose: shoulder: 1 rad, expected -2\.9 to 0\.2"):
+    with pytest.raises(
+        BadInput, match=r"link\.park\.pose: shoulder is at 1 rad, which is outside the range -2\.9 to 0\.2"
+    ):
         parse_arm(content, path)
 
 
