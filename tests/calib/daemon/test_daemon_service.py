@@ -70,7 +70,7 @@ def test_under_propose_nothing_is_written_until_a_person_approves(tmp_path: Path
     assert (approved.state, approved.decided_by) == ("applied", "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
     assert daemon.store.activations(daemon.arm)[-1].by == "ann"
-    with pytest.raises(NotPossible, match="applied already"):
+    with pytest.raises(NotPossible, match="already applied"):
         daemon.view.decisions.approve(proposal.id, "ann").result(0)
 
 

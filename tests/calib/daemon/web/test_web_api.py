@@ -91,7 +91,7 @@ def test_a_proposal_is_decided_once_and_by_somebody(server: Served, view: MadeUp
     rejected = client.post("/api/proposals/2/reject").json()
     assert (rejected["state"], "on the socket" in rejected["decided_by"]) == ("rejected", True)
     again = client.post("/api/proposals/1/reject")
-    assert (again.status_code, again.json()) == (409, {"error": "proposal 1 is approved already"})
+    assert (again.status_code, again.json()) == (409, {"error": "proposal 1 is already approved"})
     assert client.post("/api/proposals/9/approve").status_code == 404
     assert [one["state"] for one in client.get("/api/proposals").json()] == ["rejected", "approved"]
 
