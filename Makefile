@@ -5,7 +5,7 @@ export PYTHON
 CAMPAIGNS ?= ends false_readings demo_seeds random_arms hard_cases kill_sweep kill_records kill_host random_kills daemon_days daemon_kills fuzz_frames fuzz_drives fuzz_guard fuzz_files fault_injection systemd_units kill_drives two_hosts scales web
 
 .DEFAULT_GOAL := help
-.PHONY: long sound published elsewhere mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
+.PHONY: long sound hands published elsewhere mutantdraw servopeer repeats motortorque moving fleetdays batched help venv demo test lint format bench soak realtime stalls blind corruptions mutants docs constraints clean realism walk observer wheel firsthour creep creepwalk bodies again laws pictures container lock audit sbom
 
 help: ## Say what can be done
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -99,6 +99,9 @@ elsewhere: .venv/.dev ## Long campaign outside make test: arms that MuJoCo simul
 
 bodies: .venv/.dev ## Long campaign outside make test: turned bases, bodies added and missing (ARGS="--tilts 40 --bodies 40")
 	$(BIN)/python tests/campaigns/gap_tilts_and_bodies.py $(ARGS)
+
+hands: .venv/.dev ## Long campaign outside make test: a hand that the model of a published arm lacks, or has too much (ARGS="--arms 60 --seed 2")
+	$(BIN)/python tests/campaigns/gap_hands.py $(ARGS)
 
 again: .venv/.dev ## Long campaign outside make test: a second diagnosis from the model that the first one wrote (ARGS="--only panda")
 	$(BIN)/python tests/campaigns/gap_again.py $(ARGS)

@@ -19,9 +19,8 @@ from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_motion
 from calib.commissioning.model_judgement import refuse_impossible_sweep
-from calib.creep.fit import fit_creep
-from calib.creep.record import CreepCalibration
 from calib.dataset import SweepData, all_creep, data_sets
+from calib.fit.creep_fit import CreepFit, fit_creep
 from calib.fit.gravity_fit import GravityFit, identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.observer.config import ObserverConfig
@@ -38,7 +37,7 @@ ArmLike: TypeAlias = ArmFile | str | Path
 """An arm file: loaded, its path, or the name of a bundled arm."""
 SweepLike: TypeAlias = SweepData | str | Path
 """The data set of a pass of sweeps: loaded, or its folder."""
-Calibrated: TypeAlias = SensorFit | CreepCalibration
+Calibrated: TypeAlias = SensorFit | CreepFit
 """Result of `calibrate`: from steps at rest, or from creep sweeps of drives whose torque is a motor current."""
 
 
@@ -177,7 +176,7 @@ def verify(
     Raises BadInput, Refused, BusFault.
     """
     arm_file = arm.arm if _is_link(arm) else _arm(arm)
-    calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepCalibration) else sensors
+    calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepFit) else sensors
     model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity
     if calibration is None and sweep_motion(arm_file) == "creep":
         raise BadInput("verify: the drives of this arm store no calibration: give what calibrate found as `sensors`")
@@ -210,9 +209,7 @@ def observe(
     names = arm_file.joint_names or gcomp_arm(arm_file).names
     if run.n != len(names):
         raise BadInput(f"observe: the recording has {run.n} joints, but {arm_file.name} has {len(names)}")
-    calibration = (
-        sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepCalibration) else sensors.require(arm_file)
-    )
+    calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepFit) else sensors.require(arm_file)
     model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity.require(arm_file)
     rated = arm_file.require_link().rated_torques
     observer = observer_of(gcomp_arm(arm_file), calibration, model, rated, config)
@@ -271,17 +268,17 @@ def _sweeps(function: str, sweeps: tuple[object, ...]) -> list[SweepData]:
 def calibrated(arm_file: ArmFile, data: list[SweepData]) -> Calibrated:
     """The fit of data sets, by their motion; raises BadInput, Refused."""
     if all_creep(data):
-        return CreepCalibration(fit_creep(arm_file, [each.require(arm_file) for each in data]))
+        return fit_creep(arm_file, data)
     return fit_sensors(arm_file, data)
 
 
 def identified(arm_file: ArmFile, data: list[SweepData], sensors: Calibrated | CalibrationRecord) -> GravityFit:
     """Mass moments from data sets and their sensors, by their motion; raises BadInput, Refused."""
-    if isinstance(sensors, CreepCalibration if not all_creep(data) else SensorFit):
+    if isinstance(sensors, CreepFit if not all_creep(data) else SensorFit):
         raise BadInput(
             "identify: `sensors` were found in sweeps of the other kind (creep or steps): leave this argument out"
         )
-    return sensors.gravity if isinstance(sensors, CreepCalibration) else identify_gravity(arm_file, data, sensors)
+    return sensors.gravity if isinstance(sensors, CreepFit) else identify_gravity(arm_file, data, sensors)
 
 
 def _arm_of(data: list[SweepData], arm: ArmLike | None) -> ArmFile:

@@ -170,12 +170,7 @@ def needed_recordings(answers: Mapping[str, Mapping[str, Any]]) -> str:
     if undated:
         return f"{undated[0].partition('/')[2]} has no date in its name, such as 2026-10-02, so no change can be dated"
     needed = FIRST + LAST + 1
-    return (
-        f"a change can be found from {needed} recordings on (the last {LAST} are compared with the first {FIRST}, "
-        "twice in a row)"
-        if len(used) < needed
-        else ""
-    )
+    return f"a change can be found from {needed} recordings on" if len(used) < needed else ""
 
 
 def fleet_outliers(answers: Mapping[str, Mapping[str, Any]]) -> list[Outlier]:

@@ -10,18 +10,20 @@ from armlink.errors import BadInput
 from armlink.extras import require_extra
 
 VIRTUAL_INTERFACES = ("virtual", "udp_multicast")
-FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0 or socketcan:can0@1000000"
+FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0@1000000, or with CAN FD socketcan:can0@1000000/5000000"
 
 
 def parse_bus(spec: str, default_bitrate: int = 1_000_000) -> Bus:
     """Parse a bus specification; raises BadInput with the expected form."""
     interface, colon, rest = spec.partition(":")
-    channel, at, bitrate = rest.partition("@")
+    channel, at, rates = rest.partition("@")
+    bitrate, fd, data_bitrate = rates.partition("/")
     if not (interface and colon and channel):
         raise BadInput(f"bus {spec!r}: expected {FORM}")
-    if at and not (bitrate.isdigit() and int(bitrate) > 0):
-        raise BadInput(f"bus {spec!r}: bit rate {bitrate!r}, expected bits per second: {FORM}")
-    return Bus(interface=interface, channel=channel, bitrate=int(bitrate) if at else default_bitrate)
+    if at and not all(each.isdigit() and int(each) > 0 for each in (bitrate, data_bitrate if fd else bitrate)):
+        raise BadInput(f"bus {spec!r}: bit rate {rates!r}, expected bits per second: {FORM}")
+    keys: dict[str, Any] = {"fd": True, "options": {"data_bitrate": int(data_bitrate)}} if fd else {}
+    return Bus(interface=interface, channel=channel, bitrate=int(bitrate) if at else default_bitrate, **keys)
 
 
 def resolve_bus(spec: str | None, section: Bus) -> Bus:
@@ -29,8 +31,9 @@ def resolve_bus(spec: str | None, section: Bus) -> Bus:
     if spec is None:
         return section
     bus = parse_bus(spec, section.bitrate)
-    same = {"fd": section.fd, "options": section.options} if bus.interface == section.interface else {}
-    return bus.model_copy(update=same)
+    if bus.fd or bus.interface != section.interface:
+        return bus
+    return bus.model_copy(update={"fd": section.fd, "options": section.options})
 
 
 def is_virtual(bus: Bus) -> bool:

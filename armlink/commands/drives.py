@@ -15,7 +15,7 @@ def drives(
 
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
-    from armlink.drives.registry import family, family_names
+    from armlink.drives.family import family, family_names
 
     found = [family(name) for name in family_names()]
     columns = ("torque", "calibration", "silence", "bounds", "cadence", "frame")

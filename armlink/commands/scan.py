@@ -1,27 +1,26 @@
 """Lists the drives on the bus with their identity and state; writes nothing to them."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from armlink.commands.options import Json, OtherBus
 
 if TYPE_CHECKING:
-    from armlink.arm_file import ArmFile
+    from rich.table import Table
 
-SEARCHED = "canopen"
-"""Family whose drives can be found on a bus without an arm file."""
+    from armlink.arm_file import ArmFile
 
 
 def scan(
-    arm: Annotated[
-        str | None, typer.Argument(help="Bundled arm or path of an arm file; without an arm, all nodes are listed.")
-    ] = None,
+    arm: Annotated[str | None, typer.Argument(help="Bundled arm or path of an arm file; without: all drives.")] = None,
     bus: OtherBus = None,
     json: Json = None,
 ) -> int:
-    """List the nodes that answer on a bus; with an arm file also its joints that do not answer (exit status 3).
+    """List the drives that answer on a bus; with an arm file also those of its joints that do not (exit status 3).
+
+    Without an arm file every family is looked for whose drives can be asked without harm to what else may be there.
 
     Exit status 1 if a joint has another drive than the arm file states (link.joints, key identity).
 
@@ -29,33 +28,54 @@ def scan(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
-    from armlink.drives.registry import family, not_looked_for
+    from armlink.commands.plain_console import command_line, results, suggest
+    from armlink.drives.family import family
     from armlink.errors import BadInput
 
-    if arm is None and bus is None:
-        raise BadInput("scan: give an arm file, or --bus INTERFACE:CHANNEL[@BITRATE]")
-    described = None if arm is None else load_arm(arm)
-    kinds = set() if described is None else {joint.settings.family for joint in described.require_link().joints}
-    search = family(kinds.pop() if len(kinds) == 1 else SEARCHED).search if len(kinds) < 2 else None
+    if arm is None:
+        if bus is None:
+            raise BadInput("scan: give an arm file, or --bus INTERFACE:CHANNEL[@BITRATE]")
+        return _look_for_all(bus, json)
+    described = load_arm(arm)
+    kinds = {joint.settings.family for joint in described.require_link().joints}
+    search = family(kinds.pop()).search if len(kinds) == 1 else None
     if search is not None:
         status = search(described, bus, json, write_json, results(json).print)
     else:
-        assert described is not None
         status = _ask_all(described, bus, json)
-    if arm is not None and status == 0:
+    if status == 0:
         suggest(command_line("check", arm, bus=bus))
-    if arm is None:
-        PlainConsole().print(not_looked_for())
     return status
+
+
+def _look_for_all(bus: str, json: Path | None) -> int:
+    """The drives on a bus, of whatever family."""
+    from armlink.arm_file import Bus
+    from armlink.bus.open import open_bus
+    from armlink.commands.output import write_json
+    from armlink.commands.plain_console import command_line, results, suggest
+    from armlink.drives.discovery import BusDrives
+
+    opened = open_bus(bus, Bus())
+    try:
+        drives, channel = BusDrives(opened), str(opened.channel_info)
+    finally:
+        opened.shutdown()
+    nodes, out = drives.nodes, results(json)
+    out.print(_table(channel, nodes, ("model", "reply")) if nodes else f"{channel}: no drive answers")
+    for line in filter(None, dict.fromkeys(node[key] for node in nodes for key in ("wrong", "note"))):
+        out.print(f"{', '.join(each['address'] for each in nodes if line in (each['wrong'], each['note']))}: {line}")
+    write_json(json, {"bus": channel, "nodes": nodes})
+    out.print(drives.told)
+    drives.require_own_ids()
+    if nodes:
+        out.print(f"{len(nodes)} drives answer")
+        suggest(command_line("new", out="arm.yaml", bus=bus))
+    return 0
 
 
 def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     """The drives of an arm, each asked for its identity."""
-    from rich.box import SIMPLE
-    from rich.table import Column, Table
-    from rich.text import Text
-
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
     from armlink.errors import BusFault, Refused
@@ -65,26 +85,13 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
     with Link.open(arm, bus) as link:
         found, channel = link.scan(), str(link.bus.channel_info)
         traits = traits_of(link.groups)
-    table = Table(
-        Column("joint", overflow="fold"),
-        "family",
-        "id",
-        "state",
-        "device",
-        "serial",
-        "firmware",
-        box=SIMPLE,
-        title=channel,
-    )
     nodes = []
     for each in found:
         name, kind = link.names[each.joint], link.section.joints[each.joint].settings.family
-        state = each.power.value if each.present else Text("no answer", style="red")
-        table.add_row(name, kind, each.address, state, each.name, each.serial, each.firmware)
         node = {**vars(each), "joint": name, "family": kind, "power": each.power.value}
         nodes.append(node | {"traits": traits[each.joint].as_json()})
     out = results(json)
-    out.print(table)
+    out.print(_table(channel, nodes))
     write_json(json, {"bus": channel, "nodes": nodes})
     missing = [f"{link.names[each.joint]} ({each.address})" for each in found if not each.present]
     if missing:
@@ -96,3 +103,19 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
         )
     out.print(f"all {len(found)} joints answer")
     return 0
+
+
+def _table(channel: str, nodes: list[dict[str, Any]], more: tuple[str, ...] = ()) -> "Table":
+    """The drives of an answer."""
+    from rich.box import SIMPLE
+    from rich.table import Column, Table
+    from rich.text import Text
+
+    table = Table(Column("joint", overflow="fold"), "family", "id", "state", "device", "serial", "firmware", *more)
+    table.box, table.title = SIMPLE, channel
+    for node in nodes:
+        state = node["power"] if node["present"] else Text("no answer", style="red")
+        told = [f"{node[key]:02X}h" if isinstance(node[key], int) else node[key] for key in more]
+        cells = (node["joint"], node["family"], node["address"], state, node["name"], str(node["serial"]))
+        table.add_row(*cells, node["firmware"], *told)
+    return table

@@ -8,15 +8,23 @@ It is named in the entry-point group `armlink.drives`:
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.can_bus import CanBus
+from armlink.contributed import contributed, named
 from armlink.drives.base import BasicDrives
-from armlink.drives.findings import FoundDrives, Result, SetupFinding
+from armlink.drives.findings import Result, SetupFinding
 from armlink.drives.orders import power_name
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
+from armlink.errors import BadInput
+
+if TYPE_CHECKING:
+    from armlink.drives.discovery import Discovery
+
+GROUP = "armlink.drives"
 
 
 @dataclass(frozen=True)
@@ -32,9 +40,9 @@ class Family:
     """`self_test(link, drives, limits, power, progress)` of an arm with these drives alone, open and not started, where
     it goes further than the one for all families."""
     search: Callable[..., int] | None = None
-    """`search(arm or None, bus or None, json, write, show)`: `armlink scan` of a bus; None: each drive is asked."""
-    find: Callable[[CanBus], FoundDrives] | None = None
-    """`find(bus)`: the drives on an open bus, asked without an arm file; None: they are found by their ids alone."""
+    """`search(arm, bus or None, json, write, show)`: `armlink scan` of an arm; None: each drive is asked by its id."""
+    discovery: "Discovery | None" = None
+    """How its drives are found without an arm file; None: they are found by their ids alone."""
     examine: Callable[[ArmFile, CanBus, str], Iterator[SetupFinding]] | None = None
     """`examine(arm, bus, name)`: what the drives of an arm with this family alone say against its file, on an open bus
     of this name; they are only read. None: each drive is asked who it is."""
@@ -42,3 +50,16 @@ class Family:
     """State of a drive in words, from its code in `Sample.status`; by default an index of Power."""
     summary: str = ""
     """Which devices these are, in a line."""
+
+
+def family_names() -> list[str]:
+    return sorted({point.name for point in contributed(GROUP)})
+
+
+@cache
+def family(name: str) -> Family:
+    """The family of this name; raises BadInput."""
+    found: Family | None = named(GROUP, name)
+    if found is None:
+        raise BadInput(f"no drive family {name!r}; there are {', '.join(family_names())}")
+    return found

@@ -1,5 +1,6 @@
 """Drives on a bus that no arm file describes yet; findings about drives, and results of their self-test."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -9,35 +10,55 @@ from armlink.errors import ArmlinkError
 
 @dataclass(frozen=True)
 class FoundDrive:
-    """One drive as it answers."""
+    """One drive as it answers; NaN or empty: it does not tell."""
 
+    family: str
     node: int
     """Its id on the bus."""
-    vendor: int
-    product: int
-    rated_torque: float
-    """[N·m]"""
-    max_torque: float
-    """Most that it is set to [N·m]."""
-    unit: float
-    """One count of its position [rad]."""
+    address: str
+    """The id as people write it, unique on its bus."""
     drive: Mapping[str, Any] | None = None
-    """`link.joints[].drive` of an arm file, where its node id alone does not say what it is."""
+    """Keys of `link.joints[].drive`, the family left out; None: its node id alone says what it is, or nothing does."""
+    vendor: int = 0
+    product: int = 0
+    rated_torque: float = math.nan
+    """[N·m]"""
+    max_torque: float = math.nan
+    """Most that it is set to, or that its frames carry [N·m]."""
+    unit: float = math.nan
+    """One count of its position [rad]."""
+    reply: int | None = None
+    """Identifier of its answers, where that is set in the drive."""
+    model: str = ""
+    """As on the label."""
+    largest_gains: tuple[float, float] | None = None
+    """Most kp [N·m/rad] and kd [N·m·s/rad] that its frames carry; None: it has a position controller of its own."""
+    note: str = ""
+    """A key that was assumed, and why."""
+    wrong: str = ""
+    """A setting of the drive that has to be another one."""
+    answers: int = 1
+    """How many answered one request; more than one is an id given twice."""
 
     @property
     def keys(self) -> dict[str, Any]:
         """As a row of `link.joints` names it."""
-        return {"node": self.node} if self.drive is None else {"drive": dict(self.drive)}
+        return {"node": self.node} if self.drive is None else {"drive": {"family": self.family, **self.drive}}
 
 
 class FoundDrives(Protocol):
     """The drives of an open bus."""
 
     @property
-    def found(self) -> list[FoundDrive]: ...
+    def nodes(self) -> list[dict[str, Any]]:
+        """All that answer, as `armlink scan` writes them."""
 
-    def positions(self) -> dict[int, float]:
-        """Position reading of every drive by its id [rad]; raises BusFault."""
+    @property
+    def found(self) -> list[FoundDrive]:
+        """Those that an arm file can name."""
+
+    def positions(self) -> dict[str, float]:
+        """Position reading of every drive by its address [rad]; raises BusFault."""
 
 
 Level = Literal["error", "warning", "hint"]

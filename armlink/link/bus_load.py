@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from armlink.arm_file import SIMULATED, ArmFile, Bus, LinkJoint, LinkSection
 from armlink.bus.open import is_virtual, resolve_bus
-from armlink.drives.registry import family
+from armlink.drives.family import family
 
 HIGH_LOAD = 0.8
 """Share of the bit rate above which frames come late; a choice."""

@@ -42,6 +42,8 @@ class SelfTest:
         self.link, self.progress = link, progress
         self.checks = Checks()
         self._parked = False
+        self._under_way = "answers"
+        """The check that an error of the bus ends."""
 
     def run(self, power: bool) -> list[Result]:
         """All checks; those with power only where `power`, and where all before them passed.
@@ -65,7 +67,8 @@ class SelfTest:
         except ArmlinkError as error:
             reason = str(error)
             if self.checks.results and not self.checks.failed:
-                self.checks.add(link.names[0], "answers", "failed", reason)
+                who = next((name for name in link.names if reason.startswith(f"{name}:")), link.names[0])
+                self.checks.add(who, self._under_way, "failed", reason)
         finally:
             if link.enabled:
                 link.stop()
@@ -160,22 +163,30 @@ class SelfTest:
 
     def _with_power(self) -> str:
         """Enable, hold, silence of each drive, stow; returns why what is left is not run."""
-        link = self.link
-        self.progress("enabling the joints, which should hold")
+        link, self._under_way = self.link, "enables and holds"
+        self.progress("enable, and hold")
         start = link.clock.now()
         standing = link.enable().position
         seconds = link.clock.now() - start
-        on = [Power.ON] * link.n
-        sample = self._cycle(on, standing, HELD)
+        on, sags = [Power.ON] * link.n, self._sags()
+        sample = self._cycle(on, standing, HELD + sags)
         for _ in range(self._cycles(HOLD_SECONDS)):
-            sample = self._cycle(on, standing, HELD)
+            sample = self._cycle(on, standing, HELD + sags)
         moved = np.abs(sample.position - standing)
         for joint, name in enumerate(link.names):
             found = f"moved by {moved[joint]:.4f} rad in {HOLD_SECONDS} s"
             self.checks.add(name, "enables and holds", "passed", found, seconds)
+        self._under_way = "silence"
         for joint in range(link.n):
             self._silence(joint)
+        self._under_way = "park"
         return self._park()
+
+    def _sags(self) -> np.typing.NDArray[np.float64]:
+        """How far a load of the rated torque moves each joint that a position gain holds, until the integral term
+        has taken the load over, (n,) [rad]; 0 where the drive closes the loop."""
+        pairs = zip(self.link.section.joints, self.link.commander.limits, strict=True)
+        return np.array([joint.rated_torque / limit.kp if limit.kp else 0.0 for joint, limit in pairs])
 
     def _park(self) -> str:
         """Stow the arm where drives let go without their host; returns why it is not stowed."""
@@ -273,7 +284,9 @@ class SelfTest:
             return "falls"
         return "holds" if moved < HELD else "damps"
 
-    def _cycle(self, power: list[Power], standing: np.typing.NDArray[np.float64], most: float) -> Sample:
+    def _cycle(
+        self, power: list[Power], standing: np.typing.NDArray[np.float64], most: float | np.typing.NDArray[np.float64]
+    ) -> Sample:
         """One cycle; raises BusFault where the bus has a fault or a joint moves too far."""
         link = self.link
         sample = link.commander.stand(power)

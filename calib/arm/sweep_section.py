@@ -7,8 +7,9 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from armlink.arm_file import ArmFile, Positive, Section
-from armlink.drives.registry import family
+from armlink.drives.family import family
 from armlink.errors import BadInput
+from gcomp.identify.motor_model import MotorDoubt
 from gcomp.identify.parameters import Prior
 
 Motion = Literal["creep", "steps"]
@@ -120,6 +121,11 @@ class SweepSection(Section):
         if self.reference_point is None:
             return None
         return Prior(np.array(self.reference_point), self.reference_point_std)
+
+    @property
+    def motor_doubt(self) -> MotorDoubt:
+        """Of drives whose torque is a motor current, before any sweep."""
+        return MotorDoubt(zero=self.creep.zero_std, point=self.known_point)
 
 
 def sweep_section(arm_file: ArmFile) -> SweepSection:

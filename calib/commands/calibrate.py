@@ -12,8 +12,7 @@ from calib.commands.options import APPLY, Bus, Check, Flash, JsonFile, Replaced,
 if TYPE_CHECKING:
     from armlink.commands.plain_console import PlainConsole
     from calib.api import Calibrated
-    from calib.creep.record import CreepCalibration
-    from calib.dataset import SweepData
+    from calib.fit.creep_fit import CreepFit
     from calib.fit.sensor_fit import SensorFit
     from calib.records.records import CalibrationRecord
 
@@ -43,6 +42,8 @@ def calibrate(
 
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
+    from dataclasses import replace
+
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
@@ -54,17 +55,15 @@ def calibrate(
     from calib.dataset import all_creep, drives_of
     from calib.fit.felt_mass import felt_mass
     from calib.fit.sensor_fit import SensorFit
-    from calib.install.apply import Apply, apply_calibration
+    from calib.install.apply import Apply, apply_calibration, apply_creep
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore
 
     if report is not None:
         require_extra("--report", "reports")
     data, arm_file = load_sweeps("calibrate", directories, arm)
-    if apply and all_creep(data):
-        raise BadInput(
-            "--apply: these drives store no calibration, the host does: the record is in force without `--apply`"
-        )
+    if flash and all_creep(data):
+        raise BadInput("--flash: the host keeps the calibration of these drives: leave the option out")
     fit = calibrated(arm_file, data)
     records = RecordStore(store)
     current = records.current(CalibrationRecord, arm_file)
@@ -74,10 +73,10 @@ def calibrate(
         felt = felt_mass(gcomp_arm(arm_file), fit.rows.readings)
         if felt is not None and felt.contradicts:
             records.add(record.model_copy(update={"note": f"not made current: {felt}"}))
-            write_json(json_file, _answer(fit, data, record, False))
-            raise Refused(f"{felt} Record {record.id} is stored, but not made current")
+            write_json(json_file, _answer(fit, record, False))
+            raise Refused(f"{felt} Record {record.id} is kept, and not made current")
     out = results(json_file)
-    _show(fit, data, out)
+    _show(fit, out)
     user = getpass.getuser()
     if apply:
         record = record.model_copy(update={"confirmed_by": user})
@@ -85,35 +84,36 @@ def calibrate(
         from calib.report.calibration import Calibrated, write_report
 
         write_report(Calibrated(arm_file, data, fit, record, current), report)
-    if apply:
-        assert isinstance(fit, SensorFit)
-        how = Apply(
-            by=user, bus=bus, replaced=tuple(replaced or ()), accepted=tuple(accept or ()), check=check, flash=flash
-        )
-        again = command_line("calibrate", *map(str, directories), "--apply", arm=arm, bus=bus, store=store)
+    how = Apply(
+        by=user, bus=bus, replaced=tuple(replaced or ()), accepted=tuple(accept or ()), check=check, flash=flash
+    )
+    again = command_line("calibrate", *map(str, directories), "--apply", arm=arm, bus=bus, store=store)
+    kept = "the controllers keep what they hold until --apply writes it to them"
+    if not isinstance(fit, SensorFit):
+        with early_end(arm_file, again) as work:
+            work.enabled = apply and check
+            by = user if apply else "armlink calibrate"
+            apply_creep(record, arm_file, records, fit, replace(how, by=by, check=work.enabled))
+        kept = "it corrects readings and commands when the arm is opened next"
+    elif apply:
         with early_end(arm_file, again) as work:
             work.enabled = check
             written = apply_calibration(record, arm_file, records, data, fit, how)
-        out.print(f"record {record.id} is current; it was written to {len(written)} drives and read back")
+        kept = f"written to {len(written)} controllers and read back"
     else:
-        of_host = not isinstance(fit, SensorFit)
-        records.put(record, arm_file, by="armlink calibrate", reason="creep sweeps" if of_host else "sweeps")
-        kept = "the drives keep their old calibration until `--apply` writes this record to them"
-        in_host = (
-            f"record {record.id} is current: it corrects readings and commands from the next opening of the arm on"
-        )
-        out.print(in_host if of_host else f"record {record.id} is current; {kept}")
+        records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
+    out.print(f"record {record.id} is current; {kept}")
     suggest(command_line("identify", *map(str, directories), arm=arm, store=store))
-    write_json(json_file, _answer(fit, data, record, apply))
+    write_json(json_file, _answer(fit, record, apply))
 
 
-def _answer(fit: "Calibrated", data: "list[SweepData]", record: "CalibrationRecord", applied: bool) -> dict[str, Any]:
+def _answer(fit: "Calibrated", record: "CalibrationRecord", applied: bool) -> dict[str, Any]:
     from calib.fit.sensor_fit import SensorFit
 
     if isinstance(fit, SensorFit):
         own: dict[str, Any] = {"schema": "armlink.calibration/1", "applied": applied, **_of_steps(fit)}
     else:
-        own = {"schema": "armlink.creep/1", **_of_creeps(fit, data)}
+        own = {"schema": "armlink.creep/1", **_of_creeps(fit)}
     return {
         **own,
         "record": record.id,
@@ -153,8 +153,8 @@ def _of_steps(fit: "SensorFit") -> dict[str, Any]:
     }
 
 
-def _of_creeps(fit: "CreepCalibration", data: "list[SweepData]") -> dict[str, Any]:
-    from calib.creep.record import VALUES, family_of
+def _of_creeps(fit: "CreepFit") -> dict[str, Any]:
+    from calib.fit.creep_fit import VALUES, family_of
 
     values = {
         family_of(name): {
@@ -165,8 +165,8 @@ def _of_creeps(fit: "CreepCalibration", data: "list[SweepData]") -> dict[str, An
     }
     return {
         **values,
-        "disturbed": [*(each.reason for one in data for each in one.contacts), *fit.findings],
-        "temperature": [None if math.isnan(each) else each for each in fit.fit.rows.warmest.tolist()],
+        "disturbed": [finding.text for finding in fit.findings],
+        "temperature": [None if math.isnan(each) else each for each in fit.rows.warmest.tolist()],
     }
 
 
@@ -181,29 +181,27 @@ def _attachment(fit: "SensorFit") -> dict[str, list[Any]] | None:
     }
 
 
-def _show(fit: "Calibrated", data: "list[SweepData]", console: "PlainConsole") -> None:
+def _show(fit: "Calibrated", console: "PlainConsole") -> None:
     from calib.commands.screen import print_intervals, print_lines
     from calib.fit.sensor_fit import SensorFit
-    from calib.report.tables import CREEP_HEADINGS, SENSOR_HEADINGS
+    from calib.report.tables import columns_of
 
-    reasons = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
-    if not isinstance(fit, SensorFit):
-        drives = {heading: (fit.value(name), fit.half95(name)) for name, heading in CREEP_HEADINGS.items()}
-        print_intervals("Drives, ± half of the 95 % interval", fit.names, drives, console)
-        print_lines(reasons, console=console)
-        print_lines([*(each.reason for one in data for each in one.contacts), *fit.findings], "yellow", console)
-        return
-    columns = {heading: (fit.value(name), fit.half95(name)) for name, heading in SENSOR_HEADINGS.items()}
-    columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
-    print_intervals("Sensors, ± half of the 95 % interval", fit.names, columns, console)
-    doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
-    lines = [*reasons, f"at new poses, sensors and gravity model still differ by [N·m]: {', '.join(doubts)}"]
-    lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
-    if fit.gain_ratio is not None:
-        ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
-        lines.append(f"gains relative to the gain of the last joint: {ratios}")
+    lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
+    columns = columns_of(fit)
+    if isinstance(fit, SensorFit):
+        columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
+        doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
+        lines.append(f"at new poses, sensors and gravity model still disagree by [N·m]: {', '.join(doubts)}")
+        lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
+        if fit.gain_ratio is not None:
+            ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
+            lines.append(f"gains relative to the last joint's: {ratios}")
+    title = "Sensors" if isinstance(fit, SensorFit) else "Drives"
+    print_intervals(f"{title}, ± half of the 95 % interval", fit.names, columns, console)
     print_lines(lines, console=console)
     print_lines([finding.text for finding in fit.findings], "yellow", console)
+    if not isinstance(fit, SensorFit):
+        return
     worst = max(fit.goodness.left_out, key=lambda each: each.ratio, default=None)
     if worst is not None:
         worst_sweep = f"the worst sweep is {worst.sweep}, with {worst.ratio:.1f} times its expected error"

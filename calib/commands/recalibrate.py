@@ -12,7 +12,7 @@ from calib.commands.options import Bus, Check, Flash, JsonFile, Replaced, Store
 if TYPE_CHECKING:
     from armlink.arm_file import ArmFile
     from armlink.commands.plain_console import PlainConsole
-    from calib.field.field_fit import FieldFit
+    from calib.fit.field_fit import FieldFit
     from calib.records.records import CalibrationRecord
     from gcomp.identify.readings import StaticReadings
 
@@ -47,8 +47,7 @@ def recalibrate(
     from armlink.commands.early_end import early_end
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import command_line, results, suggest
-    from calib.field.field_fit import fit_field
-    from calib.field.field_record import field_record
+    from calib.fit.field_fit import fit_field
     from calib.records.records import CalibrationRecord, GravityRecord
     from calib.records.store import RecordStore, no_record
 
@@ -57,8 +56,8 @@ def recalibrate(
     if gravity is None:
         raise no_record(arm_file, "gravity")
     rows, sources = _rows(arm_file, data, before if held == "record" else None)
-    fit = fit_field(arm_file, rows, gravity, before)
-    record = field_record(arm_file, fit, before, {**sources, f"gravity record {gravity.id}": gravity.id})
+    fit = fit_field(arm_file, rows, gravity, before, {**sources, f"gravity record {gravity.id}": gravity.id})
+    record = fit.record(arm_file, before)
     out = results(json_file)
     _show(fit, out)
     given = {"held": None if held == "record" else held, "bus": bus, "store": store}
@@ -95,7 +94,7 @@ def _rows(
     from armlink.recording.files import load_recording
     from armlink.torque_calibration import UNCALIBRATED, per_joint
     from calib.dataset import labels, load_data
-    from calib.field.rows import rows_of_recording, rows_of_sweeps
+    from calib.fit.slow_windows import rows_of_recording, rows_of_sweeps
 
     n = len(arm_file.joint_names)
     blank = per_joint([UNCALIBRATED] * n)
@@ -120,21 +119,22 @@ def _rows(
 
 
 def _answer(fit: "FieldFit", record: "CalibrationRecord", gravity: str, applied: bool) -> dict[str, Any]:
+    import numpy as np
+
     return {
         "schema": "armlink.field/1",
         "record": record.id,
         "gravity_record": gravity,
         "applied": applied,
         "joints": list(fit.names),
-        "gain": {"estimated": fit.gain.tolist(), "ci95": fit.ci95("gain").tolist()},
-        "offset": {"estimated": fit.offset.tolist(), "ci95": fit.ci95("offset").tolist()},
+        **{key: {"estimated": fit.value(key).tolist(), "ci95": fit.ci95(key).tolist()} for key in ("gain", "offset")},
         "hysteresis": fit.hysteresis.tolist(),
         "common_scale_std": fit.common_scale_std,
         "not_separable": [
             {"joint": joint, "parameter": parameter, "reason": reason}
             for (joint, parameter), reason in fit.reasons.items()
         ],
-        "rows": fit.rows.tolist(),
+        "rows": np.isfinite(fit.residual).sum(axis=0).tolist(),
     }
 
 
@@ -142,8 +142,8 @@ def _show(fit: "FieldFit", console: "PlainConsole") -> None:
     from calib.commands.screen import print_intervals, print_lines
 
     columns = {
-        "gain": (fit.gain, 1.96 * fit.std("gain")),
-        "offset [N·m]": (fit.offset, 1.96 * fit.std("offset")),
+        "gain": (fit.value("gain"), fit.half95("gain")),
+        "offset [N·m]": (fit.value("offset"), fit.half95("offset")),
         "hysteresis [N·m]": (fit.hysteresis, 0 * fit.hysteresis),
     }
     print_intervals("Sensors in the field, ± half of the 95 % interval", fit.names, columns, console)

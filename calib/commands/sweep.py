@@ -137,8 +137,8 @@ def _plan(
     """Print and check the plan, and draw it if asked to; the answer for machines."""
     from calib.arm.sweep_section import sweep_motion
     from calib.commands.screen import print_plan
-    from calib.creep.plan import creep_seconds, plan_creep
     from calib.plan.collisions import check_plan
+    from calib.plan.creep_plan import creep_seconds, plan_creep
     from calib.plan.drawing import draw_plan, pass_seconds, stops_seconds
     from calib.plan.rough_gravity import guess_of_file
     from calib.plan.sweep_plan import plan_sweep

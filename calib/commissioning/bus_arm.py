@@ -1,16 +1,18 @@
 """The arm file of an arm of which only the bus is known: drives, ratings and stops, and no geometry yet."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from math import pi
 from typing import Any
 
 from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
-from armlink.drives.findings import FoundDrives
-from armlink.drives.registry import not_looked_for
+from armlink.drives.findings import FoundDrive, FoundDrives
 from armlink.errors import BusFault
-from calib.commissioning.drive_match import Ask, Match, moved_node
+from calib.commissioning.draft import LEAST_TORQUE
+from calib.commissioning.drive_match import Ask, Match, moved_drive
+from calib.commissioning.motion_checks import LEAST_DAMPING
 
 DEFAULT_VELOCITY = 0.5
 """`max_velocity` where nothing says how fast the joint may be [rad/s]; a choice."""
@@ -31,17 +33,32 @@ def arm_of_bus(drives: FoundDrives, channel: str, bus: Mapping[str, str | int], 
     reads the motion, and its stops are what that reads [rad]. Else the drives are taken in the order of their ids.
     """
     if not drives.found:
-        raise BusFault(f"{channel}: no drive answers: check power, wiring and bit rate ({not_looked_for()})")
+        raise BusFault(f"{channel}: no drive answers: check power, wiring and bit rate")
     if ask is None:
         matches = [Match(f"joint_{i}", drive, by_hand=False) for i, drive in enumerate(drives.found, start=1)]
-        stops = [(-pi, pi)] * len(matches)
+        stops = [_turn_about(each) for each in _standing(drives)]
     else:
         matches, stops = _by_hand(drives, channel, ask)
     return BusArm(_text(matches, stops, channel, bus, name), matches)
 
 
+def _standing(drives: FoundDrives) -> list[float]:
+    """Where each drive stands [rad]; 0 where one does not tell."""
+    try:
+        positions = drives.positions()
+    except BusFault:
+        positions = {}
+    return [positions.get(each.address, 0.0) for each in drives.found]
+
+
+def _turn_about(position: float) -> tuple[float, float]:
+    """A turn about zero, or about a position beyond it: that of a drive before a further gear [rad]."""
+    middle = 0.0 if abs(position) < pi else position
+    return middle - pi, middle + pi
+
+
 def _by_hand(drives: FoundDrives, channel: str, ask: Ask) -> tuple[list[Match], list[tuple[float, float]]]:
-    free = {each.node: each for each in drives.found}
+    free = {each.address: each for each in drives.found}
     matches, stops = [], []
     for number in range(1, len(free) + 1):
         joint = f"joint_{number}"
@@ -49,9 +66,9 @@ def _by_hand(drives: FoundDrives, channel: str, ask: Ask) -> tuple[list[Match], 
         before = drives.positions()
         ask(f"{joint}: now turn it to its other stop")
         after = drives.positions()
-        node = moved_node(joint, {each: after[each] - before[each] for each in free}, channel)
-        matches.append(Match(joint, free.pop(node), by_hand=True))
-        stops.append((min(before[node], after[node]), max(before[node], after[node])))
+        moved = moved_drive(joint, {each: after[each] - before[each] for each in free}, channel)
+        matches.append(Match(joint, free.pop(moved), by_hand=True))
+        stops.append((min(before[moved], after[moved]), max(before[moved], after[moved])))
     return matches, stops
 
 
@@ -83,19 +100,60 @@ def _text(
     for match in matches:
         place = "found by turning the joint by hand" if known else "assumed: taken in the order of the node ids"
         lines += [yaml_item(_joint(match), 4), yaml_comment(f"node {place}; max_velocity assumed", 6)]
+        lines += [yaml_comment(note, 6) for note in drive_notes(match.drive)]
     if not known:
         lines += ["sweep:", yaml_entry("hold", "servo", 2, "assumed: the stops are not known")]
     return "\n".join(lines) + "\n"
 
 
 def _joint(match: Match) -> dict[str, Any]:
-    drive = match.drive
-    return {
+    drive = assumed_ratings(with_gains(match.drive))
+    row = {
         "name": match.joint,
         **drive.keys,
         "rated_torque": float(f"{drive.rated_torque:g}"),
         "max_torque": float(f"{drive.max_torque:g}"),
         "max_torque_rate": float(f"{2.5 * drive.max_torque:.3g}"),
         "max_velocity": DEFAULT_VELOCITY,
-        "identity": {"vendor": drive.vendor, "product": drive.product},
     }
+    return row if drive.family != "canopen" else {**row, "identity": {"vendor": drive.vendor, "product": drive.product}}
+
+
+def with_gains(drive: FoundDrive, inertia: float = 0.0) -> FoundDrive:
+    """The drive with kp and kd, where it takes them: the torque range over one radian, and a tenth of that, or the
+    damping that `armlink doctor` asks for at this inertia [kg·m²]; kp is lowered where no kd that it takes suffices."""
+    if drive.largest_gains is None or drive.drive is None:
+        return drive
+    most_kp, most_kd = drive.largest_gains
+    kp = min(drive.max_torque, most_kp) if math.isfinite(drive.max_torque) else LEAST_TORQUE
+    needed = 2 * LEAST_DAMPING * math.sqrt(kp * inertia)
+    kd = min(max(kp / 10, needed), most_kd)
+    if kd < needed:
+        kp = (kd / (2 * LEAST_DAMPING)) ** 2 / inertia
+    gains = {"kp": _rounded(kp, math.floor), "kd": min(_rounded(kd, math.ceil), most_kd)}
+    return replace(drive, drive={**drive.drive, **gains})
+
+
+def _rounded(value: float, to_whole: Callable[[float], int]) -> float:
+    """Two digits, in the direction of `to_whole`."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{to_whole(value / step) * step:.2g}")
+
+
+def assumed_ratings(drive: FoundDrive) -> FoundDrive:
+    """The drive with a rated torque, and no larger one allowed, where it tells none: a third of its range, from where
+    on `armlink doctor` warns."""
+    if math.isfinite(drive.rated_torque):
+        return drive
+    rated = drive.max_torque / 3 if math.isfinite(drive.max_torque) else LEAST_TORQUE
+    return replace(drive, rated_torque=float(f"{rated:.2g}"), max_torque=float(f"{rated:.2g}"))
+
+
+def drive_notes(drive: FoundDrive, rating: bool = True) -> list[str]:
+    """Comments for the arm file; `rating`: its ratings are assumed as well."""
+    notes = [drive.note, drive.wrong]
+    if drive.largest_gains is not None:
+        notes.append("kp, kd assumed: the torque range over one radian, with the damping that armlink doctor asks for")
+    if rating and not math.isfinite(drive.rated_torque):
+        notes.append("rated_torque, max_torque assumed: the drive does not tell them; take them from its data sheet")
+    return [note for note in notes if note]

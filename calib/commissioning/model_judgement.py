@@ -10,7 +10,7 @@ from armlink.errors import BadInput
 from armlink.link.joints.values import try_limits
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import sweep_motion
-from calib.creep.plan import refuse_unbearable_creeps
+from calib.plan.creep_plan import refuse_unbearable_creeps
 from calib.plan.rough_gravity import HAND, guess_of_file, reach
 from calib.plan.sweep_plan import DEAD_LEVER, refuse_unbearable_mass
 from gcomp.arm.arm import Arm

@@ -10,9 +10,9 @@ from armlink.drives.findings import SetupFinding
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm, model_chain
 from calib.arm.sweep_section import sweep_motion, sweep_section
 from calib.commissioning.model_judgement import gravity_need
-from calib.creep.plan import plan_creep
 from calib.plan.bias_torque import pressable_joints
 from calib.plan.collisions import check_plan
+from calib.plan.creep_plan import plan_creep
 from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
@@ -79,19 +79,24 @@ def _strength(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
             yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
 
 
-def _damping(arm_file: ArmFile) -> Iterator[SetupFinding]:
-    """Joints that their drives hold with kp and kd, and whose kd is too low for what they turn."""
-    assert arm_file.link is not None
-    joints = [joint for joint in arm_file.link.joints if getattr(joint.settings, "kp", 0.0) > 0]
-    if not joints:
-        return
+def largest_inertias(arm_file: ArmFile) -> dict[str, float]:
+    """Largest inertia that each joint turns, the reference mass of a sweep included [kg·m²]; the arm has a model."""
     placed = model_chain(arm_file)
     arm = placed.arm.arm
     low, high = np.nan_to_num([arm.lower, arm.upper], posinf=np.pi, neginf=-np.pi)
     # few: an inertia changes little from pose to pose
     poses = np.random.default_rng(0).uniform(low, high, (100, arm.n))
     mass = sweep_section(arm_file).reference_mass or 0.0
-    largest = dict(zip(arm.names, joint_inertias(placed, poses, mass).max(axis=0).tolist(), strict=True))
+    return dict(zip(arm.names, joint_inertias(placed, poses, mass).max(axis=0).tolist(), strict=True))
+
+
+def _damping(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Joints that their drives hold with kp and kd, and whose kd is too low for what they turn."""
+    assert arm_file.link is not None
+    joints = [joint for joint in arm_file.link.joints if getattr(joint.settings, "kp", 0.0) > 0]
+    if not joints:
+        return
+    largest = largest_inertias(arm_file)
     for joint in joints:
         drive, inertia = joint.settings, largest[joint.name]
         square = drive.gear**2

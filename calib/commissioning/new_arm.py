@@ -1,5 +1,6 @@
 """Makes an arm file from a model: chain, ranges, drives; asks where somebody can answer, else assumes and says so."""
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,13 +15,15 @@ from armlink.drives.findings import FoundDrives, SetupFinding
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
+from calib.commissioning.bus_arm import drive_notes, with_gains
 from calib.commissioning.chain import Chain, find_chains
 from calib.commissioning.clear_range import clear_ranges, sweep_problem
-from calib.commissioning.draft import Draft, draft_of_model, narrow
+from calib.commissioning.draft import Draft, JointDraft, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
 from calib.commissioning.model_checks import file_findings
 from calib.commissioning.model_joints import model_joints
 from calib.commissioning.model_judgement import model_errors
+from calib.commissioning.motion_checks import largest_inertias
 
 RATING_FACTOR = 2.5
 """A drive whose rated torque differs from the model's effort limit by more is doubted; a choice."""
@@ -151,17 +154,17 @@ def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -
         turned = [TurnedJoint(*each) for each in zip(arm.names, arm.lower, arm.upper, strict=True)]
         matches, findings = match_by_hand(turned, drives, bus, ask)
         made.findings += findings
+    damped = any(match.drive.largest_gains is not None for match in matches)
+    inertias = largest_inertias(made.parsed()) if damped else {}
     for joint, match in zip(made.draft.joints, matches, strict=True):
-        drive = match.drive
-        ratio = drive.rated_torque / joint.rated_torque
-        from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
-        if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
-            made.findings.append(_doubtful_rating(match, joint.rated_torque))
-        joint.node, joint.drive, joint.rated_torque = drive.node, drive, drive.rated_torque
-        joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
+        drive = with_gains(match.drive, inertias.get(joint.name, 0.0))
+        joint.node, joint.drive = drive.node, drive
+        joint.notes += drive_notes(drive, rating=False)
+        if math.isfinite(drive.rated_torque):
+            _take_ratings(made, joint, match)
+        elif math.isfinite(drive.max_torque):
+            joint.max_torque = min(joint.max_torque, drive.max_torque)
         joint.max_torque_rate = float(f"{2.5 * joint.max_torque:.3g}")
-        joint.identity = {"vendor": drive.vendor, "product": drive.product}
-        joint.notes = [note for note in joint.notes if not note.startswith("rated_torque")]
         joint.notes.append(
             "node found by turning the joint by hand"
             if match.by_hand
@@ -170,13 +173,24 @@ def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -
     return matches
 
 
+def _take_ratings(made: NewArm, joint: JointDraft, match: Match) -> None:
+    """Rating, limit and identity as the drive tells them."""
+    drive = match.drive
+    ratio = drive.rated_torque / joint.rated_torque
+    from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
+    if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
+        made.findings.append(_doubtful_rating(match, joint.rated_torque))
+    joint.rated_torque = drive.rated_torque
+    joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
+    joint.identity = {"vendor": drive.vendor, "product": drive.product}
+    joint.notes = [note for note in joint.notes if not note.startswith("rated_torque")]
+
+
 def _doubtful_rating(match: Match, effort: float) -> SetupFinding:
     drive = match.drive
-    remedy = "check that this drive moves this joint" + (
-        " (--by-hand finds the drive of each joint)" if match.by_hand else ": --by-hand finds out"
-    )
-    what = f"the drive is rated {drive.rated_torque:g} N·m, but the effort limit of the model is {effort:g} N·m"
-    return SetupFinding("warning", what, f"{match.joint} (node {drive.node})", remedy)
+    remedy = "check that this drive moves this joint" + ("" if match.by_hand else ": --by-hand finds out")
+    what = f"the drive is rated {drive.rated_torque:g} N·m, the model's effort limit is {effort:g} N·m"
+    return SetupFinding("warning", what, f"{match.joint} ({drive.address})", remedy)
 
 
 def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | int], out: Path) -> str:
@@ -188,13 +202,17 @@ def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | in
     link: Any = edited.content["link"]
     for row, match in zip(link["joints"], matches, strict=True):
         drive = match.drive
+        if drive.family != "canopen":
+            told = {key: value for key, value in (drive.drive or {}).items() if value != "" and key not in ("kp", "kd")}
+            row["drive"].update(told)
+            continue
         if "drive" in row:
             row["drive"]["node"] = drive.node
         elif drive.drive is None:
             row["node"] = drive.node
         else:
             del row["node"]
-            row["drive"] = edited.in_line(drive.drive)
+            row["drive"] = edited.in_line(drive.keys["drive"])
         row["rated_torque"] = drive.rated_torque
         row["max_torque"] = min(float(row["max_torque"]), drive.max_torque)
         row["identity"] = edited.in_line({"vendor": drive.vendor, "product": drive.product})

@@ -8,8 +8,8 @@ from typing import Any
 from armlink.arm_file import ArmFile, Bus, parse_arm, read_yaml
 from armlink.bus.can_bus import CanBus
 from armlink.content.yaml_text import yaml_comment, yaml_document, yaml_entry
+from armlink.drives.family import family
 from armlink.drives.findings import SetupFinding
-from armlink.drives.registry import family
 from armlink.errors import BusFault
 from armlink.link.link import Link
 from calib.commissioning.bus_checks import another_drive
@@ -28,7 +28,7 @@ class OwnCopy:
 def drives_have_ids(arm: ArmFile) -> bool:
     """Whether the drives of an arm are found by the ids of its arm file alone."""
     joints = arm.require_link().joints
-    return all(family(joint.settings.family).find is None for joint in joints)
+    return all(family(joint.settings.family).search is None for joint in joints)
 
 
 def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus, *, new_serial: bool) -> OwnCopy:

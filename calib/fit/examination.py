@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from calib.fit.findings import FitFinding, effect_finding, encoder_findings, outlier_findings, scatter_findings
+from calib.fit.findings import OUTLIER, FitFinding, effect_finding, encoder_findings, outlier_findings, scatter_findings
 from calib.fit.lags import Lags
 from calib.fit.position_field import PositionField
 from calib.fit.refinement import FEWEST, Extra, Refined, refine
@@ -23,8 +23,6 @@ from gcomp.identify.sensor_model import predict
 
 MOST_EFFECTS = 6
 """Largest number of effects added one after the other; a choice."""
-OUTLIER = 6.0
-"""Robust standard deviations of the deleted residual from which a reading is an outlier (docs/theory.md, 5.4)."""
 MOST_OUTLIERS = 0.15
 """Largest share of a joint's readings that are left out as outliers; beyond it the model is at fault; a choice."""
 PLATEAU, PLATEAU_POSES = 4.0, 4

@@ -22,11 +22,15 @@ Kind = Literal[
     "encoder",
     "outliers",
     "scatter",
+    "contact",
 ]
+OUTLIER = 6.0
+"""Robust standard deviations of a joint's residuals from which a reading, or a sweep, is not one of the others
+(docs/theory.md, 5.4)."""
 SCATTER, MATERIAL_SCATTER = 3.0, 0.002
 """Scatter that counts as a finding: this factor to the samples' noise, and this share of rated torque. Held by
 tests/campaigns/random_arms.py (none) and hard_cases.py (named)."""
-HOLDING: tuple[Kind, ...] = ("direction", "hysteresis", "outliers")
+HOLDING: tuple[Kind, ...] = ("direction", "hysteresis", "outliers", "contact")
 """Findings that the fit removes completely: with them removed the model holds."""
 
 

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from armlink.arm_file import ArmFile
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.gravity_fit import sensor_parameters
-from calib.fit.sweep_readings import SweepReadings
+from calib.fit.sweep_readings import FEWEST, SweepReadings
 from calib.records.records import CalibrationRecord
 from gcomp.arrays import Array
 from gcomp.errors import GcompError
@@ -21,8 +21,6 @@ NOT_BY_CHANCE = 3.0
 """Standard errors by which the held-out error must be larger to be called worse: by chance once in 740."""
 WORSE = 1.05
 """Ratio of held-out RMS, new over old, below which it is not worse."""
-FEWEST = 6
-"""Readings of a joint below which this is not judged: the standard error would be meaningless."""
 REFIT_GAIN_STD = 0.2
 """Prior standard deviation of gains in the refit: without a mass it fixes the scale, which no prediction depends on."""
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from scipy import linalg
 
 from calib.fit.levels import Levels, RandomEffects, learn
+from calib.fit.scatter import NOISE_ROUNDS
 from calib.fit.small_troubles import FAMILIES, LARGEST, UNITS, Setting, Troubles, troubles
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arrays import Array
@@ -29,8 +30,6 @@ ROUGHLY, a choice."""
 LEAST_FACTOR = 0.5
 """Least scatter over the samples' noise; it only bounds the search. Less than 1 is by chance, but so is as much more:
 cut off at 1, the intervals of perfect arms were 5 % too wide."""
-GAUSS_NEWTON_STEPS = 4
-"""Each is followed by an update of the noise; the start is the global fit's minimum; a choice."""
 NEGLIGIBLE = 0.1
 """Share of a reading's noise below which rounding is neglected: it adds 0.5 % to the standard deviation."""
 FEWEST = 8.0
@@ -107,7 +106,7 @@ def refine(
     problem = _Problem(rows, setting, fit, priors, extras)
     vector, factor = fit.complete.vector.copy(), np.ones(kinematics.n)
     level = np.ones(len(FAMILIES))
-    for _ in range(GAUSS_NEWTON_STEPS):
+    for _ in range(NOISE_ROUNDS):
         step = problem.step(vector, factor, level)
         level = step.levels.level
         vector[problem.free] += step.solution[: step.parameters]

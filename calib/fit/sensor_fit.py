@@ -12,10 +12,11 @@ from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.dataset import SweepData, digests
+from calib.fit.calibration import FittedCalibration
 from calib.fit.examination import Goodness, examine
 from calib.fit.findings import FitFinding
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
-from calib.records.records import PARAMETERS, CalibrationRecord, JointCalibration, Parameter, matrix, provenance
+from calib.records.records import PARAMETERS, Discrepancy, Parameter
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit, identify_global
 from gcomp.identify.parameters import Parameters, Prior
@@ -32,8 +33,8 @@ COMMON = (
 
 
 @dataclass(frozen=True, eq=False)
-class SensorFit:
-    """Every sensor's gains and offsets from sweeps; NaN if not identifiable, with the cause in `reasons`."""
+class SensorFit(FittedCalibration):
+    """Every sensor's gains and offsets from sweeps at rest."""
 
     names: tuple[str, ...]
     fit: GlobalFit
@@ -47,47 +48,28 @@ class SensorFit:
     that of the sensors (n,) [N·m]; NaN if the drives report none."""
     goodness: Goodness
     """Whether the sensor model holds, with findings."""
-    quantile: Parameters
+    quantiles: Parameters
     """Student quantiles of 95 % intervals, one a parameter."""
     reasons: dict[tuple[str, Parameter], str]
-    """(joint, parameter) → why it has no value."""
     gain_ratio: Array | None
     """Without a reference mass: gains as multiples of the last joint's (n,); NaN if unknown."""
     sources: dict[str, str]
 
-    def value(self, parameter: Parameter) -> Array:
-        """Estimates of one parameter (n,), NaN if not identifiable."""
-        found: Array = getattr(self.fit.values, parameter).copy()
-        for joint, name in enumerate(self.names):
-            if (name, parameter) in self.reasons:
-                found[joint] = np.nan
-        return found
+    def estimate(self, parameter: str) -> tuple[Array, Array]:
+        return getattr(self.fit.values, parameter), getattr(self.fit.std, parameter)
 
-    def std(self, parameter: Parameter) -> Array:
-        """Standard deviations (n,), NaN if not identifiable."""
-        spread: Array = getattr(self.fit.std, parameter)
-        return np.where(np.isnan(self.value(parameter)), np.nan, spread)
+    def covariance_of(self, wanted: Sequence[tuple[int, Parameter]]) -> Array:
+        return self.fit.covariance_of(*(f"{parameter}[{self.names[joint]}]" for joint, parameter in wanted))
 
-    def half95(self, parameter: Parameter) -> Array:
-        """Half widths (n,) of the 95 % intervals, NaN if not identifiable."""
-        half: Array = getattr(self.quantile, parameter) * self.std(parameter)
-        return half
-
-    def ci95(self, parameter: Parameter) -> Array:
-        """95 % intervals (n, 2), NaN if not identifiable."""
-        half = self.half95(parameter)
-        return np.stack([self.value(parameter) - half, self.value(parameter) + half], axis=1)
+    def quantile(self, parameter: str) -> Array:
+        return np.asarray(getattr(self.quantiles, parameter))
 
     @property
     def findings(self) -> tuple[FitFinding, ...]:
-        """Effects in the readings that the sensor model does not have."""
         return self.goodness.findings
 
-    @property
-    def doubtful(self) -> tuple[str, ...]:
-        """Joints at which the model does not hold, so that their values must not be used."""
-        broken = {finding.joint for finding in self.findings if finding.breaks_model}
-        return tuple(name for name in self.names if name in broken)
+    def discrepancy_of(self, joint: int) -> Discrepancy:
+        return self.goodness.discrepancy[joint]
 
     @property
     def attachment(self) -> tuple[Array, Array] | None:
@@ -98,7 +80,7 @@ class SensorFit:
         if not any(self.rows.masses):
             return None
         point = self.fit.values.rho
-        return point, np.where(np.isnan(point), np.nan, self.quantile.rho * self.fit.std.rho)
+        return point, np.where(np.isnan(point), np.nan, self.quantiles.rho * self.fit.std.rho)
 
     @property
     def attachment_text(self) -> str:
@@ -129,38 +111,8 @@ class SensorFit:
 
     @property
     def residual_rms(self) -> Array:
-        """RMS of each joint's torque residual over the readings that count (n,) [N·m]."""
         rms: Array = np.sqrt(np.nanmean(self.fit.residual**2, axis=0))
         return rms
-
-    def record(self, arm_file: ArmFile) -> CalibrationRecord:
-        residual = self.residual_rms
-        joints = tuple(
-            JointCalibration(
-                name=name,
-                gain=_number(self.value("gain")[joint]),
-                offset=_number(self.value("offset")[joint]),
-                position_gain=_number(self.value("position_gain")[joint]),
-                position_offset=_number(self.value("position_offset")[joint]),
-                not_identifiable={p: self.reasons[name, p] for p in PARAMETERS if (name, p) in self.reasons},
-                residual_std=_number(residual[joint]),
-                discrepancy=self.goodness.discrepancy[joint],
-            )
-            for joint, name in enumerate(self.names)
-        )
-        wanted = [
-            (f"{name}.{parameter}", f"{parameter}[{name}]")
-            for name in self.names
-            for parameter in PARAMETERS
-            if (name, parameter) not in self.reasons and f"{parameter}[{name}]" in self.fit.names
-        ]
-        covariance = self.fit.covariance_of(*(inner for _, inner in wanted)) if wanted else np.zeros((0, 0))
-        return CalibrationRecord(
-            **provenance(arm_file, self.sources),
-            joints=joints,
-            covariance_of=tuple(outer for outer, _ in wanted),
-            covariance=matrix(covariance) if wanted else (),
-        )
 
 
 def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
@@ -185,7 +137,7 @@ def fit_sensors(arm_file: ArmFile, data: Sequence[SweepData]) -> SensorFit:
         hysteresis=_half_difference(left, rows),
         friction=_friction(fit, rows),
         goodness=good,
-        quantile=Parameters.from_vector(stdtrit(good.refined.certainty.vector, 0.975), len(arm_file.joint_names)),
+        quantiles=Parameters.from_vector(stdtrit(good.refined.certainty.vector, 0.975), len(arm_file.joint_names)),
         reasons=missing_values(fit, rows),
         gain_ratio=gain_ratio,
         sources=digests(data),
@@ -241,10 +193,6 @@ def _triple(values: Array) -> str:
 
 def _value_text(value: float, interval: str = "") -> str:
     return "not observable" if np.isnan(value) else f"{value:.4f}{interval}"
-
-
-def _number(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
 
 
 WHERE_IT_HANGS = ": measure where the reference mass hangs (sweep.reference_point in the arm file)"

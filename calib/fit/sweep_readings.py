@@ -1,15 +1,16 @@
-"""The static readings of sweep data sets as the fit takes them: which count, how exact each is, where it comes from."""
+"""The readings of sweep data sets as the fits take them: which count, how exact each is, where it comes from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from armlink.errors import BadInput
 from armlink.torque_calibration import TorqueCalibration
-from calib.dataset import SweepData, labels
-from calib.motion.static_reading import StaticReading, batch, stack
+from calib.dataset import SweepData, all_creep, labels
+from calib.motion.static_reading import StaticReading, stack
 from gcomp.arrays import Array, Mask
 from gcomp.identify.readings import StaticReadings
 
@@ -18,11 +19,19 @@ UNSETTLED = 3.0
 their noise, by a swing or a creep, is added whole: averaging does not reduce it."""
 FLOOR = 2e-5
 """Smallest standard deviation of a reading, as a share of rated torque: the resolution of a sensor."""
+FEWEST = 6
+"""Readings of a joint below which nothing is judged by them: a standard error would be meaningless."""
+STEADY = 0.02
+"""Largest difference of a bin's speed from the middle one of its creep, as a share: beyond, inertia takes torque."""
+ROUGH = 6.0
+"""Where the speeds of a creep scatter more: so many times the middle size of these differences."""
+LEAST_TEMPERATURE_SPREAD = 1.0
+"""Spread of the logged temperatures from which they, and not time, say how warm a drive is [K]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SweepReadings:
-    """K static readings of n joints from all passes, with what the data sets know of them."""
+    """K readings of n joints from all passes, at rest or creeping, with what the data sets know of them."""
 
     readings: StaticReadings
     """As the sensors gave them: the calibration that the controllers had installed is taken out."""
@@ -43,6 +52,34 @@ class SweepReadings:
     """Standard deviation of a position reading from its resolution (n,) [rad]."""
     resolution: Array
     """Smallest step seen in each joint's position reading (n,) [rad]; 0 if unknown."""
+    warmest: Array
+    """Temperature of each joint's drive at which its warmth is 0 (n,) [°C]; NaN where warmth is not in kelvin."""
+
+    def __len__(self) -> int:
+        return len(self.swept)
+
+    def swept_value(self, values: Array) -> Array:
+        """Of values (K, n), those of the swept joint (K,)."""
+        return values[np.arange(len(self)), self.swept]
+
+    @property
+    def reading(self) -> Array:
+        """Torque reading of the swept joint (K,) [N·m]."""
+        return self.swept_value(self.readings.torque)
+
+    @property
+    def side(self) -> Array:
+        """Direction of the swept joint, ±1 (K,)."""
+        return self.swept_value(self.readings.direction)
+
+    @property
+    def by_temperature(self) -> bool:
+        """Whether warmth is in kelvin."""
+        return bool(np.isfinite(self.warmest).any())
+
+    def kept(self, mask: Mask) -> Self:
+        rows = ("swept", "time", "felt", "motor_torque", "target")
+        return replace(self, readings=self.readings.rows(mask), **{name: getattr(self, name)[mask] for name in rows})
 
     @property
     def own(self) -> Mask:
@@ -57,8 +94,13 @@ class SweepReadings:
 
 
 def sweep_readings(data: Sequence[SweepData]) -> SweepReadings:
-    """All readings of data sets of one arm; raises BadInput if there are none or the arms differ."""
+    """All readings of data sets of one arm; raises BadInput if there are none or the arms differ.
+
+    Of creeps, those at steady speed, in the order in which the passes were made.
+    """
     _require_one_arm(data)
+    if all_creep(data):
+        data = sorted(data, key=lambda each: (each.manifest.created, each.path.name))
     taken = [reading for each in data for reading in each.readings]
     folders = labels([each.path for each in data])
     names = [f"{folder}/{reading.sweep}" for folder, one in zip(folders, data, strict=True) for reading in one.readings]
@@ -66,26 +108,65 @@ def sweep_readings(data: Sequence[SweepData]) -> SweepReadings:
     sweeps = tuple(dict.fromkeys(names))
     sigma = _sigma(taken, np.array(data[0].manifest.rated_torque))
     resolution = np.max([each.resolution for each in data], axis=0)
-    sent = batch(taken, sigma)
     gain = np.array([each.manifest.installed_gain for each in data])[source]
     offset = np.array([each.manifest.installed_offset for each in data])[source]
-    readings = replace(
-        sent,
-        torque=TorqueCalibration(gain, offset).apply(sent.torque),
+    felt, time = TorqueCalibration(gain, offset).apply(stack(taken, "torque")), _time(data)
+    swept = np.array([-1 if reading.joint is None else reading.joint for reading in taken])
+    own = np.arange(len(resolution)) == swept[:, None]
+    speed = np.array([each.speed or 0.0 for each in taken])
+    creeping = (speed > 0)[:, None]
+    warmth, warmest = _warmth(stack(taken, "temperature"), own & creeping, time)
+    direction = stack(taken, "direction")
+    readings = StaticReadings(
+        stack(taken, "position"),
+        np.where(np.where(creeping, own, stack(taken, "counted")), felt, np.nan),
+        sigma,
         load=np.array([each.manifest.reference_mass for each in data])[source],
+        direction=direction,
         series=np.array([sweeps.index(name) for name in names]),
+        velocity=direction * speed[:, None],
+        warmth=warmth,
     )
-    return SweepReadings(
+    found = SweepReadings(
         readings=readings,
         sweeps=sweeps,
-        swept=np.array([-1 if reading.joint is None else reading.joint for reading in taken]),
-        time=_time(data),
-        felt=TorqueCalibration(gain, offset).apply(stack(taken, "torque")),
+        swept=swept,
+        time=time,
+        felt=felt,
         motor_torque=stack(taken, "motor_torque"),
         target=np.concatenate([_targets(each) for each in data if each.readings]),
         position_sigma=_rounding(readings.position, resolution),
         resolution=resolution,
+        warmest=warmest,
     )
+    return found.kept(steady(found))
+
+
+def steady(rows: SweepReadings) -> Mask:
+    """Rows at rest, or at the constant speed of their creep (K,): a loop that still settles at its beginning speeds up
+    or slows."""
+    found, speed = np.ones(len(rows), dtype=bool), np.abs(rows.readings.velocity).max(axis=1)
+    for sweep in range(len(rows.sweeps)):
+        for side in (-1.0, 1.0):
+            own = np.flatnonzero((rows.readings.series == sweep) & (rows.side == side) & (speed > 0))
+            if own.size:
+                off = np.abs(speed[own] / np.median(speed[own]) - 1)
+                found[own] = off <= max(STEADY, ROUGH * float(np.median(off)))
+    return found
+
+
+def _warmth(temperature: Array, creeping: Mask, time: Array) -> tuple[Array, Array]:
+    """(How much colder each creeping drive was than at the end (K, n), its temperature then (n,) [°C] or NaN)."""
+    nowhere = np.full(creeping.shape[1], np.nan)
+    if not creeping.any():
+        return np.zeros(creeping.shape), nowhere
+    own = temperature[creeping]
+    if np.isfinite(own).all() and np.ptp(own) >= LEAST_TEMPERATURE_SPREAD:
+        warmest = np.max(temperature, axis=0, where=creeping, initial=-np.inf)
+        return np.where(creeping, temperature - warmest, 0.0), np.where(np.isfinite(warmest), warmest, np.nan)
+    since = time[creeping.any(axis=1)]
+    share = (time - since.max()) / max(float(np.ptp(since)), 1.0)
+    return np.where(creeping, share[:, None], 0.0), nowhere
 
 
 def _require_one_arm(data: Sequence[SweepData]) -> None:

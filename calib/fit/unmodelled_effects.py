@@ -8,7 +8,7 @@ from scipy.special import fdtrc
 
 from calib.fit.lags import play
 from calib.fit.refinement import Extra, Refined
-from calib.fit.sweep_readings import SweepReadings
+from calib.fit.sweep_readings import FEWEST, SweepReadings
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
 from gcomp.identify.readings import StaticReadings
@@ -21,8 +21,6 @@ MATERIAL = 0.0005
 """RMS of an effect, as a share of rated torque, below which it is not material (docs/theory.md, section 5.4)."""
 KNEE_SHARES = (0.6, 0.7, 0.8, 0.9, 0.95)
 """Shares of the largest torque tried as the onset of saturation."""
-FEWEST = 6
-"""Smallest number of a joint's readings for a search of effects; a choice."""
 LEAST_ECCENTRIC_RANGE = 2.0
 """Range of a joint from which an error once a turn can be separated from a gain [rad] (docs/theory.md, section 5.2)."""
 OWN_DOUBT, HELD_DOUBT = 0.1, 0.75

@@ -1,4 +1,4 @@
-"""`--apply`: gates, check motion, write, check motion; for records from sweeps, from slow motion and from earlier."""
+"""Gates, check motion, write, check motion; for records from sweeps, creeps, slow motion and from earlier."""
 
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
@@ -9,17 +9,20 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput, Refused
 from armlink.loop.driver import ArmDriver
 from armlink.loop.open import open_arm
+from calib.arm.kinematics import DriveLimits
 from calib.dataset import SweepData
-from calib.field.field_fit import FieldFit, heldout_errors
+from calib.fit.creep_fit import CreepFit
+from calib.fit.field_fit import FieldFit, heldout_errors
 from calib.fit.findings import FitFinding
 from calib.fit.heldout import heldout_scores, worse_joint
 from calib.fit.sensor_fit import SensorFit
 from calib.fit.sweep_readings import sweep_readings
-from calib.install.check_motion import CheckMotion
+from calib.install.check_motion import CheckMotion, check_poses
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, GateRefused, Refusal, admit, admit_rollback
 from calib.records.records import ArmRecord, CalibrationRecord, GravityRecord
 from calib.records.store import RecordStore
+from calib.sweep.verify import run_verify
 from gcomp.arrays import Array
 from gcomp.identify.readings import StaticReadings
 
@@ -59,6 +62,29 @@ def apply_calibration(
     admitted = admit_sweeps(record, arm, store, data, fit.goodness.findings, how)
     beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
     return _write(lambda link: admitted, record, arm, store, beta, how, "sweeps")
+
+
+def apply_creep(record: CalibrationRecord, arm: ArmFile, store: RecordStore, fit: CreepFit, how: Apply) -> None:
+    """Make a record current that was fitted to creep sweeps; the host keeps it. The record is kept in any case.
+
+    With `how.check`, short creeps about the arm's present pose have to agree with it first. Raises Refused, BusFault.
+    """
+    _keep(record, arm, store, how)
+    check_holds(fit.findings, how.accepted)
+    admit(record, arm, store, how.replaced)
+    if how.check and fit.found_gain.any():
+        gravity, limits = fit.gravity.record(arm, record), DriveLimits.of(arm)
+        with open_arm(arm, how.bus) as link:
+            link.start()
+            link.enable()
+            found = run_verify(link, arm, gravity, record, at=lambda begin: check_poses(begin, limits))
+        worst = int(np.argmax(found.rms / found.tolerance))
+        if not found.passed:
+            raise Refused(
+                f"{found.names[worst]}: in the check motion {found.rms[worst]:.3f} N·m RMS against the model, allowed"
+                f" {found.tolerance[worst]:.3f}; record {record.id} is kept, and not made current"
+            )
+    store.activate(record.id, arm, how.by, "creep sweeps")
 
 
 def apply_field(

@@ -62,15 +62,20 @@ class SettleRule:
         covered = np.nanmax(position, axis=0) - np.nanmin(position, axis=0)
         if np.any(covered > np.maximum(2 * self.span, 1.5 * resolution)):
             return False
+        joints = zip(torque.T, self.standard_error, counts, strict=True)
+        return all(self._is_steady(x[np.isfinite(x)], error) for x, error, counted in joints if counted)
+
+    def _is_steady(self, torque: Array, standard_error: float) -> bool:
+        """Whether a joint's torque readings (k,) have settled; drives send them in all cycles, or in one of several."""
         half = len(torque) // 2
-        drift = np.nanmean(torque[half:], axis=0) - np.nanmean(torque[:half], axis=0)
-        spread = np.nanvar(torque, axis=0)
-        step = np.nanmean(np.diff(torque, axis=0) ** 2, axis=0) / 2
-        allowed = np.maximum(self.scatter**2 * step, (QUIET * self.standard_error) ** 2)
-        steady = drift**2 <= DRIFT**2 * np.maximum(step, self.standard_error**2) * 4 / len(torque)
-        return bool(np.all((spread <= allowed) & steady | ~counts))
+        if half < 2:
+            return False
+        drift, step = torque[half:].mean() - torque[:half].mean(), float(np.mean(np.diff(torque) ** 2)) / 2
+        allowed = max(self.scatter**2 * step, (QUIET * standard_error) ** 2)
+        steady = drift**2 <= DRIFT**2 * max(step, standard_error**2) * 4 / len(torque)
+        return bool(steady and torque.var() <= allowed)
 
     def exact(self, torque: Array, counts: Mask) -> bool:
         """Whether the mean of the torque samples (K, n) is as exact as asked for, in every joint that `counts`."""
-        error = np.nanstd(torque, axis=0, ddof=1) / np.sqrt(len(torque))
+        error = np.nanstd(torque, axis=0, ddof=1) / np.sqrt(np.isfinite(torque).sum(axis=0))
         return bool(np.all((error <= self.standard_error) | ~counts))

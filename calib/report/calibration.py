@@ -11,15 +11,15 @@ from markupsafe import Markup
 from armlink.arm_file import ArmFile
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.record import CreepCalibration
 from calib.dataset import SweepData
+from calib.fit.creep_fit import CreepFit
 from calib.fit.heldout import heldout_scores
 from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord
 from calib.report.figures import before_after_figure, creep_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
-from calib.report.page import ReportSection, bullets, html_of, paragraph, paragraphs, render, verdict_line
-from calib.report.tables import CREEP_HEADINGS, SENSOR_HEADINGS, ReportTable, interval_table
+from calib.report.page import ReportSection, html_of, paragraph, paragraphs, render, verdict_line
+from calib.report.tables import ReportTable, columns_of, interval_table
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
 
@@ -30,7 +30,7 @@ class Calibrated:
 
     arm: ArmFile
     data: Sequence[SweepData]
-    fit: SensorFit | CreepCalibration
+    fit: SensorFit | CreepFit
     record: CalibrationRecord
     before: CalibrationRecord | None
     """The current record until now; None if this is the first."""
@@ -45,9 +45,9 @@ def write_report(done: Calibrated, path: Path) -> None:
 
 def sections(done: Calibrated) -> list[ReportSection]:
     """The results, for a part of another report."""
-    if isinstance(done.fit, CreepCalibration):
-        return [_drives(done.fit, done.data), _creeps(done.fit)]
-    return [_comparison(done, done.fit), _sensors(done.fit), *_sweeps(done, done.fit), _left_out(done, done.fit)]
+    if isinstance(done.fit, CreepFit):
+        return [_values(done.fit), _creeps(done.fit)]
+    return [_comparison(done, done.fit), _values(done.fit), *_sweeps(done, done.fit), _left_out(done, done.fit)]
 
 
 def _identity(done: Calibrated) -> ReportSection:
@@ -100,18 +100,18 @@ def _advice(done: Calibrated, fit: SensorFit, broken: list[str]) -> Markup:
     return paragraph(f"{exactly}{without}. {next_step}") + html_of("<p><code>{}</code></p>", command)
 
 
-def _sensors(fit: SensorFit) -> ReportSection:
-    columns = {heading: (fit.value(key), fit.half95(key)) for key, heading in SENSOR_HEADINGS.items()}
-    columns |= {"residual RMS [N·m]": (fit.residual_rms, 0 * fit.residual_rms)}
-    columns |= {"hysteresis [N·m]": (fit.hysteresis, 0 * fit.hysteresis)}
-    table = interval_table(
-        fit.names, columns, "Estimates ± half of the 95 % interval; reading = gain · torque + offset."
-    )
+def _values(fit: SensorFit | CreepFit) -> ReportSection:
+    columns, text = columns_of(fit), "Estimates ± half of the 95 % interval."
     reasons = [f"{joint}, {parameter.replace('_', ' ')}: {why}." for (joint, parameter), why in fit.reasons.items()]
-    reasons += [f"{why}." for why in fit.imprecise.values()]
-    if fit.attachment is not None:
-        reasons.append(f"{fit.attachment_text[0].upper()}{fit.attachment_text[1:]}.")
-    return ReportSection("Sensors", paragraphs(reasons), (), [table])
+    if isinstance(fit, SensorFit):
+        text = "Estimates ± half of the 95 % interval; reading = gain · torque + offset."
+        columns |= {"residual RMS [N·m]": (fit.residual_rms, 0 * fit.residual_rms)}
+        columns |= {"hysteresis [N·m]": (fit.hysteresis, 0 * fit.hysteresis)}
+        reasons += [f"{why}." for why in fit.imprecise.values()]
+        if fit.attachment is not None:
+            reasons.append(f"{fit.attachment_text[0].upper()}{fit.attachment_text[1:]}.")
+    title = "Sensors" if isinstance(fit, SensorFit) else "Drives"
+    return ReportSection(title, paragraphs(reasons), (), [interval_table(fit.names, columns, text)])
 
 
 def _comparison(done: Calibrated, fit: SensorFit) -> ReportSection:
@@ -248,17 +248,8 @@ def _number(value: float | None, form: str) -> str:
     return "–" if value is None or not np.isfinite(value) else format(value, form)
 
 
-def _drives(fit: CreepCalibration, data: Sequence[SweepData]) -> ReportSection:
-    columns = {title: (fit.value(key), fit.half95(key)) for key, title in CREEP_HEADINGS.items()}
-    values = interval_table(fit.names, columns, "Estimates ± half of the 95 % interval.")
-    unknown = (f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items())
-    contacts = (each.reason for one in data for each in one.contacts)
-    return ReportSection("Drives", bullets([*unknown, *contacts]), (), [values])
-
-
-def _creeps(fit: CreepCalibration) -> ReportSection:
-    text = (
-        "At each position, half the sum of the readings up (▸) and down (◂) is gravity, and half their "
-        "difference is friction."
+def _creeps(fit: CreepFit) -> ReportSection:
+    text = "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
+    return ReportSection(
+        "Creep sweeps", paragraph(text) + paragraphs(each.text for each in fit.findings), [creep_figure(fit)]
     )
-    return ReportSection("Creep sweeps", paragraph(text) + paragraphs(fit.findings), [creep_figure(fit.fit)])

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from calib.creep.fit import CreepFit
+from calib.fit.creep_fit import CreepFit
 from calib.fit.sensor_fit import SensorFit
 from calib.sweep.verify import Verification
 from gcomp.arm.arm import Arm
@@ -73,13 +73,13 @@ def creep_figure(fit: CreepFit) -> Any:
     n, rows = len(fit.names), fit.rows
     figure = make_subplots(rows=n, cols=1, subplot_titles=[f"{name}: reading [N·m]" for name in fit.names])
     for joint in range(n):
-        own, place = np.flatnonzero(rows.joint == joint), {"row": joint + 1, "col": 1, "showlegend": False}
-        for number, sweep in enumerate(np.unique(rows.sweep[own])):
+        own, place = np.flatnonzero(rows.swept == joint), {"row": joint + 1, "col": 1, "showlegend": False}
+        for number, sweep in enumerate(np.unique(rows.readings.series[own])):
             paint = COLOURS[number % len(COLOURS)]
             for side, symbol in ((1.0, "triangle-right"), (-1.0, "triangle-left")):
-                at = own[(rows.sweep[own] == sweep) & (rows.side[own] == side)]
-                at = at[np.argsort(rows.position[at, joint])]
-                x, y, marker = rows.position[at, joint], rows.reading[at], {"symbol": symbol, "color": paint}
+                at = own[(rows.readings.series[own] == sweep) & (rows.side[own] == side)]
+                at = at[np.argsort(rows.readings.position[at, joint])]
+                x, y, marker = rows.readings.position[at, joint], rows.reading[at], {"symbol": symbol, "color": paint}
                 figure.add_scatter(x=x, y=y, mode="markers", marker=marker, **place)
                 figure.add_scatter(x=x, y=y - fit.solution.residual[at], mode="lines", line={"color": GREY}, **place)
     figure.update_xaxes(title_text="position reading [rad]", row=n)

@@ -6,16 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from calib.creep.record import Value
-from calib.records.records import Parameter
+from calib.fit.calibration import FittedCalibration
+from calib.fit.creep_fit import CreepFit
 
-SENSOR_HEADINGS: dict[Parameter, str] = {
-    "gain": "gain",
-    "offset": "offset [N·m]",
-    "position_gain": "position gain",
-}
+SENSOR_HEADINGS = {"gain": "gain", "offset": "offset [N·m]", "position_gain": "position gain"}
 """Parameters of torque and position sensors, as people read them."""
-CREEP_HEADINGS: dict[Value, str] = {
+CREEP_HEADINGS = {
     "gain": "reading per N·m (1/k)",
     "offset": "offset [N·m]",
     "position_offset": "zero [rad]",
@@ -35,6 +31,12 @@ class ReportTable:
     caption: str = ""
     texts: int = field(default=1, kw_only=True)
     """Number of text columns, from the left; the others are numbers, aligned right."""
+
+
+def columns_of(fit: FittedCalibration) -> dict[str, tuple[Any, Any]]:
+    """Heading → (value, half of its 95 % interval), (n,) each, of what people want to know of a calibration."""
+    headings = CREEP_HEADINGS if isinstance(fit, CreepFit) else SENSOR_HEADINGS
+    return {heading: (fit.value(name), fit.half95(name)) for name, heading in headings.items()}
 
 
 def interval_text(value: float, half: float) -> str:

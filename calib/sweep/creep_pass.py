@@ -4,12 +4,11 @@ import numpy as np
 
 from armlink.errors import Refused, Stall
 from armlink.link.guard import ReadingBounds
-from calib.creep.plan import RAMP, CreepGround, check_creep_limits, creep_ends, creep_speed, plan_creep
-from calib.creep.rows import bin_readings
 from calib.dataset import StallLine
 from calib.motion.mover import Stalled
-from calib.motion.static_reading import StaticReading
+from calib.motion.static_reading import StaticReading, bin_readings
 from calib.plan.collisions import check_creeps
+from calib.plan.creep_plan import RAMP, CreepGround, check_creep_limits, creep_ends, creep_speed, plan_creep
 from calib.plan.types import Sweep, SweepPlan
 from calib.sweep.sweep_pass import SweepPass
 from gcomp.arrays import Array

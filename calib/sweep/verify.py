@@ -18,9 +18,9 @@ from armlink.loop.driver import ArmDriver
 from armlink.torque_calibration import per_joint
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_motion, sweep_section
-from calib.creep.plan import CreepGround
 from calib.motion.mover import STALL, Mover, Stalled
 from calib.motion.static_reading import stack
+from calib.plan.creep_plan import CreepGround
 from calib.plan.poses import nearest_first, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.stalls import OnStall, give_up, repeat_work
@@ -95,11 +95,13 @@ def run_verify(
     *,
     poses: int = 24,
     seed: int = 0,
+    at: Callable[[Array], Array] | None = None,
     progress: Callable[[int, int], None] | None = None,
     on_stall: OnStall = give_up,
 ) -> Verification:
     """Drive, servo-held, to random poses within the joint range and read every torque there.
 
+    `at` chooses other poses (P, n) [rad] by the present one (n,).
     The link must have been enabled. Without a calibration record the controllers' own calibration is used; an arm that
     creeps needs one. A pose whose reading a Stall interrupts is repeated where `on_stall` accepts it. Raises Refused on
     records of another arm, or if no pose can be reached; BadInput, BusFault.
@@ -120,6 +122,8 @@ def run_verify(
         read_at, held_out = _half_sum_at, _creep_poses(CreepGround.of(arm_file), poses, seed, mover.position)
     else:
         read_at, held_out = _rest_at, verify_poses(limits, section, poses, seed, mover.position)
+    if at is not None:
+        held_out = at(mover.position)
     as_sent = np.isnan(calibration.values("gain")) if creeping and calibration is not None else np.zeros(link.n, bool)
     angles, torques = list[Array](), list[Array]()
     for number, pose in enumerate(held_out, start=1):

@@ -1,4 +1,4 @@
-"""Static readings, the input of every identification: one row per reading, one column per joint."""
+"""Readings at rest or in slow motion, the input of every identification: one row a reading, one column a joint."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
@@ -19,7 +19,7 @@ def _zero() -> Any:
 
 @dataclass(frozen=True, eq=False)
 class StaticReadings:
-    """K static readings of an arm of n joints. Raises BadArray on wrong shapes, infinite readings and sigma ≤ 0."""
+    """K readings at rest or in slow motion. Raises BadArray on wrong shapes, infinite readings and sigma ≤ 0."""
 
     position: Array
     """Raw position readings φ (K, n) [rad]."""
@@ -33,6 +33,11 @@ class StaticReadings:
     """Sign of each joint's last motion (K, n); 0 if it has not moved or that is not known."""
     series: NDArray[np.int64] = field(default_factory=_zero)
     """Number of the sweep or recording that a reading belongs to (K,)."""
+    velocity: Array = field(default_factory=_zero)
+    """Of each joint (K, n) [rad/s]; 0 at rest."""
+    warmth: Array = field(default_factory=_zero)
+    """How much warmer each drive was than at a reference (K, n) [K], or the share of the time since then if no
+    temperature is known."""
 
     def __post_init__(self) -> None:
         position = as_array("position", self.position, (None, None))
@@ -46,7 +51,10 @@ class StaticReadings:
         load = as_array("load", _spread(self.load, (count,)), (count,))
         direction = as_array("direction", _spread(self.direction, (count, n)), (count, n))
         series = np.asarray(as_array("series", _spread(self.series, (count,)), (count,)), dtype=np.int64)
+        velocity = as_array("velocity", _spread(self.velocity, (count, n)), (count, n))
+        warmth = as_array("warmth", _spread(self.warmth, (count, n)), (count, n))
         frozen(self, position=position, torque=torque, sigma=sigma, load=load, direction=direction, series=series)
+        frozen(self, velocity=velocity, warmth=warmth)
 
     @classmethod
     def of(cls, position: ArrayLike, torque: ArrayLike, sigma: ArrayLike, load: ArrayLike = 0.0) -> "StaticReadings":

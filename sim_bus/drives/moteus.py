@@ -121,7 +121,7 @@ class MoteusDrive(SimulatedDrive):
     def _write(self, values: dict[int, float]) -> list[Subframe]:
         """Take the registers of a frame; errors for those that cannot be written."""
         unknown = [number for number in values if number not in COMMANDS and number != MoteusRegister.MODE]
-        if MoteusRegister.MODE in values:
+        if MoteusRegister.MODE in values and not values[MoteusRegister.MODE] > max(MoteusMode):  # else it is refused
             self.command = COMMANDS | {number: value for number, value in values.items() if number in COMMANDS}
             self._enter(int(values[MoteusRegister.MODE]) if math.isfinite(values[MoteusRegister.MODE]) else 0)
         else:

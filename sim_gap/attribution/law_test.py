@@ -54,8 +54,7 @@ class LawTest:
         laws = [law for law in self.laws if not self._holds(law, own)]
         for law in choice.shortlist(rest, laws, TRIED):
             beside = [term for term in rest if term.place == law.place and not term.form.signature.whole_arm]
-            score = choice.judge(choice.pruned([*rest, law], beside))
-            worse = (score - choice.score) / choice.equations.measurements
+            worse = choice.loss(choice.judge(choice.pruned([*rest, law], beside)))
             best = min(best, StandIn(worse, law.effect), key=lambda each: each.worse)
         return best
 

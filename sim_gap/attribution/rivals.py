@@ -79,20 +79,16 @@ class Rivals:
         motion = SEPARATING_MOTION.get(frozenset({effect, confounded[0]}), GENERAL_MOTION)
         return Weighed(max(lost, 0.0), confounded, f"record {motion}")
 
-    def _worse(self, terms: Sequence[Term]) -> float:
-        """By how much other terms score worse than those chosen, per independent measurement."""
-        return (self.choice.judge(terms) - self.choice.score) / self.choice.equations.measurements
-
     def _replaced(self, term: Term) -> tuple[float, list[str]]:
         """Score lost without a term, if best replaced, and the effects that are as good in its place."""
         choice = self.choice
         rest = choice.without(term, choice.current)
-        lost = self._worse(rest)
+        lost = choice.loss(choice.judge(rest))
         enough = max(0.5 * lost, min(lost, BARE))
         weakest, rivals = lost, []
         for other in self._tried(term, rest):
             trial = choice.with_needs(other, rest)
-            worse = self._worse(trial)
+            worse = choice.loss(choice.judge(trial))
             if AS_GOOD <= worse < NEAR and _bends(term) and _bends(other):
                 worse = min(worse, self._refitted(trial, rest))
             weakest = min(weakest, worse)
@@ -122,7 +118,7 @@ class Rivals:
         start = {term: c for term, c in store.values.items() if term in rest}
         about, kept = converge(store.nominal or store, trial, start)
         again = TermChoice(TermEquations(about, kept), kept, self.choice.usual)
-        return (again.score - self.choice.score) / self.choice.equations.measurements
+        return self.choice.loss(again.score)
 
 
 def _bends(term: Term) -> bool:

@@ -15,8 +15,7 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import spec_of, with_effects
-from sim_gap.better_model.effects_module import joint_effects
-from sim_gap.better_model.export import Written, model_files
+from sim_gap.better_model.export import Written, joint_effects, model_files
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.preprocess import CHANNELS

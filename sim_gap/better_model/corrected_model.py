@@ -22,42 +22,15 @@ LEAST_SECOND_MOMENT = 1e-6
 """Least second moment of mass along a principal axis [kg·m²]."""
 
 
-@dataclass(frozen=True)
-class CoupledMotor:
-    """A motor that turns by q_joint + lever·q_other and so loads both joints."""
-
-    joint: str
-    other: str
-    lever: float
-    inertia: float
-    """[kg·m²]."""
-    coulomb: float
-    """[N·m]."""
-    viscous: float
-    """[N·m·s/rad]."""
-
-
-def coupled_motors(
-    sim: SimModel, estimate: EffectEstimate | None, chosen: Sequence[Term] | None = None
-) -> list[CoupledMotor]:
-    """Motors coupled to two joints, of an estimate or of some of its terms."""
-    every = () if estimate is None else estimate.terms if chosen is None else chosen
-    terms = [term for term in every if term.effect == "transmission.coupling"]
-    names = sim.arm.names
-    return [
-        CoupledMotor(names[t.place], names[int(t.shape[0]) - 1], t.shape[1], *estimate.of(t).tolist())
-        for t in terms
-        if estimate is not None
-    ]
-
-
-def add_to(spec: Any, motors: Sequence[CoupledMotor]) -> None:
-    for number, motor in enumerate(motors, start=1):
-        tendon = spec.add_tendon(name=f"motor_{number}_of_{motor.joint}_and_{motor.other}")
-        tendon.wrap_joint(motor.joint, 1.0)
-        tendon.wrap_joint(motor.other, motor.lever)
-        tendon.armature, tendon.frictionloss = motor.inertia, motor.coulomb
-        tendon.damping[0] = motor.viscous
+def add_motors(spec: Any, sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> None:
+    """Add the motors that turn with two joints, by q_joint + lever·q_other, and so load both."""
+    coupled = [term for term in terms if term.effect == "transmission.coupling"]
+    for number, term in enumerate(coupled, start=1):
+        joint, other = (sim.arm.names[place] for place in (term.place, int(term.shape[0]) - 1))
+        tendon = spec.add_tendon(name=f"motor_{number}_of_{joint}_and_{other}")
+        tendon.wrap_joint(joint, 1.0)
+        tendon.wrap_joint(other, term.shape[1])
+        tendon.armature, tendon.frictionloss, tendon.damping[0] = estimate.of(term).tolist()
 
 
 HELD = {
@@ -105,7 +78,7 @@ def with_effects(
     if estimate is None:
         return CorrectedModel(copy.copy(sim.mujoco_model), (), ())
     chosen = estimate.terms if terms is None else tuple(terms)
-    model, coupled = _base(sim, coupled_motors(sim, estimate, chosen))
+    model, coupled = _base(sim, estimate, chosen)
     bent = {term.place for term in chosen if term.effect in OF_READING}
     left_out = {
         *(term for term in chosen if term.effect == "transmission.coupling" and not coupled),
@@ -151,13 +124,18 @@ def _set_link(model: Any, joints: Sequence[int], link: int, added: Array) -> boo
             total = whole
             for other in fixed:
                 model.body_mass[other], model.body_inertia[other] = LEFT_KG, LEFT_KG
+    return set_body(model, body, anchor, total)
+
+
+def set_body(model: Any, body: int, anchor: Array, total: Array) -> bool:
+    """Give a body ten inertial parameters about a point of it, or the closest that can exist; whether it has them."""
     mass, centre, about = mass_centre_inertia(total)
     values, axes = np.linalg.eigh(about)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
-    model.body_mass[body], model.body_ipos[body] = mass, anchor + centre
-    model.body_inertia[body] = closest_possible(values)
+    possible = closest_possible(values)
+    model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = mass, anchor + centre, possible
     mujoco_quaternion(model.body_iquat[body], axes)
-    return bool(np.allclose(closest_possible(values), values, rtol=1e-3, atol=1e-9) and mass == total[0])
+    return bool(np.allclose(possible, values, rtol=1e-3, atol=1e-9) and mass == total[0])
 
 
 def _fixed_to(model: Any, body: int, joints: Sequence[int]) -> list[int]:
@@ -211,12 +189,12 @@ def in_model(term: Term, number: int) -> bool:
     )
 
 
-def _base(sim: SimModel, motors: list[CoupledMotor]) -> tuple[Any, bool]:
-    """A copy of the nominal model with these motors, and whether it has them (only a model from a file can)."""
-    if not motors or sim.path is None:
+def _base(sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term]) -> tuple[Any, bool]:
+    """A copy of the nominal model with its coupled motors, and whether it has any (only a model from a file can)."""
+    if sim.path is None or not any(term.effect == "transmission.coupling" for term in terms):
         return copy.copy(sim.mujoco_model), False
     spec = spec_of(sim)
-    add_to(spec, motors)
+    add_motors(spec, sim, estimate, terms)
     return spec.compile(), True
 
 
@@ -235,6 +213,32 @@ def compiled_copy(spec: Any) -> Any:
     own = spec.copy()
     own.compile()
     return own
+
+
+def write_changes(spec: Any, sim: SimModel, model: Any) -> None:
+    """Write what a copy of the compiled model has of the arm's joints and links into its file's specification: one way
+    to a file for what torques and what positions have shown."""
+    nominal = sim.mujoco_model
+    fields = ("body_mass", "body_ipos", "body_inertia", "body_iquat", "body_gravcomp")
+    changed = {
+        i for field in fields for i in np.argwhere(getattr(model, field) != getattr(nominal, field))[:, 0].tolist()
+    }
+    for body in spec.bodies:
+        if (i := body.id) in changed:
+            body.explicitinertial, body.fullinertia = True, [np.nan] * 6
+            body.mass, body.ipos, body.iquat = float(model.body_mass[i]), model.body_ipos[i], model.body_iquat[i]
+            body.inertia, body.gravcomp = model.body_inertia[i], float(model.body_gravcomp[i])
+    for number in sim.joints:
+        joint, dof, adr = spec.joints[number], model.jnt_dofadr[number], model.jnt_qposadr[number]
+        unit = float(np.degrees(1.0)) if joint.compiler.degree else 1.0
+        joint.frictionloss, joint.armature = float(model.dof_frictionloss[dof]), float(model.dof_armature[dof])
+        joint.damping[0] = float(linear_part(model.dof_damping, model.nv)[dof])
+        joint.stiffness[0] = float(linear_part(model.jnt_stiffness, model.njnt)[number])
+        joint.springref, joint.ref = unit * float(model.qpos_spring[adr]), unit * float(model.qpos0[adr])
+        joint.solref_friction, joint.solimp_friction = model.dof_solref[dof], model.dof_solimp[dof]
+        joint.range = unit * model.jnt_range[number] if model.jnt_limited[number] else joint.range
+        joint.actfrcrange = model.jnt_actfrcrange[number] if model.jnt_actfrclimited[number] else joint.actfrcrange
+    spec.option.gravity = model.opt.gravity
 
 
 def offsets(estimate: EffectEstimate, held: Sequence[Term]) -> dict[int, float]:

@@ -1,25 +1,29 @@
 """Export of the corrected model (`--out-model`): MJCF, and a module for the effects that MJCF cannot hold."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
-from sim_gap.better_model.corrected_model import add_to, compiled_copy, coupled_motors, spec_of, with_effects
-from sim_gap.better_model.effects_module import joint_effects, module_path, module_text
+from sim_gap.better_model import forward_effects
+from sim_gap.better_model.corrected_model import (
+    add_motors,
+    compiled_copy,
+    offsets,
+    spec_of,
+    with_effects,
+    write_changes,
+)
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import DRIVE, LONGEST_STEP_S, motors_of, put_drive
 from sim_gap.better_model.urdf import URDF, urdf_of, xml_comment
-from sim_gap.model.load import SimModel, linear_part, urdf_behind
+from sim_gap.effects.torque import is_gradual
+from sim_gap.model.load import SimModel, urdf_behind
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.term import Term
-
-HINGE = 3
-"""MuJoCo's number of this type of joint."""
 
 
 @dataclass(frozen=True)
@@ -56,18 +60,15 @@ def model_files(
     chosen = () if estimate is None else estimate.terms if terms is None else tuple(terms)
     spec = spec_of(sim) if spec is None else compiled_copy(spec)
     corrected = with_effects(sim, estimate, chosen, number, mount)
-    for body in list(spec.bodies)[1:]:
-        _set_inertial(body, corrected.model)
-    for joint in spec.joints:
-        _set_joint(joint, corrected.model, spec.compiler.degree)
-    add_to(spec, coupled_motors(sim, estimate, chosen))
+    write_changes(spec, sim, corrected.model)
+    if estimate is not None:
+        add_motors(spec, sim, estimate, chosen)
     motors, drives = motors_of(spec), _drives(sim, estimate, chosen)
     for joint, drive in drives.items():
         if joint in motors:
             put_drive(motors[joint], drive)
     if any("actuator.delay" in drive and joint in motors for joint, drive in drives.items()):
         spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
-    spec.option.gravity = corrected.model.opt.gravity
     spec.compile()
     left = [t for t in corrected.not_held if t.effect not in DRIVE or sim.arm.names[t.place] not in motors]
     lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
@@ -94,19 +95,74 @@ def write_model(
     if the nominal model did not come from a file or a file cannot be written.
     """
     files = model_files(sim, estimate, path.name, laws=laws)
-    text, lines = files.xml, files.lines
+    beside = {module_path(path): files.module or None}
+    return write_files(path, sim, files.xml, files.spec.compile, files.lines, beside)
+
+
+def write_files(
+    path: Path,
+    sim: SimModel,
+    xml: str,
+    compiled: Callable[[], Any],
+    lines: Sequence[str],
+    beside: Mapping[Path, str | None],
+) -> list[str]:
+    """Write a corrected model, its MJCF or if the path ends so URDF, and texts beside it; None removes a file of an
+    earlier model. Returns a line for all that the file cannot hold, `lines` first. Raises BadInput."""
     if path.suffix == URDF:
-        text, lines = urdf_of(files.spec.compile(), urdf_behind(sim.path), lines)
+        xml, lines = urdf_of(compiled(), urdf_behind(sim.path), lines)
     try:
-        write_whole(path, text)
-        module = module_path(path)
-        if files.module:
-            write_whole(module, files.module)
-        else:
-            module.unlink(missing_ok=True)
+        for file, text in {path: xml, **beside}.items():
+            if text is None:
+                file.unlink(missing_ok=True)
+            else:
+                write_whole(file, text)
     except OSError as error:
         raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
-    return lines
+    return list(lines)
+
+
+def module_path(model: Path) -> Path:
+    """Path of the module of a written model: `closed.xml` → `closed_effects.py`."""
+    return model.with_name(f"{model.stem}_effects.py")
+
+
+def joint_effects(
+    sim: SimModel, estimate: EffectEstimate, terms: Sequence[Term], held: Sequence[Term] = ()
+) -> list[JointEffect]:
+    """The terms in the module's form, beside a model with those `held`; without those present in one recording alone.
+
+    Without a torque sensor, an offset of the motor's torque is torque lost. A ripple follows the position as the model
+    has it: as it is read, if the model holds an offset of that.
+    """
+    out: list[JointEffect] = []
+    zeros = offsets(estimate, held)
+    for term in terms:
+        if term.bound:
+            continue
+        values = {name: each.value for name, each in estimate.parameters(term).items()}
+        if term.effect == "torque.offset" and estimate.store.data.layout.sensor is None:
+            values = {"lost": values["offset"]}
+        if term.effect == "torque.hysteresis" and is_gradual(term.shape):
+            values["gradual"] = 1.0
+        if term.effect == "transmission.ripple":
+            values["phase"] += values["cycles"] * zeros.get(term.place, 0.0)
+        out.append((term.effect, sim.arm.names[term.place], values))
+    return out
+
+
+def module_text(sim: SimModel, effects: Sequence[JointEffect], model: str) -> str:
+    """Source of the module with the effects that the MJCF file `model` cannot hold; it imports none of ours."""
+    rows = "".join(f"    {each!r},\n" for each in effects)
+    text = Path(forward_effects.__file__).read_text(encoding="utf-8")
+    values = {
+        "from gcomp.arrays import Array": "Array = np.ndarray",
+        'MODEL = ""': f"MODEL = {model!r}",
+        "JOINTS: tuple[str, ...] = ()": f"JOINTS = {sim.arm.names!r}",
+        "EFFECTS: tuple[JointEffect, ...] = ()": f"EFFECTS = (\n{rows})",
+    }
+    declared = "|".join(map(re.escape, values))  # in one pass: what is filled in is not searched
+    return re.sub(f"^(?:{declared})$", lambda found: values[found[0]], text, flags=re.MULTILINE)
 
 
 def _drives(sim: SimModel, estimate: EffectEstimate | None, terms: Sequence[Term]) -> dict[str, dict[str, float]]:
@@ -124,24 +180,3 @@ def _line(sim: SimModel, estimate: EffectEstimate, term: Term) -> str:
     where = f"in recording {', '.join(map(str, term.bound))}" if term.bound else sim.arm.names[term.place]
     listed = (f"{name} {v.value:.6g}" + (f" {v.unit}" if v.unit != "1" else "") for name, v in values.items())
     return f"{term.effect} {where} " + ", ".join(listed)
-
-
-def _set_inertial(body: Any, model: Any) -> None:
-    i = body.id
-    body.explicitinertial = True
-    body.mass, body.ipos, body.iquat = float(model.body_mass[i]), model.body_ipos[i], model.body_iquat[i]
-    body.inertia = model.body_inertia[i]
-    body.fullinertia = [np.nan] * 6
-
-
-def _set_joint(joint: Any, model: Any, degrees: bool) -> None:
-    """Give a joint of a file what the compiled one has; angles in the file's unit."""
-    dof, adr = model.jnt_dofadr[joint.id], model.jnt_qposadr[joint.id]
-    joint.frictionloss, joint.armature = float(model.dof_frictionloss[dof]), float(model.dof_armature[dof])
-    joint.damping[0] = float(linear_part(model.dof_damping, model.nv)[dof])
-    joint.stiffness[0] = float(linear_part(model.jnt_stiffness, model.njnt)[joint.id])
-    unit = float(np.degrees(1.0)) if degrees and model.jnt_type[joint.id] == HINGE else 1.0
-    joint.springref, zero = unit * float(model.qpos_spring[adr]), unit * float(model.qpos0[adr])
-    if not np.isclose(zero, joint.ref, rtol=1e-9, atol=1e-12):
-        joint.ref = zero
-        joint.range = unit * model.jnt_range[joint.id] if model.jnt_limited[joint.id] else joint.range

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy import constants
 
 from gcomp.arrays import Array
-
-GRAVITY = 9.80665
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +95,7 @@ def draw_arm(random: np.random.Generator, joints: int | None = None) -> BenchArm
         frictionloss=lossy * np.geomspace(2.0, 0.2, n) * random.uniform(0.5, 1.5, n),
         lower=np.round(centre - half, 3),
         upper=np.round(centre + half, 3),
-        gravity=_mounting(random) @ np.array([0.0, 0.0, -GRAVITY]),
+        gravity=_mounting(random) @ np.array([0.0, 0.0, -constants.g]),
     )
 
 

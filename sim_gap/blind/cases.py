@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -17,24 +17,23 @@ import numpy as np
 from armlink.recording.csv_text import write_numbers
 from gcomp.arrays import Array
 from sim_bus.effects.registry import imperfections
-from sim_gap.blind.arms import BenchArm, compile_arm, inverse, mjcf
-from sim_gap.blind.effects.drawn_effect import DrawnEffect, Values
-from sim_gap.blind.motion import RATE
-from sim_gap.blind.plant import Log, PlantRun, TrueArm, columns_at, controller_bandwidth, record, simulate, true_arm
+from sim_gap.blind.arms import BenchArm, inverse, mjcf
+from sim_gap.blind.effects.drawn_effect import DrawnEffect
+from sim_gap.blind.motion import RATE, RECORDED_HZ
+from sim_gap.blind.plant import TrueArm, columns_at, controller_bandwidth, record, simulate, true_arm
 from sim_gap.blind.recipe import CaseDrawing, CaseRecipe, draw, recipes, servo_recipes
-from sim_gap.blind.servo_plant import ServoRun, record_servos, simulate_servos
+from sim_gap.blind.scene import LEAST_SPEED
+from sim_gap.blind.servo_plant import record_servos, simulate_servos
 
-RECORDED_HZ, SERVO_HZ = 250.0, (50.0, 100.0)
-"""Rates of the recordings with torques, and of positions alone [Hz]."""
+SERVO_HZ = 50.0, 100.0
+"""Rates of the recordings of positions alone [Hz]."""
 BAND_HZ = 6.0
 """Band in which a gap counts [Hz]."""
-REVERSAL_SPEED = 0.02
-"""Speed over which nominal friction changes sign [rad/s]."""
 VISIBLE_RATIO, VISIBLE_LEAST, VISIBLE_COUNTS = 3.0, 0.08, 2.0
 """Least factor on some held-out gap, and least increase of it by a visible effect: [N·m], and of positions alone counts
 of the encoder."""
-MOVING = 0.03
-"""Motor channels count only above this speed [rad/s]: at rest friction is undetermined."""
+CHANNEL_SHARES = {"dq": 0.5, "q_cmd": 0.8, "tau_cmd": 0.8}
+"""Channel that not every case has → share of those that do; that of tau_cmd is 1 for effects of drives."""
 ROUNDS = 4
 """Number of drawings of a case that does not show its effects."""
 FOLLOWED, SERVO_FOLLOWED = 0.3, 0.6
@@ -47,7 +46,7 @@ Columns = dict[str, Array]
 Gap = dict[str, list[float]]
 
 
-def gap(arm: BenchArm, columns: Columns) -> Gap:
+def gap(model: Any, arm: BenchArm, columns: Columns) -> Gap:
     """RMS [N·m] per joint of `tau`, `tau_motor` and `tau_cmd` against the nominal model, below 6 Hz."""
     from scipy.signal import butter, sosfiltfilt
 
@@ -57,16 +56,16 @@ def gap(arm: BenchArm, columns: Columns) -> Gap:
     q = sosfiltfilt(butter(4, 15.0, fs=RECORDED_HZ, output="sos"), even["q"], axis=0)
     v = np.gradient(q, 1.0 / RECORDED_HZ, axis=0)
     a = np.gradient(v, 1.0 / RECORDED_HZ, axis=0)
-    motor = inverse(compile_arm(arm), q, v, a)
+    motor = inverse(model, q, v, a)
     link = motor - arm.armature * a
-    motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / REVERSAL_SPEED)
+    motor = motor + arm.damping * v + arm.frictionloss * np.tanh(v / LEAST_SPEED)
     out = {}
-    for channel, model in (("tau", link), ("tau_motor", motor), ("tau_cmd", motor)):
-        rest = sosfiltfilt(low, even[channel] - model, axis=0)[100:-100]
-        counts = (np.abs(v[100:-100]) > MOVING) if channel != "tau" else np.ones(rest.shape, bool)
-        out[channel] = [
-            float(np.sqrt((x[c] ** 2).mean())) if c.any() else 0.0 for x, c in zip(rest.T, counts.T, strict=True)
-        ]
+    for channel, nominal in (("tau", link), ("tau_motor", motor), ("tau_cmd", motor)):
+        rest = sosfiltfilt(low, even[channel] - nominal, axis=0)[100:-100]
+        # at rest friction is undetermined, which no sensor on the link reads
+        counts = (np.abs(v[100:-100]) > LEAST_SPEED) | (channel == "tau")
+        mean = np.where(counts, rest**2, 0.0).sum(0) / np.maximum(counts.sum(0), 1)
+        out[channel] = np.sqrt(mean).tolist()
     return out
 
 
@@ -81,44 +80,171 @@ def largest_fall(before: Gap, after: Gap) -> dict[str, Any]:
     return {"channel": channel, "joint": f"joint_{j + 1}", "before": b, "after": a, "shrink": 1.0 - a / max(b, 1e-9)}
 
 
-def is_visible(fall: dict[str, Any], least: float = VISIBLE_LEAST) -> bool:
+def is_visible(fall: dict[str, Any], least: float) -> bool:
     """Whether the gap caused by an effect exceeds that of every arm clearly."""
     return bool(fall["before"] > VISIBLE_RATIO * fall["after"] and fall["before"] - fall["after"] > least)
 
 
 @dataclass(frozen=True)
-class MadeCase:
-    """A case as it is written: the model, recordings, and what its label has beside the drawing."""
+class Trial:
+    """One motion of a true arm."""
 
-    sim: str
-    train: Columns
-    heldout: Columns
-    label: dict[str, Any]
-    clear: bool
-    """Whether its effects show in the held-out data, and its arm stayed under control."""
+    columns: Columns
+    """Of its recording."""
+    position: Array
+    """Exact readings at `motion.RATE` (K, n) [rad]."""
+    is_steady: bool
+    """Whether the arm followed its command without oscillation."""
+
+
+class Rig:
+    """The arm of a drawing, with any effects."""
+
+    missing = frozenset[str]()
+    """Channels that are not recorded."""
+
+    def __init__(self, drawing: CaseDrawing) -> None:
+        self.drawing, self.scene = drawing, drawing.scene
+        self.seed = int(drawing.random.integers(2**31))
+
+    def truth(self, effects: Sequence[DrawnEffect]) -> TrueArm:
+        return true_arm(self.scene.arm, self.scene.rated, np.random.default_rng(self.seed), effects)
+
+    def noise(self, number: int) -> np.random.Generator:
+        return np.random.default_rng([*self.drawing.recipe.seed, self.drawing.attempt, number])
+
+
+class TorqueRig(Rig):
+    """With torque sensors, under a controller with feed-forward."""
+
+    least_fall = VISIBLE_LEAST
+
+    def __init__(self, drawing: CaseDrawing) -> None:
+        super().__init__(drawing)
+        self.bandwidth = controller_bandwidth(self.truth(drawing.drawn))  # the same controller for all runs
+        missing = {name for name, share in CHANNEL_SHARES.items() if drawing.random.random() >= share}
+        of_drives = any(effect.startswith("actuator") for effect in drawing.recipe.effects)
+        self.missing = frozenset(missing - {"tau_cmd"} if of_drives else missing)
+        self.sim, self.label = mjcf(self.scene.arm), label_of(drawing)
+
+    def run(self, number: int, command: Array, effects: Sequence[DrawnEffect]) -> Trial:
+        """The command of motion `number` under these effects."""
+        truth = self.truth(effects)
+        log = simulate(truth, self.scene, command, self.bandwidth, self.seed + number)
+        oscillating = np.abs(np.diff(log.motor, 2, axis=0)).mean(0) > 0.25 * log.motor.std(0) + 0.1
+        is_steady = bool(np.abs(log.position - command).max() < FOLLOWED and not oscillating.any())
+        return Trial(record(truth, command, log, self.noise(1000 + number)), log.position, is_steady)
+
+    def gap(self, trial: Trial) -> Gap:
+        return gap(self.scene.model, self.scene.arm, trial.columns)
+
+
+class ServoRig(Rig):
+    """With position servos, of which the model may know, and no torques."""
+
+    def __init__(self, drawing: CaseDrawing) -> None:
+        super().__init__(drawing)
+        arm, law = drawing.nominal, drawing.scene.law
+        assert law is not None
+        self.law, self.limit, self.hz = law, 2.0 * self.scene.rated, float(drawing.random.choice(SERVO_HZ))
+        self.encoder_step = 2 * np.pi / 2 ** int(drawing.random.integers(12, 16))
+        self.least_fall = VISIBLE_COUNTS * self.encoder_step
+        self.small = np.random.default_rng([self.seed, 5]).uniform(0.99, 1.01, (2, arm.n))
+        known = bool(drawing.recipe.controller_known)
+        rows = [
+            f'<position name="{name}" joint="{name}" kp="{kp:.9g}" kv="{kv:.9g}" forcerange="{-top:.9g} {top:.9g}"/>'
+            for name, kp, kv, top in zip(arm.names, law.stiffness, law.damping, self.limit, strict=True)
+        ]
+        self.sim = mjcf(arm, ["<actuator>", *rows, "</actuator>"] if known else ())
+        self.label = {**label_of(drawing), "controller_known": known}
+        for effect in self.label["effects"]:
+            self._report_whole(effect)
+
+    def _report_whole(self, told: dict[str, Any]) -> None:
+        """Friction and inertia are answered as all of a joint's, with what the model has of it."""
+        truth, names = self.truth(self.drawing.drawn), self.drawing.nominal.names
+        servo = self.law.damping * self.small[1] if self.label["controller_known"] else 0.0
+        whole = {
+            "friction.coulomb": ("torque", truth.state.coulomb),
+            "friction.viscous": ("damping", truth.state.viscous + servo),
+            "actuator.rotor_inertia": ("inertia", truth.arm.armature + truth.state.rotor_inertia),
+        }
+        if told["effect"] in whole:
+            name, values = whole[told["effect"]]
+            told["parameters"] = {joint: {name: float(values[names.index(joint)])} for joint in told["parameters"]}
+
+    def truth(self, effects: Sequence[DrawnEffect]) -> TrueArm:
+        truth = super().truth(effects)
+        truth.state.actuator_saturation = np.minimum(truth.state.actuator_saturation, self.limit)
+        return truth
+
+    def run(self, number: int, command: Array, effects: Sequence[DrawnEffect]) -> Trial:
+        """The command of motion `number`, sent with each row and held until the next, under these effects."""
+        law, held = deepcopy(self.law), self.held(command)
+        law.stiffness *= self.small[0]
+        law.damping *= self.small[1]
+        for effect in effects:
+            effect.law(law)
+        position = simulate_servos(self.truth(effects), held, law)
+        columns = record_servos(held, position, self.hz, self.encoder_step, self.noise(2000 + number))
+        return Trial(columns, position, bool(np.abs(position - held).max() < SERVO_FOLLOWED))
+
+    def held(self, command: Array) -> Array:
+        rows = round(RATE / self.hz)
+        return command[np.arange(len(command)) // rows * rows]
+
+    @cached_property
+    def ideal(self) -> Array:
+        """Held-out positions of the nominal model (K, n) [rad]."""
+        arm = self.scene.arm
+        state = imperfections(arm.names, ())
+        state.coulomb, state.viscous, state.actuator_saturation = arm.frictionloss, arm.damping, self.limit
+        return simulate_servos(replace(self.truth(()), arm=arm, state=state), self.held(self.drawing.heldout), self.law)
+
+    def gap(self, trial: Trial) -> Gap:
+        """RMS [rad] of held-out positions against those of the nominal model."""
+        judged = slice(round(SETTLING_S * RATE), None)
+        return {"q": np.sqrt(np.mean((trial.position - self.ideal)[judged] ** 2, axis=0)).tolist()}
 
 
 def make_case(recipe: CaseRecipe, out: Path, labels: Path, train_s: float, heldout_s: float) -> None:
     """Draw, simulate and write a case: `out/case_XXXX/{sim.xml,train.csv,heldout.csv}`, `labels/case_XXXX.json`.
 
-    It is drawn again if it is not clear, and left out if no arm shows its effects.
+    It is drawn again if its effects do not show in the held-out data or its arm is not steady, and left out if no arm
+    can show them.
     """
-    make, first = _servo_case if recipe.servos else _torque_case, 0
-    for last in (*[False] * (ROUNDS - 1), True):
+    first = 0
+    for _ in range(ROUNDS):
         drawing = draw(recipe, train_s, heldout_s, first)
-        if drawing is None:
+        if drawing is None or write_case(drawing, out / recipe.name, labels / f"{recipe.name}.json"):
             return
-        first, made = drawing.attempt + 1, make(drawing, last)
-        if made is not None and (made.clear or last):
-            folder = out / recipe.name
-            folder.mkdir(parents=True, exist_ok=True)
-            labels.mkdir(parents=True, exist_ok=True)
-            (folder / "sim.xml").write_text(made.sim, encoding="utf-8")
-            write_csv(folder / "train.csv", made.train)
-            write_csv(folder / "heldout.csv", made.heldout)
-            label = {**label_of(drawing), **made.label, "clear": made.clear}
-            (labels / f"{recipe.name}.json").write_text(json.dumps(label, indent=1), encoding="utf-8")
-            return
+        first = drawing.attempt + 1
+
+
+def write_case(drawing: CaseDrawing, folder: Path, label: Path) -> bool:
+    """Simulate and write one drawing; whether it was: it is not if some effect does not show by itself."""
+    rig: TorqueRig | ServoRig = (ServoRig if drawing.recipe.servos else TorqueRig)(drawing)
+    drawn, several = drawing.drawn, drawing.recipe.several
+    sets: list[tuple[DrawnEffect, ...]] = [drawn, *([(each,) for each in drawn] if len(drawn) > 1 else ()), ()]
+    trials = [rig.run(1, drawing.heldout, effects) for effects in sets]
+    gaps = [rig.gap(trial) for trial in trials]
+    # channels that are not recorded do not make a case clear
+    *alone, sound = [{name: rms for name, rms in each.items() if name not in rig.missing} for each in gaps]
+    falls = [largest_fall(each, sound) for each in alone[-len(drawn) :] if drawn]
+    if not (several or all(is_visible(fall, rig.least_fall) for fall in falls)):
+        return False
+    training = rig.run(0, drawing.scene.command, drawn)
+    if not all(trial.is_steady for trial in (training, *trials)):
+        return False
+    for path in (folder, label.parent):
+        path.mkdir(parents=True, exist_ok=True)
+    (folder / "sim.xml").write_text(rig.sim, encoding="utf-8")
+    for name, trial in (("train", training), ("heldout", trials[0])):
+        recorded = {channel: values for channel, values in trial.columns.items() if channel not in rig.missing}
+        write_csv(folder / f"{name}.csv", recorded)
+    told = {"gap": {"with": gaps[0], "without": gaps[-1], "falls": falls}, "clear": True}
+    label.write_text(json.dumps({**rig.label, **told}, indent=1), encoding="utf-8")
+    return True
 
 
 def label_of(drawing: CaseDrawing) -> dict[str, Any]:
@@ -144,130 +270,6 @@ def label_of(drawing: CaseDrawing) -> dict[str, Any]:
         "effects": effects,
         "motions": {name: list(kinds) for name, kinds in drawing.motions.items()},
     }
-
-
-def _torque_case(drawing: CaseDrawing, last: bool) -> MadeCase | None:
-    """The held-out motion with all effects against that without each in turn (of several: with each alone), and without
-    any; None before the training motion if they do not show, unless it is the last attempt."""
-    scene, drawn, random, several = drawing.scene, drawing.drawn, drawing.random, bool(drawing.recipe.several)
-    seed = int(random.integers(2**31))
-
-    def truth(effects: Sequence[DrawnEffect]) -> TrueArm:
-        return true_arm(scene.arm, scene.rated, np.random.default_rng(seed), effects)
-
-    def run(effects: Sequence[DrawnEffect], number: int) -> PlantRun:
-        command = (scene.command, drawing.heldout)[number]
-        bandwidth = controller_bandwidth(truth(drawn))  # the same controller for all runs
-        return PlantRun(truth(effects), command, scene.feed_forward(command), scene.inertia, bandwidth, seed + number)
-
-    shares = {"dq": 0.5, "q_cmd": 0.8, "tau_cmd": 0.8}
-    missing = {name for name, share in shares.items() if random.random() >= share}
-    if any(effect.startswith("actuator") for effect in drawing.recipe.effects):
-        missing.discard("tau_cmd")
-
-    def recorded(run: PlantRun, log: Log, number: int) -> Columns:
-        noise = np.random.default_rng([*drawing.recipe.seed, drawing.attempt, 1000 + number])
-        return record(run, log, RECORDED_HZ, noise)
-
-    some = [(each,) if several else tuple(d for d in drawn if d is not each) for each in drawn]
-    runs = [run(effects, 1) for effects in (drawn, *(some if several or len(drawn) > 1 else ()), ())]
-    logs = [simulate(each) for each in runs]
-    columns = [recorded(each, log, 1) for each, log in zip(runs, logs, strict=True)]
-    gaps = [gap(scene.arm, each) for each in columns]
-    # channels that are not recorded do not make a case clear
-    seen = [{name: values for name, values in each.items() if name not in missing} for each in gaps]
-    others = seen[1 : 1 + len(drawn)]
-    falls = [largest_fall(each, seen[-1]) if several else largest_fall(seen[0], each) for each in others]
-    clear = all(_is_steady(*each) for each in zip(runs, logs, strict=True))
-    clear = clear and (several or all(is_visible(fall) for fall in falls))
-    if not (clear or last):
-        return None
-    training = run(drawn, 0)
-    log = simulate(training)
-    train, heldout = (
-        {name: values for name, values in each.items() if name not in missing}
-        for each in (recorded(training, log, 0), columns[0])
-    )
-    label = {"gap": {"with": gaps[0], "without": gaps[-1], "falls": falls}}
-    return MadeCase(mjcf(scene.arm), train, heldout, label, clear and _is_steady(training, log))
-
-
-def _is_steady(run: PlantRun, log: Log) -> bool:
-    """Whether the controller followed its trajectory without oscillation."""
-    oscillating = np.abs(np.diff(log.motor, 2, axis=0)).mean(0) > 0.25 * log.motor.std(0) + 0.1
-    return bool(np.abs(log.position - run.command).max() < FOLLOWED and not oscillating.any())
-
-
-def _servo_case(drawing: CaseDrawing, last: bool) -> MadeCase | None:
-    """The held-out motion with the effect and without, each against that of the nominal model; None before the training
-    motion if they do not differ, unless it is the last attempt."""
-    scene, drawn, random, names = drawing.scene, drawing.drawn, drawing.random, drawing.nominal.names
-    assert scene.law is not None
-    nominal, law, limit = scene.arm, scene.law, 2.0 * scene.rated
-    seed, hz, bits = int(random.integers(2**31)), float(random.choice(SERVO_HZ)), int(random.integers(12, 16))
-    hold = round(RATE / hz)  # the command is sent with each row, and holds until the next
-    paths = [path[np.arange(len(path)) // hold * hold] for path in (scene.command, drawing.heldout)]
-    small = np.random.default_rng([seed, 5]).uniform(0.99, 1.01, (2, nominal.n))
-
-    def run(number: int, effects: Sequence[DrawnEffect], perfect: bool = False) -> ServoRun:
-        truth = replace(true_arm(nominal, scene.rated, np.random.default_rng(seed), effects), encoder_bits=bits)
-        off = np.ones_like(small) if perfect else small
-        own = deepcopy(law)
-        own.stiffness *= off[0]
-        own.damping *= off[1]
-        for effect in effects:
-            effect.law(own)
-        if perfect:
-            truth = replace(truth, arm=nominal, state=imperfections(names, ()))
-            truth.state.coulomb, truth.state.viscous = nominal.frictionloss, nominal.damping
-        truth.state.actuator_saturation = np.minimum(truth.state.actuator_saturation, limit)
-        return ServoRun(truth, paths[number], own, seed + number)
-
-    runs = [run(1, drawn), run(1, ()), run(1, (), perfect=True)]
-    positions = [simulate_servos(each) for each in runs]
-    real, without, ideal = (each[round(SETTLING_S * RATE) :] for each in positions)
-    gaps: list[Gap] = [{"q": np.sqrt(np.mean((each - ideal) ** 2, axis=0)).tolist()} for each in (real, without)]
-    falls = [largest_fall(*gaps)] * len(drawn)
-    clear = all(np.abs(q - paths[1]).max() < SERVO_FOLLOWED for q in positions)
-    clear = clear and all(is_visible(fall, VISIBLE_COUNTS * runs[0].truth.encoder_step) for fall in falls)
-    if not (clear or last):
-        return None
-    training = run(0, drawn)
-    trained = simulate_servos(training)
-    train, heldout = (
-        record_servos(each, q, hz, np.random.default_rng([*drawing.recipe.seed, 2000 + number]))
-        for number, (each, q) in enumerate(((training, trained), (runs[0], positions[0])))
-    )
-    known = bool(drawing.recipe.controller_known)
-    rows = [
-        f'<position name="{name}" joint="{name}" kp="{kp:.9g}" kv="{kv:.9g}" forcerange="{-top:.9g} {top:.9g}"/>'
-        for name, kp, kv, top in zip(names, law.stiffness, law.damping, limit, strict=True)
-    ]
-    label: dict[str, Any] = {"controller_known": known, "gap": {"with": gaps[0], "without": gaps[1], "falls": falls}}
-    if drawn:
-        whole = label_of(drawing)["effects"][0]
-        label["effects"] = [{**whole, "parameters": _whole_parameters(drawn[0], training, names, known)}]
-    return MadeCase(
-        mjcf(nominal, ["<actuator>", *rows, "</actuator>"] if known else ()),
-        train,
-        heldout,
-        label,
-        clear and bool(np.abs(trained - paths[0]).max() < SERVO_FOLLOWED),
-    )
-
-
-def _whole_parameters(effect: DrawnEffect, run: ServoRun, names: Sequence[str], known: bool) -> dict[str, Values]:
-    """Parameters as they are answered: all of a joint's friction and inertia, with what the model has of it."""
-    arm, state = run.truth.arm, run.truth.state
-    whole = {
-        "friction.coulomb": ("torque", state.coulomb),
-        "friction.viscous": ("damping", state.viscous + (run.law.damping if known else 0.0)),
-        "actuator.rotor_inertia": ("inertia", arm.armature + state.rotor_inertia),
-    }
-    if effect.effect not in whole:
-        return effect.parameters
-    name, values = whole[effect.effect]
-    return {joint: {name: float(values[names.index(joint)])} for joint in effect.parameters}
 
 
 def write_csv(path: Path, columns: dict[str, Array]) -> None:

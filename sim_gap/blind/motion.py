@@ -8,6 +8,8 @@ from gcomp.arrays import Array
 
 RATE = 500.0
 """Rate of the commanded trajectories [Hz]."""
+RECORDED_HZ = RATE / 2
+"""Rate of the recordings with torques [Hz]."""
 KINDS = ("sines", "points", "sweeps")
 LONGEST_CHIRP_S = 12.0
 """Longest chirp [s]; it takes at most a fifth of the motion."""

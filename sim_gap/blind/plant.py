@@ -20,7 +20,8 @@ from sim_bus.sim_section import Sensors, SimSection
 from sim_bus.truth import Truth
 from sim_gap.blind.arms import BenchArm, mjcf, perturb
 from sim_gap.blind.effects.drawn_effect import DrawnEffect
-from sim_gap.blind.motion import RATE
+from sim_gap.blind.motion import RATE, RECORDED_HZ
+from sim_gap.blind.scene import Scene
 
 VELOCITY_HZ = 40.0
 """Low pass of the velocity in the controller, which a drive reports too [Hz]."""
@@ -31,8 +32,6 @@ LATE_PHASE = 0.35
 """Bandwidth of the controller times a drive's lag and delay, at most [rad]."""
 ENCODER_NOISE = 0.4
 """Standard deviation of a position reading before it is rounded, in counts."""
-UNLIMITED_TORQUE = 1e6
-"""[N·m]."""
 JITTER_S = 4e-4
 LATE_SHARE, LOST_SHARE = 0.003, 0.001
 """Share of rows that are late by a good part of a period, and share of rows that are lost."""
@@ -93,22 +92,6 @@ def controller_bandwidth(truth: TrueArm) -> Array:
 
 
 @dataclass(frozen=True)
-class PlantRun:
-    """One arm and the trajectory that it is to follow."""
-
-    truth: TrueArm
-    command: Array
-    """Positions at `motion.RATE`, (K, n) [rad]."""
-    feed_forward: Array
-    """Nominal torque along the trajectory, (K, n) [N·m]."""
-    inertia: Array
-    """Inertia of each joint for the controller's gains (n,) [kg·m²]."""
-    bandwidth: Array
-    """Of the controller (n,) [rad/s]."""
-    seed: int
-
-
-@dataclass(frozen=True)
 class Log:
     """Time series at `motion.RATE`, (K, n) each, before the sensors; `position` is the exact encoder reading."""
 
@@ -151,27 +134,28 @@ def plant_at_rest(truth: TrueArm, angle: Array, torque: Array) -> Plant:
         model = Path(folder) / "arm.xml"
         model.write_text(mjcf(truth.arm), encoding="utf-8")
         plant = Plant(arm_file(truth, model, angle - stretch), state)
-    plant.set_servo(np.zeros(plant.n), np.zeros(plant.n), np.full(plant.n, UNLIMITED_TORQUE))
+    plant.set_servo(np.zeros(plant.n), np.zeros(plant.n), np.full(plant.n, np.inf))
     return plant
 
 
-def simulate(run: PlantRun) -> Log:
-    """The run under a PID controller with feed-forward, on quantised and noisy readings."""
-    sensors = joint_sensors(run.truth)
-    plant = plant_at_rest(run.truth, sensors.angle_of(run.command[0]), run.feed_forward[0])
-    step, period = run.truth.encoder_step, 1.0 / RATE
-    speed = np.diff(run.command, axis=0, prepend=run.command[:1]) * RATE
-    noise = ENCODER_NOISE * np.random.default_rng([run.seed, 1]).standard_normal(run.command.shape)
-    stiffness, damping = run.inertia * run.bandwidth**2, 2 * DAMPING_RATIO * run.inertia * run.bandwidth
+def simulate(truth: TrueArm, scene: Scene, command: Array, bandwidth: Array, seed: int) -> Log:
+    """The arm along a command (K, n) [rad] under a PID controller of a bandwidth (n,) [rad/s], the nominal torque fed
+    forward, on quantised and noisy readings."""
+    sensors, feed_forward = joint_sensors(truth), scene.feed_forward(command)
+    plant = plant_at_rest(truth, sensors.angle_of(command[0]), feed_forward[0])
+    step, period = truth.encoder_step, 1.0 / RATE
+    speed = np.diff(command, axis=0, prepend=command[:1]) * RATE
+    noise = ENCODER_NOISE * np.random.default_rng([seed, 1]).standard_normal(command.shape)
+    stiffness, damping = scene.inertia * bandwidth**2, 2 * DAMPING_RATIO * scene.inertia * bandwidth
     smooth = 1.0 - np.exp(-2 * np.pi * VELOCITY_HZ / RATE)
-    before, velocity, error_sum = run.command[0], np.zeros(plant.n), np.zeros(plant.n)
-    log = Log(*np.empty((5, *run.command.shape)))
-    for tick, target in enumerate(run.command):
+    before, velocity, error_sum = command[0], np.zeros(plant.n), np.zeros(plant.n)
+    log = Log(*np.empty((5, *command.shape)))
+    for tick, target in enumerate(command):
         seen = np.rint(sensors.reading_of(plant.motor_position) / step + noise[tick]) * step
         velocity += smooth * ((seen - before) * RATE - velocity)
         before, error = seen, target - seen
         error_sum += error * period
-        torque = run.feed_forward[tick] + stiffness * (error + error_sum / INTEGRAL_S)
+        torque = feed_forward[tick] + stiffness * (error + error_sum / INTEGRAL_S)
         torque += damping * (speed[tick] - velocity)
         plant.step(torque, torque, period)
         # torques are those at the start of the last step of the physics, so positions have to be
@@ -181,11 +165,11 @@ def simulate(run: PlantRun) -> Log:
     return replace(log, position=sensors.reading_of(log.position))
 
 
-def record(run: PlantRun, log: Log, rate: float, random: np.random.Generator) -> dict[str, Array]:
-    """Columns of a recording at about `rate` Hz: `t` (K,); q, dq, tau, tau_motor, tau_cmd, q_cmd."""
-    truth, clock = run.truth, np.arange(len(log.position)) / RATE
+def record(truth: TrueArm, command: Array, log: Log, random: np.random.Generator) -> dict[str, Array]:
+    """Columns of a recording at about `RECORDED_HZ`: `t` (K,); q, dq, tau, tau_motor, tau_cmd, q_cmd."""
+    clock = np.arange(len(log.position)) / RATE
     sensors = joint_sensors(truth, int(random.integers(2**31)))
-    t = _times(clock[-1], rate, random)
+    t = _times(clock[-1], RECORDED_HZ, random)
     step, per_mille = truth.encoder_step, 1e-3 * truth.rated
     position = columns_at(t, clock, log.position) / step + ENCODER_NOISE * random.standard_normal((len(t), truth.arm.n))
     torque = zip(columns_at(t, clock, log.torque), t.tolist(), strict=True)
@@ -198,7 +182,7 @@ def record(run: PlantRun, log: Log, rate: float, random: np.random.Generator) ->
         "tau": np.array([sensors.torque(now, time) for now, time in torque]),
         "tau_motor": np.rint(motor / per_mille) * per_mille,  # a drive's estimate in per mille of rated torque
         "tau_cmd": log.command[last],
-        "q_cmd": run.command[last],
+        "q_cmd": command[last],
     }
 
 

@@ -14,6 +14,8 @@ SENSOR_LEAST, MOTOR_LEAST = 0.12, 0.3
 """Least RMS that an effect causes in its channel [N·m], for every torque."""
 SHARES = (0.06, 0.14)
 """RMS that an effect causes, as a share of the joint's RMS torque: several times that of small background errors."""
+LEAST_SPEED = 0.02
+"""Speed below which friction is undetermined, and does not show in the readings [rad/s]."""
 THIN = 25
 """Magnitudes are judged on every 25th row of the trajectory."""
 THINNED_S = THIN / RATE
@@ -69,6 +71,11 @@ class Scene:
         """Link-side torque (K', n) [N·m]."""
         return inverse(self.model, *self.motion) - self.rotor_torque
 
+    @property
+    def motor_torque(self) -> Array:
+        """Torque of the motors without friction (K', n) [N·m]."""
+        return self.torque + self.rotor_torque
+
     @cached_property
     def gravity(self) -> Array:
         """Gravity torque (K', n) [N·m]."""
@@ -78,7 +85,7 @@ class Scene:
     @cached_property
     def rated(self) -> Array:
         """Rated torque of the drives: 1.5 times the peak torque of the motion, at least 3 N·m; (n,)."""
-        return np.asarray(np.maximum(1.5 * np.abs(self.torque + self.rotor_torque).max(0), 3.0))
+        return np.asarray(np.maximum(1.5 * np.abs(self.motor_torque).max(0), 3.0))
 
     @cached_property
     def inertia(self) -> Array:
@@ -117,7 +124,7 @@ class Scene:
 
     def motor_level(self, random: np.random.Generator) -> Array:
         """RMS that an effect should cause in `tau_motor` − model, (n,) [N·m]."""
-        return np.maximum(MOTOR_LEAST, random.uniform(*SHARES) * rms(self.torque + self.rotor_torque))
+        return np.maximum(MOTOR_LEAST, random.uniform(*SHARES) * rms(self.motor_torque))
 
     def turn_felt(self, error: Array) -> Array:
         """RMS torque at joint i (first axis) caused by an angle error (K', n) of joint j, (n, n) [N·m]."""

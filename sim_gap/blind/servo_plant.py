@@ -9,12 +9,13 @@ range (|z| below 0.7 z_ss, or v and z of opposite sign), rises smoothly and is 1
 g = (coulomb + breakaway·exp(−(v/v_s)²) + load·|τ|)·(1 ± asymmetry).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from gcomp.arrays import Array
 from sim_bus.effects.state import Imperfections
+from sim_bus.physics.transmission import DAMPING_RATIO
 from sim_gap.blind.arms import compile_arm
 from sim_gap.blind.motion import RATE
 from sim_gap.blind.plant import JITTER_S, TrueArm, columns_at
@@ -23,33 +24,14 @@ from sim_gap.blind.scene import ServoLaw
 SUBSTEPS = 4
 STEP = 1.0 / (RATE * SUBSTEPS)
 """Time step [s]: springs must be slower."""
-VELOCITY_HZ = 200.0
-"""Low pass of the velocity in a servo [Hz]."""
-FINE = 1e-6
-"""Resolution of the servo's own position [rad]; it is finer than what is recorded."""
 ENCODER_NOISE = 0.2
 """Standard deviation of a recorded position before it is rounded, in counts."""
 ELASTIC_SHARE = 0.7
 """Deflection of the bristles, as a share of z_ss, up to which α is 0."""
-SPRING_DAMPING_RATIO = 0.04
-"""Damping ratio of a gear with play."""
-SPRING_SHARE = 0.04
-"""Stiffness of a gear with play times the square of the time step over inertia, for a stable step."""
 STIFFEST = 0.05
-"""σ₀ h²/(inertia) is at most this, for a stable step."""
+"""Stiffness of bristles, and of a gear with play, times the square of the time step over inertia, for a stable step."""
 LEAST_INERTIA = 0.01
 """Least inertia that a motor is taken to move [kg·m²]."""
-
-
-@dataclass(frozen=True)
-class ServoRun:
-    """One arm with servos and the commands that they get."""
-
-    truth: TrueArm
-    command: Array
-    """Positions at `motion.RATE`, (K, n) [rad]."""
-    law: ServoLaw
-    seed: int
 
 
 class Bristles:
@@ -78,52 +60,40 @@ class Bristles:
         return np.asarray(self.bristle * self._bend + self._bristle_damping * rate + state.viscous * v)
 
 
-class ServoController:
-    """Torque commands of one arm at `motion.RATE`."""
-
-    def __init__(self, law: ServoLaw, command: Array) -> None:
-        self._law = law
-        ticks, last = np.arange(len(command)), command[0]
-        self._targets = np.column_stack(
-            [np.interp(ticks - late * RATE, ticks, column) for late, column in zip(law.delay, command.T, strict=True)]
-        )
-        if np.isfinite(law.slew).any():
-            for tick, wanted in enumerate(self._targets):
-                last = last + np.clip(wanted - last, -law.slew / RATE, law.slew / RATE)
-                self._targets[tick] = last
-        self._smooth = 1.0 - np.exp(-2 * np.pi * VELOCITY_HZ / RATE)
-        self._before: Array = command[0]
-        self._velocity, self._error_sum = np.zeros_like(command[0]), np.zeros_like(command[0])
-
-    def torque(self, tick: int, reading: Array) -> Array:
-        """Torque [N·m] from the exact reading [rad], (n,)."""
-        law, seen = self._law, np.rint(reading / FINE) * FINE
-        self._velocity += self._smooth * ((seen - self._before) * RATE - self._velocity)
-        self._before = seen
-        error = self._targets[tick] - seen
-        error = np.sign(error) * np.maximum(np.abs(error) - law.dead_zone, 0.0)
-        self._error_sum += error / RATE
-        return np.asarray(law.stiffness * error - law.damping * self._velocity + law.integral * self._error_sum)
+def servo_targets(law: ServoLaw, command: Array) -> Array:
+    """Targets of servos under a command, at `motion.RATE` (K, n) [rad] each: late, and no faster than their slew."""
+    ticks, last = np.arange(len(command)), command[0]
+    late = zip(law.delay * RATE, command.T, strict=True)
+    targets = np.column_stack([np.interp(ticks - delay, ticks, column) for delay, column in late])
+    if np.isfinite(law.slew).any():
+        for tick, wanted in enumerate(targets):
+            last = targets[tick] = last + np.clip(wanted - last, -law.slew / RATE, law.slew / RATE)
+    return targets
 
 
-def simulate_servos(run: ServoRun) -> Array:
-    """Exact readings of the encoders, which are at the motors, at `motion.RATE` (K, n) [rad]."""
+def simulate_servos(truth: TrueArm, command: Array, law: ServoLaw) -> Array:
+    """Exact readings of the encoders, which are at the motors, of an arm whose servos get a command, at `motion.RATE`
+    (K, n) [rad] each."""
     import mujoco
 
-    arm, state = run.truth.arm, run.truth.state
+    arm, state = truth.arm, truth.state
     rotor, soft = arm.armature + state.rotor_inertia, state.backlash > 0.0
     model = compile_arm(replace(arm, armature=np.where(soft, 0.0, rotor)))
     data = mujoco.MjData(model)
-    bristles, servo = Bristles(state, np.maximum(rotor, LEAST_INERTIA), STEP), ServoController(run.law, run.command)
-    stiffness = SPRING_SHARE * rotor / STEP**2
-    damping, half_play = 2.0 * SPRING_DAMPING_RATIO * np.sqrt(stiffness * rotor), 0.5 * state.backlash
+    bristles, targets = Bristles(state, np.maximum(rotor, LEAST_INERTIA), STEP), servo_targets(law, command)
+    stiffness = STIFFEST * rotor / STEP**2
+    damping, half_play = 2.0 * DAMPING_RATIO * np.sqrt(stiffness * rotor), 0.5 * state.backlash
     spring, rest = state.spring.T
-    turn = np.tile(run.command[0] + state.position_offset, (2, 1))  # of links and motors
+    turn = np.tile(command[0] + state.position_offset, (2, 1))  # of links and motors
     speed, half, pull = np.zeros_like(turn), np.zeros_like(turn), np.zeros_like(turn)
-    carried, out = np.zeros(arm.n), np.empty_like(run.command)
-    for tick in range(len(out)):
+    carried, error_sum, out = np.zeros(arm.n), np.zeros(arm.n), np.empty_like(command)
+    for tick, target in enumerate(targets):
         out[tick] = turn[1] - state.position_offset
-        asked = np.clip(servo.torque(tick, out[tick]), -state.actuator_saturation, state.actuator_saturation)
+        error = target - out[tick]
+        error = np.sign(error) * np.maximum(np.abs(error) - law.dead_zone, 0.0)
+        error_sum += error / RATE
+        asked = law.stiffness * error - law.damping * speed[1] + law.integral * error_sum
+        asked = np.clip(asked, -state.actuator_saturation, state.actuator_saturation)
         for _ in range(SUBSTEPS):
             passed = state.actuator_gain * asked - bristles.force(speed[1], carried)
             if soft.any():
@@ -144,12 +114,14 @@ def simulate_servos(run: ServoRun) -> Array:
     return out
 
 
-def record_servos(run: ServoRun, position: Array, hz: float, random: np.random.Generator) -> dict[str, Array]:
+def record_servos(
+    command: Array, position: Array, hz: float, encoder_step: float, random: np.random.Generator
+) -> dict[str, Array]:
     """Columns t, q, q_cmd; positions are read at uneven times, each with the command that was sent in its turn."""
     clock = np.arange(len(position)) / RATE
     t = np.arange(0.0, clock[-1] - 2.0 / hz, 1.0 / hz)
-    sent = run.command[np.rint(t * RATE).astype(int)]
+    sent = command[np.rint(t * RATE).astype(int)]
     t[1:] += np.clip(JITTER_S * random.standard_normal(len(t) - 1), -0.2 / hz, 0.2 / hz)
-    step = run.truth.encoder_step
     q = columns_at(t, clock, position)
-    return {"t": t, "q": np.rint(q / step + ENCODER_NOISE * random.standard_normal(q.shape)) * step, "q_cmd": sent}
+    counts = np.rint(q / encoder_step + ENCODER_NOISE * random.standard_normal(q.shape))
+    return {"t": t, "q": counts * encoder_step, "q_cmd": sent}

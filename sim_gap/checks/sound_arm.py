@@ -15,7 +15,7 @@ from gcomp.estimate.choice import PRICE, REWEIGHINGS, LinearTerms
 from gcomp.estimate.problem import Index
 from sim_gap.checks.channel_motion import TURNING, ChannelMotion
 from sim_gap.checks.joint_range import beyond_range
-from sim_gap.model.rigid_body import RigidArm
+from sim_gap.model.rigid_body import INERTIAL, RigidArm
 
 ERROR_STD = 0.3
 """Standard deviation of gains, masses, springs and offsets of sound arms, as a share of what they change; of the
@@ -34,6 +34,10 @@ FOLDS = 6
 """Parts of a recording of which each is held out once."""
 LOAD_DISTANCE_STD = 0.2
 """Standard deviation of the distance of a load from the last joint, over the arm's length."""
+LOAD_GYRATION = 0.5
+"""Radius of gyration of a load about the last link's frame, over LOAD_DISTANCE_STD."""
+INERTIA_DIAGONAL = np.isin(INERTIAL[4:], ("ixx", "iyy", "izz"))
+"""Which inertias of a link are moments, of which a load cannot take off more than there is."""
 SMALLEST_STROKE, SMALLEST_MOVING_SHARE = 0.05, 0.1
 """Stroke from which a joint moves [rad], and share of the rows in which it must."""
 SMALLEST_TORQUE = 1e-9
@@ -253,7 +257,7 @@ def _shared_columns(arm: RigidArm, motion: ChannelMotion) -> Columns:
     columns, spread, limits = list[Array](), list[float](), list[tuple[float, float]]()
     for j in range(arm.n):
         beyond = [lengths[k] for k in range(arm.n) if arm.parent[k] == j]
-        own = arm.link_regressor(links, j)[:, :, :4].transpose(2, 1, 0)
+        own = arm.link_regressor(links, j).transpose(2, 1, 0)
         moment = float(np.linalg.norm(arm.inertial[j, 1:4]))
         size = ERROR_STD * max(moment, 0.5 * masses[j] * max(beyond, default=0.0), 1e-9)
         if beyond:
@@ -261,10 +265,11 @@ def _shared_columns(arm: RigidArm, motion: ChannelMotion) -> Columns:
             limits += 3 * [(low / ERROR_STD * size, high / ERROR_STD * size)]
         else:
             size = max(size, load * reach)
-            columns.append(own[0])
-            spread.append(max(load, 1e-9))
-            limits += [(-masses[j], np.inf), *3 * [(-np.inf, np.inf)]]
-        columns += [*own[1:]]
+            columns += [own[0], *own[4:]]
+            spread += [max(load, 1e-9), *6 * [max(load * LOAD_GYRATION**2 * reach**2, 1e-9)]]
+            least = np.where(INERTIA_DIAGONAL, -arm.inertial[j, 4:], -np.inf)
+            limits += [(-masses[j], np.inf), *((low, np.inf) for low in least.tolist()), *3 * [(-np.inf, np.inf)]]
+        columns += [*own[1:4]]
         spread += 3 * [size]
     still, weight = np.zeros_like(motion.q), float(np.linalg.norm(arm.gravity))
     if weight > 0.0:

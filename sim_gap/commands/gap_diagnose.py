@@ -196,7 +196,7 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
 
 
 def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
-    from sim_gap.better_model.actuator_entries import write_motor_entries
+    from sim_gap.better_model.training_files import write_motor_entries
     from sim_gap.position_gap.training.training_files import write_actuators
 
     if answer.unit == "rad":
@@ -206,7 +206,7 @@ def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
 
 
 def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
-    from sim_gap.better_model.samples import drawn_parameters, write_rows
+    from sim_gap.better_model.training_files import drawn_parameters, write_rows
     from sim_gap.position_gap.training.training_files import write_samples
 
     target = path or Path("samples.csv")
@@ -223,7 +223,7 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     kind = "URDF" if path.suffix == ".urdf" else "MJCF"
     if answer.unit == "rad":
-        from sim_gap.better_model.effects_module import module_path
+        from sim_gap.better_model.export import module_path
         from sim_gap.position_gap.training.training_files import batch_path, module_model, write_exported
 
         with_actuators = " with its position actuators" if kind == "MJCF" else ""
@@ -238,8 +238,7 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
             )
         return
     from sim_gap.attribution.residual_laws import as_effects
-    from sim_gap.better_model.effects_module import module_path
-    from sim_gap.better_model.export import write_model
+    from sim_gap.better_model.export import module_path, write_model
 
     missing = write_model(
         answer.internals.model, answer.internals.estimate, path, as_effects(answer.laws, answer.names)

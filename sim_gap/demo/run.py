@@ -1,9 +1,16 @@
 """Runs the demo: each step is a call of the product; the demo's own are the hidden truth, the operator, the order."""
 
+import os
 import shutil
+import signal
 import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import active_children, get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,8 +26,8 @@ from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
 from calib.commissioning.arm_text import assumed_lines
 from calib.commissioning.model_judgement import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
-from calib.creep.record import CreepCalibration
 from calib.dataset import SweepData
+from calib.fit.creep_fit import CreepFit
 from calib.install.journaled_write import install
 from calib.install.plausibility import admit
 from calib.motion.random_work import WorkMotion, work_targets
@@ -40,12 +47,12 @@ from sim_bus.sim_section import with_realism
 from sim_bus.truth import Truth
 from sim_gap.demo.account import Account
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
-from sim_gap.demo.beside import beside
 from sim_gap.model.load import compile_model
 from sim_gap.report.effect_text import sentence
 from sim_gap.report.page import sections as gap_sections
 from sim_gap.report.time_figures import watch_figure
 
+Made = TypeVar("Made")
 BY = "armlink demo"
 SUFFIX = ".mcap" if has_extra("bags") else ".csv.gz"
 QUICK = CreepSection(span=1.1, speeds=(0.2, 0.14))
@@ -103,6 +110,29 @@ def _fresh(out: Path) -> Path:
     except OSError as error:
         raise BadInput(f"{out}: cannot be written: {error.strerror}") from None
     return data
+
+
+@contextmanager
+def beside(work: Callable[..., Made], *given: Any, **options: Any) -> Iterator[Callable[[], Made]]:
+    """A call that returns what `work`, a module's function, makes of what is given, or raises as it does.
+
+    A process of its own works from now on, where there is a core for it; else the work is done in the call. It ends
+    with the context: where this process gives up, nobody waits for the other.
+    """
+    whole = partial(work, *given, **options)
+    if len(os.sched_getaffinity(0)) < 2:
+        yield whole
+        return
+    ignored = signal.SIGINT, signal.SIG_IGN  # Ctrl-C is this process's, which then ends the other
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=signal.signal, initargs=ignored) as pool:
+        others = active_children()
+        job = pool.submit(whole)
+        try:
+            yield job.result
+        finally:
+            for worker in active_children():
+                if worker not in others:
+                    worker.terminate()
 
 
 class Demo:
@@ -255,11 +285,11 @@ class Demo:
         account.note(sensors={name: {"true": true[name], **_estimate(fit, name)} for name in names}, drift=None)
         account.note(not_identifiable={f"{joint}.{name}": why for (joint, name), why in fit.reasons.items()})
         swept = "was swept without and with"
-        if isinstance(fit, CreepCalibration):
-            swept = "moved slowly through its range without, with and again without"
+        if isinstance(fit, CreepFit):
+            swept = "crept through its range without, with and again without"
             friction = {name: _estimate(fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
             friction["coulomb"]["true"] = true["coulomb"]
-            account.note(friction=friction, disturbed=fit.findings, sag=None)
+            account.note(friction=friction, disturbed=[each.text for each in fit.findings], sag=None)
             names += ("coulomb", "load", "viscous")
         parts = calibration.sections(calibration.Calibrated(self.bench.arm, passes, fit, record, None))
         columns: dict[str, tuple[Array, Array]] = {}

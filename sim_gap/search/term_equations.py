@@ -158,6 +158,11 @@ class TermChoice(EffectChoice[Term]):
                     return float("inf")
         return super().judge(names)
 
+    def loss(self, score: float) -> float:
+        """By how much a score is worse than that of the terms chosen, per independent measurement; zero if these end at
+        a bound, for then they explain nothing."""
+        return (score - self.score) / self.equations.measurements if np.isfinite(self.score) else 0.0
+
     def values(self, terms: Sequence[Term] | None = None) -> dict[Term, Array]:
         """Coefficients of a fit of some terms, of those chosen if none are given."""
         terms = self.current if terms is None else terms

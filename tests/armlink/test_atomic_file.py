@@ -17,7 +17,7 @@ from armlink.content.atomic_file import open_whole, write_whole
 from armlink.recording.files import load_recording, save_recording
 from armlink.recording.recording import Recording
 from calib.report.page import ReportSection, paragraph, render
-from sim_gap.better_model.samples import write_rows
+from sim_gap.better_model.training_files import write_rows
 
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mcap")
 

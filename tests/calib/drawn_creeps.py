@@ -1,13 +1,14 @@
 """Readings of creeping joints of drawn arms, without a bus: gravity by MuJoCo, friction and warming from the truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
-from calib.creep.rows import CreepRows
+from calib.fit.sweep_readings import SweepReadings
 from calib.plan.types import SweepPlan
+from gcomp.identify.readings import StaticReadings
 from sim_bus.effects.state import Imperfections
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
@@ -22,7 +23,7 @@ SAMPLES = 100
 class DrawnCreep:
     """Rows of an arm, and what it truly is."""
 
-    rows: CreepRows
+    rows: SweepReadings
     truth: Truth
     state: Imperfections
     simulated: SimulatedArm
@@ -36,6 +37,33 @@ class DrawnCreep:
             return self.simulated.sensors.gain_at(self.simulated.time)
         fall, _, heating = self.state.warm_constant.T
         return self.truth.gain / (1 - fall * (self.top + 0.5) / heating)
+
+
+def creep_rows(
+    joint: Array, position: Array, reading: Array, velocity: Array, mass: Array, warmth: Array, sweep: Array,
+    sweeps: tuple[str, ...], warmest: Array,
+) -> SweepReadings:  # fmt: skip
+    """Readings (R,) of a creeping joint each, in its column of the table."""
+    own, nothing = np.arange(position.shape[1]) == joint[:, None], np.zeros(position.shape[1])
+    readings = StaticReadings(
+        position,
+        np.where(own, reading[:, None], np.nan),
+        np.ones(position.shape[1]),
+        load=mass,
+        direction=own * np.sign(velocity)[:, None],
+        series=sweep,
+        velocity=own * velocity[:, None],
+        warmth=own * warmth[:, None],
+    )
+    unknown, time = np.full(position.shape, np.nan), np.arange(len(joint), dtype=float)
+    return SweepReadings(
+        readings, sweeps, joint, time, readings.torque, unknown, unknown, nothing, nothing, np.asarray(warmest)
+    )
+
+
+def pushed(rows: SweepReadings, push: Array) -> SweepReadings:
+    """With a push (R,) [N·m] in each reading."""
+    return replace(rows, readings=replace(rows.readings, torque=rows.readings.torque + push[:, None]))
 
 
 def draw_creep(
@@ -73,10 +101,8 @@ def draw_creep(
     )
     top = np.array([heat[joint == j].max() for j in joint])
     warmth = heat - top if np.ptp(heat) >= 1 else np.linspace(-1, 0, len(heat))
-    rows = CreepRows(
-        joint.astype(int), position, reading, velocity, masses, warmth, sweep_of.astype(int), tuple(names),
-        bool(np.ptp(heat) >= 1), np.array([heat[joint == j].max() for j in range(len(rated))]),
-    )  # fmt: skip
+    warmest = np.array([heat[joint == j].max() if np.ptp(heat) >= 1 else np.nan for j in range(len(rated))])
+    rows = creep_rows(joint.astype(int), position, reading, velocity, masses, warmth, sweep_of, tuple(names), warmest)
     return DrawnCreep(rows, truth, state, simulated, np.array([heat[joint == j].max() for j in range(len(rated))]))
 
 

@@ -11,13 +11,13 @@ from armlink.arm_file import ArmFile, parse_arm
 from armlink.arrays import Array
 from armlink.link.link import Link
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.fit import QUANTILE, CreepFit, fit_creep
-from calib.creep.levers import is_vertical
-from calib.creep.plan import plan_creep
-from calib.creep.record import CreepCalibration
 from calib.dataset import SweepData
+from calib.fit.calibration import QUANTILE
+from calib.fit.creep_fit import CreepFit, fit_creep
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
+from calib.plan.creep_plan import plan_creep
+from calib.plan.levers import is_vertical
 from calib.plan.types import SweepPlan
 from calib.sweep.run import run_sweep
 from gcomp.arm.mass_moments import base_parameters
@@ -142,7 +142,7 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
     fit, described, n = fit_creep(arm, data), gcomp_arm(arm), len(arm.joint_names)
     truth, state = simulated.truth, simulated.plant._imperfections
     gain = warm_gain(simulated, fit)
-    lost = CreepCalibration(fit).reasons
+    lost = fit.reasons
     seen = np.array([(name, "gain") not in lost for name in fit.names])
     off = np.where(seen, fit.value("gain") / gain - 1, np.nan)
     pairs = {
@@ -161,7 +161,7 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
     friction = np.where(seen, fit.value("coulomb") - state.coulomb, np.nan)
     error, largest = gravity_error(arm, simulated, fit.beta, fit.value("zero"))
     loaded = largest > 0.02 * largest.max()
-    given = loaded & fit.found("beta").any()
+    given = loaded & fit.found_beta.any()
     share = np.where(given, error / np.maximum(largest, 1e-9), np.nan)
     nominal = nominal_error(arm, simulated, gain) / np.maximum(largest, 1e-9)
     upright = [name for joint, name in enumerate(fit.names) if is_vertical(described, joint)]
@@ -170,7 +170,7 @@ def judge_creep(arm: ArmFile, simulated: SimulatedArm, data: list[SweepData], st
     wrong += [f"{fit.names[j]}: friction {friction[j]:+.3f}" for j in range(n) if abs(friction[j]) > bound[j]]
     wrong += [f"{fit.names[j]}: gravity {share[j]:.2%}" for j in range(n) if share[j] > GRAVITY]
     wrong += [f"{name}: vertical, but a gain is given" for name in upright if (name, "gain") not in lost]
-    wrong += list(fit.findings) + [each.reason for one in data for each in one.contacts]
+    wrong += [each.text for each in fit.findings]
     return CreepVerdict(
         fit.names, off, scores, friction, share,
         np.full(n, np.nan) if steps is None else np.where(loaded, steps / np.maximum(largest, 1e-9), np.nan),

@@ -20,8 +20,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
 from judged_creeps import CreepVerdict, creep_arm, creep_passes, judge_creep, steps_error
 
-from calib.creep.fit import QUANTILE
 from calib.dataset import load_data
+from calib.fit.calibration import QUANTILE
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

@@ -9,21 +9,20 @@ torque constant (off by more than 1.5 % and by more than three standard deviatio
 
 import argparse
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "calib"))
-from drawn_creeps import DrawnCreep, draw_creep
+from drawn_creeps import DrawnCreep, draw_creep, pushed
 
 from armlink.arm_file import load_arm
 from armlink.arrays import Array
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import CreepSection, SweepSection
-from calib.creep.fit import fit_rows
-from calib.creep.plan import plan_creep
+from calib.fit.creep_fit import fit_rows
+from calib.plan.creep_plan import plan_creep
 
 GAIN = 0.015
 STOPPED = 0.25
@@ -38,7 +37,7 @@ def plane_push(made: DrawnCreep, random: np.random.Generator, inner: bool) -> Ar
     """Torque (R,) [N·m] on each row's joint of a table below the arm, or of a cover beside its body (`inner`)."""
     model, data = made.simulated.plant.model, mujoco.MjData(made.simulated.plant.model)
     body = model.body("openarm_right_link5" if inner else "openarm_right_ee_base_link").id
-    angles = made.rows.position + made.truth.position_offset
+    angles = made.rows.readings.position + made.truth.position_offset
     normal = np.array([0.0, -1.0, 0.0]) if inner else np.array([0.0, 0.0, 1.0])
     points, jacobians = np.empty((len(angles), 3)), np.empty((len(angles), 3, model.nv))
     for row, pose in enumerate(angles):
@@ -49,17 +48,17 @@ def plane_push(made: DrawnCreep, random: np.random.Generator, inner: bool) -> Ar
         mujoco.mj_jac(model, data, jacobians[row], None, points[row], body)
     height = points @ normal
     depth = np.maximum(np.quantile(height, random.uniform(0.03, 0.15)) - height, 0.0)
-    pushed = -STIFFNESS * depth[:, None] * np.einsum("rx,rxj->rj", np.tile(normal, (len(angles), 1)), jacobians)
-    return np.asarray(pushed[np.arange(len(angles)), made.rows.joint])
+    felt = -STIFFNESS * depth[:, None] * np.einsum("rx,rxj->rj", np.tile(normal, (len(angles), 1)), jacobians)
+    return np.asarray(felt[np.arange(len(angles)), made.rows.swept])
 
 
 def cable_push(made: DrawnCreep, rated: Array, random: np.random.Generator) -> Array:
     """Torque (R,) of a cable at one joint, taut over its whole range or beyond a place in it."""
     joint, rows = int(random.integers(0, len(rated))), made.rows
-    own = rows.position[:, joint]
-    slack = own[rows.joint == joint].mean() if random.random() < 0.5 else -np.inf
-    stretch = np.where(np.isfinite(slack), np.maximum(own - slack, 0.0), own - own[rows.joint == joint].mean())
-    return np.where(rows.joint == joint, random.uniform(0.05, 0.12) * rated[joint] * stretch, 0.0)
+    own = rows.readings.position[:, joint]
+    slack = own[rows.swept == joint].mean() if random.random() < 0.5 else -np.inf
+    stretch = np.where(np.isfinite(slack), np.maximum(own - slack, 0.0), own - own[rows.swept == joint].mean())
+    return np.where(rows.swept == joint, random.uniform(0.05, 0.12) * rated[joint] * stretch, 0.0)
 
 
 def main() -> int:
@@ -76,18 +75,21 @@ def main() -> int:
         made = draw_creep(arm, plan, seed, plan.reference_mass)
         kind = ("table", "own body", "cable")[seed % 3]
         push = cable_push(made, rated, random) if kind == "cable" else plane_push(made, random, kind == "own body")
-        gain = made.warm_gain[made.rows.joint]
-        rows = replace(made.rows, reading=made.rows.reading + gain * push)
-        hard = np.abs(push) > STOPPED * rated[rows.joint]
-        stopped = np.unique(rows.sweep[hard])
-        fit = fit_rows(described, rows.kept(~np.isin(rows.sweep, stopped)), rated)
-        found = fit.found("gain") & ~np.isin(fit.names, [each.joint for each in fit.springs])
+        gain = made.warm_gain[made.rows.swept]
+        rows = pushed(made.rows, gain * push)
+        hard = np.abs(push) > STOPPED * rated[rows.swept]
+        stopped = np.unique(rows.readings.series[hard])
+        fit = fit_rows(described, rows.kept(~np.isin(rows.readings.series, stopped)), rated)
+        found = fit.found_gain & ~np.isin(fit.names, [each.joint for each in fit.findings if each.kind == "spring"])
         off = np.where(found, np.abs(fit.value("gain") / made.warm_gain - 1), 0.0)
         wrong = bool(((off > GAIN) & (off > 3 * fit.std("gain") / made.warm_gain)).any())
         told = bool(len(stopped) or fit.findings)
         silent, named = silent + (wrong and not told), named + told
         light = float(
-            np.abs(push[~np.isin(rows.sweep, stopped)] / rated[rows.joint[~np.isin(rows.sweep, stopped)]]).max()
+            np.abs(
+                push[~np.isin(rows.readings.series, stopped)]
+                / rated[rows.swept[~np.isin(rows.readings.series, stopped)]]
+            ).max()
         )
         print(
             f"{seed:>3} {kind:>8}: stopped {len(stopped)} sweeps, left {light:.1%} of rated torque, fit names"

@@ -22,11 +22,10 @@ from armlink.arrays import Array
 from armlink.errors import Refused
 from armlink.link.types import Command
 from calib.arm.kinematics import model_arm
-from calib.creep.fit import fit_creep
-from calib.creep.plan import plan_creep
-from calib.creep.record import CreepCalibration
+from calib.fit.creep_fit import fit_creep
 from calib.install.journaled_write import install
 from calib.install.plausibility import admit
+from calib.plan.creep_plan import plan_creep
 from calib.plan.types import SweepPlan
 from calib.records.store import RecordStore
 from calib.sweep.run import run_sweep
@@ -105,7 +104,7 @@ def run(seed: int, folder: Path, wrong: bool) -> bool:
         bench.simulated.attach_mass(mass) if mass else bench.simulated.detach_mass()
         passes.append(run_sweep(link, arm, folder / name, reference_mass=mass, plan=plan))
     fit = fit_creep(arm, passes)
-    record = CreepCalibration(fit).record(arm)
+    record = fit.record(arm)
     before = measured(bench, plan, model_arm(believed).beta, np.zeros(link.n))
     install(admit(record, arm, store), store, link, by="campaign", reason="creep sweeps", check=None)
     after = measured(bench, plan, fit.beta, record.values("position_offset", 0.0))

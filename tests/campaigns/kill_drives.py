@@ -22,8 +22,8 @@ from real_host import Host
 
 from armlink.arm_file import Bus
 from armlink.bus.open import open_bus
+from armlink.drives.family import family
 from armlink.drives.orders import Limits, Mode, Order, Power
-from armlink.drives.registry import family
 
 DRIVES = serving.drives(kd=1.0)
 DEADLINE, LONGEST = 0.25, 5.0

@@ -20,10 +20,9 @@ from drawn_work import NOTHING, Change, work
 from judged_creeps import creep_arm
 
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.fit import fit_rows
-from calib.creep.plan import plan_creep
-from calib.creep.record import CreepCalibration
+from calib.fit.creep_fit import fit_rows
 from calib.observer.motion.observer import MovingObserver
+from calib.plan.creep_plan import plan_creep
 
 GAIN, FRICTION, PAYLOAD = 0.05, 1.3, 0.3
 UNCHANGED = 480
@@ -39,8 +38,8 @@ def run(seed: int, rows: int) -> dict[str, tuple[bool, bool, str]]:
     made = draw_creep(arm, plan, seed, plan.reference_mass)
     kinematics, rated = gcomp_arm(arm), arm.require_link().rated_torques
     fit = fit_rows(kinematics, made.rows, rated)
-    calibration = CreepCalibration(fit).record(arm)
-    gravity = CreepCalibration(fit).gravity.record(arm, calibration)
+    calibration = fit.record(arm)
+    gravity = fit.gravity.record(arm, calibration)
     told: dict[str, tuple[bool, bool, str]] = {}
     for kind in KINDS:
         observer, events = MovingObserver(kinematics, calibration, gravity, rated), []

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from bus_attacks import BARE, GUARDED, Scene, link, scene
 
-pytestmark = pytest.mark.vcan
+pytestmark = [pytest.mark.vcan, pytest.mark.long]  # quick: `test_vcan.py`
 
 OWN_WATCHES = "the joints could not be told to stop, so they stop by their own watch of the bus"
 CLOSED = {
@@ -52,7 +52,6 @@ def need_ip(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CLOSED)
-@pytest.mark.sample(1)
 def test_an_attack_on_the_guard_leaves_the_joints_holding(name: str, place: Scene) -> None:
     need_ip(name)
     found = place.attack(GUARDED[name], guarded=True)
@@ -63,7 +62,6 @@ def test_an_attack_on_the_guard_leaves_the_joints_holding(name: str, place: Scen
 
 
 @pytest.mark.parametrize("name", SAID)
-@pytest.mark.sample(1)
 def test_an_attack_on_the_bus_leaves_the_joints_holding(name: str, place: Scene) -> None:
     need_ip(name)
     found = place.attack(BARE[name], guarded=False)
@@ -73,7 +71,6 @@ def test_an_attack_on_the_bus_leaves_the_joints_holding(name: str, place: Scene)
     assert re.search(f"{SAID[name]}|{LATE}", found.host), found.host
 
 
-@pytest.mark.long
 def test_an_interface_that_is_removed_during_work_is_one_line(place: Scene) -> None:
     """Last, since it takes vcan1 away, and makes it again."""
     need_ip("down")

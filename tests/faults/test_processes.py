@@ -6,15 +6,16 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long  # the quick ones are in armlink/loop/test_remote_link.py and on SocketCAN
+
 ROOT = Path(__file__).parent.parent.parent
 
 
 @pytest.mark.parametrize(
     "options",
     [
-        pytest.param(["--tries", "1"], id="SIGKILL"),
-        pytest.param(["--tries", "3"], id="SIGKILL again", marks=pytest.mark.long),
-        pytest.param(["--tries", "1", "--stop"], id="SIGSTOP", marks=pytest.mark.long),
+        pytest.param(["--tries", "3"], id="SIGKILL"),
+        pytest.param(["--tries", "1", "--stop"], id="SIGSTOP"),
     ],
 )
 def test_a_host_that_dies_under_a_bias_torque_leaves_every_joint_safe(options: list[str]) -> None:

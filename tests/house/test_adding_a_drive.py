@@ -10,8 +10,8 @@ import pytest
 from armlink import contributed
 from armlink.arm_file import load_arm
 from armlink.cli import run
+from armlink.drives.family import family
 from armlink.drives.orders import Limits, Mode, Order, Power
-from armlink.drives.registry import family
 from armlink.link.link import Link
 from armlink.link.types import Command
 from sim_bus.bus.lock_step import LockStepBus

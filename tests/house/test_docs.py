@@ -149,7 +149,7 @@ def test_arm_files_in_the_documentation_are_valid(page):
             assert parse_arm(yaml.safe_load(text), page).joint_names
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)  # `test_docs_walk.py` types the others' in this process
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, RUN)], ids=name)
 def test_the_commands_of_a_page_run(page, tmp_path):
     script = "set -euo pipefail\n" + "\n".join(blocks(page, RUN))

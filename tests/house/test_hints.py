@@ -27,7 +27,10 @@ def hints() -> Iterator[tuple[str, str]]:
     """Every command line in a string of ours, docstrings apart, with a bundled arm for each value put in."""
     for package in ("armlink", "calib", "gcomp", "sim_bus", "sim_gap"):
         for file in sorted((ROOT / package).rglob("*.py")):
-            tree = ast.parse(file.read_text())
+            source = file.read_text()
+            if not re.search(r"armlink (?!import\b)", source):
+                continue
+            tree = ast.parse(source)
             nodes = list(ast.walk(tree))
             apart = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
             apart |= {id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in node.values}

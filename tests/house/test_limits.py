@@ -9,7 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from armlink.arm_file import LinkJoint, LinkSection, Section
-from armlink.drives.registry import family, family_names
+from armlink.drives.family import family, family_names
 from calib.arm.sweep_section import SweepSection
 from calib.daemon.settings import DaemonSection, RecordingSettings
 from sim_bus.sim_section import SimSection

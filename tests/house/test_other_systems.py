@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 ELSEWHERE = """
 import ctypes, os, resource, select, selectors, signal, socket, sys
 
@@ -39,6 +41,7 @@ for words in (["--help"], ["sweep", "sarcos", "--plan"], ["scan", "sarcos"], ["d
 """
 
 
+@pytest.mark.long
 def test_what_needs_no_bus_needs_no_linux(tmp_path):
     done = subprocess.run([sys.executable, "-c", ELSEWHERE], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]

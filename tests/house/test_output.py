@@ -88,6 +88,7 @@ def test_results_are_on_standard_output_and_hints_on_standard_error(run, name):
     assert said.out.rstrip().splitlines()[-1][0].isalnum(), "ends with a verdict, not with a table"
 
 
+@pytest.mark.sample(6)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_json_on_standard_output_is_alone_there(run, name):
     said = run(name, "--json", "-")
@@ -95,7 +96,7 @@ def test_json_on_standard_output_is_alone_there(run, name):
     assert name == "torque" or said.err.strip()
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", ["scan", "gap diagnose", "monitor", "sweep --plan", "torque"])
 def test_names_come_whole_on_a_narrow_terminal(run, monkeypatch, name):
     monkeypatch.setenv("COLUMNS", "30")
@@ -170,6 +171,7 @@ def test_a_question_leaves_standard_output_alone(tmp_path):
     assert (tmp_path / "out").read_text() == "found: one\nverdict: both\n"
 
 
+@pytest.mark.long
 def test_new_asks_on_a_terminal_for_what_the_model_does_not_state(folder, tmp_path):
     shutil.copy(folder / "arm.urdf", tmp_path)
     command = [

@@ -14,8 +14,8 @@ import published_models  # noqa: E402
 MODELS = sorted((ROOT / "tests" / "models" / "published").glob("*.urdf"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.stem)
-@pytest.mark.sample(1)
 def test_what_new_writes_has_no_error(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "arm.yaml"
     made = published_models.command("new", str(model), "--out", str(out), seconds=600)

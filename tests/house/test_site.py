@@ -47,6 +47,7 @@ def site(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_a_link_that_leads_nowhere_fails_the_build(tmp_path):
     """By the site's own settings, on one page."""
     page = tmp_path / "docs" / "index.md"

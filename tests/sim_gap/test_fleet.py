@@ -1,8 +1,10 @@
 """A fleet's recordings on a cluster of real worker processes: every answer once, whatever dies on the way."""
 
+import contextlib
 import json
 import os
 import signal
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,9 +70,18 @@ def test_a_case_that_cannot_be_diagnosed_says_why_in_one_line(fleet: Path) -> No
     assert "heldout.csv" in answer["error"]
 
 
+@contextlib.contextmanager
+def in_this_process(scheduler: str | None, workers: int) -> Iterator[Client]:
+    """A cluster whose worker is a thread."""
+    with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client:
+        yield client
+
+
+@pytest.mark.parametrize("cluster", [in_this_process, pytest.param(cluster, marks=pytest.mark.long)])
 def test_the_command_gathers_a_table_by_arm_and_effect_and_goes_on_where_it_stopped(
-    fleet: Path, tmp_path: Path
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cluster: Callable[..., object]
 ) -> None:
+    monkeypatch.setattr("sim_gap.fleet.cluster", cluster)
     out, table, answers = (str(tmp_path / name) for name in ("answers.jsonl", "table.parquet", "answers.json"))
     arguments = ["diagnose-fleet", str(fleet), "--out", out, "--table", table, "--json", answers, "--workers", "1"]
     result = CliRunner().invoke(app, arguments, standalone_mode=False)
@@ -99,7 +110,7 @@ def test_recordings_in_degrees_are_followed_with_the_options_of_a_diagnosis(flee
     units = ["--units", "q=deg"]
     first = CliRunner().invoke(app, [*command, *units], standalone_mode=False)
     assert json.loads(first.stdout)["newest"]["answer"]["causes"][0]["effect"] == "friction.coulomb"
-    assert "1 recording: a change can be found once there are 13" in " ".join(first.stderr.split())
+    assert "1 recording: a change can be found from 13 recordings on" in " ".join(first.stderr.split())
     (line,) = (tmp_path / "answers.jsonl").read_text(encoding="utf-8").splitlines()
     assert set(json.loads(line)["options"]["units"]) == {"q"}
     (tmp_path / "2026-10-02.parquet").write_bytes(b"")  # it is diagnosed, and need not be read again

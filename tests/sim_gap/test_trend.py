@@ -80,6 +80,7 @@ def test_by_command(folder: Path) -> None:
     assert (folder / "answers.jsonl").read_text().splitlines() == lines
 
 
+@pytest.mark.long
 def test_the_newest_is_that_of_the_latest_date(folder: Path) -> None:
     for name in ("a-2026-11-17.mcap", "b-2026-11-16.mcap"):
         worn(folder / name)

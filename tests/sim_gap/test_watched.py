@@ -18,6 +18,7 @@ def of(wrong: Wrong, **options) -> dict[tuple[str, str], float]:
     return {(one["effect"], one["joint"]): one["value"] for one in watched_parameters(answer)}
 
 
+@pytest.mark.long
 def test_a_play_that_no_answer_names_is_seen():
     worn = Wrong(coulomb=1.0, viscous=0.8, gain=1.1)
     before, after = of(worn), of(replace(worn, play=np.array([SMALL, 0.0, 0.0])))

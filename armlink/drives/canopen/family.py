@@ -7,6 +7,7 @@ from typing import Any
 from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen.cia402 import state_of
 from armlink.drives.canopen.settings import TRAITS, CanopenSettings
+from armlink.drives.discovery import Discovery
 from armlink.drives.family import Family
 
 
@@ -31,7 +32,7 @@ FAMILY = Family(
     build=_late("drives", "CanopenDrives"),
     self_test=_late("check.self_test", "self_test"),
     search=_late("check.scan", "scan_report"),
-    find=_late("check.scan", "FoundNodes"),
+    discovery=Discovery("device type of nodes 1 to 127", _late("check.scan", "FoundNodes"), ("moteus", "odrive")),
     examine=_late("check.scan", "arm_findings"),
     state_name=state_name,
     summary="CiA 402 (CANopen), with or without our torque sensor object 2100h",

@@ -14,7 +14,9 @@ from armlink.bus.port import Frame
 from armlink.drives.base import Ask
 from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, error_text, unpack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
+from armlink.drives.discovery import Discovery, SearchedBus
 from armlink.drives.family import Family
+from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory
 from armlink.drives.mit_packing import Special, grid_of, pack_command, special, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, law_torque
@@ -233,6 +235,18 @@ def _watched(settings: CubeMarsSettings) -> str:
     )
 
 
-FAMILY = Family(
-    "cubemars", TRAITS, CubeMarsSettings, CubeMarsDrives, summary="CubeMars AK (firmware 1 and 2), MIT mode"
-)
+def find_drives(bus: SearchedBus) -> list[FoundDrive]:
+    """By answers to another host that are heard, its commands too; nothing in them tells a model."""
+    commanded = {can_id for can_id, data in bus.heard if len(data) == 8}
+    heard = {(*data[:1], can_id) for can_id, data in bus.heard if can_id <= 0x7F and len(data) in (6, 8)}
+    note = "its model is not told: write its keys by hand"
+    return [
+        FoundDrive("cubemars", drive, f"id {drive:02X}h", reply=reply, note=note)
+        for drive, reply in sorted(heard)
+        if 0 < drive != reply and drive in commanded
+    ]
+
+
+SEARCH = Discovery("only heard: whatever asks them commands them", find_drives, ("damiao", "odrive"))
+SUMMARY = "CubeMars AK (firmware 1 and 2), MIT mode"
+FAMILY = Family("cubemars", TRAITS, CubeMarsSettings, CubeMarsDrives, discovery=SEARCH, summary=SUMMARY)

@@ -4,13 +4,17 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.base import Ask
 from armlink.drives.damiao import frames
 from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, DamiaoRegister, DamiaoStatus
 from armlink.drives.damiao.settings import MODELS, DamiaoSettings
+from armlink.drives.discovery import Discovery, SearchedBus
 from armlink.drives.family import Family
+from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory
 from armlink.drives.mit_packing import Grid, Ranges, Special, grid_of, special, unpack_feedback, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
@@ -37,6 +41,9 @@ NOTED = (
     DamiaoRegister.LARGEST_CURRENT,
     DamiaoRegister.GEAR_RATIO,
 )
+STOPS = range(0x0D, 0x10)
+"""Ids whose register requests stop a moteus controller that nobody could find, for its bus was opened without CAN FD:
+to it they write a float near 0 to its mode."""
 LARGEST_RANGE = 1e4
 """No range of a real drive is larger [rad, rad/s, N·m]."""
 REGISTER_KINDS = frozenset((READ, WRITE))
@@ -303,6 +310,51 @@ def _fault_text(state: int) -> str:
     return f"{words} (state {state:X}h)"
 
 
-FAMILY = Family(
-    "damiao", TRAITS, DamiaoSettings, DamiaoDrives, summary="Damiao DM-J (OpenArm, YAM, reBot B601-DM), MIT mode"
-)
+def find_drives(bus: SearchedBus) -> list[FoundDrive]:
+    """By register 8, the command id, of every id, then the ranges of those that answered."""
+    answers = _answers(bus, [(drive, DamiaoRegister.COMMAND_ID) for drive in range(1, 0x100) if drive not in STOPS])
+    if answers:
+        answers += _answers(bus, [(drive, DamiaoRegister.COMMAND_ID) for drive in STOPS])
+    replies = {drive: can_id for can_id, drive, _, _ in sorted(answers, key=lambda answer: answer[1])}
+    commands = {drive + mode: drive for drive in replies for mode in (0, *OTHER_MODES)}
+    # the answers of one that replies on a command id command the drive of that id: it is asked no more
+    asked = [(drive, each) for drive, reply in replies.items() if reply not in commands for each in RANGE_FIELDS]
+    told = {(drive, register): value for _, drive, register, value in _answers(bus, asked)}
+    found = []
+    for drive, reply in replies.items():
+        ranges = Ranges(*(told.get((drive, each), math.nan) for each in RANGE_FIELDS))
+        models = [name for name, usual in MODELS.items() if np.allclose(ranges, usual, rtol=1e-3)]
+        alike = [each for each in replies if (replies[each], each & 0xF) == (reply, drive & 0xF) and each != drive]
+        lack = "the value as delivered" if reply == 0 else ""
+        lack = f"and cannot be told from those of id {alike[0]:02X}h" if alike else lack
+        lack = f"on which id {commands[reply]:02X}h takes commands" if reply in commands else lack
+        wrong = f"answers come on {reply:02X}h, {lack}: set another reply id in it (register 7)" if lack else ""
+        keys = {"id": drive, "reply": reply, "model": (*models, "")[0], "kp": 0.0, "kd": 0.0}
+        each = FoundDrive(
+            *("damiao", drive, f"id {drive:02X}h", None if reply in commands or alike else keys),
+            reply=reply,
+            model=" or ".join(models),
+            wrong=wrong,
+            max_torque=ranges.torque,
+            largest_gains=(ranges.kp, ranges.kd),
+            answers=sum(each[1] == drive for each in answers),
+        )
+        found.append(each)
+    return found
+
+
+def _answers(bus: SearchedBus, asked: Sequence[tuple[int, int]]) -> list[tuple[int, int, int, float]]:
+    """Identifier, drive, register and value of each answer to reading these registers of these drives."""
+    came = bus.gather([(frames.REGISTERS_ID, frames.read_request(*each)) for each in asked]) if asked else []
+    heads = {frames.read_request(*each)[:4] for each in asked}
+    return [
+        (can_id, data[0], data[3], frames.unpack_value(data[3], data[4:8]))
+        for can_id, data in came
+        if len(data) == 8 and can_id < frames.REGISTERS_ID and data[:4] in heads
+    ]
+
+
+HOW = "register 8 of ids 01h to FFh; of 0Dh to 0Fh if another answers"
+SEARCH = Discovery(HOW, find_drives, ("canopen", "moteus", "odrive"))
+SUMMARY = "Damiao DM-J (OpenArm, YAM, reBot B601-DM), MIT mode"
+FAMILY = Family("damiao", TRAITS, DamiaoSettings, DamiaoDrives, discovery=SEARCH, summary=SUMMARY)

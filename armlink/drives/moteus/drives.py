@@ -10,7 +10,9 @@ from pydantic import Field
 from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import Ask, BasicDrives, DriveMemory, no_order
+from armlink.drives.discovery import Discovery, SearchedBus
 from armlink.drives.family import Family
+from armlink.drives.findings import FoundDrive
 from armlink.drives.moteus import frames
 from armlink.drives.moteus.frames import (
     COMMAND,
@@ -340,4 +342,22 @@ def _finite(value: float) -> float:
     return value if math.isfinite(value) else math.nan
 
 
-FAMILY = Family("moteus", TRAITS, MoteusSettings, MoteusDrives, summary="mjbots moteus r4, c1, n1, x1, on CAN FD")
+def find_drives(bus: SearchedBus) -> list[FoundDrive]:
+    """By the model of every controller id."""
+    model = frames.pack({}, (MoteusRegister.MODEL,))
+    heard = bus.gather([(_flagged(frames.identifier(0, each, True)), model) for each in range(1, 0x7F)])
+    replies = [
+        can_id >> 8 & 0x7F
+        for can_id, data in heard
+        if not can_id & 0x1FFF80FF and any(each[:2] == (REPLY, MoteusRegister.MODEL) for each in frames.unpack(data))
+    ]
+    return [
+        FoundDrive("moteus", each, f"controller {each}", {"id": each}, answers=replies.count(each))
+        for each in sorted(set(replies))
+    ]
+
+
+SEARCH = Discovery("model of controllers 1 to 126, register 100h", find_drives)
+FAMILY = Family(
+    "moteus", TRAITS, MoteusSettings, MoteusDrives, discovery=SEARCH, summary="mjbots moteus r4, c1, n1, x1, on CAN FD"
+)

@@ -14,7 +14,9 @@ from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import REMOTE, Frame
 from armlink.drives.base import Ask, BasicDrives, DriveMemory, no_order
+from armlink.drives.discovery import Discovery, SearchedBus
 from armlink.drives.family import Family
+from armlink.drives.findings import FoundDrive
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import (
     INPUT_FEED_FORWARD,
@@ -361,6 +363,23 @@ def _checked(value: float) -> float:
     return value
 
 
-FAMILY = Family(
-    "odrive", TRAITS, ODriveSettings, ODriveDrives, summary="ODrive Pro, S1, Micro with firmware 0.6, CANSimple"
-)
+def find_drives(bus: SearchedBus) -> list[FoundDrive]:
+    """By the heartbeats heard; another device's frames on such an identifier hardly all are ones."""
+    known, beats = sum(AxisError), dict[int, list[bool]]()
+    for can_id, data in bus.heard:
+        if can_id <= 0x7FF and can_id & 0x1F == Message.HEARTBEAT:
+            beat = frames.heartbeat(data)
+            real = beat is not None and not beat.error & ~known and beat.state <= max(AxisState) and beat.done <= 1
+            beats.setdefault(can_id >> 5, []).append(real)
+    return [
+        FoundDrive("odrive", node, f"node {node}", {"node": node}, note="gear assumed 1: torques are the motor's")
+        if node < 0x3F
+        else FoundDrive("odrive", node, f"node {node}", wrong="an axis without a node id: set axis0.config.can.node_id")
+        for node, real in sorted(beats.items())
+        if len(real) > 1 and all(real)
+    ]
+
+
+SEARCH = Discovery("heartbeats heard, then the version by a remote frame", find_drives)
+SUMMARY = "ODrive Pro, S1, Micro with firmware 0.6, CANSimple"
+FAMILY = Family("odrive", TRAITS, ODriveSettings, ODriveDrives, discovery=SEARCH, summary=SUMMARY)

@@ -41,6 +41,7 @@ class AxisState(IntEnum):
     UNDEFINED = 0
     IDLE = 1
     CLOSED_LOOP = 8
+    ANTICOGGING = 14  # the last of all
 
 
 TORQUE_CONTROL, VELOCITY_CONTROL, POSITION_CONTROL, PASSTHROUGH = 1, 2, 3, 1

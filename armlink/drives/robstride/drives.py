@@ -1,6 +1,7 @@
 """RobStride drives on one bus, in the private protocol: one motion command and one feedback a cycle."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -10,7 +11,9 @@ from pydantic import Field, FiniteFloat, model_validator
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import ANY, BROADCAST, Ask, no_order
+from armlink.drives.discovery import Discovery, SearchedBus
 from armlink.drives.family import Family
+from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory, Steps, order_of
 from armlink.drives.mit_packing import Grid, MitCommand
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
@@ -32,6 +35,10 @@ from armlink.errors import BusFault
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="29")
 HOST_TYPES = frozenset((Type.MOTION, Type.ENABLE, Type.STOP, Type.SET_ZERO, Type.SET_ID, Type.WRITE, Type.SAVE))
 """Frames that change something, which one host alone may send."""
+OUR_ID, IDENTITY_TARGET = 0xFD, 0xFE
+"""Id that asks, and that all answers to type 0 go to."""
+MOST_TORQUE = max(RANGES, key=lambda model: RANGES[model].torque)
+"""Model with the largest torque range."""
 TOLERANCE = 1e-3
 """Relative difference between a float that was written and its reading."""
 
@@ -42,7 +49,7 @@ class RobStrideSettings(DriveSettings):
     family: Literal["robstride"] = "robstride"
     id: Annotated[int, Field(ge=1, le=0x7F)]
     """Motor id."""
-    host: Annotated[int, Field(ge=0, le=0xFF)] = 0xFD
+    host: Annotated[int, Field(ge=0, le=0xFF)] = OUR_ID
     """Our id, to which it replies."""
     model: Literal["RS00", "RS01", "RS02", "RS03", "RS04", "RS05", "RS06"]
     """Model as on its label: its frames are scaled by it, and the drive has no register that tells it."""
@@ -283,10 +290,36 @@ def _extended(frame: Frame) -> Frame:
     return frame[0] | EXTENDED, frame[1]
 
 
-FAMILY = Family(
-    "robstride",
-    TRAITS,
-    RobStrideSettings,
-    RobStrideDrives,
-    summary="RobStride RS00 to RS06 (reBot B601-RS), private protocol",
-)
+def find_drives(bus: SearchedBus) -> list[FoundDrive]:
+    """By the device id of every motor id, then the torque limit and the deadman of those that answered."""
+    came = Counter(
+        frames.data_of(can_id) & 0xFF
+        for can_id, _ in bus.gather([_extended(frames.identity_frame(motor, OUR_ID)) for motor in range(1, 0x80)])
+        if can_id & EXTENDED and frames.kind_of(can_id) == Type.IDENTITY and can_id & 0xFF == IDENTITY_TARGET
+    )
+    wanted = (RobStrideParameter.LIMIT_TORQUE, RobStrideParameter.TIMEOUT)
+    heard = bus.gather([_extended(frames.read_frame(motor, OUR_ID, each)) for motor in came for each in wanted])
+    answers = [frames.parameter_answer(*frame) for frame in heard if frame[0] & EXTENDED]
+    told = {answer[:2]: answer[2] for answer in answers if answer is not None}
+    found = []
+    for motor in sorted(came):
+        limit, timeout = (told.get((motor, int(each))) for each in wanted)
+        # a host that has set up a drive since its power-on has set the limit, and with it the deadman
+        models = [] if timeout != 0 else [name for name, ranges in RANGES.items() if ranges.torque == limit]
+        model = (*models, MOST_TORQUE)[0]
+        why = "has its torque limit as delivered" if models else "any other then makes less than is asked of it"
+        each = FoundDrive(
+            *("robstride", motor, f"motor {motor}", {"id": motor, "model": model, "kp": 0.0, "kd": 0.0}),
+            max_torque=RANGES[model].torque,
+            largest_gains=(RANGES[model].kp, RANGES[model].kd),
+            model=" or ".join(models),
+            note=f"model {model} assumed, compare it with the label: {why}",
+            answers=came[motor],
+        )
+        found.append(each)
+    return found
+
+
+SEARCH = Discovery("device id of motors 1 to 127, by type 0", find_drives, ("moteus",))
+SUMMARY = "RobStride RS00 to RS06 (reBot B601-RS), private protocol"
+FAMILY = Family("robstride", TRAITS, RobStrideSettings, RobStrideDrives, discovery=SEARCH, summary=SUMMARY)

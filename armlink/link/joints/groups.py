@@ -7,8 +7,7 @@ from typing import Any
 from armlink.arm_file import ArmFile
 from armlink.bus.can_bus import CanBus
 from armlink.drives.base import BasicDrives
-from armlink.drives.family import Family
-from armlink.drives.registry import family
+from armlink.drives.family import Family, family
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput
 

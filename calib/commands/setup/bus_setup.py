@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from armlink.bus.can_bus import CanBus
-    from armlink.drives.findings import SetupFinding
+    from armlink.drives.discovery import BusDrives
+    from armlink.drives.findings import FoundDrives, SetupFinding
     from calib.commissioning.drive_match import Ask, Match
 
 SCHEMA = "armlink.new/1"
@@ -19,18 +20,19 @@ SCHEMA = "armlink.new/1"
 def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None) -> int:
     """An arm file of nothing but a bus: its drives, and no geometry."""
     from armlink.arm_file import parse_arm
-    from armlink.drives.registry import found_drives
     from calib.commissioning.bus_arm import arm_of_bus
+    from calib.commissioning.drive_match import addresses
 
     opened = open_named(bus)
     try:
-        made = arm_of_bus(found_drives(opened), str(opened.channel_info), bus_keys(bus, out), name or out.stem, ask)
+        drives = search(opened)
+        made = arm_of_bus(drives, str(opened.channel_info), bus_keys(bus, out, drives), name or out.stem, ask)
     finally:
         opened.shutdown()
     parse_arm(parse_yaml(made.text, out), out)
     write_whole(out, made.text)
-    nodes = ", ".join(str(match.drive.node) for match in made.matches)
-    told = f"{len(made.matches)} joints, nodes {nodes}; the geometry is not known, and the file says so"
+    ids = addresses([match.drive for match in made.matches])
+    told = f"{len(made.matches)} joints, {ids}; the geometry is not known, and says so in the file"
     return _tell(out, told, "check", name or out.stem, _matched(made.matches), [], json_file)
 
 
@@ -39,9 +41,8 @@ def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path 
     from armlink.arm_file import load_arm, parse_arm
     from armlink.content.file_content import parse_yaml
     from armlink.content.yaml_text import yaml_comment
-    from armlink.drives.registry import found_drives
     from calib.arm.kinematics import gcomp_arm
-    from calib.commissioning.drive_match import TurnedJoint, match_by_hand, match_in_order
+    from calib.commissioning.drive_match import TurnedJoint, addresses, match_by_hand, match_in_order
     from calib.commissioning.new_arm import rewired_text
 
     arm = load_arm(model)
@@ -49,22 +50,22 @@ def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path 
     findings: list[SetupFinding] = []
     opened = open_named(bus)
     try:
-        drives, channel = found_drives(opened), str(opened.channel_info)
+        drives, channel = search(opened), str(opened.channel_info)
         if ask is None:
             matches = match_in_order(arm.joint_names, drives, channel)
         else:
             known = gcomp_arm(arm)
-            turned = [TurnedJoint(*each) for each in zip(known.names, known.lower, known.upper, strict=True)]
+            settings = [joint.settings for joint in arm.require_link().joints]
+            gears = [1.0 if each.family == "canopen" else each.gear for each in settings]
+            turned = [TurnedJoint(*each) for each in zip(known.names, known.lower, known.upper, gears, strict=True)]
             matches, findings = match_by_hand(turned, drives, channel, ask)
     finally:
         opened.shutdown()
-    text = rewired_text(arm, matches, bus_keys(bus, out), out)
+    text = rewired_text(arm, matches, bus_keys(bus, out, drives), out)
     parse_arm(parse_yaml(text, out), out)
-    title = f"{arm.name} with the drives on {channel}: made from {model.name} by `armlink new`."
-    write_whole(
-        out, yaml_comment(f"{title} Nodes, rated torques and identities were read from the drives.") + "\n" + text
-    )
-    told = f"nodes {', '.join(str(match.drive.node) for match in matches)}"
+    title = f"{arm.name} with the drives on {channel}, from {model.name}, by the command new."
+    write_whole(out, yaml_comment(f"{title} Nodes, rated torques and identities are the drives' own.") + "\n" + text)
+    told = addresses([match.drive for match in matches])
     return _tell(out, told, "check", arm.name, _matched(matches), findings, json_file)
 
 
@@ -128,14 +129,31 @@ def open_named(bus: str) -> "CanBus":
     return open_bus(bus, Bus())
 
 
-def bus_keys(bus: str, out: Path) -> dict[str, str | int]:
-    """Keys of link.bus for a bus given on the command line; the arm file of a simulated one relative to `out`."""
+def search(opened: "CanBus") -> "BusDrives":
+    """The drives on an open bus; which families were looked for is said, and what must be set otherwise in a drive."""
+    from armlink.commands.plain_console import PlainConsole
+    from armlink.drives.discovery import BusDrives
+
+    drives = BusDrives(opened)
+    for line in (drives.told, *(f"{node['address']}: {node['wrong']}" for node in drives.nodes if node["wrong"])):
+        PlainConsole().print(line)
+    return drives
+
+
+def bus_keys(bus: str, out: Path, drives: "FoundDrives | None" = None) -> dict[str, Any]:
+    """Keys of link.bus for a bus given on the command line, with these drives; the arm file of a simulated one relative
+    to `out`."""
     import os
 
     from armlink.bus.open import parse_bus
+    from armlink.drives.family import family
 
     parsed = parse_bus(bus)
     channel = parsed.channel
     if Path(channel).is_file():
         channel = os.path.relpath(Path(channel).resolve(), out.resolve().parent)
-    return {"interface": parsed.interface, "channel": channel, "bitrate": parsed.bitrate}
+    keys: dict[str, Any] = {"interface": parsed.interface, "channel": channel, "bitrate": parsed.bitrate}
+    kinds = {each.family for each in drives.found} if drives is not None else set()
+    if parsed.fd or any(family(kind).traits.frame == "fd" for kind in kinds):
+        keys["fd"] = True
+    return keys | ({"options": parsed.options} if parsed.options else {})

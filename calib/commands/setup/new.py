@@ -93,7 +93,15 @@ def new(
     from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.errors import BadInput
     from armlink.model_file import expanded
-    from calib.commands.setup.bus_setup import begin_with_drives, bus_keys, copy, drives_by_ids, open_named, rewire
+    from calib.commands.setup.bus_setup import (
+        begin_with_drives,
+        bus_keys,
+        copy,
+        drives_by_ids,
+        open_named,
+        rewire,
+        search,
+    )
     from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
     from calib.commissioning.new_arm import new_arm
 
@@ -133,12 +141,7 @@ def new(
         model = expanded(model, out.with_suffix(".urdf"))
     if is_arm_file:
         found = bundled or model
-        if drives_by_ids(found):
-            if by_hand:
-                raise BadInput(
-                    "--by-hand: these drives are found by their ids in the arm file, and give no position "
-                    "before their set-up: leave `--by-hand` out"
-                )
+        if drives_by_ids(found) and not by_hand:
             return copy(found, out, str(bus), bundled is not None, json_file)
         return rewire(found, out, str(bus), hand(by_hand, interactive), json_file)
     if bus is not None:
@@ -157,15 +160,15 @@ def new(
             questions=asked,
         )
     if bus is not None:
-        from armlink.drives.registry import found_drives
         from calib.commissioning.new_arm import match_drives
 
         opened = open_named(bus)
         try:
-            match_drives(made, found_drives(opened), str(opened.channel_info), hand(by_hand, interactive))
+            drives = search(opened)
+            match_drives(made, drives, str(opened.channel_info), hand(by_hand, interactive))
+            made.draft.bus = bus_keys(bus, out, drives)
         finally:
             opened.shutdown()
-        made.draft.bus = bus_keys(bus, out)
     made.parsed()
     made.write()
     _show(results(json_file), made)

@@ -1,7 +1,7 @@
 """Belief about drives whose torque is a motor current: friction, gravity and their doubts.
 
-The unknowns are those of the creep fit (`calib.creep.parameters`), against readings that are corrected by the record in
-force: gains are 1 and offsets 0 while nothing has changed. Records say how sure each value is, though not how gains and
+The unknowns are those of `gcomp.identify.motor_model`, against readings that are corrected by the record in force:
+gains are 1 and offsets 0 while nothing has changed. Records say how sure each value is, though not how gains and
 mass moments go together, nor how friction changes over position: that is learned from work in which nothing changed.
 """
 
@@ -11,14 +11,13 @@ from typing import Self
 
 import numpy as np
 
-from calib.creep.model import CreepModel
-from calib.creep.parameters import LAST_ZERO, Doubt, family_slices
-from calib.creep.rows import CreepRows
 from calib.observer.motion.passages import Passage
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_regressor
+from gcomp.identify.motor_model import LAST_ZERO, MotorDoubt, MotorModel, family_slices
+from gcomp.identify.readings import StaticReadings
 
 ZERO_STD = 2e-3
 """Least standard deviation of a position zero [rad]: links give way."""
@@ -47,7 +46,7 @@ class MotorBelief:
     def __init__(self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated: Array) -> None:
         """Of records of creep sweeps; rated torques (n,) [N·m]."""
         self.arm, self.rated, n = arm, rated, arm.n
-        doubt = Doubt()  # of what the records do not hold
+        doubt = MotorDoubt()  # of what the records do not hold
         motors = [_motor(joint.motor) for joint in calibration.joints]
         self._at = family_slices(n)
         self.mean = np.zeros(self._at["rho"].stop)
@@ -74,20 +73,20 @@ class MotorBelief:
         """Rows that the belief rests on, beside the records."""
         self._first = (self.mean, self.covariance, self.sigma)
 
-    def rows(self, passages: Sequence[Passage]) -> CreepRows:
+    def rows(self, passages: Sequence[Passage]) -> StaticReadings:
         joint = np.array([each.joint for each in passages], dtype=np.int64)
         warm = np.array([each.temperature for each in passages]) - self.reference_temperature[joint]
-        return CreepRows(
-            joint=joint,
-            position=np.array([each.position for each in passages]).reshape(-1, self.arm.n),
-            reading=np.array([each.torque for each in passages]),
-            velocity=np.array([each.velocity for each in passages]),
-            mass=np.zeros(len(joint)),
-            warmth=np.nan_to_num(warm),
-            sweep=np.zeros(len(joint), dtype=np.int64),
-            sweeps=("work",),
-            by_temperature=bool(np.isfinite(warm).any()),
-            warmest=self.reference_temperature,
+        own = np.arange(self.arm.n) == joint[:, None]
+
+        def of_own(values: Array) -> Array:
+            return np.asarray(own * values[:, None])
+
+        return StaticReadings(
+            np.array([each.position for each in passages]).reshape(-1, self.arm.n),
+            np.where(own, np.array([each.torque for each in passages])[:, None], np.nan),
+            self.sigma,
+            velocity=of_own(np.array([each.velocity for each in passages])),
+            warmth=of_own(np.nan_to_num(warm)),
         )
 
     def linearised(self, passages: Sequence[Passage], carried: Array | None = None) -> tuple[Array, Array, Array]:
@@ -95,47 +94,46 @@ class MotorBelief:
 
         `carried` (2n,) [kg·m] is added to the mass moments.
         """
-        rows, mean = self.rows(passages), self.mean
+        model, mean = MotorModel(self.arm, self.rows(passages)), self.mean
         if carried is not None:
             mean = mean.copy()
             mean[self._at["beta"]] += carried
-        predicted, jacobian = CreepModel(self.arm, rows).linearised(mean)
+        predicted, jacobian = model.linearised(mean)
         covariance = jacobian @ self.covariance @ jacobian.T
-        covariance[np.diag_indices(len(rows))] += self.sigma[rows.joint] ** 2
+        covariance[np.diag_indices(len(jacobian))] += self.sigma[model.joint] ** 2
         untold = np.array([np.isnan(each.temperature - self.reference_temperature[each.joint]) for each in passages])
         by_gain = jacobian[:, self._at["gain"]] * np.where(untold, UNKNOWN_WARMTH_STD, KNOWN_WARMTH_STD)[:, None]
-        return rows.reading - predicted, jacobian, covariance + by_gain @ by_gain.T
+        return model.reading - predicted, jacobian, covariance + by_gain @ by_gain.T
 
     def learn(self, passages: Sequence[Passage]) -> Self:
         """The belief with more rows in which nothing has changed."""
         belief = copy(self)
         belief.learnt = [*self.learnt, *passages]
         first_mean, first_covariance, belief.sigma = self._first
-        rows = self.rows(belief.learnt)
-        model = CreepModel(self.arm, rows)
+        model = MotorModel(self.arm, self.rows(belief.learnt))
         belief.mean = first_mean
         for _ in range(LEARNING_ROUNDS):
             predicted, jacobian = model.linearised(belief.mean)
-            noise = belief.sigma[rows.joint] ** 2
-            target = rows.reading - predicted + jacobian @ (belief.mean - first_mean)
+            noise = belief.sigma[model.joint] ** 2
+            target = model.reading - predicted + jacobian @ (belief.mean - first_mean)
             of_mean = first_covariance @ jacobian.T
             gain = np.linalg.solve(jacobian @ of_mean + np.diag(noise), of_mean.T).T
             belief.mean = first_mean + gain @ target
             belief.covariance = first_covariance - gain @ of_mean.T
-            belief.sigma = self._scatter(rows, rows.reading - model.predict(belief.mean))
+            belief.sigma = self._scatter(model, model.reading - model.predict(belief.mean))
         return belief
 
-    def _scatter(self, rows: CreepRows, residual: Array) -> Array:
+    def _scatter(self, model: MotorModel, residual: Array) -> Array:
         """Standard deviation of a row (n,) [N·m]: as measured, drawn towards what was assumed.
 
-        Neighbouring rows whose residuals are alike count for less than one each, as in `calib.creep.scatter`.
+        Neighbouring rows whose residuals are alike count for less than one each, as in `calib.fit.scatter`.
         """
         usual, found = self._first[2], np.empty(self.arm.n)
         for j in range(self.arm.n):
-            own = np.flatnonzero(rows.joint == j)
+            own = np.flatnonzero(model.joint == j)
             square = residual[own] ** 2
             variance = (square.sum() + USUAL_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + USUAL_ROWS)
-            near = np.abs(np.diff(rows.position[own, j])) < NEIGHBOUR_DISTANCE
+            near = np.abs(np.diff(model.readings.position[own, j])) < NEIGHBOUR_DISTANCE
             common = float((residual[own][1:] * residual[own][:-1])[near].sum() / max(square[1:][near].sum(), 1e-12))
             found[j] = np.sqrt(variance * (1 + 2 * min(max(common, 0.0), 1.0)))
         return found
@@ -152,7 +150,7 @@ def _motor(motor: MotorTorque | None) -> MotorTorque:
     return motor or MotorTorque(coulomb=nothing, load=nothing, viscous=nothing, asymmetry=nothing)
 
 
-def _sensors(calibration: CalibrationRecord, rated: Array, doubt: Doubt) -> tuple[Array, Array, Array]:
+def _sensors(calibration: CalibrationRecord, rated: Array, doubt: MotorDoubt) -> tuple[Array, Array, Array]:
     """Standard deviations (n,) of relative gains, of offsets [N·m] and of zeros [rad]; where one is not known, what is
     assumed before any sweep."""
     known = {name: float(row[at]) ** 0.5 for at, (name, row) in enumerate(

@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.creep.parameters import family_slices
 from calib.observer.config import ObserverConfig
 from calib.observer.evidence import ChangeFit, ChangeHypothesis, ResidualTest, Verdict
 from calib.observer.motion.belief import USUAL_ROWS, MotorBelief
 from calib.observer.motion.passages import Passage
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
+from gcomp.identify.motor_model import family_slices
 
 LEAST_ROWS = 6
 """Rows of a joint from which a change of its drive can be told."""

@@ -1,8 +1,11 @@
 """Errors of position servos, and which effects of the arm positions alone show."""
 
+from functools import partial
+
 import numpy as np
 
-from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, pick, sign
+from gcomp.arrays import Array
+from sim_gap.blind.effects.drawn_effect import Draw, DrawnEffect, SizedDraw, Values, sign
 from sim_gap.blind.scene import Scene, ServoLaw, rms
 
 OF_THE_ARM = (
@@ -23,60 +26,47 @@ OF_THE_ARM = (
 """Effects of the torque bench that a position shows."""
 
 
-def _law(scene: Scene) -> ServoLaw:
-    assert scene.law is not None
-    return scene.law
-
-
-def _servo(scene: Scene, name: str, parameter: str, joints: list[int], value: float) -> DrawnEffect:
-    """A servo whose law has another value at these joints; `name` is both the effect's and the law's."""
+def on_servos(scene: Scene, joints: int | list[int], effect: str, values: Values) -> DrawnEffect:
+    """Servos whose law has another value at these joints; effect and value of the law have one name."""
+    name, (value,) = effect.removeprefix("controller."), values.values()
+    places = np.atleast_1d(joints)
 
     def change(law: ServoLaw) -> None:
-        getattr(law, name)[joints] = value
+        getattr(law, name)[places] = value
 
-    told = {scene.arm.names[j]: {parameter: value} for j in joints}
-    return DrawnEffect(f"controller.{name}", told, law=change)
-
-
-def stiffness(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    j = int(random.integers(scene.arm.n))
-    factor = float(np.exp(sign(random) * random.uniform(0.25, 0.6)))
-    return _servo(scene, "stiffness", "kp", [j], float(_law(scene).stiffness[j] * factor))
+    return DrawnEffect(effect, {scene.arm.names[j]: values for j in places}, law=change)
 
 
 def delay(scene: Scene, random: np.random.Generator) -> DrawnEffect:
     """A command that arrives late at every joint."""
-    return _servo(scene, "delay", "time", list(range(scene.arm.n)), float(random.uniform(0.015, 0.06)))
+    return on_servos(scene, list(range(scene.arm.n)), "controller.delay", {"time": float(random.uniform(0.015, 0.06))})
 
 
-def slew(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    """A command whose rate is limited below the fastest motion."""
-    j = int(random.integers(scene.arm.n))
-    limit = float(np.quantile(np.abs(scene.motion[1][:, j]), random.uniform(0.8, 0.95)))
-    return _servo(scene, "slew", "limit", [j], limit)
+def stiffness(scene: Scene) -> Array:
+    assert scene.law is not None
+    return scene.law.stiffness
 
 
-def dead_zone(scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
-    """A servo that does not answer to small errors."""
-    usual = rms(scene.torque + scene.rotor_torque) / _law(scene).stiffness
-    wanted = np.maximum(random.uniform(0.25, 0.6) * usual, 0.006)
-    j = pick(wanted, 0.06, random)
-    return None if j is None else _servo(scene, "dead_zone", "width", [j], float(wanted[j]))
-
-
-def integral(scene: Scene, random: np.random.Generator) -> DrawnEffect:
-    """An integral part that the model's actuator has not."""
-    j = int(random.integers(scene.arm.n))
-    return _servo(scene, "integral", "ki", [j], float(_law(scene).stiffness[j] * random.uniform(0.5, 2.0)))
-
-
-DRAWS: dict[str, Draw] = {
-    "controller.stiffness": stiffness,
-    "controller.delay": delay,
-    "controller.slew": slew,
-    "controller.dead_zone": dead_zone,
-    "controller.integral": integral,
-}
+servo = partial(SizedDraw, make=on_servos)
+SIZED = (
+    servo(
+        "controller.stiffness",
+        "kp",
+        lambda s, r: stiffness(s) * np.exp(sign(r) * r.uniform(0.25, 0.6)),
+    ),
+    servo("controller.slew", "limit", lambda s, r: np.quantile(np.abs(s.motion[1]), r.uniform(0.8, 0.95), axis=0)),
+    servo(
+        "controller.dead_zone",
+        "width",
+        lambda s, r: r.uniform(0.25, 0.6) * rms(s.motor_torque) / stiffness(s),
+        0.006,
+        0.06,
+    ),
+    servo("controller.integral", "ki", lambda s, r: stiffness(s) * r.uniform(0.5, 2.0)),
+)
+"""A gain that is not the model's, a command whose rate is limited below the fastest motion, a servo that does not
+answer to small errors, an integral part that the model's actuator has not."""
+DRAWS: dict[str, Draw] = {"controller.delay": delay, **{each.effect: each for each in SIZED}}
 UNKNOWN = (
     "controller.slew",
     "controller.dead_zone",

@@ -11,8 +11,8 @@ from gcomp.arrays import Array, Mask
 from sim_gap.blind.arms import BenchArm
 from sim_gap.blind.scene import Scene, ServoLaw
 
-OFTEN = 0.08
-"""Torque reversals per second from which effects at a reversal show."""
+OFTEN_HZ = 0.08
+"""Rate of torque reversals from which effects at a reversal show [Hz]."""
 
 Values = dict[str, float]
 
@@ -69,11 +69,37 @@ def on_joint(scene: Scene, joint: int, effect: str, values: Values, **more: Any)
     return DrawnEffect(effect, {name: values}, **{"settings": (ArmSetting(effect, name, values),), **more})
 
 
-def pick(wanted: Array, cap: float | Array, random: np.random.Generator, allowed: Mask | None = None) -> int | None:
-    """A joint with a wanted magnitude that is finite and within the cap; None if there is none."""
-    fit = np.isfinite(wanted) & (wanted <= cap)
-    if allowed is not None:
-        fit &= allowed
+@dataclass(frozen=True)
+class SizedDraw:
+    """Draws one parameter at one joint of those that can show it."""
+
+    effect: str
+    parameter: str
+    size: Callable[[Scene, np.random.Generator], Array]
+    """Size that shows at each joint, (n,); not finite where none does."""
+    least: float = 0.0
+    most: float | Callable[[Scene], Array] = np.inf
+    """Range of sizes: a joint that would need a larger one does not get the effect."""
+    shows: Callable[[Scene, Array], Mask] | None = None
+    """Joints that show these sizes, (n,), if not all do."""
+    sound: float | None = None
+    """Value of a sound arm, from which the size goes to either side; None if the size is the value."""
+    make: Callable[..., DrawnEffect] = on_joint
+    more: Callable[[Scene, int], dict[str, Any]] = lambda scene, joint: {}
+    """Further fields of the effect of a joint."""
+
+    def __call__(self, scene: Scene, random: np.random.Generator) -> DrawnEffect | None:
+        sizes = np.maximum(self.size(scene, random), self.least)
+        fit = np.isfinite(sizes) & (sizes <= (self.most(scene) if callable(self.most) else self.most))
+        joint = pick(fit if self.shows is None else fit & self.shows(scene, sizes), random)
+        if joint is None:
+            return None
+        value = float(sizes[joint]) if self.sound is None else self.sound + sign(random) * float(sizes[joint])
+        return self.make(scene, joint, self.effect, {self.parameter: value}, **self.more(scene, joint))
+
+
+def pick(fit: Mask, random: np.random.Generator) -> int | None:
+    """One of the joints that fit, (n,); None if none does."""
     return int(random.choice(np.flatnonzero(fit))) if fit.any() else None
 
 
@@ -81,7 +107,8 @@ def sign(random: np.random.Generator) -> float:
     return float(random.choice([-1.0, 1.0]))
 
 
-def reversals(x: Array, width: Array) -> Array:
-    """How often each column passes from beyond +width to beyond −width or back, (n,)."""
-    beyond = (np.sign(column[np.abs(column) > limit]) for column, limit in zip(x.T, width, strict=True))
-    return np.array([np.count_nonzero(np.diff(signs)) for signs in beyond], float)
+def reverses_often(scene: Scene, width: Array) -> Mask:
+    """Joints whose torque often passes from beyond +width to beyond −width or back, (n,)."""
+    beyond = (np.sign(column[np.abs(column) > limit]) for column, limit in zip(scene.torque.T, width, strict=True))
+    counts = np.array([np.count_nonzero(np.diff(signs)) for signs in beyond])
+    return np.asarray(counts >= OFTEN_HZ * scene.seconds)

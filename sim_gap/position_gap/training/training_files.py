@@ -5,14 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from armlink.content.atomic_file import write_whole
 from armlink.errors import BadInput
 from gcomp.arrays import Array
-from sim_gap.better_model.actuator_entries import Row, steps_of, write_entries
-from sim_gap.better_model.effects_module import module_path, module_text
-from sim_gap.better_model.samples import write_rows
-from sim_gap.better_model.urdf import URDF, urdf_of, xml_comment
-from sim_gap.model.load import urdf_behind
+from sim_gap.better_model.export import module_path, module_text, write_files
+from sim_gap.better_model.training_files import Row, steps_of, write_entries, write_rows
+from sim_gap.better_model.urdf import URDF, xml_comment
 from sim_gap.position_gap.choice import effect_there
 from sim_gap.position_gap.identify import Identified
 from sim_gap.position_gap.training.draws import draw
@@ -40,21 +37,10 @@ def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
     import mujoco
 
     if found.export is None:
-        raise BadInput("--out-model needs a model that came from a file: give MJCF, URDF or an arm file with --sim")
-    text, lines = found.export.xml, found.export.lines
-    if path.suffix == URDF:
-        text, told = urdf_of(mujoco.MjModel.from_xml_string(text), urdf_behind(found.sim.path), lines)
-        lines = tuple(told)
-    try:
-        write_whole(path, text)
-        for file, content in ({} if path.suffix == URDF else _beside(found, path)).items():
-            if content is None:
-                file.unlink(missing_ok=True)
-            else:
-                write_whole(file, content)
-    except OSError as error:
-        raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
-    return lines
+        raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+    xml, beside = found.export.xml, {} if path.suffix == URDF else _beside(found, path)
+    made = write_files(path, found.sim, xml, lambda: mujoco.MjModel.from_xml_string(xml), found.export.lines, beside)
+    return tuple(made)
 
 
 def _beside(found: Identified, path: Path) -> dict[Path, str | None]:

@@ -25,7 +25,7 @@ def shown(table: Table, width: int) -> list[str]:
     return console.file.getvalue().splitlines()
 
 
-@settings(deadline=None, max_examples=150, derandomize=True)
+@settings(deadline=None, max_examples=60, derandomize=True)
 @given(st.lists(NAMES, min_size=1, max_size=4), st.integers(20, 200), st.booleans(), st.booleans())
 def test_every_word_comes_whole(rows, width, no_wrap, light):
     columns = max(map(len, rows))

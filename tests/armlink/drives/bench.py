@@ -7,8 +7,8 @@ import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
 from armlink.drives.board import Board
+from armlink.drives.family import family
 from armlink.drives.orders import Limits, Mode, Order, Power, Reading
-from armlink.drives.registry import family
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

@@ -20,11 +20,11 @@ from armlink.bus.message_port import as_message
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.bus.taps import TappedPort
 from armlink.drives.damiao import frames as damiao
+from armlink.drives.family import family
 from armlink.drives.mit_packing import MitFeedback
 from armlink.drives.moteus import frames as moteus
 from armlink.drives.odrive import frames as odrive
 from armlink.drives.orders import Limits, Mode, Order, Power
-from armlink.drives.registry import family
 from armlink.drives.robstride import frames as robstride
 from armlink.errors import BadInput, BusFault, Stall
 from armlink.link.link import Link
@@ -353,7 +353,7 @@ def lies(name, draw, bench, joint):
 
 
 @every_arm
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(draw=st.data())
 def test_no_frame_leaves_beyond_a_limit(name, draw):
     bench = prepared(name)

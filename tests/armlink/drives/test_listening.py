@@ -8,9 +8,9 @@ import pytest
 from armlink.arm_file import load_arm
 from armlink.drives.damiao import frames
 from armlink.drives.damiao.drives import READ, WRITE
+from armlink.drives.family import family
 from armlink.drives.odrive.drives import ODriveDrives
 from armlink.drives.odrive.frames import AxisState
-from armlink.drives.registry import family
 
 PMAX = 21
 

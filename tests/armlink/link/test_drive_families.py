@@ -31,6 +31,7 @@ def test_enable_hold_disable(name):
         assert set(states) == {Power.OFF}
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("name", FROM_CURRENT)
 def test_a_calibration_in_the_host_corrects_reading_and_command(name):
     """A drive that makes (τ_told − offset) / gain gets gain · τ + offset for τ."""

@@ -70,7 +70,7 @@ def test_whatever_ends_the_job_the_arm_is_parked(name, end):
     assert (bench.peak < speed + EXTRA_SPEED).all(), bench.peak
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @every_family
 def test_an_arm_afloat_is_held_although_the_frames_of_one_cycle_are_lost(name):
     """Those that tell drives of their new mode, too: no drive may go on with torque while it is sent positions."""
@@ -211,7 +211,7 @@ def test_a_drive_that_stops_by_itself_is_caught(name):
     assert not any(bench.powered)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @every_family
 def test_a_host_that_stood_still_catches_the_arm(name):
     bench = EndsBench(name)

@@ -96,7 +96,7 @@ def flooded(family: str, kind: str, count: int) -> tuple[FloodedBus, ArmlinkErro
 
 
 @pytest.mark.parametrize(("family", "kind", "count"), ROWS)
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 def test_a_flood_drops_no_arm(family: str, kind: str, count: int) -> None:
     bus, error = flooded(family, kind, count)
     assert isinstance(error, BusFault)

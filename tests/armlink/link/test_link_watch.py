@@ -91,7 +91,7 @@ def test_scan_shows_a_node_id_given_twice(capsys, monkeypatch):
 
     monkeypatch.setattr(LockStepBus, "put", twice)
     assert run(["scan", "--bus", "armlink_sim:sarcos"]) == 3
-    assert "node id 4 answers twice: give every node an id of its own" in capsys.readouterr().err.splitlines()[-1]
+    assert "node 4 answers twice: give every drive an id of its own" in capsys.readouterr().err.splitlines()[-1]
 
 
 # ---- modes

@@ -38,6 +38,7 @@ def away(arm, link, by):
         link.cycle(Command.hold(goal))
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("name", FALLING)
 def test_parking_stows_the_arm_and_takes_the_power(name):
     arm = load_arm(name)

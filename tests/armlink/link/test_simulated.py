@@ -138,6 +138,7 @@ def test_a_joint_of_a_model_file_gets_its_range_from_the_model(tmp_path):
     np.testing.assert_allclose(np.degrees(ranges), [[-10, 10], [-90, 45]])
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("number", [3, 4])
 def test_an_rpdo_that_another_program_has_mapped_cannot_move_a_joint(link, simulated, number):
     """A second program mapped an RPDO of its own before the link came, and sends to it while the link holds."""

@@ -15,7 +15,7 @@ from vcan_pair import pair_text
 from armlink.drives.canopen.cia402 import DriveState, state_of
 from armlink.guard import bus_guard
 
-pytestmark = pytest.mark.vcan
+pytestmark = [pytest.mark.vcan, pytest.mark.long]  # quick: `tests/faults/test_vcan.py`, a link on the same bus
 
 ROOT = Path(__file__).parents[3]
 BUS = "socketcan:vcan0"
@@ -128,7 +128,6 @@ def test_a_killed_host_leaves_every_joint_in_quick_stop(simulated, arm_file, lis
     }
 
 
-@pytest.mark.long
 def test_an_interrupted_host_quick_stops_itself(simulated, arm_file, listener):
     process = pushing(arm_file)
     process.send_signal(signal.SIGINT)
@@ -139,7 +138,6 @@ def test_an_interrupted_host_quick_stops_itself(simulated, arm_file, listener):
     }
 
 
-@pytest.mark.long
 def test_the_host_keeps_no_higher_rate_than_it_should(simulated, arm_file):
     process = host(arm_file, 250)
     out, _ = process.communicate(timeout=60)
@@ -173,7 +171,6 @@ def test_the_self_test_shows_that_the_joints_stop_without_their_host(simulated, 
     assert all(0.9 < each["seconds"] < 1.6 for each in alone)
 
 
-@pytest.mark.long
 def test_a_second_host_is_noticed(simulated, arm_file):
     process = pushing(arm_file)
     second = armlink("check", arm_file, "--yes")

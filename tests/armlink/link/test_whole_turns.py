@@ -75,6 +75,7 @@ def zeros_named(text, joint):
     return [float(each) for each in re.findall(r"zero: (-?\d+\.\d{4})", said)]
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("draws", [SHORT, pytest.param(LONG, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", FAMILIES)
 def test_none_is_driven_and_each_is_named(name, draws):
@@ -123,6 +124,7 @@ def test_a_turn_of_a_drive_before_a_gear_is_named_wherever_it_can_be_seen(draws)
     assert seen > draws / 4
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("name", FAMILIES)
 def test_turns_auto_corrects_zero_limits_and_readings(name):
     """The joint is held where it truly stands, and a second start finds nothing to correct."""

@@ -194,6 +194,7 @@ def test_a_start_that_parks_first_for_longer_than_a_hang_is_given_may_be_interru
     pendulum.require_parked()
 
 
+@pytest.mark.long
 def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulum) -> None:
     pendulum.hold_out()
     pendulum.send(signal.SIGINT)
@@ -209,9 +210,10 @@ def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulu
     pendulum.job.communicate(timeout=30)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("park_speed", "longest"),
-    [(0.8, 60.0), pytest.param(0.05, 120.0, marks=pytest.mark.long)],  # the second takes longer than a hang is given
+    [(0.8, 60.0), (0.05, 120.0)],  # the second takes longer than a hang is given
 )
 def test_a_daemon_that_is_stopped_parks_the_arm_first(
     pendulum: Pendulum, park_speed: float, longest: float, tmp_path: Path

@@ -202,6 +202,7 @@ def test_a_loop_that_stands_still_says_that_the_host_was_late(
     assert np.isfinite(link.cycle(Command.hold(link.position_sent)).position).all()
 
 
+@pytest.mark.long
 def test_an_arm_that_stands_still_is_not_called_broken(
     started: tuple[RemoteLink, subprocess.Popen[bytes]],
 ) -> None:
@@ -254,6 +255,7 @@ def dawdle(link: Link, tell: Callable[[str], None], seconds: float) -> int:
     return os.getpid()
 
 
+@pytest.mark.long
 def test_a_function_runs_in_the_loop_until_it_ends_or_ctrl_c(tmp_path: Path) -> None:
     def interrupt(text: str) -> None:
         raise KeyboardInterrupt

@@ -117,9 +117,9 @@ def test_a_stream_decodes_as_single_messages_do():
         assert stream(some[choice]) == JointStateDecoder()(some[choice])
 
 
-@pytest.mark.parametrize(("rows", "cuts"), [(3, None), (300, 40)])
+@pytest.mark.parametrize(("rows", "cuts"), [(3, 200), (300, 40), pytest.param(3, None, marks=pytest.mark.long)])
 def test_a_recording_cut_anywhere_loads_up_to_the_cut_and_says_so(tmp_path, rows, cuts):
-    """The short one at every byte, the long one, of many chunks, at some."""
+    """The short one at some bytes, in the long test at every one, the long one, of many chunks, at some."""
     recording = recording_of(rows=rows)
     save_recording(recording, tmp_path / "whole.mcap")
     whole = (tmp_path / "whole.mcap").read_bytes()

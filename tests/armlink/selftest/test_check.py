@@ -12,7 +12,7 @@ from armlink.arm_file import bundled_arms, parse_arm
 from armlink.cli import run
 from armlink.commands.check import _outcomes
 from armlink.drives.canopen.check.power_test import PowerTest
-from armlink.drives.findings import Result
+from armlink.drives.findings import HELD, Result
 from armlink.link.link import Link
 from armlink.selftest.self_test import SelfTest
 from sim_bus.bus.lock_step import LockStepBus
@@ -201,6 +201,26 @@ def test_an_arm_that_is_not_there_is_a_bus_fault(capsys):
     assert content
     assert run(["check", "sarcos", "--bus", "virtual:nobody", "--yes"]) == 3
     assert "no answer from joint_1" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.sample(1)
+@pytest.mark.parametrize("arm", ["openarm", *(name for name in bundled_arms() if name != "openarm")])
+def test_every_bundled_arm_passes_in_process(arm, capsys):
+    """The OpenArm's wrist sags under its soft gains until the integral term has taken its load over."""
+    assert run(["check", arm, "--yes"]) == 0
+    assert "checks passed" in capsys.readouterr().out
+
+
+def test_the_joint_that_moved_is_blamed(capsys, monkeypatch):
+    """A shoulder that carries the arm, with gains that are not its own: no tolerance is left for its load."""
+    monkeypatch.setattr(SelfTest, "_sags", lambda test: np.full(test.link.n, -HELD))
+    assert run(["check", "openarm", "--yes"]) == 1
+    told = capsys.readouterr()
+    (line,) = [line for line in told.out.splitlines() if "while it should hold" in line]
+    moved = line.partition(": enables and holds: ")
+    assert moved[1]
+    assert moved[2].startswith(f"{moved[0]}: moved by")
+    assert "no answer from" not in told.err
 
 
 @pytest.mark.parametrize("drive", [{"family": "canopen", "node": 12}, DAMIAO])

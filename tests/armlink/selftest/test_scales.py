@@ -94,7 +94,7 @@ def test_few_rows_with_gains_are_no_law():
     assert law(ScaleTrack(*(getattr(short, name)[:100] for name in short.__dataclass_fields__))) == []
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("name", ALL[:4])  # CubeMars drives, whose evidence is Damiao's: in the campaign
 def test_every_family_by_hand_and_by_its_own_host(name):
     found = judged(name, OFF)

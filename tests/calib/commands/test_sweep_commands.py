@@ -96,6 +96,7 @@ def test_plan_prints_and_moves_nothing(arm_path: Path, tmp_path: Path, capsys: p
     assert legend == "↔ sweeps; ▲ ▼ rests on its upper or lower stop", "no sign that the table has not"
 
 
+@pytest.mark.long
 def test_a_dry_run_makes_the_whole_sweep_on_the_simulated_arm(
     arm_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -131,6 +131,7 @@ def test_a_lock_that_cannot_be_is_one_line(model: Path, tmp_path: Path, lock: st
     assert not (tmp_path / "arm.yaml").exists()
 
 
+@pytest.mark.long
 def test_doctor_and_a_rehearsal_take_it(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "arm.yaml"
     assert run_armlink("new", str(model), "--out", str(out), "--lock", "lift:0.1").returncode == 0

@@ -239,6 +239,40 @@ def test_the_command_finds_other_ids_by_hand_and_its_file_passes_the_check(made,
     assert [joint.node for joint in load_arm("found.yaml").require_link().joints] == [12, 10, 11, 13]
 
 
+def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doctor_accepts(
+    made, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    content = yaml.safe_load(made.text)
+    turns = [(3, -1, 0.7), (1, 1, 0.0), (4, 1, -0.4), (2, -1, 0.2)]
+    for row, (number, direction, zero) in zip(content["link"]["joints"], turns, strict=True):
+        del row["node"]
+        drive = {"family": "damiao", "id": number, "reply": number + 0x10, "model": "DM8009", "kp": 40, "kd": 2}
+        row["drive"] = drive | {"direction": direction, "zero": zero}
+    (tmp_path / "real.yaml").write_text(yaml.safe_dump(content))
+    described = load_arm("real.yaml")
+    arm = SimulatedArm(described, Truth.of(described))
+    monkeypatch.setattr("calib.commands.setup.bus_setup.open_named", lambda bus: LockStepBus(arm=arm))
+    person = hands(arm, made)
+
+    def turn(text: str) -> None:
+        person(text)
+        arm.advance(0.001)  # such a drive reads its encoder once in a while
+
+    monkeypatch.setattr("calib.commands.setup.terminal.hand", lambda by_hand, interactive: turn)
+    line = ["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]
+    assert cli.run(line) == 0
+    drives = [joint.settings for joint in load_arm("found.yaml").require_link().joints]
+    assert [(each.id, each.reply, each.model, each.direction) for each in drives] == [
+        (number, number + 0x10, "DM8009", direction) for number, direction, _ in turns
+    ]
+    assert [each.zero for each in drives] == pytest.approx([zero for *_, zero in turns], abs=2e-3)
+    capsys.readouterr()
+    cli.run(["doctor", "found.yaml", "--offline"])
+    assert "damping ratio" not in capsys.readouterr().out
+    assert cli.run(["check", "found.yaml", "--passive"]) == 0
+
+
 def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_be_missing(
     made, tmp_path, monkeypatch, capsys
 ):
@@ -277,7 +311,7 @@ def test_a_joint_that_nobody_turned_and_a_drive_that_is_missing(made, tmp_path):
     with pytest.raises(BusFault, match="no drive read the motion of j1"):
         match_drives(made, drives, "the bus", lambda text: None)
     drives.found.pop()
-    with pytest.raises(BusFault, match=r"3 drives answer \(nodes 1, 2, 3\), but the arm has 4 joints"):
+    with pytest.raises(BusFault, match=r"3 drives answer \(node 1, node 2, node 3\), the arm has 4 joints"):
         match_drives(made, drives, "the bus", None)
 
 

@@ -1,23 +1,29 @@
 """The creep fit: derivatives, recovery of drawn arms, what cannot be seen, sweeps with a contact."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from drawn_creeps import DrawnCreep, draw_creep, without
+from drawn_creeps import DrawnCreep, draw_creep, pushed, without
 from judged_creeps import creep_arm
 
 from armlink.arm_file import ArmFile, Kinematics, load_arm
+from armlink.errors import Refused
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import CreepSection, SweepSection
-from calib.creep.fit import CreepFit, fit_rows
-from calib.creep.model import CreepModel
-from calib.creep.parameters import Doubt
-from calib.creep.plan import plan_creep
-from calib.creep.record import CreepCalibration
+from calib.fit.creep_fit import CreepFit, fit_rows
+from calib.install.apply import Apply, apply_creep
+from calib.install.plausibility import GateRefused
+from calib.plan.creep_plan import plan_creep
 from calib.plan.types import SweepPlan
+from calib.records.records import CalibrationRecord
+from calib.records.store import RecordStore
 from gcomp.gravity.torque import gravity_torque
+from gcomp.identify.motor_model import MotorModel
 
 SIDEWAYS = (0.0, -9.80665, 0.0)
 """Along the first axis of OpenArm."""
@@ -48,7 +54,7 @@ def fitted(made: DrawnCreep) -> CreepFit:
 
 
 def test_derivatives_agree_with_finite_differences() -> None:
-    model, random = CreepModel(gcomp_arm(arm()), drawn(0).rows), np.random.default_rng(0)
+    model, random = MotorModel(gcomp_arm(arm()), drawn(0).rows.readings), np.random.default_rng(0)
     x = 0.1 * random.standard_normal(model.size)
     x[model.slices["gain"]] = 1.1
     jacobian, step = model.linearised(x)[1], 1e-6
@@ -69,7 +75,7 @@ def test_an_arm_exactly_as_the_model_is_found_to_a_few_parts_in_ten_thousand() -
     assert off.max() < 2.5e-3
     np.testing.assert_allclose(fit.value("coulomb"), made.state.coulomb, rtol=0.05, atol=0.01)
     np.testing.assert_allclose(fit.value("load"), made.state.uneven[:, 2], atol=0.01)
-    assert not fit.disturbed
+    assert not fit.findings
 
 
 @pytest.mark.sample(1)
@@ -103,7 +109,7 @@ def test_a_loaded_pass_alone_after_the_empty_one_passes_warming_off_as_scale() -
 
 
 def test_without_a_mass_no_torque_constant_is_given() -> None:
-    reasons = CreepCalibration(fitted(drawn(5, "empty empty"))).reasons
+    reasons = fitted(drawn(5, "empty empty")).reasons
     assert {joint for joint, parameter in reasons if parameter == "gain"} == set(arm().joint_names)
     assert "reference mass" in reasons[arm().joint_names[3], "gain"]
 
@@ -113,13 +119,13 @@ def test_a_vertical_axis_is_named_with_its_remedy() -> None:
     assert any("openarm_right_joint1" in note and "tilted" in note for note in plan(True).notes)
     made = draw_creep(arm(True), plan(True), 6, plan(True).reference_mass)
     fit = fit_rows(gcomp_arm(arm(True)), made.rows, rated)
-    reasons = CreepCalibration(fit).reasons
+    reasons = fit.reasons
     assert "vertical" in reasons["openarm_right_joint1", "gain"]
     assert [joint for joint, parameter in reasons if parameter == "gain"] == ["openarm_right_joint1"]
     assert np.abs(fit.value("gain") / made.warm_gain - 1)[1:].max() < 0.015
-    record = CreepCalibration(fit).record(arm(True))
+    record = fit.record(arm(True))
     assert record.joints[0].gain is None
-    assert not any(CreepCalibration(fit).gravity.record(arm(True), record).identifiable[:2])
+    assert not any(fit.gravity.record(arm(True), record).identifiable[:2])
 
 
 @pytest.mark.long
@@ -130,12 +136,12 @@ def test_an_arm_whose_axes_meet_has_no_scale_until_the_place_of_the_mass_is_meas
     made = draw_creep(wrist, planned, 4, planned.reference_mass)
     rated = wrist.require_link().rated_torques
     fit = fit_rows(gcomp_arm(wrist), made.rows, rated)
-    reasons = CreepCalibration(fit).reasons
-    assert all("meet (nearly) in one point" in reasons[name, "gain"] for name in ("j2", "j3", "j4"))
-    assert not CreepCalibration(fit).gravity.record(wrist, None).identifiable.count(True)
+    reasons = fit.reasons
+    assert all("meet in one point" in reasons[name, "gain"] for name in ("j2", "j3", "j4"))
+    assert not fit.gravity.record(wrist, None).identifiable.count(True)
     measured = SweepSection(reference_point=tuple(made.truth.attachment + np.array([3e-4, -4e-4, 4e-4])))
-    cured = fit_rows(gcomp_arm(wrist), made.rows, rated, Doubt.of(measured))
-    assert [joint for joint, parameter in CreepCalibration(cured).reasons if parameter == "gain"] == ["j1"]
+    cured = fit_rows(gcomp_arm(wrist), made.rows, rated, measured.motor_doubt)
+    assert [joint for joint, parameter in cured.reasons if parameter == "gain"] == ["j1"]
     off = cured.value("gain") / made.warm_gain - 1
     assert np.abs(off[1:] / (cured.std("gain") / made.warm_gain)[1:]).max() < 3
     assert np.abs(off[1:]).max() < 0.015
@@ -146,19 +152,19 @@ def test_a_push_on_one_sweep_is_named_and_left_out() -> None:
     made = drawn(7)
     rows = made.rows
     chosen = next(k for k, name in enumerate(rows.sweeps) if name == "pass 2, openarm_right_joint4 creep 1")
-    place = rows.position[:, 3]
-    own = rows.sweep == chosen
+    place = rows.readings.position[:, 3]
+    own = rows.readings.series == chosen
     beyond = np.maximum(place - np.median(place[own]), 0.0)
-    pushed = replace(rows, reading=rows.reading + np.where(own, 4.0 * beyond, 0.0))
-    fit = fit_rows(gcomp_arm(arm()), pushed, arm().require_link().rated_torques)
-    assert [each.name for each in fit.disturbed] == ["pass 2, openarm_right_joint4 creep 1"]
-    assert "openarm_right_joint4" in str(fit.disturbed[0])
+    touched = pushed(rows, np.where(own, 4.0 * beyond, 0.0))
+    fit = fit_rows(gcomp_arm(arm()), touched, arm().require_link().rated_torques)
+    assert [(each.kind, each.joint) for each in fit.findings] == [("contact", "openarm_right_joint4")]
+    assert "pass 2, openarm_right_joint4 creep 1" in fit.findings[0].text
     assert np.abs(fit.value("gain") / made.warm_gain - 1).max() < 0.015
 
 
 def test_records_keep_friction_and_temperature() -> None:
     made = drawn(8)
-    record = CreepCalibration(fitted(made)).record(arm())
+    record = fitted(made).record(arm())
     motor = record.joints[1].motor
     assert motor is not None
     assert motor.coulomb[0] == pytest.approx(made.state.coulomb[1], abs=0.1)
@@ -167,13 +173,51 @@ def test_records_keep_friction_and_temperature() -> None:
     assert record.joints[-1].position_offset is None
 
 
-def test_a_cable_that_pulls_in_every_sweep_is_named_and_no_constant_is_given() -> None:
+def test_a_cable_that_pulls_in_every_sweep_is_named_and_no_constant_is_given(tmp_path: Path) -> None:
     made = drawn(9)
     rows = made.rows
-    own = rows.joint == 3
-    pull = np.where(own, 0.8 * (rows.position[:, 3] - 1.0) * made.truth.gain[3], 0.0)
-    fit = fit_rows(gcomp_arm(arm()), replace(rows, reading=rows.reading + pull), arm().require_link().rated_torques)
-    assert [each.joint for each in fit.springs] == ["openarm_right_joint4"]
-    assert fit.springs[0].stiffness == pytest.approx(0.8, abs=0.3)
-    assert "cable" in CreepCalibration(fit).reasons["openarm_right_joint4", "gain"]
+    own = rows.swept == 3
+    pull = np.where(own, 0.8 * (rows.readings.position[:, 3] - 1.0) * made.truth.gain[3], 0.0)
+    fit = fit_rows(gcomp_arm(arm()), pushed(rows, pull), arm().require_link().rated_torques)
+    assert [(each.kind, each.joint) for each in fit.findings] == [("spring", "openarm_right_joint4")]
+    assert fit.findings[0].size == pytest.approx(0.8, abs=0.3)
+    assert "cable" in fit.reasons["openarm_right_joint4", "gain"]
+    store, how = RecordStore(str(tmp_path / "records.db")), Apply(by="ann", check=False)
+    record = fit.record(arm())
+    with pytest.raises(GateRefused, match=r"cable under tension.*--accept openarm_right_joint4"):
+        apply_creep(record, arm(), store, fit, how)
+    assert store.current(CalibrationRecord, arm()) is None
+    apply_creep(record, arm(), store, fit, replace(how, accepted=("openarm_right_joint4",)))
+    assert store.current(CalibrationRecord, arm()) == record
     assert not fitted(made).findings
+
+
+def test_a_check_motion_decides_whether_a_record_comes_into_force(tmp_path: Path, monkeypatch) -> None:
+    """Gates as for sensors; with --apply --bus, short creeps about the present pose have to agree with the fit."""
+    fit, store, asked = fitted(drawn(8)), RecordStore(str(tmp_path / "records.db")), []
+    how = Apply(by="ann", bus="socketcan:vcan7")
+    record, ones = fit.record(arm()), np.ones(7)
+
+    def opened(_: ArmFile, bus: str | None) -> object:
+        asked.append(bus)
+        link = SimpleNamespace(start=lambda: None, enable=lambda: None)
+        return nullcontext(link)
+
+    monkeypatch.setattr("calib.install.apply.open_arm", opened)
+    for rms, fine in ((2 * ones, False), (0.5 * ones, True)):
+        found = SimpleNamespace(names=arm().joint_names, rms=rms, tolerance=ones, passed=fine)
+        monkeypatch.setattr("calib.install.apply.run_verify", lambda *_, found=found, **__: found)
+        if fine:
+            apply_creep(record, arm(), store, fit, how)
+        else:
+            with pytest.raises(Refused, match=r"in the check motion 2.000 N·m RMS"):
+                apply_creep(record, arm(), store, fit, how)
+            assert store.current(CalibrationRecord, arm()) is None
+    assert store.current(CalibrationRecord, arm()) == record
+    assert asked == ["socketcan:vcan7"] * 2
+    other = record.model_copy(
+        update={"joints": tuple(each.model_copy(update={"gain": 1.3 * (each.gain or 1.0)}) for each in record.joints)}
+    )
+    with pytest.raises(GateRefused, match="--replaced"):
+        apply_creep(other, arm(), store, fit, replace(how, check=False))
+    apply_creep(other, arm(), store, fit, replace(how, check=False, replaced=arm().joint_names))

@@ -11,10 +11,9 @@ from soft_links import soft_arm
 from armlink.errors import Refused
 from armlink.link.link import Link
 from calib.arm.sweep_section import sweep_motion
-from calib.creep.fit import fit_creep
-from calib.creep.plan import CreepGround, check_creep_limits, plan_creep
-from calib.creep.record import CreepCalibration
 from calib.dataset import load_data
+from calib.fit.creep_fit import fit_creep
+from calib.plan.creep_plan import CreepGround, check_creep_limits, plan_creep
 from calib.sweep.run import run_sweep
 from calib.sweep.verify import run_verify
 from sim_bus.bus.lock_step import LockStepBus
@@ -44,8 +43,8 @@ def test_passes_through_the_link_find_constants_that_verification_confirms(tmp_p
             simulated.attach_mass(mass, simulated.truth.attachment)
             passes.append(run_sweep(link, arm(), tmp_path / name, reference_mass=mass, plan=plan))
         fit = fit_creep(arm(), passes)
-        record = CreepCalibration(fit).record(arm())
-        check = run_verify(link, arm(), CreepCalibration(fit).gravity.record(arm(), record), record, poses=3)
+        record = fit.record(arm())
+        check = run_verify(link, arm(), fit.gravity.record(arm(), record), record, poses=3)
         link.disable()
     assert all(data.creeps and not data.contacts for data in passes)
     np.testing.assert_allclose(fit.value("gain") / simulated.true_sensors.gain, 1.0, atol=0.015)

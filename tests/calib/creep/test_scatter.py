@@ -4,27 +4,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn_creeps import draw_creep, without
+from drawn_creeps import creep_rows, draw_creep, without
 from judged_creeps import creep_arm
 
 from armlink.arrays import Array
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.fit import CreepFit, fit_rows
-from calib.creep.plan import plan_creep
-from calib.creep.ripple import ripple_cycles
-from calib.creep.rows import CreepRows, _steady
-from calib.creep.scatter import Scatter, scatter
+from calib.fit.creep_fit import CreepFit, fit_rows
+from calib.fit.pushes import ripple_cycles
+from calib.fit.scatter import Scatter, scatter
+from calib.fit.sweep_readings import SweepReadings, steady
+from calib.plan.creep_plan import plan_creep
 
 BINS, SWEEPS = 14, 5
 NONE = np.zeros(2 * BINS * SWEEPS)
 
 
-def creeps(span: float = 1.1) -> CreepRows:
+def creeps(span: float = 1.1) -> SweepReadings:
     """Sweeps of one joint, up and down through the same bins, which differ a little in place."""
     random, rows = np.random.default_rng(0), 2 * BINS * SWEEPS
     places = np.linspace(0.2, 0.2 + span, BINS)
     position = np.tile(np.concatenate([places, places[::-1]]), SWEEPS) + 1e-3 * random.standard_normal(rows)
-    return CreepRows(
+    return creep_rows(
         joint=np.zeros(rows, dtype=np.int64),
         position=position[:, None],
         reading=np.ones(rows),
@@ -33,7 +33,6 @@ def creeps(span: float = 1.1) -> CreepRows:
         warmth=np.zeros(rows),
         sweep=np.repeat(np.arange(SWEEPS), 2 * BINS),
         sweeps=tuple(f"creep {k}" for k in range(SWEEPS)),
-        by_temperature=False,
         warmest=np.array([np.nan]),
     )
 
@@ -48,7 +47,7 @@ def test_half_sums_and_half_differences_scatter_each_in_its_own_way() -> None:
     alike, opposite = 5e-3, 1e-3
     residual = np.empty(len(rows))
     for sweep in range(SWEEPS):
-        own = np.flatnonzero(rows.sweep == sweep)
+        own = np.flatnonzero(rows.readings.series == sweep)
         half_sum, half_difference = random.normal(0, alike, BINS), random.normal(0, opposite, BINS)
         residual[own] = np.concatenate([half_sum + half_difference, (half_sum - half_difference)[::-1]])
     found = scatter(rows, residual, np.array([10.0]), 1.0, NONE)
@@ -73,7 +72,7 @@ def test_what_a_degree_makes_is_alike_in_all_rows_of_a_sweep() -> None:
 
 def test_places_that_one_direction_lacks_have_no_partner() -> None:
     rows = creeps()
-    kept = rows.kept(~((rows.velocity < 0) & (rows.position[:, 0] < 0.5)))
+    kept = rows.kept(~((rows.side < 0) & (rows.readings.position[:, 0] < 0.5)))
     residual = np.random.default_rng(3).normal(0, 1e-3, len(kept))
     found = scatter(kept, residual, np.array([10.0]), 1.0, NONE[: len(kept)])
     assert sorted(np.concatenate([each for each, _ in found.blocks]).tolist()) == list(range(len(kept)))
@@ -83,18 +82,18 @@ def test_places_that_one_direction_lacks_have_no_partner() -> None:
 @pytest.mark.parametrize("cycles", [14.0, 19.3, 27.0])
 def test_the_period_of_a_ripple_is_found(cycles: float) -> None:
     rows = creeps()
-    place = rows.position[:, 0]
+    place = rows.readings.position[:, 0]
     residual = 2e-3 * np.sin(cycles * place + 1.0) + np.random.default_rng(4).normal(0, 1e-3, len(rows))
-    assert ripple_cycles(rows, residual, 1)[0] == pytest.approx(cycles, abs=0.5)
+    assert ripple_cycles(rows, residual)[0] == pytest.approx(cycles, abs=0.5)
 
 
 def test_no_ripple_is_found_in_noise_or_in_a_slow_course() -> None:
     rows, random = creeps(), np.random.default_rng(5)
     noise = random.normal(0, 1e-3, (100, len(rows)))
-    assert not any(ripple_cycles(rows, each, 1).any() for each in noise)
-    opposite = np.sign(rows.velocity) * 2e-3 * np.sin(19.0 * rows.position[:, 0])
-    assert not ripple_cycles(rows, noise[0] + opposite, 1).any()
-    assert not ripple_cycles(rows.kept(rows.position[:, 0] < 0.4), noise[0], 1).any()
+    assert not any(ripple_cycles(rows, each).any() for each in noise)
+    opposite = rows.side * 2e-3 * np.sin(19.0 * rows.readings.position[:, 0])
+    assert not ripple_cycles(rows, noise[0] + opposite).any()
+    assert not ripple_cycles(rows.kept(rows.readings.position[:, 0] < 0.4), noise[0]).any()
 
 
 def fitted(**changes: float) -> tuple[CreepFit, Array, Array]:
@@ -119,6 +118,7 @@ def test_ripple_is_fitted_and_does_not_widen_the_intervals() -> None:
     np.testing.assert_allclose(sizes, 0.1 * 0.6 * coulomb, rtol=0.2)
 
 
+@pytest.mark.long
 def test_the_usual_unevenness_of_friction_is_that_of_all_joints() -> None:
     uneven, *_ = fitted()
     even, *_ = fitted(uneven=0.0)
@@ -132,9 +132,9 @@ def test_the_usual_unevenness_of_friction_is_that_of_all_joints() -> None:
 
 def test_bins_at_unsteady_speed_are_left_out() -> None:
     rows = creeps()
-    velocity = rows.velocity * (1 + 2e-3 * np.random.default_rng(6).standard_normal(len(rows)))
-    velocity[:2] *= [1.1, 1.04]
-    left = _steady(replace(rows, velocity=velocity))
+    velocity = rows.readings.velocity * (1 + 2e-3 * np.random.default_rng(6).standard_normal((len(rows), 1)))
+    velocity[:2, 0] *= [1.1, 1.04]
+    left = steady(replace(rows, readings=replace(rows.readings, velocity=velocity)))
     assert np.flatnonzero(~left).tolist() == [0, 1]
-    rough = rows.velocity * (1 + 0.03 * np.random.default_rng(7).standard_normal(len(rows)))
-    assert _steady(replace(rows, velocity=rough)).mean() > 0.95
+    rough = rows.readings.velocity * (1 + 0.03 * np.random.default_rng(7).standard_normal((len(rows), 1)))
+    assert steady(replace(rows, readings=replace(rows.readings, velocity=rough))).mean() > 0.95

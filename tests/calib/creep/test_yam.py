@@ -10,8 +10,8 @@ from armlink.arm_file import ArmFile, load_arm
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_motion
 from calib.commissioning.model_checks import model_findings
-from calib.creep.levers import VERTICAL, is_vertical
-from calib.creep.plan import plan_creep
+from calib.plan.creep_plan import plan_creep
+from calib.plan.levers import VERTICAL, is_vertical
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "yam.yaml"
 LINKS = (

@@ -33,7 +33,7 @@ BURSTS = {"store": (14, 28), "journal": (11, 22), "disk": (2, 4), "pipe": (5, 20
 """How many calls in a row fail, of how many; each failure of the pipe is a new bus process."""
 
 
-@pytest.mark.sample(1)  # all five of them fail in the test below
+@pytest.mark.long
 @pytest.mark.parametrize("failing", DEPENDENCIES)
 def test_no_failing_call_ends_it_or_loses_an_event(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: list[tuple[str, str | None]], failing: str
@@ -242,17 +242,18 @@ def test_a_journal_that_is_damaged_under_way_is_set_aside_too(tmp_path: Path) ->
 EVENTS = "UPDATE events SET "
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize(
     "spoil",
     [
         "INSERT INTO decisions(proposal, time, state, by, note) VALUES (1, '2026-01-01', 'appro\x01ed', 'ann', '')",
         "UPDATE proposals SET finding = '{\"joint\": 2'",
+        EVENTS + "evidence = substr(evidence, 2)",
+        EVENTS + "text = x'ff'",
         "UPDATE proposals SET finding = '[]'",
         "UPDATE proposals SET time = 'x'",
-        EVENTS + "evidence = substr(evidence, 2)",
         EVENTS + "evidence = '[1]'",
         EVENTS + "time = 'x'",
-        EVENTS + "text = x'ff'",
         EVENTS + "text = CAST(x'ff' AS TEXT)",
     ],
 )
@@ -273,6 +274,7 @@ def test_a_row_that_is_damaged_and_still_a_row_is_damage_of_the_journal(tmp_path
     assert daemon.view.proposals() == ()
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("spoil", ["estimate = '{'", "estimate = '{}'", "estimate = '7'", "time = '2026'", "t = 'x'"])
 def test_a_damaged_row_of_history_is_left_out(tmp_path: Path, spoil: str) -> None:
     daemon = FastDaemon(tmp_path, 1, settings("propose"))

@@ -454,6 +454,7 @@ def at_a_job_of_few_poses(tmp_path: Path, **more: object) -> FastDaemon:
     return daemon
 
 
+@pytest.mark.long
 def test_where_watching_cannot_decide_a_sweep_follows_and_decides(tmp_path: Path) -> None:
     daemon = at_a_job_of_few_poses(tmp_path, sweep_when_undecided=True)
     daemon.run(900, until=lambda: daemon.view.status().state is State.SWEEPING)
@@ -498,9 +499,16 @@ def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
         Journal(tmp_path / "journal.db")
 
 
+def keep_history(daemon: FastDaemon) -> None:
+    """Six points, a second apart."""
+    for _ in range(6):
+        daemon.run(1)
+        daemon.service.save(history=True)
+
+
 def test_history_is_thinned_evenly_and_ends_with_the_newest(tmp_path: Path) -> None:
     daemon = FastDaemon(tmp_path, 1, settings("apply"))
-    daemon.run(320)
+    keep_history(daemon)
     points = daemon.view.history("joint_3")
     assert len(points) >= 6
     few = daemon.view.history("joint_3", most=3)
@@ -518,7 +526,7 @@ def test_history_older_than_a_month_is_thinned_the_rest_stays_whole(tmp_path: Pa
     journal, old = daemon.service.journal, daemon.wall() - timedelta(days=31)
     for minute in range(100):
         journal.add_history(old + timedelta(minutes=minute), 60.0 * minute, None, {"gain": []})
-    daemon.run(320)
+    keep_history(daemon)
     reader = HistoryReader(journal.path)
     times = [point[0] for page in reader.pages(reader.chosen(None, None, 1000)) for point in page]
     assert sum(time < daemon.wall() - timedelta(days=30) for time in times) == 10

@@ -71,13 +71,17 @@ class Bench:
                 return
 
 
-@pytest.fixture
-def without_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In place of a diagnosis, whose start takes seconds, a program that says at once that there is no model."""
-    program = tmp_path / "program"
-    program.write_text("#!/bin/sh\necho 'armlink: no model file absent.xml' >&2\nexit 2\n")
+def in_place_of_a_diagnosis(program: Path, script: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that answers at once; a diagnosis takes seconds to start."""
+    program.write_text(f"#!/bin/sh\n{script}\n")
     program.chmod(0o700)
     monkeypatch.setattr(daily_diagnosis, "sys", SimpleNamespace(executable=str(program)))
+
+
+@pytest.fixture
+def without_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = "echo 'armlink: no model file absent.xml' >&2\nexit 2"
+    in_place_of_a_diagnosis(tmp_path / "program", script, monkeypatch)
 
 
 def test_the_minute_with_the_most_motion_is_taken_once_a_day(tmp_path: Path) -> None:
@@ -139,7 +143,7 @@ def test_a_day_without_motion_has_none(tmp_path: Path) -> None:
     assert bench.said == []
 
 
-def test_why_there_is_none_is_said_once(tmp_path: Path) -> None:
+def test_why_there_is_none_is_said_once(tmp_path: Path, without_model: None) -> None:
     bench = Bench(tmp_path / "diagnosis")
     for _ in range(2):
         bench.work(30.0)
@@ -201,7 +205,25 @@ def test_one_that_takes_too_long_is_ended(tmp_path: Path) -> None:
     assert "took longer than 30 min" in bench.said[0][2]
 
 
-@pytest.mark.slow
+def test_the_causes_are_said_each_day_and_wear_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cause = {"effect": "friction.coulomb", "joints": ["joint_1", "joint_2"]}
+    trend: dict[str, Any] = {"effect": "friction.coulomb", "joint": "joint_2", "parameter": "torque", "unit": "N·m"}
+    trend |= {"before": 0.5, "now": 0.75, "since": "2026-10-01"}
+    newest = {"case": "20261102T000000Z", "answer": {"verdict": "no_gap", "causes": [cause]}}
+    (tmp_path / "answer").write_text(json.dumps({"newest": newest, "trends": [trend]}))
+    script = f'for last; do :; done\ncp {tmp_path / "answer"} "$last"'
+    in_place_of_a_diagnosis(tmp_path / "program", script, monkeypatch)
+    bench = Bench(tmp_path / "diagnosis")
+    for _ in range(2):
+        bench.work(30.0)
+        bench.day()
+    text = "diagnosis of the day: no gap: friction.coulomb of joint_1 and joint_2"
+    said = ("diagnosis", None, text, {"recording": "20261102T000000Z", "causes": [cause]})
+    wear = "joint_2: wear: torque of friction.coulomb went from 0.5 to 0.75 N·m since 2026-10-01"
+    assert bench.said == [said, ("wear", "joint_2", wear, trend), said]
+
+
+@pytest.mark.long
 def test_the_service_diagnoses_what_it_has_recorded(tmp_path: Path) -> None:
     """Its recordings of the arm at work, against the arm file's own masses, after its day of three minutes."""
     settings = DaemonSection.model_validate({"diagnosis": {"hours": 0.05}})

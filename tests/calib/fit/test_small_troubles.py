@@ -118,6 +118,7 @@ def _unloaded(q: np.ndarray) -> SweepReadings:
         target=nothing,
         position_sigma=np.zeros(q.shape[1]),
         resolution=np.zeros(q.shape[1]),
+        warmest=np.full(q.shape[1], np.nan),
     )
 
 

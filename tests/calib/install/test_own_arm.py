@@ -154,6 +154,7 @@ def daemon(folder: Path, store: Path, serial: str, policy: str, first: int, seed
     return made
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(("serial", "written"), [("unknown", [0, 0]), ("7", [1, 0])])
 def test_of_two_arms_of_one_name_on_one_store_none_gets_the_other_s_calibration(
     tmp_path: Path, serial: str, written: list[int]

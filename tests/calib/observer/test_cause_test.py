@@ -150,7 +150,7 @@ def share_right(arm, beta, effect, rows, trials=30, model_std=None) -> tuple[flo
     return float(np.mean([answer(truth, was) == truth for truth, was in results])), said
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("effect", "rows", "least"),
     [  # `least` is the table's figure less three standard deviations of 30 trials
@@ -185,7 +185,7 @@ def test_two_joints_that_drift_at_once_are_both_named(sarcos, sarcos_beta) -> No
     assert right >= 0.8, said
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("mass", [0.02, 0.05, 0.25, 1.0, 3.0])
 def test_a_payload_is_never_called_drift(sarcos, sarcos_beta, mass) -> None:
     _, said = share_right(sarcos, sarcos_beta, payload(mass), 20, trials=60)
@@ -198,11 +198,11 @@ def test_a_payload_comes_with_its_mass(sarcos, sarcos_beta) -> None:
     assert np.sqrt(np.mean((np.array(masses) - 0.5) ** 2)) < 0.005  # theory: 3.2 g
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(
     ("effect", "least"),
-    [(nothing, 0.97), (offset(0.2), 0.93), (payload(0.25), 0.97)],
-    ids=["none", "offset", "payload"],
+    [(offset(0.2), 0.93), (nothing, 0.97), (payload(0.25), 0.97)],
+    ids=["offset", "none", "payload"],
 )
 def test_an_imperfect_model_does_not_spoil_the_verdict(sarcos, sarcos_beta, effect, least) -> None:
     right, said = share_right(sarcos, sarcos_beta, effect, 60, model_std=MODEL_STD)

@@ -117,6 +117,7 @@ def test_a_slow_drift_is_followed(sarcos, sarcos_beta) -> None:
     assert worst < 0.005
 
 
+@pytest.mark.long
 def test_a_step_and_a_ramp_on_two_joints_at_once_are_put_right(sarcos, sarcos_beta) -> None:
     bench = Bench(sarcos, sarcos_beta, 65)
     bench.work(40)
@@ -206,6 +207,7 @@ def test_position_gain_and_offset_are_applied(sarcos, sarcos_beta) -> None:
         )
 
 
+@pytest.mark.long
 def test_a_payload_that_stays_becomes_a_tool_and_drift_is_seen_again(sarcos, sarcos_beta) -> None:
     at_origin, by_point = payload_columns(sarcos)
     bench = Bench(sarcos, sarcos_beta, 130, ObserverConfig(tool_windows=5))

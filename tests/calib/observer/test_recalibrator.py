@@ -128,6 +128,7 @@ class Calls:
             raise error
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("step", ["apply", "undo", "restore"])
 def test_whichever_call_fails_it_and_the_store_agree_on_what_is_in_force(tmp_path: Path, step: str) -> None:
     """Nothing fails after the write that would make a record that is in force look refused, and be written twice."""

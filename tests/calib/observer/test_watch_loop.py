@@ -157,6 +157,7 @@ def test_apply_puts_a_drifted_sensor_right(tmp_path: Path) -> None:
     assert alarm < written == history.recalibrations[0][0]
 
 
+@pytest.mark.long
 def test_propose_and_observe_leave_the_controller_alone(tmp_path: Path) -> None:
     for policy, kept in (("propose", 1), ("observe", 0)):
         setup = Setup(tmp_path / policy, policy)

@@ -180,6 +180,7 @@ def test_two_open_stores_see_one_another(tmp_path: Path) -> None:
     assert one.current(CalibrationRecord, ARM) == two.current(CalibrationRecord, ARM) == calibration(1.05)
 
 
+@pytest.mark.long
 def test_a_process_killed_while_it_writes_leaves_whole_records(tmp_path: Path) -> None:
     """SIGKILL inside the transaction: the record before stands, the one begun is gone."""
     script = (

@@ -6,6 +6,10 @@ from loaded_campaign import campaign
 
 
 def test_three_kills_tear_and_lose_nothing(tmp_path: Path) -> None:
-    records, _, wrong = campaign("kill_records").campaign(str(tmp_path / "records.db"), tmp_path, 3, seed=5)
-    assert wrong == []
+    kills, records = campaign("kill_records"), 0
+    for seed in range(5, 25):  # on a busy machine three may come before the first record
+        records, _, wrong = kills.campaign(str(tmp_path / "records.db"), tmp_path, 3, seed)
+        assert wrong == []
+        if records > 0:
+            break
     assert records > 0

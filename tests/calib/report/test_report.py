@@ -9,13 +9,12 @@ from sweep_arms import random_arm
 from synthetic_sweeps import passes
 
 from armlink.errors import Refused
-from calib.field.field_fit import fit_field, heldout_errors
-from calib.field.field_record import field_record
-from calib.field.rows import rows_of_sweeps
+from calib.fit.field_fit import fit_field, heldout_errors
 from calib.fit.findings import FitFinding
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.heldout import heldout_scores, worse_joint
 from calib.fit.sensor_fit import SensorFit, fit_sensors
+from calib.fit.slow_windows import rows_of_sweeps
 from calib.install.apply import Apply, admit_sweeps, check_heldout, check_holds
 from calib.records.compare import differences
 from calib.records.records import CalibrationRecord, JointCalibration
@@ -135,13 +134,13 @@ def test_sweeps_without_a_mass_recalibrate_against_the_gravity_record(fit, recor
     gravity = identify_gravity(ARM, DATA, fit).record(ARM, record)
     later = changed(record, 1, gain=1.03, offset=0.3)
     rows = rows_of_sweeps(DATA[0], 0)
-    found = fit_field(ARM, rows, gravity, later)
+    found = fit_field(ARM, rows, gravity, later, {"pass": DATA[0].digest})
     for name in ("gain", "offset"):
-        true, value, std = getattr(TRUTH, name), getattr(found, name), found.std(name)
+        true, value, std = getattr(TRUTH, name), found.value(name), found.std(name)
         known = np.isfinite(value)
         assert known.any()
         assert (np.abs(value - true)[known] < 4 * std[known]).all()
-    new = field_record(ARM, found, later, {"pass": DATA[0].digest})
+    new = found.record(ARM, later)
     assert new.parent == later.id
     assert new.joints[1].gain == pytest.approx(TRUTH.gain[1], rel=0.01)
     for joint, parameter in found.reasons:

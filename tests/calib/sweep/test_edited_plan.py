@@ -139,6 +139,7 @@ def test_nothing_moves_along_a_plan_beyond_the_limits(what: str, bare: tuple[Arm
     assert farthest < STANDING
 
 
+@pytest.mark.long
 def test_the_planner_keeps_to_the_limits_that_it_is_judged_by(tmp_path: Path) -> None:
     arm = small(tmp_path)
     check_limits(arm, plan_sweep(arm))

@@ -74,6 +74,15 @@ def test_a_creeping_joint_has_not(speed: float) -> None:
     assert not RULE.settled(position, np.zeros((RULE.window, 1)), COUNTS, STEP)
 
 
+@pytest.mark.parametrize("drift", [0.0, 2.0])
+def test_a_torque_that_comes_with_every_fourth_cycle_settles_by_the_same_rule(drift: float) -> None:
+    random, torque = np.random.default_rng(3), np.full((RULE.window, 1), np.nan)
+    every = torque[::4, 0]
+    every[:] = drift * np.linspace(0.0, 1.0, len(every)) + random.normal(0.0, 0.05, len(every))
+    assert RULE.settled(np.zeros_like(torque), torque, COUNTS, STEP) == (drift == 0.0)
+    assert RULE.exact(torque, COUNTS) == (drift == 0.0)
+
+
 def test_a_drifting_torque_has_not_but_one_that_does_not_count_may() -> None:
     noise = np.random.default_rng(1).normal(0, 0.2, (RULE.window, 1))
     drifting = noise + np.linspace(0, 1.0, RULE.window)[:, None]

@@ -10,7 +10,7 @@ from armlink.arm_file import load_arm
 from calib.dataset import load_data
 from sim_bus.truth import Truth
 
-pytestmark = pytest.mark.vcan
+pytestmark = [pytest.mark.vcan, pytest.mark.long]  # quick: sweeps in lock-step, `test_sweep_run.py`
 
 BUS = "socketcan:vcan0"
 OPTIONS = ("--bus", BUS, "--yes", "--keep-going", "5", "--no-check-stops")
@@ -37,7 +37,6 @@ def test_a_short_sweep_is_complete_and_true(tmp_path: Path) -> None:
     assert found["gain"]["estimated"] == [None, None], "without a mass there are ratios alone"
 
 
-@pytest.mark.long
 def test_sweep_to_apply(tmp_path: Path) -> None:
     path = described(tmp_path)
     with simulated(tmp_path, BUS) as (pipe, _):

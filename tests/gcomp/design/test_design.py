@@ -28,6 +28,7 @@ def random_design(arm: Arm, rng: np.random.Generator, poses: int, steps: int) ->
     return predict_covariance(arm, rows, GUESS, unknown=MOMENTS)
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("criterion", ["D", "A"])
 def test_chosen_stops_beat_all_of_a_hundred_random_ones(criterion: str, sarcos, rng) -> None:
     design = choose_sweeps(sarcos, GUESS, sigma=SIGMA, unknown=MOMENTS, poses=2, criterion=criterion)

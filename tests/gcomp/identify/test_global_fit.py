@@ -128,6 +128,7 @@ def test_position_noise_widens_the_intervals_to_what_happens(sarcos) -> None:
     assert np.std(naive) > 2
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_robust_loss_survives_outliers_with_honest_intervals(loss: str, sarcos) -> None:
     rng = np.random.default_rng(11)

@@ -80,6 +80,7 @@ def test_in_lock_step_a_sync_is_a_period(ends: tuple[can.BusABC, can.BusABC]) ->
     assert arm.time == pytest.approx(2 * 0.004, abs=1e-9)
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
 def test_a_process_answers_until_it_is_signalled(number: int, status: int) -> None:
     group = "239.74.163.29"

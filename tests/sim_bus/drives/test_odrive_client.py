@@ -101,6 +101,10 @@ def test_the_published_message_file_operates_an_axis(arm, client):
     assert client.until(lambda c: c.latest["Get_Version"]["Fw_Version_Minor"] == 6)
 
 
+PATIENCE = 6000
+"""Looks, 10 ms apart, at a drive that a busy machine keeps waiting."""
+
+
 async def operate(arm, bus):
     drive = ODriveCAN(axis_id=1, can_bus=bus)
     await asyncio.wait_for(drive.start(), 20.0)
@@ -109,7 +113,7 @@ async def operate(arm, bus):
         drive.set_controller_mode("POSITION_CONTROL", "PASSTHROUGH")
         drive.set_input_pos(0.1)
         drive.set_axis_state_no_wait("CLOSED_LOOP_CONTROL")
-        for _ in range(400):
+        for _ in range(PATIENCE):
             drive.set_input_pos(0.1)
             await asyncio.sleep(0.01)
             if drive.axis_state == "CLOSED_LOOP_CONTROL" and abs(arm.angle - 0.1 * TURN) < 0.02:
@@ -118,12 +122,16 @@ async def operate(arm, bus):
         estimate = await drive.get_encoder_estimates()
         assert as_float(estimate["Pos_Estimate"]) == pytest.approx(0.1, abs=0.01)
         arm.inject("feedback.lost")
-        for _ in range(400):
+        said = ""
+        for _ in range(PATIENCE):
+            drive.set_input_pos(0.1)  # or its watchdog ends it
             await asyncio.sleep(0.01)
-            if drive.axis_state == "IDLE":
+            try:
+                drive.check_errors()
+            except DriveError as error:
+                said = str(error)
                 break
-        with pytest.raises(DriveError, match="MISSING_ESTIMATE"):
-            drive.check_errors()
+        assert "MISSING_ESTIMATE" in said
         arm.drive.faults.clear()
         drive.clear_errors()
         await asyncio.sleep(0.3)

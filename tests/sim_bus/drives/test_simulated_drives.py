@@ -249,6 +249,7 @@ def test_a_drive_without_a_model_on_its_label_is_not_simulated():
 # ---- the command
 
 
+@pytest.mark.long
 def test_armlink_sim_serves_drives_of_a_family_on_a_bus():
     channel = "239.74.163.93"
     command_line = [sys.executable, "-c", "from armlink.cli import main; main()", "sim", "six-damiao"]

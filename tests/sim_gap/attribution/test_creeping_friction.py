@@ -47,6 +47,7 @@ def sim(tmp_path_factory) -> Path:
     return written(tmp_path_factory.mktemp("creeping"), arm())
 
 
+@pytest.mark.long
 def test_an_arm_like_its_model_has_no_gap(sim: Path) -> None:
     """Creep was told as friction that rises with the velocity, a negative breakaway of 0.9, with more than 0.8."""
     answer = diagnose(sim, [measured(arm(), 1), measured(arm(), 2)], [measured(arm(), 3)])

@@ -19,9 +19,16 @@ def at(joint: int, value: float, other: float = 0.0) -> np.ndarray:
     return np.array([value if j == joint else other for j in range(3)])
 
 
+ANSWERS: dict[str, Diagnosis] = {}
+"""Those that more than one test asks for, by what they are of."""
+
+
 def diagnosed(wrong: Wrong, channels=BOTH, **options) -> Diagnosis:
-    train = record(model(), wrong, seed=1, seconds=40, channels=channels)
-    return diagnose(model(), [train], [record(model(), wrong, seed=2, seconds=25, channels=channels)], **options)
+    key = repr((wrong, channels, options))
+    if key not in ANSWERS:
+        train, other = (record(model(), wrong, seed=s, seconds=t, channels=channels) for s, t in ((1, 40), (2, 25)))
+        ANSWERS[key] = diagnose(model(), [train], [other], **options)
+    return ANSWERS[key]
 
 
 def value(answer: Diagnosis, place: str, name: str) -> float:
@@ -85,11 +92,13 @@ def test_a_true_model_has_no_gap(channels):
     assert (answer.verdict, answer.causes) == ("no_gap", ())
 
 
+@pytest.mark.long
 def test_an_effect_that_was_withheld_is_not_blamed_on_another_with_confidence():
     answer = diagnosed(Wrong(ripple=at(1, 0.6)), withhold=["transmission.ripple"])
     assert answer.verdict == "unexplained" or not [c for c in answer.causes if c.confidence > 0.8]
 
 
+@pytest.mark.long
 def test_noise_in_the_motion_that_no_effect_makes_is_unexplained():
     def shaken(recording: Recording) -> Recording:
         wave = 1.5 * np.sin(2 * np.pi * 1.37 * recording.t + np.sin(0.9 * recording.t))

@@ -44,7 +44,7 @@ def test_a_sensors_gain_and_a_payload():
     assert value(answer, "link.payload", "arm", "mass").value == pytest.approx(2.0, rel=0.03)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("degrees", [90.0, 30.0, 150.0])
 def test_a_base_that_is_turned_far(degrees):
     angles = np.radians(degrees) * np.array([0.8, -0.6])
@@ -102,7 +102,7 @@ def test_a_body_of_the_model_that_the_arm_lacks_is_a_payload_of_negative_mass():
     assert any("the arm lacks" in note for note in answer.notes)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("groups", [(), ("loaded=b,c",)])
 def test_a_payload_of_one_training_and_of_the_held_out_recording(groups):
     """Two recordings of three have it, the held-out one among them."""

@@ -36,7 +36,7 @@ def smooth_step(t: np.ndarray, start: np.ndarray, goal: np.ndarray) -> tuple[np.
     return t, q, v, a
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_efforts_without_gravity_are_known_as_such(seed: int) -> None:
     """As drivers publish them that subtract their own model of gravity: nothing is left at rest."""
@@ -65,7 +65,7 @@ def test_efforts_without_gravity_are_known_as_such(seed: int) -> None:
     np.testing.assert_allclose(again.motor_torque, whole[0].motor_torque, atol=1e-9)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_joint_that_went_one_way_rubs(seed: int) -> None:
     """Its torque may as well have an offset, in what is fitted; every gear rubs, and the way back shows which it is."""
@@ -149,6 +149,7 @@ def test_friction_behind_the_sensor_is_told_from_that_before_it(seed: int) -> No
     assert values(answer, "friction.bearing", "damping") == pytest.approx(np.full(N, 0.2), abs=0.1)
 
 
+@pytest.mark.long
 def test_recordings_of_some_seconds_are_diagnosed_together() -> None:
     wrong = Wrong(coulomb=0.8, viscous=0.4)
     parts = [record(model(), wrong, seed=k, seconds=2.5, rate=100.0, channels=("tau_motor",)) for k in range(5)]
@@ -182,6 +183,7 @@ def swing(real: mujoco.MjModel, start: float, random: np.random.Generator, noise
     return Recording(t=0.004 * np.arange(2000), position=np.array(positions)[:, None], motor_torque=torque)
 
 
+@pytest.mark.long
 def test_a_doubtful_unit_leaves_the_answer_open() -> None:
     wrong = Wrong(coulomb=0.5, viscous=0.3)
     made = [record(model(), wrong, seed=k, seconds=20.0, channels=("tau_motor",)) for k in range(2)]

@@ -56,7 +56,7 @@ def test_where_a_law_does_for_a_crowd_of_small_causes_the_crowd_gives_way():
 HIDDEN = (("link.payload", Wrong(payload=1.0)), ("base.tilt", Wrong(tilt=(0.05, 0.04))))
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize(("withheld", "wrong"), HIDDEN)
 def test_what_a_law_says_as_well_is_not_said_with_confidence(withheld, wrong):
     recordings = [record(model(), wrong, seed=seed, seconds=40, rate=50.0) for seed in (1, 2)]

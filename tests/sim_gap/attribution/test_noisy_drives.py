@@ -46,6 +46,7 @@ def residuals(recording: Recording) -> ResidualSet:
     return ResidualSet((signals,), layout_of([signals]))
 
 
+@pytest.mark.long
 def test_a_lag_far_below_the_noise_of_sensor_and_estimate_is_told_from_the_command_against_the_model():
     answer = diagnosed(lag=0.06, noise=(9.0, 5.0))
     first = answer.causes[0]

@@ -8,6 +8,7 @@ import pytest
 from sim_gap.attribution import rivals as module
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.search.term import Term
+from sim_gap.search.term_equations import TermChoice
 
 LAG, DELAY = Term("actuator.lag", 0, (0.01,)), Term("actuator.delay", 0, (0.01,))
 CLIPS = [Term("actuator.saturation", joint, (5.0,)) for joint in range(6)]
@@ -31,6 +32,7 @@ def lag_choice(
         judge=lambda terms: scores.get(frozenset(terms), float("inf")),
         without=lambda term, terms: [other for other in terms if other != term],
         with_needs=lambda term, terms: [*terms, term],
+        loss=lambda score: score,
     )
 
 
@@ -82,6 +84,12 @@ def test_the_rivals_of_a_weak_place_are_none_of_the_best_founded_one_in_whatever
     weighed = Rivals(lag_choice(scores, in_order([LAG, weak], turned), late)).weigh("actuator.lag", [LAG, weak])
     assert weighed.evidence == 0.4
     assert weighed.confounded_with == ()
+
+
+def test_terms_that_end_at_a_bound_have_no_evidence():
+    """Their score is infinite, and so may be that of all others."""
+    found = SimpleNamespace(score=float("inf"), equations=SimpleNamespace(measurements=100.0))
+    assert TermChoice.loss(found, 3.0) == TermChoice.loss(found, float("inf")) == 0.0
 
 
 def in_order(terms: list[Term], turned: bool) -> list[Term]:

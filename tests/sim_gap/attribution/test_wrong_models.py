@@ -26,6 +26,7 @@ def diagnosed(nominal: mujoco.MjModel, wrong: Wrong, channels: tuple[str, ...], 
     return diagnose(nominal, [train], [heldout])
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("channels", [("tau_motor",), ("tau", "tau_motor")])
 def test_friction_that_the_arm_lacks_is_an_effect_of_negative_size(channels):
     answer = diagnosed(with_friction(model()), LESS, channels, model())

@@ -135,6 +135,7 @@ def test_the_module_reads_as_the_simulated_arms_sensors_read(name):
     assert np.abs(off_torque).max() < 0.06  # of some 20 N·m; the simulated arm's own step is implicit
 
 
+@pytest.mark.long
 def test_what_is_written_runs_by_itself_and_closes_the_gap(tmp_path):
     (tmp_path / "arm.xml").write_text(THREE)
     wrong = Wrong(coulomb=np.full(3, 0.6), load=np.array([0.0, 0.3, 0.0]), ripple=np.array([0.0, 0.0, 0.5]))

@@ -13,8 +13,7 @@ from armlink import cli
 from armlink.errors import BadInput
 from armlink.recording.files import save_recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.better_model.actuator_entries import write_motor_entries
-from sim_gap.better_model.samples import drawn_parameters
+from sim_gap.better_model.training_files import drawn_parameters, write_motor_entries
 
 TRUE = np.array([0.6, 0.4, 0.02])
 
@@ -30,6 +29,7 @@ def arm(tmp_path_factory):
     return folder, diagnose(folder / "arm.xml", [made])
 
 
+@pytest.mark.long
 def test_draws_scatter_about_the_estimate_by_its_intervals(arm):
     answer = arm[1]
     estimate = answer.internals.estimate

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_gap.better_model.actuator_entries import write_entries
-from sim_gap.better_model.effects_module import module_text
+from sim_gap.better_model.export import module_text
+from sim_gap.better_model.training_files import write_entries
 from sim_gap.better_model.urdf import xml_comment
 
 HOSTILE = (

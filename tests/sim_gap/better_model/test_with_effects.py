@@ -1,6 +1,7 @@
 """The model with the effects added: MuJoCo then gives the torque that the recording shows."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -9,7 +10,7 @@ from wrong_arms import THREE, Wrong, model, motion, record
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.better_model.corrected_model import CoupledMotor, add_to, coupled_motors
+from sim_gap.better_model.corrected_model import add_motors
 from sim_gap.better_model.export import write_model
 from sim_gap.model.load import load_model, tendons_of
 
@@ -23,7 +24,7 @@ CASES = {
 }
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_the_written_model_has_no_gap_any_more(tmp_path, name):
     (tmp_path / "arm.xml").write_text(THREE)
@@ -67,7 +68,6 @@ def _sprung(stiffness: np.ndarray, rest: np.ndarray, seed: int) -> Recording:
 def test_a_shared_motor_becomes_a_fixed_tendon(tmp_path):
     """Its inertia and friction load both joints; the model with it can be diagnosed again."""
     (tmp_path / "arm.xml").write_text(THREE)
-    shared = CoupledMotor("joint_3", "joint_2", 0.8, inertia=0.05, coulomb=0.8, viscous=0.3)
     nominal = load_model(tmp_path / "arm.xml")
     recordings = []
     for seed in (1, 2):
@@ -80,20 +80,18 @@ def test_a_shared_motor_becomes_a_fixed_tendon(tmp_path):
     assert answer.causes[0].effect == "transmission.coupling"
     assert write_model(nominal, answer.internals.estimate, tmp_path / "closed.xml") == []
     assert answer.rollout.after.max() < 0.2 * answer.rollout.before.max()
-    (fitted,) = coupled_motors(nominal, answer.internals.estimate)
-    assert (fitted.joint, fitted.other) == (shared.joint, shared.other)
-    assert [fitted.lever, fitted.inertia, fitted.coulomb, fitted.viscous] == pytest.approx(
-        [0.8, 0.05, 0.8, 0.3], rel=0.05
-    )
+    motors = tendons_of(load_model(tmp_path / "closed.xml").mujoco_model, range(3))
+    assert motors.turns == pytest.approx(np.array([[0.0, 0.8, 1.0]]), rel=0.05)
+    fitted = [motors.armature[0], motors.frictionloss[0], motors.damping[0]]
+    assert fitted == pytest.approx([0.05, 0.8, 0.3], rel=0.05)
     assert diagnose(tmp_path / "closed.xml", recordings[1:], recordings[:1]).verdict == "no_gap"
 
 
 def test_two_motors_may_turn_with_the_same_pair_of_joints():
     spec = mujoco.MjSpec.from_string(THREE)
-    pair = [CoupledMotor("joint_3", "joint_2", lever, inertia=0.05, coulomb=0.8, viscous=0.3) for lever in (0.8, -0.6)]
-    add_to(spec, pair)
-    model = spec.compile()
-    assert tendons_of(model, range(3)).turns == pytest.approx(np.array([[0.0, 0.8, 1.0], [0.0, -0.6, 1.0]]))
+    pair = [SimpleNamespace(effect="transmission.coupling", place=2, shape=(2, lever)) for lever in (0.8, -0.6)]
+    add_motors(spec, load_model(model()), SimpleNamespace(of=lambda term: np.array([0.05, 0.8, 0.3])), pair)
+    assert tendons_of(spec.compile(), range(3)).turns == pytest.approx(np.array([[0.0, 0.8, 1.0], [0.0, -0.6, 1.0]]))
 
 
 def test_an_arm_files_model_can_be_written_too(tmp_path):

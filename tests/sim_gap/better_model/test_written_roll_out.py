@@ -48,6 +48,7 @@ def test_the_reported_roll_out_is_that_of_the_exported_files(tmp_path, name):
     assert np.all(answer.rollout.after < 0.5 * answer.rollout.before.max())
 
 
+@pytest.mark.long
 def test_the_module_needs_nothing_of_this_package(tmp_path):
     (tmp_path / "arm.xml").write_text(THREE)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))

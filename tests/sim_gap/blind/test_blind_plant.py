@@ -15,7 +15,7 @@ from sim_gap.blind.arms import BenchArm, draw_arm
 from sim_gap.blind.cases import make_case
 from sim_gap.blind.effects import DRAWS, EFFECTS
 from sim_gap.blind.motion import KINDS, RATE, MotionLimits, derivatives, trajectory
-from sim_gap.blind.plant import Log, PlantRun, controller_bandwidth, joint_sensors, record, simulate, true_arm
+from sim_gap.blind.plant import Log, TrueArm, controller_bandwidth, joint_sensors, record, simulate, true_arm
 from sim_gap.blind.recipe import CaseRecipe
 from sim_gap.blind.scene import Scene
 from sim_gap.blind.servo_plant import Bristles
@@ -62,27 +62,26 @@ def limits(n: int) -> MotionLimits:
 
 
 @pytest.fixture(scope="module")
-def no_effect() -> tuple[PlantRun, Log]:
+def no_effect() -> tuple[TrueArm, np.ndarray, Log]:
     random = np.random.default_rng(3)
     arm = draw_arm(random, 5)
     scene = Scene(arm, trajectory(("sines",), 8.0, limits(5), random))
-    truth, feed = true_arm(arm, scene.rated, random), scene.feed_forward(scene.command)
-    run = PlantRun(truth, scene.command, feed, scene.inertia, controller_bandwidth(truth), 7)
-    return run, simulate(run)
+    truth = true_arm(arm, scene.rated, random)
+    return truth, scene.command, simulate(truth, scene, scene.command, controller_bandwidth(truth), 7)
 
 
-def link_motion(run: PlantRun, log: Log) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def link_motion(truth: TrueArm, log: Log) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """True angles, velocities and accelerations but for the first and the last row."""
-    angle = joint_sensors(run.truth).angle_of(log.position)
+    angle = joint_sensors(truth).angle_of(log.position)
     return angle[1:-1], derivatives(angle)[0][1:-1], (angle[2:] - 2 * angle[1:-1] + angle[:-2]) * RATE**2
 
 
-def test_link_torque_is_pinocchios_for_the_true_arm(no_effect: tuple[PlantRun, Log]) -> None:
-    run, log = no_effect
-    model = _pinocchio(run.truth.arm)
+def test_link_torque_is_pinocchios_for_the_true_arm(no_effect: tuple[TrueArm, np.ndarray, Log]) -> None:
+    truth, _command, log = no_effect
+    model = _pinocchio(truth.arm)
     inner = slice(20, -20)
     data = model.createData()
-    motion = (part[inner] for part in link_motion(run, log))
+    motion = (part[inner] for part in link_motion(truth, log))
     expected = np.array([pin.rnea(model, data, *row) for row in zip(*motion, strict=True)])
     # the torque of one instant against a second difference over 4 ms: equal but for the controller's own noise
     left = np.sqrt(((log.torque[1:-1][inner] - expected) ** 2).mean(0))
@@ -100,10 +99,10 @@ def _pinocchio(arm: BenchArm) -> pin.Model:
     return model
 
 
-def test_motor_torque_is_link_torque_plus_rotor_and_friction(no_effect: tuple[PlantRun, Log]) -> None:
-    run, log = no_effect
-    state, (_, velocity, acceleration) = run.truth.state, link_motion(run, log)
-    rest = state.actuator_gain * log.motor[1:-1] - log.torque[1:-1] - run.truth.arm.armature * acceleration
+def test_motor_torque_is_link_torque_plus_rotor_and_friction(no_effect: tuple[TrueArm, np.ndarray, Log]) -> None:
+    truth, _command, log = no_effect
+    state, (_, velocity, acceleration) = truth.state, link_motion(truth, log)
+    rest = state.actuator_gain * log.motor[1:-1] - log.torque[1:-1] - truth.arm.armature * acceleration
     moving = np.abs(velocity) > 0.1
     most = state.coulomb + state.viscous * np.abs(velocity)
     mean = np.array([rest[m, j].mean() for j, m in enumerate((moving & (velocity > 0)).T)])
@@ -111,25 +110,25 @@ def test_motor_torque_is_link_torque_plus_rotor_and_friction(no_effect: tuple[Pl
     assert (mean > 0.0).all()
 
 
-def test_arm_stays_on_its_trajectory(no_effect: tuple[PlantRun, Log]) -> None:
-    run, log = no_effect
-    assert np.abs(log.position - run.command).max() < 0.05
+def test_arm_stays_on_its_trajectory(no_effect: tuple[TrueArm, np.ndarray, Log]) -> None:
+    _truth, command, log = no_effect
+    assert np.abs(log.position - command).max() < 0.05
 
 
-def test_recording_is_uneven_quantised_and_complete(no_effect: tuple[PlantRun, Log]) -> None:
-    run, log = no_effect
-    columns = record(run, log, 250.0, np.random.default_rng(0))
+def test_recording_is_uneven_quantised_and_complete(no_effect: tuple[TrueArm, np.ndarray, Log]) -> None:
+    truth, command, log = no_effect
+    columns = record(truth, command, log, np.random.default_rng(0))
     step = np.diff(columns["t"])
     assert columns["t"][0] == 0.0
     assert (step > 0).all()
     assert 0.003 < np.median(step) < 0.005
     assert np.unique(step.round(7)).size > 100
-    counts = columns["q"] / run.truth.encoder_step
+    counts = columns["q"] / truth.encoder_step
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
     assert all(
         columns[name].shape == (len(step) + 1, 5) for name in ("q", "dq", "tau", "tau_motor", "tau_cmd", "q_cmd")
     )
-    motor_counts = columns["tau_motor"] / (1e-3 * run.truth.rated)
+    motor_counts = columns["tau_motor"] / (1e-3 * truth.rated)
     np.testing.assert_allclose(motor_counts, np.rint(motor_counts), atol=1e-6)
 
 

@@ -208,6 +208,7 @@ def fail(sim: Path, train: Any, heldout: Any, exclude: Any) -> dict[str, Any]:
     raise ZeroDivisionError
 
 
+@pytest.mark.long
 def test_a_diagnosis_that_breaks_ends_the_bench_and_says_where(tmp_path: Path) -> None:
     todo = [(f"case_{k:04d}", "") for k in range(1000)]
     with pytest.raises(ZeroDivisionError) as raised:

@@ -1,7 +1,5 @@
 """Single parts of the blind check's plant against what their laws say: drives, friction, sensors, servos."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -11,10 +9,10 @@ from sim_gap.blind import bench
 from sim_gap.blind.arms import draw_arm
 from sim_gap.blind.effects.drawn_effect import ArmSetting, DrawnEffect
 from sim_gap.blind.motion import RATE
-from sim_gap.blind.plant import LATE_PHASE, Log, PlantRun, TrueArm, controller_bandwidth, record, true_arm
+from sim_gap.blind.plant import LATE_PHASE, Log, TrueArm, controller_bandwidth, record, true_arm
 from sim_gap.blind.recipe import CaseRecipe, draw
 from sim_gap.blind.scene import ServoLaw
-from sim_gap.blind.servo_plant import FINE, STIFFEST, Bristles, ServoController, ServoRun, record_servos
+from sim_gap.blind.servo_plant import STIFFEST, Bristles, record_servos, servo_targets
 
 STEP = 5e-4
 """Of the plant of positions alone [s]."""
@@ -66,39 +64,35 @@ def test_a_sensor_reads_the_torque_in_whole_steps() -> None:
     arm = truth()
     arm.state.torque_gain[:], arm.state.torque_offset[:] = 1.0, 0.0
     torque = np.tile(np.array([7.0, -3.0, 0.1]), (500, 1))
-    run = PlantRun(arm, torque, torque, np.ones(3), np.ones(3), 1)
-    read = record(run, Log(*[torque] * 5), 250.0, np.random.default_rng(0))
+    read = record(arm, torque, Log(*[torque] * 5), np.random.default_rng(0))
     step = 4.0 * 10.0 / 2**arm.encoder_bits
     np.testing.assert_allclose(read["tau"] / step, np.rint(read["tau"] / step), atol=1e-6)
     assert np.abs(read["tau"] - torque[0]).max() <= 6.0 * arm.torque_noise * 10.0
 
 
-def servo_run(late: float) -> ServoRun:
-    """One joint with a ramp of 1 mrad a tick as its command, which arrives late [s]."""
+RAMP = 1e-3 * np.arange(200.0)[:, None]
+"""The command of one joint, a milliradian a tick [rad]."""
+
+
+def law(late: float = 0.0, slew: float = np.inf) -> ServoLaw:
+    """Of one joint whose command arrives late [s] and is limited in speed [rad/s]."""
     zero = np.zeros(1)
-    law = ServoLaw(np.array([100.0]), zero, zero, np.array([late]), np.array([np.inf]), zero)
-    return ServoRun(SimpleNamespace(encoder_step=1e-4), 1e-3 * np.arange(200.0)[:, None], law, 1)
+    return ServoLaw(np.array([100.0]), zero, zero, np.array([late]), np.array([slew]), zero)
 
 
 def test_a_servo_gets_its_command_late_by_a_number_of_ticks_that_need_not_be_whole() -> None:
-    run = servo_run(2.25 / RATE)
-    servo = ServoController(run.law, run.command)
-    torques = [float(servo.torque(tick, np.zeros(1))[0]) for tick in range(20)]
-    np.testing.assert_allclose(torques, 0.1 * np.maximum(np.arange(20) - 2.25, 0.0), atol=100.0 * FINE)
+    targets = servo_targets(law(late=2.25 / RATE), RAMP)
+    np.testing.assert_allclose(targets[:, 0], 1e-3 * np.maximum(np.arange(200) - 2.25, 0.0), atol=1e-12)
 
 
 def test_a_servo_follows_its_command_no_faster_than_its_slew() -> None:
-    run = servo_run(0.0)
-    run.law.slew[:] = 0.5e-3 * RATE
-    servo = ServoController(run.law, run.command)
-    torques = [float(servo.torque(tick, np.zeros(1))[0]) for tick in range(20)]
-    np.testing.assert_allclose(torques, 0.05 * np.arange(20), atol=100.0 * FINE)
+    targets = servo_targets(law(slew=0.5e-3 * RATE), RAMP)
+    np.testing.assert_allclose(targets[:, 0], 0.5e-3 * np.arange(200), atol=1e-12)
 
 
 def test_positions_are_recorded_at_their_times_beside_the_command_of_their_turn() -> None:
-    run, random = servo_run(0.0), np.random.default_rng(1)
-    columns = record_servos(run, run.command, RATE / 5.0, random)
-    np.testing.assert_allclose(columns["q"][:, 0], 1e-3 * RATE * columns["t"], atol=2.5 * run.truth.encoder_step)
+    columns = record_servos(RAMP, RAMP, RATE / 5.0, 1e-4, np.random.default_rng(1))
+    np.testing.assert_allclose(columns["q"][:, 0], 1e-3 * RATE * columns["t"], atol=2.5e-4)
     np.testing.assert_allclose(np.diff(columns["q_cmd"][:, 0]), 5e-3, atol=1e-12)
 
 

@@ -79,6 +79,7 @@ def test_a_folder_without_recordings_and_a_list_of_another_form_are_refused(tmp_
         read_cases(other)
 
 
+@pytest.mark.long
 def test_recordings_are_diagnosed_and_sealed(tmp_path):
     (tmp_path / "sim.xml").write_text(THREE)
     made = record(model(), Wrong(coulomb=np.full(3, 0.5)), seconds=20.0, rate=50.0)

@@ -2,6 +2,7 @@ import json
 
 import mujoco
 import numpy as np
+import pytest
 
 from armlink.recording.files import load_recording
 from sim_gap.blind.cases import make_case
@@ -20,6 +21,7 @@ def test_every_effect_comes_in_turn() -> None:
     assert drawn == servo_recipes(3, 80)
 
 
+@pytest.mark.long
 def test_the_arm_without_an_effect_moves_as_its_model_does_in_mujoco(tmp_path) -> None:
     """Plant and servo against MuJoCo's own position actuators; with a lower gain both part."""
     for k, effects in enumerate(((), ("controller.stiffness",))):

@@ -83,6 +83,7 @@ def test_a_motion_that_repeats_tells_a_delay_but_for_whole_periods():
     assert finding is None or -float(finding.option.removeprefix("--clock tau=")) % period == pytest.approx(0.4)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("factor", [0.01, 0.05, 20.0, 1000.0])
 def test_another_unit_of_all_joints_is_asked_about(factor: float):
     finding = found(channel(factor * sound(0.3)))

@@ -74,7 +74,7 @@ def test_a_delay_is_no_unsigned_joint_and_no_order_that_changes(arms, folder, by
     assert float(finding.option.partition("=")[2]) == pytest.approx(-by_s, abs=0.08)
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("joint", [4, 6])
 def test_one_joint_in_another_unit_makes_no_motors_of_link_sensors(arms, joint):
     arm, recording = arms["panda"]

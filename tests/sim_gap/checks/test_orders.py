@@ -32,6 +32,7 @@ def in_order(recording: Recording, order: list[int], channels: tuple[str, ...]) 
     return replace(recording, **{name: x[:, order] for name, x in values.items() if x is not None})
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("channels", [POSITIONS, TORQUES, POSITIONS + TORQUES], ids=["positions", "torques", "all"])
 def test_any_order_is_put_right(arms, channels):
     arm, recording = arms["ur10e"]
@@ -42,6 +43,7 @@ def test_any_order_is_put_right(arms, channels):
     np.testing.assert_allclose(checked.motor_torque, recording.motor_torque)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("order", [[1, 2, 5, 0, 4, 3], [0, 5, 1, 4, 2, 3]])
 def test_another_order_is_no_angle_in_degrees(arms, order):
     """As degrees, positions of another order hardly move: then friction and a rotor explain most of what is read."""

@@ -36,6 +36,7 @@ def drop(text: str, held: float, seconds: float, start: float) -> Recording:
 POSITION = '<position name="servo" joint="servo" kp="30" kv="2"/>'
 
 
+@pytest.mark.long
 def test_drops_show_friction_and_rotor(tmp_path: Path) -> None:
     random = np.random.default_rng(1128)
     friction, armature = random.uniform(0.2, 0.35), random.uniform(0.015, 0.025)
@@ -50,6 +51,7 @@ def test_drops_show_friction_and_rotor(tmp_path: Path) -> None:
     assert point["armature"][0] == pytest.approx(armature, rel=0.3)
 
 
+@pytest.mark.long
 def test_known_gains_are_the_models(tmp_path: Path) -> None:
     """Of a model with a motor; what is written has a position actuator."""
     random = np.random.default_rng(1128)

@@ -70,6 +70,7 @@ def test_a_limit_that_is_stated_fitted_or_left_out_is_not_drawn(arm) -> None:
     assert {(x.joint, x.name) for x in unreached_limits.find_unreached(withheld, fitted)} == {(0, "slew")}
 
 
+@pytest.mark.long
 def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> None:
     search, fit = arm
     spread = replace(covariance(search, fit), limits=unreached_limits.find_unreached(search, fit))
@@ -87,7 +88,7 @@ def test_the_band_widens_where_motion_asks_for_more_and_nowhere_else(arm) -> Non
         assert widened or (within < 1.1 * without).all()
 
 
-@pytest.mark.sample(1)
+@pytest.mark.long
 @pytest.mark.parametrize("over", [1.1, 1.6, np.inf])
 def test_the_band_holds_motion_beyond_the_training_whatever_the_limit_is(arm, over) -> None:
     search, fit = arm

@@ -9,6 +9,7 @@ import pytest
 from servo_arm import model_text, record, search_on
 
 from armlink.recording.recording import Recording
+from sim_gap.better_model.corrected_model import body_parameters, set_body
 from sim_gap.position_gap import choice as edits
 from sim_gap.position_gap.choice import best_level, look_about, select
 from sim_gap.position_gap.fit import LoopFit, batch, coordinate, evaluate, jacobian, residuals
@@ -88,11 +89,9 @@ def test_delays_are_told_in_whole_steps(monkeypatch, late: float, steps: float) 
 
 def test_a_body_gets_the_inertial_parameters_that_it_is_said_to_have() -> None:
     """Half a kilogram at the elbow's axis: mass and first moment of the fore arm, as MuJoCo compiles it."""
-    spec = mujoco.MjSpec.from_string(TEXT)
-    compiled = spec.compile()
+    after = mujoco.MjModel.from_xml_string(TEXT)
     change = np.array([0.5, 0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.005, 0.0, 0.005])  # a point mass at (0.1, 0, 0)
-    export._set_body(spec, compiled, 1, change)
-    after = spec.compile()
+    assert set_body(after, 2, after.jnt_pos[1], body_parameters(after, 2, after.jnt_pos[1], np.eye(3)) + change)
     assert after.body_mass[2] == pytest.approx(0.8)
     assert after.body_mass[2] * after.body_ipos[2] == pytest.approx([0.3 * 0.08 + 0.05, 0.0, 0.0], abs=1e-9)
     apart = 0.3 * 0.5 / 0.8 * 0.02**2

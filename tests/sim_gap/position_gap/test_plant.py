@@ -58,6 +58,7 @@ def test_another_gain_shows() -> None:
     assert (left(search_on(model_text(kp=30.0, friction=0.2), [record(TEXT, 1, 12.0)])) > 0.01).all()
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("load", "breakaway"), [(0.3, (0.0, 1.0)), (0.0, (0.4, 0.1)), (0.0, (0.15, 0.03)), (0.2, (0.2, 0.1))]
 )

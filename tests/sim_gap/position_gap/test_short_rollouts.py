@@ -51,6 +51,7 @@ def test_a_command_within_the_limit_of_its_change_is_followed_and_another_at_the
     assert follow(given, before, most) == pytest.approx(np.array(expected), abs=1e-12)
 
 
+@pytest.mark.long
 def test_a_servo_that_limits_its_speed_is_found_from_a_model_that_filters(tmp_path: Path) -> None:
     """As published models of hobby servos do: gain and lag of the model hide the real servo's limit of speed."""
     random = np.random.default_rng(1128)

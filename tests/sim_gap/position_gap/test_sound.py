@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from servo_arm import model_text, record, search_on
 
 from sim_gap.position_gap.fit import LoopFit, evaluate
@@ -28,6 +29,7 @@ def test_errors_of_a_hundredth_are_those_of_a_sound_arm() -> None:
     assert (found.left < 1.3 * margin).all()
 
 
+@pytest.mark.long
 def test_a_tilt_is_no_error_of_a_sound_arm() -> None:
     """It acts where other poses feel gravity least, as no gain or mass does."""
     found, margin, _ = split(NOMINAL.replace("<option", '<option gravity="2.43 0 -9.5"'))
@@ -35,6 +37,7 @@ def test_a_tilt_is_no_error_of_a_sound_arm() -> None:
     assert (found.left > margin).any()
 
 
+@pytest.mark.long
 def test_a_gain_that_is_far_off_is_no_error_of_a_sound_arm() -> None:
     found, _, _ = split(model_text(kp=36.0, friction=0.05))
     assert not found.explained

@@ -35,6 +35,7 @@ def deviations(found: Covariance, name: str) -> np.ndarray:
     return np.array([np.sqrt(found.matrix[k, k]) for k in (found.names.index((j, name)) for j in (0, 1))])
 
 
+@pytest.mark.long
 def test_an_interval_holds_what_other_recordings_of_the_arm_show(several) -> None:
     """The arm is warm in half of them: noise within a recording says nothing of that."""
     search, fit = several
@@ -107,7 +108,7 @@ def test_no_draw_moves_the_arm_further_than_it_may(several) -> None:
     """A delay known to 0.1 s at one joint alone: draws of it are shortened, and those of the other joint are not."""
     search, fit = several
     found = Covariance([(0, "delay"), (1, "kp")], np.diag([(0.1 / search.scales.of("delay")[0]) ** 2, 0.05**2]))
-    free, near = (draw(search, fit, found, 40, reach=reach) for reach in (None, np.array([0.01, 1.0])))
+    free, near = (draw(search, fit, found, 12, reach=reach) for reach in (None, np.array([0.01, 1.0])))
 
     def moved(rows: list[dict[str, float]]) -> np.ndarray:
         points = [{**fit.point, "delay": np.array([row["shoulder.delay"], fit.point["delay"][1]])} for row in rows]

@@ -11,7 +11,7 @@ from servo_arm import model_text, record, search_on, written
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.position_notes import _ranges
-from sim_gap.better_model.effects_module import module_text
+from sim_gap.better_model.export import module_text
 from sim_gap.model.load import SimModel, load_model
 from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import LoopFit
@@ -37,7 +37,7 @@ def made(tmp_path_factory) -> tuple[SimModel, LoopSearch, LoopFit]:
     sim = load_model(written(tmp_path_factory.mktemp("arm"), TEXT))
     search = search_on(TEXT, [record(TEXT, seed, 14.0, load=LOAD) for seed in (1, 2)])
     known = ("kp", "coulomb", "viscous", "load")
-    return sim, search, search.improve(LoopFit({**search.nominal, "load": np.full(2, 0.1)}, (known, known)), 8)
+    return sim, search, search.improve(LoopFit({**search.nominal, "load": np.full(2, 0.1)}, (known, known)), 4)
 
 
 def loaded(sim: SimModel, beside: Exported) -> Simulated:

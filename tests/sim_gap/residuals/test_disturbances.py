@@ -43,6 +43,7 @@ def test_what_may_be_the_arms_own_is_no_disturbance(knocks):
     assert found(*knocks) == ()
 
 
+@pytest.mark.long
 def test_the_diagnosis_is_that_of_the_rest_and_says_what_it_left_out():
     wrong = Wrong(coulomb=np.array([0.0, 0.6, 0.0]))
     channels = ("tau_motor",)

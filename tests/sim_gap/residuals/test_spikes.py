@@ -52,6 +52,7 @@ def test_a_slow_channel_has_no_spikes():
     assert not found(slow, T[::10]).any()
 
 
+@pytest.mark.long
 def test_the_diagnosis_is_the_same_and_says_how_many_samples_it_left_out():
     wrong = Wrong(coulomb=np.array([0.0, 0.6, 0.0]))
     recordings = [record(model(), wrong, seed=seed, seconds=24.0, rate=100.0) for seed in (1, 2)]

@@ -1,8 +1,9 @@
 """Nodes on a CANopen bus: a search, `armlink scan`, and how they differ from an arm file; reads only."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,10 @@ from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
 
-from armlink.arm_file import ArmFile, Bus
+from armlink.arm_file import ArmFile
 from armlink.bus.bus_group import BusGroup, GroupPort
 from armlink.bus.can_bus import CanBus
-from armlink.bus.open import open_bus, open_link_bus
+from armlink.bus.open import open_link_bus
 from armlink.bus.port import BUS_SHIFT, Port
 from armlink.clock import Clock, MonotonicClock
 from armlink.drives.canopen import object_dictionary as objects
@@ -23,11 +24,10 @@ from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID, SDO_RESPONS
 from armlink.drives.canopen.profile import Profile, lacking
 from armlink.drives.canopen.sdo import NodeServices, Pump, PumpedNetwork
 from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE, told_units
+from armlink.drives.discovery import SEARCH_SECONDS
 from armlink.drives.findings import FoundDrive, SetupFinding
 from armlink.errors import BusFault
 
-SEARCH_SECONDS = 0.3
-"""Wait for responses after the last request of the search [s]."""
 _READ_DEVICE_TYPE = b"\x40\x00\x10\x00\x00\x00\x00\x00"
 
 
@@ -104,21 +104,34 @@ class FoundNodes:
     """The drives of an open bus, by node id."""
 
     def __init__(self, bus: CanBus) -> None:
-        """Search the bus and read every drive; raises BusFault naming the node."""
+        """Search the bus; raises BusFault naming the node."""
         port, clock = bus.open_port(), bus.clock or MonotonicClock()
-        identities = scan_bus(port, clock, {})
-        _require_own_ids(identities, bus.channel_info)
+        self._channel = bus.channel_info
+        self.identities = {each.node: each for each in scan_bus(port, clock, {})}
+        """By node id."""
         network, pump = reading_network(port, clock)
         self._services = {
-            each.node: NodeServices(network, f"node {each.node}", each.node, bundled(), pump) for each in identities
+            node: NodeServices(network, f"node {node}", node, bundled(), pump) for node in self.identities
         }
-        self.identities = {each.node: each for each in identities}
-        """By node id."""
-        self.found = [self._read(each) for each in identities]
 
-    def positions(self) -> dict[int, float]:
-        """Position reading (6064h) of every drive by node id [rad]; raises BusFault."""
-        return {each.node: int(self._services[each.node].read(objects.POSITION)) * each.unit for each in self.found}
+    @property
+    def nodes(self) -> list[dict[str, Any]]:
+        usual = {"reply": None, "model": "", "wrong": "", "note": "", "firmware": ""}
+        return [
+            usual | _answer(each, []) | {"address": f"node {each.node}", "power": each.state.value}
+            for each in self.identities.values()
+        ]
+
+    @cached_property
+    def found(self) -> list[FoundDrive]:
+        """As every drive describes itself; raises BusFault naming the node."""
+        _require_own_ids(self.identities.values(), self._channel)
+        return [self._read(each) for each in self.identities.values()]
+
+    def positions(self) -> dict[str, float]:
+        """Position readings (6064h)."""
+        services = self._services
+        return {each.address: int(services[each.node].read(objects.POSITION)) * each.unit for each in self.found}
 
     def _read(self, identity: Identity) -> FoundDrive:
         services = self._services[identity.node]
@@ -131,9 +144,9 @@ class FoundNodes:
             ) from None
         most = int(services.read(objects.MAX_TORQUE)) * units.torque
         own = services.has(objects.TORQUE_READING)
-        keys = {"family": "canopen", "node": identity.node, "torque": "motor", "calibration": "host"}
-        ratings = rated * 1e-3, most, units.position
-        return FoundDrive(identity.node, identity.vendor, identity.product, *ratings, None if own else keys)
+        keys = None if own else {"node": identity.node, "torque": "motor", "calibration": "host"}
+        ids = identity.node, f"node {identity.node}", keys, identity.vendor, identity.product
+        return FoundDrive("canopen", *ids, rated * 1e-3, most, units.position)
 
 
 def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFinding]:
@@ -173,33 +186,29 @@ def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupF
 
 
 def scan_report(
-    arm: ArmFile | None,
+    arm: ArmFile,
     bus: str | None,
     json: Path | None,
     write: Callable[[Path | None, Any], None],
     show: Callable[..., None],
 ) -> int:
-    """Find every node of a bus and those of an arm, `show` them, `write` them as JSON; exit status.
+    """Find every node of an arm's bus, `show` them, `write` them as JSON; exit status.
 
     Raises BusFault for a joint that does not answer, Refused for another controller than the arm file states.
     """
-    if arm is None:
-        joints, stated = {}, {}
-        opened = open_bus(bus, Bus())
-    else:
-        link = arm.require_link()
-        sheets = of_joints(arm, link.joints)
-        joints = {joint.settings.node: joint.name for joint in link.joints}
-        stated = {
-            each.settings.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)
-        }
-        opened = open_link_bus(bus, link)
+    link = arm.require_link()
+    sheets = of_joints(arm, link.joints)
+    joints = {joint.settings.node: joint.name for joint in link.joints}
+    stated = {
+        each.settings.node: expected_identity(each, sheet) for each, sheet in zip(link.joints, sheets, strict=True)
+    }
+    opened = open_link_bus(bus, link)
     try:
         clock = opened.clock or MonotonicClock()
         port = opened.open_port()
         found = []
         for place, member in enumerate(port.members if isinstance(port, GroupPort) else (port,)):
-            named = [] if arm is None else arm.require_link().joints
+            named = list(link.joints)
             if isinstance(opened, BusGroup):
                 named = [joint for joint in named if opened.tags[joint.bus] >> BUS_SHIFT == place]
             stock = {joint.settings.node for joint in named if joint.settings.torque != "record"}
@@ -221,12 +230,11 @@ def scan_report(
             table.add_row(str(each.node), each.joint, *told, identity, str(each.serial), style=style)
         else:
             table.add_row(str(each.node), each.joint, Text("no answer", style="red"))
-    show(table if found else f"{channel}: no node answers")
+    show(table)
     for lost in dict.fromkeys(lost for each in found for lost in each.lost):
         lacking = [each.joint for each in found if lost in each.lost]
         show(f"{', '.join(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} {lost}")
-    nodes = [{**vars(each), "state": each.state.value, "mismatches": wrong.get(each.node, [])} for each in found]
-    write(json, {"bus": channel, "nodes": nodes})
+    write(json, {"bus": channel, "nodes": [_answer(each, wrong.get(each.node, [])) for each in found]})
     missing = [f"{each.joint} (node {each.node})" for each in found if not each.present]
     if missing:
         raise BusFault(f"no answer from {', '.join(missing)} on {channel}")
@@ -234,6 +242,9 @@ def scan_report(
     if wrong:
         node, differs = next(iter(wrong.items()))
         raise refused_identity(joints[node], node, differs)
-    if found:
-        show(f"{len(found)} nodes answer")
+    show(f"{len(found)} nodes answer")
     return 0
+
+
+def _answer(each: Identity, mismatches: Sequence[str]) -> dict[str, Any]:
+    return {**vars(each), "family": "canopen", "state": each.state.value, "mismatches": mismatches}

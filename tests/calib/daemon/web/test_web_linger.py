@@ -99,6 +99,7 @@ def test_a_client_that_is_still_sending_gets_its_refusal(server: Served, name: s
         assert b'{"error": ' in answer
 
 
+@pytest.mark.sample(1)
 @pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("tcp", [False, True], ids=["unix", "tcp"])
 def test_many_clients_at_once_that_send_all_in_one_go_get_their_refusals(server: Served, tcp: bool) -> None:

@@ -124,6 +124,7 @@ def test_of_one_address_only_the_newest_strangers_stay() -> None:
     assert [each.is_cut for each in stuck] == [True] * 5 + [False] * 15
 
 
+@pytest.mark.long
 def test_a_long_history_nobody_reads_is_neither_made_nor_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peer, "TAKE_SECONDS", 1.0)
     made = []

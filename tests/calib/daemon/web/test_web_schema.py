@@ -1,24 +1,20 @@
 """schemathesis against the description that the daemon gives of itself: no 5xx, and every answer as described."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
-import schemathesis
 from daemon_bench import DaemonBench
 from hypothesis import HealthCheck, Phase, given, settings
-from schemathesis.checks import not_a_server_error
-from schemathesis.specs.openapi.checks import (
-    content_type_conformance,
-    response_schema_conformance,
-    status_code_conformance,
-)
 from served_page import TOKEN, Served, served
 from small_arm import small_arm
 
 from calib.daemon.service_view import ServiceView
 from calib.daemon.web.guard import RateLimit
 
-CHECKS = [not_a_server_error, content_type_conformance, response_schema_conformance, status_code_conformance]
+if TYPE_CHECKING:
+    import schemathesis
+
 EXAMPLES = 3
 """Generated requests of each kind, valid and not, to each route; tests/campaigns/web.py sends many more."""
 SETTINGS = settings(
@@ -33,6 +29,12 @@ SETTINGS = settings(
 
 def check_all(server: Served, settings: settings) -> set[str]:
     """Generated requests to every route but the stream, which does not end; returns the routes."""
+    import schemathesis  # here, since collecting the tests would wait for its two seconds in each process
+    from schemathesis.checks import not_a_server_error
+    from schemathesis.specs.openapi import checks as described
+
+    conformance = [described.content_type_conformance, described.response_schema_conformance]
+    checks = [not_a_server_error, *conformance, described.status_code_conformance]
     headers = {"Authorization": f"Bearer {TOKEN}"}
     schema = schemathesis.openapi.from_dict(server.client().get("/openapi.json").json())
     checked = set()
@@ -45,14 +47,14 @@ def check_all(server: Served, settings: settings) -> set[str]:
 
             @settings
             @given(case=operation.as_strategy(generation_mode=mode))
-            def check(case: schemathesis.Case) -> None:
-                case.call_and_validate(server.url, headers=headers, checks=CHECKS)
+            def check(case: "schemathesis.Case") -> None:
+                case.call_and_validate(server.url, headers=headers, checks=checks)
 
             check()
     return checked
 
 
-def takes_anything(operation: schemathesis.APIOperation) -> bool:
+def takes_anything(operation: "schemathesis.APIOperation") -> bool:
     return any(len(list(part)) for part in (operation.query, operation.path_parameters, operation.headers)) or bool(
         operation.body
     )

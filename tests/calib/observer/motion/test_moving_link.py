@@ -9,12 +9,11 @@ from soft_links import soft_arm
 from armlink.link.link import Link
 from armlink.link.types import Command
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.fit import fit_creep
-from calib.creep.plan import plan_creep
-from calib.creep.record import CreepCalibration
+from calib.fit.creep_fit import fit_creep
 from calib.motion.trajectory import trajectory
 from calib.observer.events import Event
 from calib.observer.observer import observer_of
+from calib.plan.creep_plan import plan_creep
 from calib.sweep.run import run_sweep
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
@@ -36,9 +35,9 @@ def test_a_load_is_told_while_the_arm_carries_it(tmp_path: Path) -> None:
             simulated.attach_mass(mass)
             passes.append(run_sweep(link, arm, tmp_path / name, reference_mass=mass, plan=plan))
         fit = fit_creep(arm, passes)
-        record = CreepCalibration(fit).record(arm)
+        record = fit.record(arm)
         rated = arm.require_link().rated_torques
-        watching = observer_of(gcomp_arm(arm), record, CreepCalibration(fit).gravity.record(arm, record), rated)
+        watching = observer_of(gcomp_arm(arm), record, fit.gravity.record(arm, record), rated)
         held = record.torque_calibration()
 
         def work(rows: int) -> list[Event]:

@@ -12,16 +12,15 @@ from drawn_work import NOTHING, Change, work
 from judged_creeps import creep_arm
 
 from calib.arm.kinematics import gcomp_arm
-from calib.creep.fit import fit_rows
-from calib.creep.plan import plan_creep
-from calib.creep.record import CreepCalibration
 from calib.daemon.view.event_text import describe
+from calib.fit.creep_fit import fit_rows
 from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
 from calib.observer.evidence import ChangeHypothesis, ResidualTest
 from calib.observer.motion.change_test import ChangeTest
 from calib.observer.motion.observer import MovingObserver
 from calib.observer.observer import Observer, observer_of
+from calib.plan.creep_plan import plan_creep
 from calib.records.records import CalibrationRecord, GravityRecord
 
 SEED = 4
@@ -35,8 +34,8 @@ def calibrated() -> tuple[Any, DrawnCreep, CalibrationRecord, GravityRecord]:
     plan = plan_creep(arm)
     made = draw_creep(arm, plan, SEED, plan.reference_mass)
     fit = fit_rows(gcomp_arm(arm), made.rows, arm.require_link().rated_torques)
-    record = CreepCalibration(fit).record(arm)
-    return arm, made, record, CreepCalibration(fit).gravity.record(arm, record)
+    record = fit.record(arm)
+    return arm, made, record, fit.gravity.record(arm, record)
 
 
 def observer() -> MovingObserver:

@@ -1,4 +1,4 @@
-"""Rows for a field calibration: slow windows of a recording, or the readings of sweeps."""
+"""Rows for a field calibration: slow windows of a recording, or the unloaded readings of sweeps."""
 
 from dataclasses import replace
 
@@ -68,7 +68,9 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
 
 
 def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
-    """The unloaded readings of a sweep data set; raises BadInput if a reference mass was attached."""
+    """The readings of a sweep at rest; raises BadInput for creep sweeps, and if a reference mass was attached."""
+    if data.creeps:
+        raise BadInput(f"{data.path}: creep sweeps: they belong to armlink calibrate {data.path}")
     if data.manifest.reference_mass > 0:
         raise BadInput(
             f"{data.path} was swept with a reference mass of {data.manifest.reference_mass:g} kg, but the field "

@@ -9,10 +9,9 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.creep.design import CreepCandidate, choose
-from calib.creep.levers import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
-from calib.creep.parameters import Doubt
 from calib.plan.collisions import POINTS, Geometry
+from calib.plan.creep_design import CreepCandidate, choose
+from calib.plan.levers import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
 from calib.plan.poses import require_range
 from calib.plan.types import Side, Sweep, SweepPlan
@@ -41,8 +40,6 @@ RAMP = 0.4
 """Time over which a creep reaches its speed, and comes to rest [s]."""
 SETTLE = 0.4
 """Time after that in which friction has turned round and the position loop has settled [s]."""
-RESTING: Side = 0
-"""No joint rests on a stop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +110,7 @@ def plan_creep(arm_file: ArmFile, *, seed: int = 0) -> SweepPlan:
     home = _home(ground, random)
     lists = [_candidates(ground, joint, home, mass, random) for joint in reversed(range(n))]
     chosen, promised = choose(
-        ground.arm, ground.beta, ground.limits.rated, lists, creep.poses, creep.speeds, mass, Doubt.of(ground.section)
+        ground.arm, ground.beta, ground.limits.rated, lists, creep.poses, creep.speeds, mass, ground.section.motor_doubt
     )
     sweeps = []
     for each in chosen:
@@ -205,13 +202,14 @@ def _sweep(ground: CreepGround, one: CreepCandidate, number: int, speed: float) 
     way = one.upper - one.lower - 2 * lead
     count = max(round(way / ground.section.creep.bin), 4)
     width = way / count
+    no_stop: Side = 0
     rest = one.rest.copy()
     rest[one.joint] = one.lower
     lever = gravity_levers(ground.arm, one.poses(3))[:, one.joint].max() / np.linalg.norm(ground.arm.gravity)
     return Sweep(
         name=f"{ground.arm.names[one.joint]} creep {number + 1}",
         joint=one.joint,
-        stops=tuple(RESTING for _ in range(ground.arm.n)),
+        stops=tuple(no_stop for _ in range(ground.arm.n)),
         rest=tuple(rest.tolist()),
         steps=tuple((one.lower + lead + width * (np.arange(count) + 0.5)).tolist()),
         lever=float(lever),

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.creep.model import CreepModel
-from calib.creep.parameters import Doubt, family_slices, prior
-from calib.creep.rows import CreepRows
-from calib.creep.solve import invert
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
+from gcomp.estimate.posterior import invert
+from gcomp.identify.motor_model import MotorDoubt, MotorModel, family_slices
+from gcomp.identify.readings import StaticReadings
 
 SCATTER_SHARE = 0.003
 """Scatter of a row, as a share of rated torque, that the choice assumes."""
@@ -38,14 +37,14 @@ class CreepCandidate:
 
 def choose(
     arm: Arm, beta: Array, rated: Array, candidates: list[list[CreepCandidate]], count: int, speeds: tuple[float, ...],
-    mass: float, doubt: Doubt,
+    mass: float, doubt: MotorDoubt,
 ) -> tuple[list[list[CreepCandidate]], Array]:  # fmt: skip
     """(`count` candidates of each list, tip to base; standard deviations of the gains that they promise (n,)).
 
     Greedy: each choice makes the sum of the gains' variances least, with one pass without and one with the mass [kg].
     beta (2n,) [kg·m] is a guess of the mass moments.
     """
-    mean, std = prior(arm, rated, doubt, True, 0.02 * rated)
+    mean, std = doubt.prior(arm, rated, True, 0.02 * rated)
     x, at = mean.copy(), family_slices(arm.n)
     x[at["beta"]], x[at["coulomb"]], x[at["load"]] = beta, 0.02 * rated, 0.05
     information = np.diag(1 / std**2)
@@ -65,19 +64,16 @@ def _information(arm: Arm, x: Array, one: CreepCandidate, speed: float, mass: fl
     """Information of a creep both ways, without and with the mass (P, P)."""
     poses = np.tile(one.poses(BINS), (4, 1))
     side, loads = np.repeat([1.0, -1.0, 1.0, -1.0], BINS), np.repeat([0.0, 0.0, mass, mass], BINS)
-    rows = CreepRows(
-        joint=np.full(len(poses), one.joint),
-        position=poses,
-        reading=np.zeros(len(poses)),
-        velocity=side * speed,
-        mass=loads,
-        warmth=np.repeat([-10.0, -10.0, -5.0, -5.0], BINS),
-        sweep=np.zeros(len(poses), dtype=np.int64),
-        sweeps=("",),
-        by_temperature=True,
-        warmest=np.zeros(arm.n),
+    own = np.arange(arm.n) == one.joint
+    readings = StaticReadings(
+        poses,
+        np.where(own, 0.0, np.nan) * np.ones((len(poses), 1)),
+        np.ones(arm.n),
+        load=loads,
+        velocity=np.outer(side * speed, own),
+        warmth=np.outer(np.repeat([-10.0, -10.0, -5.0, -5.0], BINS), own),
     )
-    _, jacobian = CreepModel(arm, rows).linearised(x)
+    _, jacobian = MotorModel(arm, readings).linearised(x)
     jacobian /= SCATTER_SHARE * rated[one.joint]
     information: Array = jacobian.T @ jacobian
     return information

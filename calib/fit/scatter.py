@@ -7,21 +7,22 @@ less than one reading: its variance is multiplied by 1 + 2 Σ ρ_k, with the cor
 summed up to the first that chance could make.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.creep.rows import CreepRows
+from calib.fit.sweep_readings import SweepReadings
 from gcomp.arrays import Array
 
 LEAST_STD_SHARE = 1e-4
 """Least standard deviation of a row, as a share of rated torque: rounding of the sums that the readings are."""
+NOISE_ROUNDS = 4
+"""Fits, each with the noise that the residuals of the one before show."""
 USUAL_BINS = 5
 """Bins that the usual scatter of a joint's sweeps counts for, beside those of a sweep itself."""
-MOST_INFLATION = 16.0
-"""Most that a variance is multiplied by; a choice, for sweeps of a dozen bins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +35,9 @@ class Scatter:
     """Rows (K,) of each sweep, and the inverse of the triangular root of their covariance (K, K)."""
 
     @classmethod
-    def even(cls, rows: CreepRows, sigma: Array) -> "Scatter":
+    def even(cls, rows: SweepReadings, sigma: Array) -> "Scatter":
         """Rows that have nothing in common."""
-        blocks = [np.flatnonzero(rows.sweep == sweep) for sweep in np.unique(rows.sweep)]
+        blocks = [np.flatnonzero(rows.readings.series == sweep) for sweep in np.unique(rows.readings.series)]
         return cls(sigma, tuple((each, np.asarray(np.diag(1 / sigma[each]))) for each in blocks))
 
     def whitened(self, columns: Array) -> Array:
@@ -48,7 +49,7 @@ class Scatter:
 
 
 def scatter(
-    rows: CreepRows, residual: Array, rated: Array, freedom: float, by_degree: Array, apart: bool = True
+    rows: SweepReadings, residual: Array, rated: Array, freedom: float, by_degree: Array, apart: bool = True
 ) -> Scatter:
     """Scatter of the rows as their residuals (R,) [N·m] have it.
 
@@ -60,7 +61,7 @@ def scatter(
     sigma, blocks = np.zeros(len(rows)), []
     residual = residual / np.sqrt(max(freedom, 0.2))
     for joint in range(len(rated)):
-        pairs = [_row_pairs(rows, joint, sweep) for sweep in np.unique(rows.sweep[rows.joint == joint])]
+        pairs = [_row_pairs(rows, joint, sweep) for sweep in np.unique(rows.readings.series[rows.swept == joint])]
         floor = (LEAST_STD_SHARE * float(rated[joint])) ** 2 / 2
         alike = _spread([(residual[up] + residual[down]) / 2 for up, down, _ in pairs], floor)
         opposite = _spread([(residual[up] - residual[down]) / 2 for up, down, _ in pairs], floor)
@@ -77,14 +78,16 @@ def scatter(
     return Scatter(sigma, tuple(blocks))
 
 
-def _row_pairs(rows: CreepRows, joint: int, sweep: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+def _row_pairs(
+    rows: SweepReadings, joint: int, sweep: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """(Rows upwards, rows downwards at the same places, rows of places that only one direction has), by position."""
-    own = np.flatnonzero(rows.sweep == sweep)
-    own = own[np.argsort(rows.position[own, joint])]
+    own = np.flatnonzero(rows.readings.series == sweep)
+    own = own[np.argsort(rows.readings.position[own, joint])]
     up, down = own[rows.side[own] > 0], own[rows.side[own] <= 0]
     if up.size < 2 or not down.size:
         return own[:0], own[:0], own
-    there, back = rows.position[up, joint], rows.position[down, joint]
+    there, back = rows.readings.position[up, joint], rows.readings.position[down, joint]
     nearest = np.abs(there[:, None] - back[None, :]).argmin(axis=1)
     same = np.abs(there - back[nearest]) < float(np.median(np.diff(there))) / 2
     _, first = np.unique(nearest[same], return_index=True)
@@ -97,12 +100,13 @@ def _spread(series: list[Array], floor: float) -> list[float]:
     means = [float(np.mean(one**2)) for one in series if one.size]
     usual = max(float(np.median(means)) if means else 0.0, floor)
     variances = [max((float(one @ one) + USUAL_BINS * usual) / (one.size + USUAL_BINS), floor) for one in series]
-    common = _inflation([one / np.sqrt(each) for one, each in zip(series, variances, strict=True) if one.size >= 4])
+    common = inflation([one / np.sqrt(each) for one, each in zip(series, variances, strict=True) if one.size >= 4])
     return [common * each for each in variances]
 
 
-def _inflation(series: list[Array]) -> float:
-    """1 + 2 Σ ρ_k."""
+def inflation(series: Sequence[Array], least: float = 0.0) -> float:
+    """1 + 2 Σ ρ_k of series of neighbouring residuals, up to the first correlation below `least`, by default that
+    chance makes of independent ones."""
     if not series:
         return 1.0
     power = sum(float(one @ one) for one in series) / sum(one.size for one in series)
@@ -111,7 +115,7 @@ def _inflation(series: list[Array]) -> float:
         pairs = [(one[lag:], one[:-lag]) for one in series if one.size > lag]
         count = sum(a.size for a, _ in pairs)
         alike = sum(float(a @ b) for a, b in pairs) / count / max(power, 1e-30)
-        if alike <= 1 / np.sqrt(count):  # no more than chance makes of independent bins
+        if alike <= (least or 1 / np.sqrt(count)):
             break
         total += 2 * alike
-    return min(total, MOST_INFLATION)
+    return total

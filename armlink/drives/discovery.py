@@ -1,0 +1,173 @@
+"""Discovery: the drives on a bus that no arm file describes, by frames that only read.
+
+What reads in one family can command in another: on 7FFh a register request to a Damiao drive writes the mode of every
+moteus controller, and sends an ODrive that has no node id yet into its boot loader. So the bus is heard first, and a
+family is asked after those whose drives its requests could command, and only where none of these is there.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from graphlib import TopologicalSorter
+from pathlib import Path
+from typing import Any, TypeVar
+
+from armlink.arm_file import parse_arm
+from armlink.bus.can_bus import CanBus
+from armlink.bus.port import Frame, Port
+from armlink.clock import Clock, MonotonicClock
+from armlink.drives.base import ANSWER, TRIES
+from armlink.drives.family import family, family_names
+from armlink.drives.findings import FoundDrive, FoundDrives
+from armlink.drives.orders import DriveIdentity
+from armlink.errors import BusFault
+
+T = TypeVar("T")
+SEARCH_SECONDS = 0.3
+"""Wait for answers after the last request of a search, and for what is sent unasked before the first: an ODrive sends
+its heartbeat every 0.1 s unless it is set otherwise [s]."""
+
+
+class SearchedBus:
+    """An open bus that is searched; implements Ask."""
+
+    def __init__(self, bus: CanBus) -> None:
+        self.channel_info = bus.channel_info
+        self.fd: bool = getattr(bus, "fd", True)
+        """Whether it carries CAN FD; a bus inside this process does."""
+        self.clock: Clock = bus.clock or MonotonicClock()
+        self.now, self.port = self.clock.now, bus.open_port()
+        self.send = self.port.send
+        self.take: Callable[[int, bytes, float], object] = lambda can_id, data, now: None
+        """Called with all frames."""
+        self.heard = self.gather([])
+        """Frames that came before anything was asked."""
+
+    def open_port(self, as_node: bool = False) -> Port:
+        return self.port
+
+    def gather(self, requests: Sequence[Frame]) -> list[Frame]:
+        """All frames that come from the first request to SEARCH_SECONDS after the last; each is sent once."""
+        found: list[Frame] = []
+        for frame in requests:
+            self.send(*frame)
+            self._receive(lambda *came: found.append(came), 0.0)
+        self._receive(lambda *came: found.append(came), SEARCH_SECONDS)
+        return found
+
+    def _receive(self, use: Callable[[int, bytes], T | None], seconds: float) -> T | None:
+        """The first value that `use` gives for a frame that comes within so long."""
+        end = self.now() + seconds
+        while (frame := self.port.receive(max(0.0, end - self.now()))) is not None:
+            self.take(*frame, self.now())
+            if (found := use(*frame)) is not None:
+                return found
+            if self.now() > end:  # a babbling node must not block the search
+                break
+        return None
+
+    def __call__(
+        self, frame: Frame, answer: Callable[[int, bytes], T | None], timeout: float = ANSWER, tries: int = TRIES
+    ) -> T | None:
+        for _ in range(tries):
+            self.send(*frame)
+            if (found := self._receive(answer, timeout)) is not None:
+                return found
+        return None
+
+    def wait(self, done: Callable[[], bool], timeout: float) -> bool:
+        return done() or bool(self._receive(lambda *frame: done() or None, timeout))
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """How the drives of a family are found."""
+
+    how: str
+    """The question that is asked, or what is listened for."""
+    find: Callable[[SearchedBus], Sequence[FoundDrive] | FoundDrives]
+    """Sends nothing but frames that read."""
+    spares: tuple[str, ...] = ()
+    """Families whose drives its requests or answers could command, or whose frames look alike: it is not looked for
+    beside them."""
+
+
+class AskedDrives:
+    """Drives of one family that were found by their ids; what else they tell is asked as of the joints of an arm.
+
+    One that no arm file can name is listed and not asked.
+    """
+
+    def __init__(self, bus: SearchedBus, found: Sequence[FoundDrive]) -> None:
+        self._bus = bus
+        self.nodes = [_node(each, DriveIdentity(0, each.address, True)) for each in found if each.drive is None]
+        self.found = [each for each in found if each.drive is not None]
+        if not self.found:
+            return
+        limits = {"rated_torque": 1.0, "max_torque": 1.0}
+        joints = [{"name": each.address, **each.keys, **limits} for each in self.found]
+        rows = [{"name": each.address, "lower": -1.0, "upper": 1.0} for each in self.found]
+        link = {"bus": {"fd": bus.fd}, "joints": joints}
+        arm = parse_arm({"name": "found", "kinematics": {"joints": rows}, "link": link}, Path(bus.channel_info))
+        self._drives = family(found[0].family).build(arm, arm.require_link().joints)
+        bus.take = self._drives.take
+        self.nodes += map(_node, self.found, self._drives.identify(bus))
+
+    def positions(self) -> dict[str, float]:
+        self._bus.take = self._drives.take
+        found = dict(zip((each.address for each in self.found), self._drives.positions(self._bus), strict=True))
+        silent = [address for address, position in found.items() if position != position]
+        if silent:
+            raise BusFault(f"{self._bus.channel_info}: {', '.join(silent)}: no position at the output is told")
+        return found
+
+
+def _node(drive: FoundDrive, identity: DriveIdentity) -> dict[str, Any]:
+    """A drive in the answer of a scan: as `armlink scan ARM` has it, and what was found."""
+    power, traits = identity.power.value, family(drive.family).traits.as_json()
+    usual = {**vars(identity), "joint": "", "family": drive.family, "power": power, "traits": traits}
+    found = {"reply": drive.reply, "model": drive.model, "answers": drive.answers}
+    return usual | found | {"wrong": drive.wrong, "note": drive.note}
+
+
+class BusDrives:
+    """The drives of all families that are found on a bus."""
+
+    def __init__(self, bus: CanBus) -> None:
+        """Search the bus; nothing but frames that read is sent."""
+        searched = SearchedBus(bus)
+        found = {name: family(name).discovery for name in family_names()}
+        ways = {name: way for name, way in found.items() if way is not None}
+        self.parts: list[FoundDrives] = []
+        asked, others = list[str](), [f"{name} (by the ids of an arm file alone)" for name in found.keys() - ways]
+        order = TopologicalSorter({name: way.spares for name, way in ways.items()}).static_order()
+        for name in filter(ways.__contains__, order):
+            way, lack = ways[name], ""
+            if family(name).traits.frame == "fd" and not searched.fd:
+                lack = "the bus is classical CAN, for CAN FD: INTERFACE:CHANNEL@1000000/5000000"
+            if beside := {node["family"] for node in self.nodes}.intersection(way.spares):
+                lack = f"its frames could be taken for those of {beside.pop()}, or command its drives"
+            (others if lack else asked).append(f"{name} ({lack or way.how})")
+            if not lack:
+                part = way.find(searched)
+                self.parts.append(AskedDrives(searched, part) if isinstance(part, Sequence) else part)
+        self.told = f"looked for: {', '.join(asked)}; not looked for: {', '.join(others) or 'none'}"
+        self._channel = searched.channel_info
+
+    @property
+    def nodes(self) -> list[dict[str, Any]]:
+        """All that answer, as a scan shows them."""
+        return [node for part in self.parts for node in part.nodes]
+
+    @property
+    def found(self) -> list[FoundDrive]:
+        """Those that an arm file can name; raises BusFault where two have the same id."""
+        self.require_own_ids()
+        return [drive for part in self.parts for drive in part.found]
+
+    def require_own_ids(self) -> None:
+        twins = ", ".join(str(node["address"]) for node in self.nodes if node["answers"] > 1)
+        if twins:
+            raise BusFault(f"{self._channel}: {twins} answers twice: give every drive an id of its own")
+
+    def positions(self) -> dict[str, float]:
+        return {key: each for part in self.parts if part.found for key, each in part.positions().items()}

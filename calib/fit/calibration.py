@@ -1,0 +1,134 @@
+"""A calibration: values of all joints with intervals, why some are missing, findings, and the record."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from calib.fit.findings import FitFinding
+from calib.records.records import (
+    PARAMETERS,
+    CalibrationRecord,
+    Discrepancy,
+    JointCalibration,
+    MotorTorque,
+    Parameter,
+    matrix,
+    provenance,
+)
+from gcomp.arrays import Array
+
+QUANTILE = 1.96
+"""Of a normal distribution, of 95 % intervals."""
+NOMINAL: dict[Parameter, float] = {"position_gain": 1.0, "position_offset": 0.0}
+"""Values of position sensors that were not fitted."""
+
+
+class FittedCalibration(ABC):
+    """Result of a fit to readings of any kind; NaN where they do not determine a value, with the cause in `reasons`."""
+
+    names: tuple[str, ...]
+    reasons: dict[tuple[str, Parameter], str]
+    """(Joint, parameter) → why it has no value."""
+    sources: dict[str, str]
+    """Names and digests of the data sets."""
+
+    @abstractmethod
+    def estimate(self, parameter: str) -> tuple[Array, Array]:
+        """(Values, standard deviations) of one parameter (n,), whether determined or not; 0 where it was known."""
+
+    @abstractmethod
+    def covariance_of(self, wanted: Sequence[tuple[int, Parameter]]) -> Array:
+        """Covariance of parameters, each given by its joint."""
+
+    @property
+    @abstractmethod
+    def residual_rms(self) -> Array:
+        """RMS of each joint's torque residual over the readings that count (n,) [N·m]."""
+
+    @property
+    def findings(self) -> tuple[FitFinding, ...]:
+        """Effects in the readings that the model does not have."""
+        return ()
+
+    @property
+    def doubtful(self) -> tuple[str, ...]:
+        """Joints at which the model does not hold, so that their values must not be used."""
+        broken = {finding.joint for finding in self.findings if finding.breaks_model}
+        return tuple(name for name in self.names if name in broken)
+
+    def quantile(self, parameter: str) -> Array | float:
+        """Of 95 % intervals (n,), in standard deviations."""
+        return QUANTILE
+
+    def value(self, parameter: str) -> Array:
+        """Estimates (n,)."""
+        lost = [(name, parameter) in self.reasons for name in self.names]
+        found = self.estimate(parameter)[0]
+        return np.where(lost, np.nan, found) if any(lost) else found
+
+    def std(self, parameter: str) -> Array:
+        """Standard deviations (n,)."""
+        value = self.value(parameter)
+        return np.where(np.isnan(value), np.nan, self.estimate(parameter)[1])
+
+    def half95(self, parameter: str) -> Array:
+        """Half widths (n,) of the 95 % intervals."""
+        return np.asarray(self.quantile(parameter) * self.std(parameter))
+
+    def ci95(self, parameter: str) -> Array:
+        """95 % intervals (n, 2)."""
+        value, half = self.value(parameter), self.half95(parameter)
+        return np.stack([value - half, value + half], axis=1)
+
+    def discrepancy_of(self, joint: int) -> Discrepancy | None:
+        """Remaining doubt at a new pose."""
+        return None
+
+    def motor_of(self, joint: int) -> MotorTorque | None:
+        """Friction of a joint whose torque is a motor current."""
+        return None
+
+    def record(self, arm_file: ArmFile, before: CalibrationRecord | None = None) -> CalibrationRecord:
+        """The values as a record; those that `before` has and this does not are carried over from it."""
+        values = {parameter: self.value(parameter) for parameter in PARAMETERS}
+        stds = {parameter: self.std(parameter) for parameter in PARAMETERS}
+        own = [(j, p) for j in range(len(self.names)) for p in PARAMETERS if stds[p][j] > 0]
+        names = tuple(f"{self.names[j]}.{p}" for j, p in own)
+        covariance = self.covariance_of(own) if own else np.zeros((0, 0))
+        if before is not None:
+            carried = [name for name in before.covariance_of if name not in names]
+            at = [before.covariance_of.index(name) for name in carried]
+            whole = np.zeros((len(names) + len(carried),) * 2)
+            whole[: len(names), : len(names)] = covariance
+            whole[len(names) :, len(names) :] = np.array(before.covariance)[np.ix_(at, at)] if at else 0.0
+            names, covariance = (*names, *carried), whole
+        return CalibrationRecord(
+            **provenance(arm_file, self.sources),
+            joints=tuple(self._joint(j, values, before) for j in range(len(self.names))),
+            covariance_of=names,
+            covariance=matrix(covariance) if names else (),
+        )
+
+    def _joint(self, j: int, values: dict[Parameter, Array], before: CalibrationRecord | None) -> JointCalibration:
+        name, old, rms = self.names[j], None if before is None else before.joints[j], float(self.residual_rms[j])
+        found: dict[str, Any] = {}
+        missing: dict[Parameter, str] = {}
+        for parameter in PARAMETERS:
+            value, reason = float(values[parameter][j]), self.reasons.get((name, parameter))
+            found[parameter] = value if np.isfinite(value) else getattr(old, parameter, None)
+            if found[parameter] is None and old is None and reason is None:
+                found[parameter] = NOMINAL[parameter]
+            elif found[parameter] is None:
+                known = None if old is None else old.not_identifiable.get(parameter)
+                missing[parameter] = known or reason or ""
+        return JointCalibration(
+            name=name,
+            **found,
+            not_identifiable=missing,
+            residual_std=rms if np.isfinite(rms) else None,
+            discrepancy=self.discrepancy_of(j) if old is None else old.discrepancy,
+            motor=self.motor_of(j),
+        )

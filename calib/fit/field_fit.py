@@ -1,0 +1,297 @@
+"""Calibration in the field, without a mass: gains and offsets from slow motion and the identified gravity parameters.
+
+v_i = K_i τ_i(q; β) + O_i + s_i f_i, with s_i the side of approach and f_i hysteresis or friction that the sensor sees;
+β ~ N(β̂, Cov β̂) from the gravity record and position offsets with their standard deviations, all joints in one problem
+(docs/theory.md, section 4.3). The intervals include the gravity record's own error, which does not average out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armlink.arm_file import ArmFile
+from armlink.errors import BadInput, Refused
+from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
+from calib.arm.kinematics import gcomp_arm
+from calib.arm.sweep_section import sweep_section
+from calib.fit.calibration import FittedCalibration
+from calib.fit.position_field import PositionField
+from calib.fit.scatter import NOISE_ROUNDS, inflation
+from calib.fit.sweep_readings import FEWEST
+from calib.records.records import CalibrationRecord, GravityRecord, Parameter
+from gcomp.arm.mass_moments import payload_columns
+from gcomp.arrays import Array, Mask
+from gcomp.estimate.posterior import PosteriorFit, linear_posterior
+from gcomp.gravity.torque import gravity_regressor
+from gcomp.identify.parameters import Parameters, family_slices
+from gcomp.identify.readings import StaticReadings
+from gcomp.identify.sensor_model import joint_positions, predict, predict_and_jacobian
+
+HYSTERESIS = 0.01
+"""Prior standard deviation of f_i, as a share of rated torque (docs/theory.md, section 4.3)."""
+UNKNOWN_MOMENT = 10.0
+"""Prior standard deviation of a mass moment that is not identifiable in the gravity record [kg·m]."""
+GAIN_STD = 0.02
+"""Relative standard deviation above which a gain counts as not separable from the offset."""
+OFFSET_STD = 0.005
+"""Likewise of an offset, as a share of rated torque."""
+DRIFT = 0.05
+"""Standard deviation allowed for the drift of a gain that these rows do not show, as a ratio."""
+LEAST_CORRELATION = 0.05
+"""Of neighbouring rows' residuals, up to which they are summed (docs/theory.md, section 4.3)."""
+PAYLOAD_EVIDENCE = 10.0
+"""BIC difference up to which a payload that explains the rows worse than new gains and offsets is not excluded."""
+BLOCK = 24
+"""Rows that are held out together, since neighbours are correlated: six seconds of a recording."""
+
+
+class FieldProblem:
+    """Rows as a linear function of gains, offsets, hysteresis, and what the records leave open, in standard deviations:
+    mass moments, position offsets, discrepancy."""
+
+    def __init__(
+        self, arm_file: ArmFile, rows: StaticReadings, gravity: GravityRecord, calibration: CalibrationRecord | None
+    ) -> None:
+        """Raises Refused if a record is of another arm, BadInput if no reading counts."""
+        self.arm, self.rated, self.rows = gcomp_arm(arm_file), arm_file.require_link().rated_torques, rows
+        n, blank = self.arm.n, per_joint([UNCALIBRATED] * self.arm.n)
+        if not rows.counted.any():
+            raise BadInput("no torque reading can be used")
+        values, vectors = np.linalg.eigh(np.array(gravity.require(arm_file).covariance))
+        unknown = UNKNOWN_MOMENT * np.eye(2 * n)[:, ~np.array(gravity.identifiable)]
+        self._root = np.hstack([vectors * np.sqrt(np.maximum(values, 0.0)), unknown])
+        self.sensors = Parameters.nominal(n, beta=np.array(gravity.beta))
+        self.installed: TorqueCalibration[Array] = blank
+        zero_std = np.full(n, sweep_section(arm_file).position_offset_std)
+        held_std = (np.zeros(n), np.zeros(n))
+        if calibration is not None:
+            self.installed = calibration.require(arm_file).torque_calibration(blank)
+            self.sensors = replace(
+                self.sensors,
+                position_gain=calibration.values("position_gain", 1.0),
+                position_offset=calibration.values("position_offset", 0.0),
+            )
+            known = calibration.std("position_offset")
+            zero_std = np.where(np.isnan(known), zero_std, known)
+            held_std = calibration.std("gain"), calibration.std("offset")
+        self._zero_std = np.maximum(zero_std, 1e-6)
+        self._held_std = (
+            np.fmax(held_std[0], 1e-3 * np.abs(self.installed.gain)),
+            np.fmax(held_std[1], 1e-3 * self.rated),
+        )
+        self.joint = np.nonzero(rows.counted)[1]
+        self._side = (np.arange(n) == self.joint[:, None]) * rows.direction[rows.counted][:, None]
+        self._local = self._discrepancy(calibration)
+
+    def _discrepancy(self, calibration: CalibrationRecord | None) -> Array:
+        """Columns (P, F) of the disagreement of calibrated torque with the gravity model, of unit variance."""
+        q, counted = joint_positions(self.sensors, self.rows), self.rows.counted
+        parts = [np.zeros((len(self.joint), 0))]
+        for joint, each in enumerate([] if calibration is None else calibration.joints):
+            told = each.discrepancy
+            if told is None or told.level == 0 or not counted[:, joint].any():
+                continue
+            poses = q[counted[:, joint]]
+            columns = told.level * PositionField.over(poses, told.length).columns(poses)
+            whole = np.zeros((len(self.joint), columns.shape[1]))
+            whole[self.joint == joint] = columns
+            parts.append(whole)
+        return np.hstack(parts)
+
+    def columns(self, gain: Array) -> Array:
+        """Change of each counted reading per parameter (P, p), at given gains (n,)."""
+        _, jacobian, _ = predict_and_jacobian(self.arm, replace(self.sensors, gain=gain), self.rows)
+        at = family_slices(self.arm.n)
+        own = jacobian[:, at["gain"]], jacobian[:, at["offset"]], self._side
+        moments, zeros = jacobian[:, at["beta"]] @ self._root, jacobian[:, at["position_offset"]] * self._zero_std
+        return np.hstack([*own, moments, zeros, gain[self.joint, None] * self._local])
+
+    def load_columns(self) -> Array:
+        """Change of each counted reading per unit of a payload's mass and of mass times place (P, 4)."""
+        fixed, by_point = payload_columns(self.arm)
+        regressor = gravity_regressor(self.arm, joint_positions(self.sensors, self.rows))[self.rows.counted]
+        return np.asarray(regressor @ np.column_stack([fixed, by_point]) * self.installed.gain[self.joint, None])
+
+    def solve(
+        self, columns: Array, noise: Array, gain_share: Array | None = None, more: Sequence[float] = ()
+    ) -> PosteriorFit:
+        """With gains free within a share of the installed ones, or as installed; `more` are the standard deviations
+        of parameters beyond those of the problem."""
+        installed = self.installed
+        loose = None if gain_share is None else (gain_share * np.abs(installed.gain), 10 * self.rated)
+        pair = self._held_std if loose is None else loose
+        rest = columns.shape[1] - len(more) - 3 * len(self.rated)
+        std = np.concatenate([*pair, HYSTERESIS * self.rated, np.ones(rest), more])
+        mean = np.concatenate([installed.gain, installed.offset, np.zeros(len(std) - 2 * len(self.rated))])
+        weight = 1 / noise[self.rows.counted]
+        target = self.rows.torque[self.rows.counted] * weight
+        return linear_posterior(columns * weight[:, None], target, mean, std)
+
+    def table(self, values: Array) -> Array:
+        """Values of the counted readings (P,) as a table (K, n), NaN elsewhere."""
+        whole = np.full(self.rows.torque.shape, np.nan)
+        whole[self.rows.counted] = values
+        return whole
+
+
+@dataclass(frozen=True, eq=False)
+class FieldFit(FittedCalibration):
+    """Present gains and offsets of the sensors; without a value if these rows do not separate them."""
+
+    names: tuple[str, ...]
+    solution: PosteriorFit
+    hysteresis: Array
+    """Half the difference between both directions (n,) [N·m]; NaN if only one was seen."""
+    reasons: dict[tuple[str, Parameter], str]
+    residual: Array
+    """Readings minus fit (K, n) [N·m]; NaN for readings that do not count."""
+    torque: Array
+    """Model torque (K, n) [N·m]."""
+    sources: dict[str, str]
+
+    def estimate(self, parameter: str) -> tuple[Array, Array]:
+        n = len(self.names)
+        if parameter not in ("gain", "offset"):
+            return np.full(n, np.nan), np.full(n, np.nan)
+        place = slice(0, n) if parameter == "gain" else slice(n, 2 * n)
+        return self.solution.x[place], np.sqrt(np.diag(self.solution.covariance)[place])
+
+    def covariance_of(self, wanted: Sequence[tuple[int, Parameter]]) -> Array:
+        places = [joint + len(self.names) * (parameter == "offset") for joint, parameter in wanted]
+        return self.solution.covariance[np.ix_(places, places)]
+
+    @property
+    def residual_rms(self) -> Array:
+        count = np.isfinite(self.residual).sum(axis=0)
+        return np.asarray(np.sqrt(np.nansum(self.residual**2, axis=0) / np.where(count, count, np.nan)))
+
+    @property
+    def common_scale_std(self) -> float:
+        """Standard deviation of a factor common to all gains; it comes from the gravity record alone."""
+        gain = self.value("gain")
+        known = np.flatnonzero(np.isfinite(gain))
+        relative = self.solution.covariance[np.ix_(known, known)] / np.outer(gain[known], gain[known])
+        return float(np.sqrt(relative.mean())) if len(known) else float("nan")
+
+    def record(self, arm_file: ArmFile, before: CalibrationRecord | None = None) -> CalibrationRecord:
+        """With what was not found as in `before`, the current one. Raises Refused if no value was identified."""
+        if np.isnan([self.value("gain"), self.value("offset")]).all():
+            (joint, parameter), why = next(iter(self.reasons.items()))
+            raise Refused(f"no gain and no offset is identifiable; {joint} {parameter}: {why}")
+        carried = ", ".join(f"{name} {parameter}" for name, parameter in self.reasons)
+        note = "field calibration without a mass"
+        known = {"note": note} if before is None else {"drives": before.drives, "parent": before.id, "note": note}
+        if carried and before is not None:
+            known["note"] = f"{note}; carried over from {before.id}: {carried}"
+        return super().record(arm_file, before).model_copy(update=known)
+
+
+def fit_field(
+    arm: ArmFile,
+    rows: StaticReadings,
+    gravity: GravityRecord,
+    calibration: CalibrationRecord | None,
+    sources: dict[str, str] | None = None,
+) -> FieldFit:
+    """Gains and offsets from slow rows; `calibration` has the position sensors and the torque calibration in use.
+
+    Raises Refused if a payload explains the rows as well, or the records are of another arm; BadInput.
+    """
+    problem = FieldProblem(arm, rows, gravity, calibration)
+    gain, noise, n = problem.installed.gain, rows.sigma, problem.arm.n
+    for _ in range(NOISE_ROUNDS):
+        columns = problem.columns(gain)
+        solved = problem.solve(columns, noise, np.ones(n))
+        residual = problem.table(rows.torque[rows.counted] - columns @ solved.x)
+        gain, noise = solved.x[:n], rows.sigma * np.maximum(_scatter(residual, rows), 1.0)
+    unseen = np.sqrt(np.diag(solved.covariance)[:n]) > GAIN_STD * np.abs(gain)
+    if unseen.any():
+        columns = problem.columns(np.where(unseen, problem.installed.gain, gain))
+        solved = problem.solve(columns, noise, np.where(unseen, DRIFT, 1.0))
+    if calibration is not None:
+        _refuse_payload(problem, noise, solved.chi2)
+    return _report(problem, columns, solved, unseen, sources or {})
+
+
+def _scatter(residual: Array, rows: StaticReadings) -> Array:
+    """Factor (n,) on the standard deviation of a row: of the residuals, and for neighbours that are alike."""
+    factor = np.ones(residual.shape[1])
+    for joint, counted in enumerate(rows.counted.T):
+        score = residual[counted, joint] / rows.sigma[counted, joint]
+        parts = [residual[counted & (rows.series == each), joint] for each in np.unique(rows.series[counted])]
+        factor[joint] = np.sqrt(score @ score / max(len(score) - 3, 1) * inflation(parts, LEAST_CORRELATION))
+    return factor
+
+
+def _refuse_payload(problem: FieldProblem, noise: Array, chi2: float) -> None:
+    """Raise Refused if the installed calibration does not fit, but fits as well as a new one with a payload added."""
+    base = problem.columns(problem.installed.gain)
+    loaded = problem.solve(np.hstack([base, problem.load_columns()]), noise, more=[UNKNOWN_MOMENT] * 4)
+    log_rows = np.log(len(problem.joint))
+    as_load, mass = loaded.chi2 + 4 * log_rows, float(loaded.x[-4])
+    as_new = chi2 + 2 * problem.arm.n * log_rows
+    as_installed = problem.solve(base, noise).chi2
+    if as_installed > as_load + PAYLOAD_EVIDENCE and mass > 0 and as_load < as_new + PAYLOAD_EVIDENCE:
+        raise Refused(
+            f"a payload of {mass:.2f} kg explains these readings as well as other gains do: take it off and record"
+            " again; if there is none, sweep with a reference mass"
+        )
+
+
+def _report(
+    problem: FieldProblem, columns: Array, solved: PosteriorFit, unseen: Mask, sources: dict[str, str]
+) -> FieldFit:
+    n, names, rows = problem.arm.n, problem.arm.names, problem.rows
+    model = np.where(rows.counted, predict(problem.arm, problem.sensors, rows), np.nan)
+    hysteresis, offset_std = solved.x[2 * n : 3 * n].copy(), np.sqrt(np.diag(solved.covariance)[n : 2 * n])
+    reasons: dict[tuple[str, Parameter], str] = {}
+    for j, name in enumerate(names):
+        counted = rows.counted[:, j]
+        here, sides = model[counted, j], set(np.sign(rows.direction[counted, j])) - {0.0}
+        if len(here) == 0:
+            reasons[name, "gain"] = reasons[name, "offset"] = "none of these rows has a usable reading of its sensor"
+        elif unseen[j]:
+            reasons[name, "gain"] = _no_gain(here)
+        if len(here) and len(sides) < 2:
+            hysteresis[j] = np.nan
+            reasons[name, "offset"] = (
+                "it was approached from one side only, so friction and hysteresis look the same: move it both ways"
+            )
+        elif len(here) and offset_std[j] > OFFSET_STD * problem.rated[j]:
+            reasons[name, "offset"] = (
+                f"it cannot be separated from the gain: known to ± {2 * offset_std[j]:.2g} N·m only, as"
+                f" torque stays between {here.min():.2f} and {here.max():.2f} N·m"
+            )
+    residual = problem.table(rows.torque[rows.counted] - columns @ solved.x)
+    return FieldFit(names, solved, hysteresis, reasons, residual, model, sources)
+
+
+def _no_gain(torque: Array) -> str:
+    spread = float(np.std(torque))
+    if np.abs(torque).max() < 1e-3:
+        return "gravity does not act on it: its axis is vertical in all these poses"
+    return (
+        f"it cannot be separated from the offset: gravity torque varies by only {spread:.2g} N·m (standard deviation)"
+        " in these poses: move it, or the joints beyond it, further"
+    )
+
+
+def heldout_errors(rows: StaticReadings, fit: FieldFit, before: CalibrationRecord) -> tuple[Array, Array]:
+    """Errors (K, n) [N·m] of held-out rows with a new calibration and with the one before; NaN if they do not count.
+
+    For every joint a line of readings over model torque is fitted to every second block of rows and predicts the
+    others.
+    """
+    block = np.arange(len(rows.torque)) // min(BLOCK, max(len(rows.torque) // 6, 1)) % 2
+    old = rows.torque - before.torque_calibration().apply(fit.torque)
+    new = np.full_like(old, np.nan)
+    counted = np.isfinite(old) & np.isfinite(fit.value("gain"))
+    for j in range(old.shape[1]):
+        for held in (0, 1):
+            train, test = counted[:, j] & (block != held), counted[:, j] & (block == held)
+            if train.sum() < FEWEST:
+                continue
+            line = np.polyfit(fit.torque[train, j], rows.torque[train, j], 1)
+            new[test, j] = rows.torque[test, j] - np.polyval(line, fit.torque[test, j])
+    return new, old
