@@ -164,7 +164,7 @@ class SelfTest:
     def _with_power(self) -> str:
         """Enable, hold, silence of each drive, stow; returns why what is left is not run."""
         link, self._under_way = self.link, "enables and holds"
-        self.progress("enable, and hold")
+        self.progress("enabling the joints, which should hold")
         start = link.clock.now()
         standing = link.enable().position
         seconds = link.clock.now() - start

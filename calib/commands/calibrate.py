@@ -74,7 +74,7 @@ def calibrate(
         if felt is not None and felt.contradicts:
             records.add(record.model_copy(update={"note": f"not made current: {felt}"}))
             write_json(json_file, _answer(fit, record, False))
-            raise Refused(f"{felt} Record {record.id} is kept, and not made current")
+            raise Refused(f"{felt} Record {record.id} is stored, but not made current")
     out = results(json_file)
     _show(fit, out)
     user = getpass.getuser()
@@ -88,7 +88,7 @@ def calibrate(
         by=user, bus=bus, replaced=tuple(replaced or ()), accepted=tuple(accept or ()), check=check, flash=flash
     )
     again = command_line("calibrate", *map(str, directories), "--apply", arm=arm, bus=bus, store=store)
-    kept = "the controllers keep what they hold until --apply writes it to them"
+    kept = "the drives keep their old calibration until `--apply` writes this record to them"
     if not isinstance(fit, SensorFit):
         with early_end(arm_file, again) as work:
             work.enabled = apply and check
@@ -191,11 +191,11 @@ def _show(fit: "Calibrated", console: "PlainConsole") -> None:
     if isinstance(fit, SensorFit):
         columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
         doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
-        lines.append(f"at new poses, sensors and gravity model still disagree by [N·m]: {', '.join(doubts)}")
+        lines.append(f"at new poses, sensors and gravity model still differ by [N·m]: {', '.join(doubts)}")
         lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
         if fit.gain_ratio is not None:
             ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
-            lines.append(f"gains relative to the last joint's: {ratios}")
+            lines.append(f"gains relative to the gain of the last joint: {ratios}")
     title = "Sensors" if isinstance(fit, SensorFit) else "Drives"
     print_intervals(f"{title}, ± half of the 95 % interval", fit.names, columns, console)
     print_lines(lines, console=console)

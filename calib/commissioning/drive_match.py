@@ -112,7 +112,7 @@ def _judge(joint: TurnedJoint, drive: FoundDrive, turned: float) -> list[SetupFi
     ratio, where = turned / expected, f"{joint.name} ({drive.address})"
     findings = []
     if ratio < 0 and drive.family == "canopen":
-        what = f"its position counts the other way: from lower to upper stop it read {turned:+.2f} rad"
+        what = f"its position counts in the wrong direction: from the lower to the upper stop it read {turned:+.2f} rad"
         findings.append(SetupFinding("error", what, where, POLARITY_REMEDY))
     if abs(abs(ratio) - 1) > SCALE_TOLERANCE:
         what = (

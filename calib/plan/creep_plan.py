@@ -227,7 +227,7 @@ def _home(ground: CreepGround, random: np.random.Generator) -> Array:
         pose = random.uniform(*ends.T)
         if ground.free(pose[None]):
             return np.asarray(pose)
-    raise BadInput("almost every pose within the joint range collides: narrow lower and upper in the arm file")
+    raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
 
 
 def _candidates(

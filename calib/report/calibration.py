@@ -249,7 +249,10 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _creeps(fit: CreepFit) -> ReportSection:
-    text = "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
+    text = (
+        "At each position, half the sum of the readings up (▸) and down (◂) is gravity, and half their "
+        "difference is friction."
+    )
     return ReportSection(
         "Creep sweeps", paragraph(text) + paragraphs(each.text for each in fit.findings), [creep_figure(fit)]
     )

@@ -82,7 +82,7 @@ def test_models_of_other_joints_are_refused(models: list[str], tmp_path: Path) -
     other.write_text(text, encoding="utf-8")
     recording = record(text, 1, 8.0)
     unnamed = replace(recording, names=())
-    with pytest.raises(BadInput, match="its joints are shoulder, elbow, not shoulder, knee"):
+    with pytest.raises(BadInput, match="its joints are shoulder, elbow, but the other models have shoulder, knee"):
         compare_models([str(other), models[0]], [unnamed])
 
 

@@ -63,8 +63,10 @@ def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path 
         opened.shutdown()
     text = rewired_text(arm, matches, bus_keys(bus, out, drives), out)
     parse_arm(parse_yaml(text, out), out)
-    title = f"{arm.name} with the drives on {channel}, from {model.name}, by the command new."
-    write_whole(out, yaml_comment(f"{title} Nodes, rated torques and identities are the drives' own.") + "\n" + text)
+    title = f"{arm.name} with the drives on {channel}: made from {model.name} by `armlink new`."
+    write_whole(
+        out, yaml_comment(f"{title} Nodes, rated torques and identities were read from the drives.") + "\n" + text
+    )
     told = addresses([match.drive for match in matches])
     return _tell(out, told, "check", arm.name, _matched(matches), findings, json_file)
 

@@ -37,7 +37,7 @@ def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
     import mujoco
 
     if found.export is None:
-        raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+        raise BadInput("--out-model needs a model that came from a file: give MJCF, URDF or an arm file with --sim")
     xml, beside = found.export.xml, {} if path.suffix == URDF else _beside(found, path)
     made = write_files(path, found.sim, xml, lambda: mujoco.MjModel.from_xml_string(xml), found.export.lines, beside)
     return tuple(made)

@@ -63,7 +63,7 @@ def test_a_vertical_joint_is_named_and_gets_no_gain() -> None:
     assert abs(fit.value("offset")[0] - truth.offset[0]) < 0.05
     record = fit.record(arm)
     assert record.joints[0].gain is None
-    assert "gravity does not load" in record.joints[0].not_identifiable["gain"]
+    assert "gravity does not act" in record.joints[0].not_identifiable["gain"]
     assert np.abs(fit.value("gain")[1:] / truth.gain[1:] - 1).max() < 0.01
 
 
