@@ -56,7 +56,7 @@ class Misplacement:
         if not self.turns:
             return (
                 "No number of whole turns of its drive explains this reading, so zero, direction, gear, the "
-                "stops or the scale of the reading are wrong: correct the arm file (`armlink check --scales "
+                "stops or the scale of the reading are wrong: correct the arm file (`check --scales "
                 "hand` judges the scale)"
             )
         zeros = [f"`zero: {self.zero_after(turns)}` ({_in_words(turns)})" for turns in self.turns]

@@ -81,7 +81,7 @@ def test_in_a_model_of_both_arms_the_other_joints_are_parked_where_the_arm_file_
     with pytest.raises(Collided, match="openarm_left_"):
         check_creeps(pair, Geometry(pair), plan, np.array(plan.scout[0]))
     wrong = pair.model_copy(update={"sweep": SweepSection(beside=(ParkedArm(pose={"openarm_right_joint4": 1.0}),))})
-    with pytest.raises(BadInput, match="'openarm_right_joint4' moves itself"):
+    with pytest.raises(BadInput, match="'openarm_right_joint4' is moved by a drive of this arm"):
         Geometry(wrong)
 
 

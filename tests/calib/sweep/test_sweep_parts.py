@@ -257,7 +257,7 @@ def test_unsettled_readings_are_told_with_their_sweeps() -> None:
     swung = replace(data.readings[0], settled=False)
     (line,) = unsettled_lines(replace(data, readings=(swung, *data.readings[1:])))
     assert line.startswith(f"1 of {len(data.readings)} readings had not settled")
-    assert "in scout: they count less" in line
+    assert "in scout: these readings count less" in line
 
 
 def test_a_missing_number_stays_missing(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_bad_data_sets_say_where(tmp_path: Path) -> None:
         pass
     with pytest.raises(BadInput, match="not empty"):
         DataWriter(tmp_path / "set", Manifest.of(arm, 0.0))
-    with pytest.raises(Refused, match=r"reference_mass is 0\.0 there, but 2\.0"):
+    with pytest.raises(Refused, match=r"reference_mass was 0\.0, but now it is 2\.0"):
         DataWriter(tmp_path / "set", Manifest.of(arm, 2.0), resume=True)
     (tmp_path / "set" / "readings.jsonl").write_text(json.dumps({"kind": "reading", "sweep": "x"}) + "\n")
     with pytest.raises(BadInput, match="line 1: key"):
