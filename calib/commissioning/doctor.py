@@ -50,10 +50,10 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
         yield _as_finding(error, arm_file)
     if arm_file.link is None:
         yield SetupFinding(
+            "error",
             "key `link` is missing: the bus and the drives of the joints are not known",
-            "add the key `link`: {FORMATS}",
             arm,
-            f"add the section link: {FORMATS}",
+            f"add the key `link`: {FORMATS}",
         )
     else:
         yield from _serial(arm_file)

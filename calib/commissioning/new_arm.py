@@ -188,7 +188,9 @@ def _take_ratings(made: NewArm, joint: JointDraft, match: Match) -> None:
 
 def _doubtful_rating(match: Match, effort: float) -> SetupFinding:
     drive = match.drive
-    remedy = "check that this drive moves this joint" + ("" if match.by_hand else ": --by-hand finds out")
+    remedy = "check that this drive moves this joint" + (
+        "" if match.by_hand else " (--by-hand finds the drive of each joint)"
+    )
     what = f"the drive is rated {drive.rated_torque:g} N·m, but the effort limit of the model is {effort:g} N·m"
     return SetupFinding("warning", what, f"{match.joint} ({drive.address})", remedy)
 

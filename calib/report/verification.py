@@ -22,11 +22,11 @@ def write_report(
         f"{len(result.sensor)} random poses that were used for no fit.{skipped}"
     )
     header = (
-        "standard deviation of the model",
+        "joint",
         "RMS [N·m]",
         "allowed RMS",
         "largest [N·m]",
-        "model's own standard deviation",
+        "standard deviation of the model",
         "largest torque",
     )
     numbers = (
