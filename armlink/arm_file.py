@@ -95,15 +95,15 @@ class Kinematics(Section):
     @model_validator(mode="after")
     def _one_description(self) -> "Kinematics":
         if bool(self.joints) == (self.model is not None):
-            raise ValueError("give either joints (Denavit-Hartenberg rows) or model (URDF or MJCF), and not both")
+            raise ValueError("give either `joints` (Denavit-Hartenberg rows) or `model` (URDF or MJCF), not both")
         _no_twins([joint.name for joint in self.joints])
         if self.stops and self.joints:
-            raise ValueError("stops is for a model: Denavit-Hartenberg rows have lower and upper")
+            raise ValueError("`stops` belongs to a model: Denavit-Hartenberg rows have `lower` and `upper`")
         if self.locked and self.joints:
-            raise ValueError("locked is for a model: leave out the Denavit-Hartenberg row of a joint that is held")
+            raise ValueError("`locked` belongs to a model: if a joint is held, leave out its Denavit-Hartenberg row")
         for name, (lower, upper) in self.stops.items():
             if lower >= upper:
-                raise ValueError(f"stops: joint {name}: lower {lower} must be less than upper {upper} [rad]")
+                raise ValueError(f"stops of joint {name}: lower {lower} must be less than upper {upper} [rad]")
         return self
 
 
@@ -124,7 +124,7 @@ def _parse_drive(keys: Any) -> Any:
     if keys is None or isinstance(keys, Section):
         return keys
     if not isinstance(keys, dict) or not isinstance(keys.get("family"), str):
-        raise ValueError("expected a mapping with the key family")
+        raise ValueError("expected a mapping with the key `family`")
     return _drive_settings(keys["family"]).model_validate(keys)
 
 
@@ -133,7 +133,7 @@ def _drive_settings(family: str) -> type[Section]:
     found = named("armlink.drives", family)
     if found is None:
         known = ", ".join(sorted({point.name for point in contributed("armlink.drives")}))
-        raise ValueError(f"no drive family {family!r}; there are {known}")
+        raise ValueError(f"drive family {family!r} is unknown; there are {known}")
     settings: type[Section] = found.settings
     return settings
 
@@ -176,9 +176,9 @@ class LinkJoint(Section):
     @model_validator(mode="after")
     def _one_drive(self) -> "LinkJoint":
         if self.node is None and self.drive is None:
-            raise ValueError(f"{self.name}: give node or drive ({{family: …}})")
+            raise ValueError(f"{self.name}: give `node` or `drive: {{family: …}}`")
         if self.node is not None and self.drive is not None:
-            raise ValueError(f"{self.name}: give node or drive, not both")
+            raise ValueError(f"{self.name}: give `node` or `drive`, not both")
         return self
 
     @property
@@ -218,7 +218,9 @@ class LinkSection(Section):
     @model_validator(mode="after")
     def _park_names_every_joint(self) -> "LinkSection":
         if self.park is not None and len(self.park.pose) != len(self.joints):
-            raise ValueError(f"park.pose has {len(self.park.pose)} positions, expected {len(self.joints)}: one a joint")
+            raise ValueError(
+                f"park.pose has {len(self.park.pose)} positions, expected {len(self.joints)}: one for each joint"
+            )
         return self
 
     @model_validator(mode="after")
@@ -253,7 +255,7 @@ class ArmFile(Section):
     def _name_is_no_folder(self) -> "ArmFile":
         for key, value in (("name", self.name), ("serial", self.serial)):
             if value in (".", ".."):
-                raise ValueError(f"{key} is {value!r}, expected a name that can be part of a file's name")
+                raise ValueError(f"{key} is {value!r}, expected a name that can be part of a file name")
         return self
 
     @model_validator(mode="after")
@@ -261,12 +263,15 @@ class ArmFile(Section):
         described = [joint.name for joint in self.kinematics.joints]
         linked = [joint.name for joint in self.link.joints] if self.link else described
         if described and linked != described:
-            raise ValueError(f"link.joints are {linked}, but kinematics.joints are {described}: same names, same order")
+            raise ValueError(
+                f"link.joints are {linked}, but kinematics.joints are {described}: give both the same names in "
+                "the same order"
+            )
         if described and self.link and self.link.park:
             for joint, position in zip(self.kinematics.joints, self.link.park.pose, strict=True):
                 if not joint.lower <= position <= joint.upper:
-                    where = f"expected {joint.lower:g} to {joint.upper:g}"
-                    raise ValueError(f"link.park.pose: {joint.name}: {position:g} rad, {where}")
+                    where = f"which is outside the range {joint.lower:g} to {joint.upper:g} of this joint"
+                    raise ValueError(f"link.park.pose: {joint.name} is at {position:g} rad, {where}")
         return self
 
     @property
@@ -305,14 +310,16 @@ class ArmFile(Section):
     def require_link(self) -> LinkSection:
         """The link section; raises BadInput where the file has none."""
         if self.link is None:
-            raise BadInput(f"{self.path}: key link is missing: this command needs the bus and its joint controllers")
+            raise BadInput(
+                f"{self.path}: key `link` is missing: this command needs the bus and the drives of the joints"
+            )
         return self.link
 
     def require(self, kind: type[S], name: Literal["sweep", "sim"]) -> S:
         """The section `name`, typed; raises BadInput where the file has none."""
         section = getattr(self, name)
         if not isinstance(section, kind):
-            raise BadInput(f"{self.path}: key {name} is missing: this command needs it")
+            raise BadInput(f"{self.path}: key `{name}` is missing: this command needs it")
         return section
 
 
@@ -336,14 +343,18 @@ def load_arm(arm: str | Path) -> ArmFile:
     if not path.is_file():
         raise BadInput(_no_arm_file(path))
     if path.suffix.lower() in MODEL_SUFFIXES:
-        raise BadInput(f"{path}: is a model, not an arm file: make one of it with armlink new {path}")
+        raise BadInput(
+            f"{path} is a model, not an arm file: make an arm file from this model with `armlink new {path}`"
+        )
     try:
         content = read_yaml(path)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
     if not isinstance(content, dict):
         kind = "nothing" if content is None else type(content).__name__
-        raise BadInput(f"{path}: expected a mapping with keys name, kinematics, link, not {kind}")
+        raise BadInput(
+            f"{path} contains {kind}: an arm file is a mapping with the keys `name`, `kinematics` and `link`"
+        )
     return parse_arm(content, path)
 
 
@@ -358,14 +369,14 @@ def _no_arm_file(path: Path) -> str:
     close = meant(str(path), [*bundled, *beside])
     hint = close if "mean" in close else ""
     if path.is_dir():
-        return f"{path}: is a folder: give the arm file in it, or a bundled arm ({', '.join(bundled)})"
-    return f"no arm file {path}: give a path, or a bundled arm ({', '.join(bundled)}){hint}"
+        return f"{path} is a folder: give the path of an arm file, or a bundled arm ({', '.join(bundled)})"
+    return f"there is no arm file {path}: give a path, or a bundled arm ({', '.join(bundled)}){hint}"
 
 
 def parse_arm(content: dict[str, Any], path: Path) -> ArmFile:
     """Validate an arm file's content; `path` is where it (would have) stood. Raises BadInput."""
     if "path" in content:
-        raise BadInput(f"{path}: key path: not a key of the arm file; remove it")
+        raise BadInput(f"{path}: `path` is not a key of an arm file: remove it")
     content, section, model = _with_simulated_bus(dict(content), path), "", ArmFile
     try:
         for point in contributed("armlink.sections"):
@@ -392,4 +403,4 @@ def _with_simulated_bus(content: dict[str, Any], path: Path) -> dict[str, Any]:
 def _no_twins(values: list[Any]) -> None:
     twins = sorted({value for value in values if values.count(value) > 1})
     if twins:
-        raise ValueError(f"{twins[0]!r} stands twice; names and nodes must be unique")
+        raise ValueError(f"{twins[0]!r} is given twice; names and nodes must be unique")

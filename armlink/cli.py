@@ -70,10 +70,10 @@ def _no_command(name: str, points: dict[str, EntryPoint]) -> str:
     import difflib
 
     if name.lower().endswith((".urdf", ".xml", ".mjcf")):
-        return f"no command {name!r}; an arm file of a model is made by armlink new {name}"
+        return f"there is no command {name!r}; to make an arm file from a model, use `armlink new {name}`"
     close = difflib.get_close_matches(name, [*points, "--help", "--version", "completion"], n=1)
     hint = f"did you mean {close[0]}? " if close else ""
-    return f"no command {name!r}; {hint}there are {', '.join(sorted(points))}"
+    return f"there is no command {name!r}; {hint}there are {', '.join(sorted(points))}"
 
 
 def _call(point: EntryPoint, arguments: list[str]) -> int:
@@ -144,11 +144,9 @@ def _help(points: dict[str, EntryPoint]) -> str:
     width = max(map(len, points), default=0)
     rows = "\n".join(f"  {name:<{width}}  {_summary(points[name])}" for name in sorted(points))
     return (
-        f"Usage: armlink COMMAND [OPTIONS]\n\n{PURPOSE}\n\nCommands:\n{rows}\n\n"
-        "Options:\n  --help     Shows this, and armlink COMMAND --help says more.\n"
-        f"  --version  Shows the version, {version('armlink')}.\n\n"
-        "armlink completion bash|zsh|fish prints the script for completion in the shell.\n\n"
-        "Example: armlink demo --seed 1\n"
+        f"Usage: armlink COMMAND [OPTIONS]\n\n{PURPOSE}\n\nCommands:\n{rows}\n\nOptions:\n  --help     Shows this, and "
+        f"armlink COMMAND --help says more.\n  --version  Shows the version, {version('armlink')}.\n\narmlink "
+        "completion bash|zsh|fish prints the script for completion in the shell.\n\nExample: armlink demo --seed 1\n"
     )
 
 

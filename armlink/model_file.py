@@ -128,8 +128,8 @@ def read_model(path: Path, locked: Mapping[str, float] | None = None) -> ModelFi
         unused.append((mesh.file, reason))
         if weighed and kind == "MJCF":
             raise BadInput(
-                f"{path}: mesh {mesh.file} is {reason}, and body {weighed[0]!r} has its mass from it alone: put a mesh "
-                "that MuJoCo reads beside the model, or give the body an inertial"
+                f"{path}: mesh {mesh.file} is {reason}, and body {weighed[0]!r} has its mass from this mesh "
+                "alone: put a mesh that MuJoCo reads beside the model, or give the body an `inertial`"
             )
         _drop(spec, mesh)
     for texture in list(spec.textures):
@@ -149,13 +149,16 @@ def expanded(path: Path, out: Path) -> Path:
         import xacro
     except ModuleNotFoundError:
         raise BadInput(
-            f"{path}: is a xacro file: pip install xacro, or expand it yourself: xacro {path} > {out}"
+            f"{path} is a xacro file: install xacro (pip install xacro), or expand the file yourself: xacro "
+            f"{path} > {out}"
         ) from None
     try:
         text = xacro.process_file(str(path)).toxml()
     except Exception as error:  # of many kinds: of XML, of expressions, of packages that are not found
         what = f"{path}: xacro cannot expand it: {one_line(error)}"
-        raise BadInput(f"{what}: $(find PACKAGE) and arguments need ROS: xacro {path} > {out} there") from None
+        raise BadInput(
+            f"{what}: $(find PACKAGE) and arguments need ROS: on a machine with ROS, run xacro {path} > {out}"
+        ) from None
     write_whole(out, text)
     return out
 
@@ -168,13 +171,13 @@ def _rest_at(spec: Any, name: str, position: float, path: Path) -> None:
     joint = spec.joint(name)
     if joint is None:
         joints = ", ".join(each.name for each in spec.joints)
-        raise BadInput(f"{path}: no joint {name!r} to lock; there are {joints}")
+        raise BadInput(f"{path}: there is no joint {name!r} to lock; there are {joints}")
     hinge, body = joint.type == mujoco.mjtJoint.mjJNT_HINGE, joint.parent
     if not hinge and joint.type != mujoco.mjtJoint.mjJNT_SLIDE:
         raise BadInput(f"{path}: joint {name!r} cannot be locked: it neither turns about one axis nor slides along it")
     if body.joints[0].name != name:
         raise BadInput(
-            f"{path}: joint {name!r} cannot be locked: {body.joints[0].name!r} moves the same body before it"
+            f"{path}: joint {name!r} cannot be locked, since joint {body.joints[0].name!r} moves the same body"
         )
     unit = np.pi / 180 if hinge and joint.compiler.degree else 1.0
     if joint.range[0] < joint.range[1] and not joint.range[0] <= position / unit <= joint.range[1]:

@@ -11,7 +11,7 @@ Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f
 def _no_step(name: str) -> str:
     """The name; raises ValueError where a part of it between slashes is empty or leads out of a folder."""
     if {"", ".", ".."} & set(name.split("/")):
-        raise ValueError("expected a name on either side of each slash, not '.', '..' or nothing")
+        raise ValueError("on either side of each slash there must be a name, not '.', '..' or nothing")
     return name
 
 

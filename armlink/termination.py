@@ -67,7 +67,9 @@ class Presses:
         self.dropped = self.dropped or now - self._pressed_at <= TWICE_SECONDS
         self._pressed_at = now
         if not self.dropped:
-            log.warning("Ctrl-C once more within %g s lets the arm fall", TWICE_SECONDS)
+            log.warning(
+                "the arm is brought to rest; pressing Ctrl-C again within %g s lets the arm fall", TWICE_SECONDS
+            )
 
     def _signalled(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT:

@@ -75,10 +75,10 @@ def open_link(arm: ArmLike, bus: str | None = None, *, simulated: bool = False, 
     arm_file = _arm(arm)
     if not simulated:
         if load:
-            raise BadInput(f"open_link: load {load:g} kg: only a simulated arm can be given a load")
+            raise BadInput(f"open_link: load is {load:g} kg, but only a simulated arm can be given a load")
         return open_arm(arm_file, bus)
     if bus is not None:
-        raise BadInput(f"open_link: bus {bus}: a simulated arm needs none: leave bus or simulated out")
+        raise BadInput(f"open_link: bus is {bus}, but a simulated arm needs no bus: leave out `bus` or `simulated`")
     own = Bus(interface=SIMULATED, channel=str(arm_file.path), options={"load": load})
     link = arm_file.require_link().model_copy(update={"bus": own, "buses": {}})
     return open_arm(arm_file.model_copy(update={"link": link}))
@@ -179,7 +179,7 @@ def verify(
     calibration = sensors.record(arm_file) if isinstance(sensors, SensorFit | CreepFit) else sensors
     model = gravity.record(arm_file, calibration) if isinstance(gravity, GravityFit) else gravity
     if calibration is None and sweep_motion(arm_file) == "creep":
-        raise BadInput("verify: sensors: the drives of this arm keep no calibration: give what calibrate found")
+        raise BadInput("verify: the drives of this arm store no calibration: give what calibrate found as `sensors`")
     with _enabled(arm, bus, simulated) as link:
         return run_verify(link, arm_file, model, calibration, poses=poses, seed=seed, progress=progress)
 
@@ -233,7 +233,7 @@ def _enabled(arm: ArmLike | ArmDriver, bus: str | None, simulated: bool, load: f
             link.enable()
             yield link
     elif bus is not None or simulated:
-        raise BadInput("bus, simulated: the link given is open already: leave both out")
+        raise BadInput("the given link is already open: leave out `bus` and `simulated`")
     else:
         yield arm
 
@@ -248,17 +248,19 @@ def _loaded(given: object, kind: type[T], load: Callable[[str | Path], T], expec
 
 
 def _arm(arm: object) -> ArmFile:
-    return _loaded(arm, ArmFile, load_arm, "arm: expected an ArmFile, a path or a bundled arm's name")
+    return _loaded(arm, ArmFile, load_arm, "arm: expected an ArmFile, a path, or the name of a bundled arm")
 
 
 def _sweeps(function: str, sweeps: tuple[object, ...]) -> list[SweepData]:
     if not sweeps:
-        raise BadInput(f"{function}: give the data sets of sweep, or their folders")
+        raise BadInput(f"{function}: give data sets of sweep, or their folders")
     given: list[Path | SweepData] = []
     for each in sweeps:
         if not isinstance(each, SweepData | str | Path):
             kind = type(each).__name__
-            raise BadInput(f"{function}: expected data sets of sweep or their folders, one argument each, not {kind}")
+            raise BadInput(
+                f"{function}: expected data sets of sweep or their folders, each as an argument of its own, not {kind}"
+            )
         given.append(Path(each) if isinstance(each, str) else each)
     return data_sets(given)
 
@@ -274,7 +276,7 @@ def identified(arm_file: ArmFile, data: list[SweepData], sensors: Calibrated | C
     """Mass moments from data sets and their sensors, by their motion; raises BadInput, Refused."""
     if isinstance(sensors, CreepFit if not all_creep(data) else SensorFit):
         raise BadInput(
-            "identify: sensors: these were found in sweeps of the other kind (creep or steps): leave the argument out"
+            "identify: `sensors` were found in sweeps of the other kind (creep or steps): leave this argument out"
         )
     return sensors.gravity if isinstance(sensors, CreepFit) else identify_gravity(arm_file, data, sensors)
 

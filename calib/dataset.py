@@ -124,7 +124,7 @@ def drives_of(data: Sequence["SweepData"]) -> tuple[str, ...]:
     told = [each for each in data if each.manifest.drives]
     for each in told[1:]:
         if not {*each.manifest.drives} & {*told[0].manifest.drives} - {""}:
-            raise Refused(f"{told[0].path} and {each.path}: they have no drive in common: they come from two arms")
+            raise Refused(f"{told[0].path} and {each.path} have no drive in common, so they come from two arms")
     return told[-1].manifest.drives if told else ()
 
 
@@ -181,7 +181,9 @@ class SweepData:
         }
         for what, (ours, wanted) in differing.items():
             if ours != wanted:
-                raise Refused(f"{self.path}: {what} is {ours}, but {wanted} is wanted: swept on something else")
+                raise Refused(
+                    f"{self.path}: {what} is {ours}, but must be {wanted}: this data set was swept with something else"
+                )
         return self
 
     def load_arm(self, override: str | None = None) -> ArmFile:
@@ -227,7 +229,7 @@ def require_vacant(path: Path, resume: bool = False) -> None:
     if resume:
         _read_manifest(path)
     elif path.exists() and (not path.is_dir() or any(each != part_of(path / MANIFEST) for each in path.iterdir())):
-        raise BadInput(f"{path}: not empty: choose another directory, or continue the sweep there with --resume")
+        raise BadInput(f"{path} is not empty: choose another directory, or continue the sweep there with `--resume`")
 
 
 class DataWriter:
@@ -259,8 +261,8 @@ class DataWriter:
             os.fsync(self._file.fileno())
         except OSError as error:
             raise BadInput(
-                f"{self._file.name}: {error.strerror}: the last reading is not kept, those before it are;"
-                " free or repair the disk, then continue with --resume"
+                f"{self._file.name}: {error.strerror}: the last reading was not saved, the readings before "
+                "it were: free or repair the disk, then continue with `--resume`"
             ) from None
 
     def __enter__(self) -> Self:
@@ -286,7 +288,7 @@ def _keep_names(path: Path) -> None:
 def _read_manifest(path: Path) -> Manifest:
     file = path / MANIFEST
     if not file.is_file():
-        raise BadInput(f"{path}: no sweep data set there: {MANIFEST} is missing")
+        raise BadInput(f"{path}: there is no sweep data set, since {MANIFEST} is missing")
     try:
         return Manifest.model_validate(json.loads(read_whole(file, MOST_JSON)))
     except ValidationError as error:
@@ -306,7 +308,10 @@ def _parse(lines: Sequence[bytes], file: Path) -> Iterator[Line]:
 def _check_width(reading: StaticReading, n: int, path: Path) -> None:
     for key in ("servo", "position", "position_std", "torque", "torque_std", "motor_torque"):
         if len(getattr(reading, key)) != n:
-            raise BadInput(f"{path}: sweep {reading.sweep}, reading {reading.index}: {key} is not one per joint ({n})")
+            raise BadInput(
+                f"{path}: sweep {reading.sweep}, reading {reading.index}: {key} must have one value for each "
+                f"joint ({n})"
+            )
 
 
 def _require_same(found: Manifest, wanted: Manifest, path: Path) -> None:
@@ -316,7 +321,7 @@ def _require_same(found: Manifest, wanted: Manifest, path: Path) -> None:
         if getattr(found, key) != getattr(wanted, key)
     }
     for key, (ours, theirs) in differing.items():
-        raise Refused(f"{path}: {key} is {ours} there, but {theirs} is asked for: resume with the same arm and mass")
+        raise Refused(f"{path}: {key} was {ours}, but now it is {theirs}: resume with the same arm and the same mass")
 
 
 log = logging.getLogger(__name__)
@@ -331,10 +336,12 @@ def data_sets(given: Sequence[Path | SweepData]) -> list[SweepData]:
     for number, each in enumerate(found):
         twin = next((other for other in found[:number] if other.readings and other.digest == each.digest), None)
         if twin is not None:
-            raise BadInput(f"{each.path}: the same readings as {twin.path}, which would count twice: give one of them")
+            raise BadInput(
+                f"{each.path} has the same readings as {twin.path}, which would count twice: give one of the two"
+            )
         if each.readings and (missing := _missing(each)):
             log.warning(
-                "%s: ended before %s: fitted to what is there; to go on: armlink sweep %s --out %s --resume",
+                "%s ended before %s, so the fit uses what is there; to continue: armlink sweep %s --out %s --resume",
                 *(each.path, missing, each.manifest.arm_file, each.path),
             )
     return found
@@ -343,7 +350,9 @@ def data_sets(given: Sequence[Path | SweepData]) -> list[SweepData]:
 def all_creep(data: Sequence[SweepData]) -> bool:
     """Whether the data sets are creep sweeps; raises BadInput where some are and some are not."""
     if any(each.creeps for each in data) and (other := next((each for each in data if not each.creeps), None)):
-        raise BadInput(f"{other.path}: steps at rest, but the other directories are creep sweeps: give one kind")
+        raise BadInput(
+            f"{other.path} holds steps at rest, but the other directories hold creep sweeps: give only one kind"
+        )
     return bool(data) and data[0].creeps
 
 

@@ -140,13 +140,13 @@ def sim_section(arm: ArmFile) -> SimSection:
     lists |= {f"sensors.{key}": getattr(section.sensors, key) for key in Sensors.model_fields}
     for key, values in lists.items():
         if isinstance(values, tuple) and len(values) != count:
-            raise BadInput(f"{arm.path}: key sim.{key}: {len(values)} values, expected {count}, one per joint")
+            raise BadInput(f"{arm.path}: key sim.{key} has {len(values)} values, expected {count}, one for each joint")
     if section.links is None and arm.kinematics.model is None:
-        raise BadInput(f"{arm.path}: key sim.links is missing: mass, com and inertia of each link")
+        raise BadInput(f"{arm.path}: key sim.links is missing: give mass, com and inertia of each link")
     for number, entry in enumerate(section.effects):
         if entry.joint is not None and entry.joint not in arm.joint_names:
             raise BadInput(
-                f"{arm.path}: key sim.effects.{number}.joint: no joint {entry.joint!r}; there are "
+                f"{arm.path}: key sim.effects.{number}.joint: there is no joint {entry.joint!r}; there are "
                 f"{', '.join(arm.joint_names)}"
             )
     return section

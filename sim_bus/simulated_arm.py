@@ -316,7 +316,7 @@ class SimulatedArm:
         if isinstance(joint, int):
             return joint
         if joint not in self.names:
-            raise BadInput(f"no joint {joint!r}; there are {', '.join(self.names)}")
+            raise BadInput(f"there is no joint {joint!r}; there are {', '.join(self.names)}")
         return self.names.index(joint)
 
     def _receive_pdo(self, slot: tuple[PdoGroup, int], data: bytes) -> None:

@@ -114,7 +114,10 @@ def compare_models(
         sim, checked, found = checked_recordings(model, recordings, labels, stated, base, tip, known_gains)
         findings += [(str(model), each) for each in found]
         if names and sim.arm.names != names:
-            raise BadInput(f"--sim {model}: its joints are {', '.join(sim.arm.names)}, not {', '.join(names)}")
+            raise BadInput(
+                f"--sim {model}: its joints are {', '.join(sim.arm.names)}, but the other models have "
+                f"{', '.join(names)}"
+            )
         names = sim.arm.names
         if all(is_position_only(recording) for recording in checked):
             own, weight, moved = _moved(model, sim, checked, labels)
@@ -136,7 +139,8 @@ def _moved(
     if not plant.servos.complete:
         missing = [name for name, kp in zip(sim.arm.names, plant.servos.kp, strict=True) if not np.isfinite(kp)]
         raise BadInput(
-            f"--sim {model}: no position actuator at {', '.join(missing)}: state the gains, --gains kp=VALUE,kd=VALUE"
+            f"--sim {model}: no position actuator at {', '.join(missing)}: give the gains with --gains "
+            "kp=VALUE,kd=VALUE"
         )
     data = windows_of(plant, recordings, labels)
     point = nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()})

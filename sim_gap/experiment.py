@@ -69,7 +69,7 @@ def plan_motion(arm: ArmFile, joints: Iterable[str] = (), poses: int = 2, seed: 
     names = list(shape.names)
     for joint in joints:
         if joint not in names:
-            raise BadInput(f"no joint {joint} in arm {arm.name}: its joints are {', '.join(names)}")
+            raise BadInput(f"there is no joint {joint} in arm {arm.name}: its joints are {', '.join(names)}")
     chosen = [names.index(joint) for joint in dict.fromkeys(joints)] or list(range(len(names)))
     random = np.random.default_rng(seed)
     for pose in range(poses):
@@ -111,7 +111,8 @@ class _Shape:
                 there = np.allclose(np.delete(self.here, joint), np.delete(goal, joint))
                 self.go(goal, np.full(len(goal), speed) if there else PACE * self.fastest)
         self.pieces.append(
-            f"{self.names[joint]} alone, {len(SPEEDS)} speeds in both directions, others at {np.round(pose, 2)}"
+            f"{self.names[joint]} alone, {len(SPEEDS)} speeds in both directions, the other joints at "
+            f"{np.round(pose, 2)}"
         )
 
     def sines(self, joints: list[int], random: np.random.Generator, seconds: float = 60.0) -> None:
@@ -128,7 +129,7 @@ class _Shape:
             rows[:, joint] += fade * (size * np.sin(np.outer(t, omega) + random.uniform(0, 2 * np.pi, TONES))).sum(1)
         self.rows.append(rows)
         self.here = rows[-1]
-        self.pieces.append(f"all joints together, {TONES} sines each, {seconds:g} s")
+        self.pieces.append(f"all joints together, {TONES} sines for each joint, {seconds:g} s")
 
     def motion(self) -> PlannedMotion:
         return PlannedMotion(self.names, self.rate, np.concatenate(self.rows), tuple(self.pieces))
@@ -146,7 +147,7 @@ def joints_in_doubt(answer: Path) -> tuple[list[str], list[str]]:
     except OSError as error:
         raise BadInput(f"{answer}: cannot be read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError):
-        raise BadInput(f"{answer}: not a result that gap diagnose wrote with --json") from None
+        raise BadInput(f"{answer}: this is not a result that gap diagnose wrote with --json") from None
 
 
 def save_motion(motion: PlannedMotion, path: Path) -> None:
@@ -177,13 +178,13 @@ def load_motion(path: Path, arm: ArmFile) -> Array:
         if column.min() < low or column.max() > high:
             raise BadInput(
                 f"{path}: {name} goes from {column.min():.3f} to {column.max():.3f} rad, beyond its range {low:.3f} to "
-                f"{high:.3f}: plan the motion for this arm: armlink gap plan {arm.argument} --out {path}"
+                f"{high:.3f} rad: plan the motion for this arm with armlink gap plan {arm.argument} --out {path}"
             )
         fastest = float(np.abs(np.diff(column)).max()) * section.rate
         if fastest > SPEED_TOLERANCE * limits.max_velocity:
             raise BadInput(
-                f"{path}: {name} turns at {fastest:.3f} rad/s, beyond its max_velocity {limits.max_velocity:.3f}: "
-                f"plan the motion for this arm: armlink gap plan {arm.argument} --out {path}"
+                f"{path}: {name} turns at {fastest:.3f} rad/s, but its max_velocity is {limits.max_velocity:.3f} "
+                f"rad/s: plan the motion for this arm with armlink gap plan {arm.argument} --out {path}"
             )
     return rows
 
@@ -198,12 +199,12 @@ def _columns(path: Path, names: list[str]) -> tuple[Array, Array]:
         layout = layout_of(content, str(path))
         missing = [name for name in ("t", *names) if name not in layout.header]
         if missing:
-            raise BadInput(f"{path}: no column {', '.join(missing)}: expected t and q_cmd_1 to {names[-1]}")
+            raise BadInput(f"{path}: column {', '.join(missing)} is missing: expected t and q_cmd_1 to {names[-1]}")
         places = {name: layout.header.index(name) for name in ("t", *names)}
         values = np.column_stack(list(read_numbers(content, layout, places, str(path)).values()))
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
-        raise BadInput(f"{path}: row {bad[0][0] + 1}: no value of {('t', *names)[bad[0][1]]}")
+        raise BadInput(f"{path}: row {bad[0][0] + 1}: {('t', *names)[bad[0][1]]} has no value")
     t = values[:, 0]
     if len(t) < 2 or not (np.diff(t) > 0).all():
         raise BadInput(f"{path}: column t does not increase from row to row: expected seconds, at least two rows")

@@ -28,7 +28,10 @@ def open_to_all(scheduler: str | None) -> str:
     """A warning of a scheduler whose address is not one of TLS; empty for others."""
     if scheduler is None or scheduler.startswith("tls://"):
         return ""
-    return f"{scheduler}: without TLS whoever reaches this scheduler can run code on its workers: use tls:// and keys"
+    return (
+        f"{scheduler}: without TLS, everybody who reaches this scheduler can run code on its workers: use tls:// "
+        "and keys"
+    )
 
 
 @contextmanager
@@ -49,7 +52,9 @@ def cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
         try:
             client = Client(scheduler, timeout=CONNECT_SECONDS)
         except (OSError, ValueError) as error:
-            raise BusFault(f"no dask scheduler at {scheduler}: {error}: start one, or omit --scheduler") from None
+            raise BusFault(
+                f"there is no dask scheduler at {scheduler} ({error}): start a scheduler, or omit --scheduler"
+            ) from None
         with client:
             yield client
         return
@@ -82,14 +87,14 @@ class Case:
 def find_cases(folder: Path, sim: Path | None = None) -> list[Case]:
     """All cases under a folder, by name. Raises BadInput if there is none."""
     if not folder.is_dir():
-        raise BadInput(f"{folder}: no such folder: give one with cases or recordings")
+        raise BadInput(f"{folder}: there is no such folder: give a folder with cases or recordings")
     cases = [case for path in sorted(p for p in folder.rglob("*") if p.is_dir()) if (case := _case(path, folder, sim))]
     if sim is not None:
         cases += [Case(path.name, sim, (path,)) for path in _recordings(folder)]
     if not cases:
         raise BadInput(
-            f"{folder}: contains no case: expected folders with one of {', '.join(MODELS)}, train* and heldout* "
-            "recordings, or recordings and --sim MODEL for all of them"
+            f"{folder} contains no case: expected folders with one of {', '.join(MODELS)}, train* and "
+            "heldout* recordings, or recordings and --sim MODEL for all of them"
         )
     return cases
 
@@ -234,7 +239,7 @@ class Answers:
                 if error.errors()[0]["type"] == "json_invalid":
                     continue
                 raise BadInput(
-                    f"{path}: line {number} is not a result of a fleet: give another file with --out"
+                    f"{path}: line {number} is not a result of diagnose-fleet: give another file with --out"
                 ) from None
             entry = json.loads(line)
             if entry.get("options", {}) == self.options:

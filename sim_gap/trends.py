@@ -168,7 +168,7 @@ def needed_recordings(answers: Mapping[str, Mapping[str, Any]]) -> str:
     used = [case for case, answer in answers.items() if "error" not in answer]
     undated = sorted(case for case in used if date_of(case) is None)
     if undated:
-        return f"{undated[0].partition('/')[2]} has no date in its name, such as 2026-10-02: no change can be dated"
+        return f"{undated[0].partition('/')[2]} has no date in its name, such as 2026-10-02, so no change can be dated"
     needed = FIRST + LAST + 1
     return f"a change can be found from {needed} recordings on" if len(used) < needed else ""
 

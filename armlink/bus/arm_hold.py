@@ -53,9 +53,13 @@ class ArmHold:
             except OSError as error:
                 held.close()
                 if error.errno != errno.EADDRINUSE:
-                    raise BusFault(f"{bus}: {address} cannot be held for this program: {error.strerror}") from None
+                    raise BusFault(
+                        f"{bus}: {address} cannot be reserved for this program ({error.strerror}), so another "
+                        "program might command the arm at the same time"
+                    ) from None
                 raise BusFault(
-                    f"{bus}: {address} is driven by {_holder(name)}: stop it, only one program may command an arm"
+                    f"{bus}: {address} is driven by {_holder(name)}: stop that program, since only one "
+                    "program may command an arm"
                 ) from None
         _held[name] = held, count + 1
         self._names.append(name)

@@ -89,7 +89,7 @@ class FrameLog:
     def __init__(self, path: Path) -> None:
         """Create the file; raises BadInput for another suffix or a file that cannot be written."""
         if path.suffix.lower() not in LOG_SUFFIXES:
-            raise BadInput(f"{path}: not the suffix of a frame log, expected {', '.join(LOG_SUFFIXES)}")
+            raise BadInput(f"{path}: this suffix is not the suffix of a frame log, expected {', '.join(LOG_SUFFIXES)}")
         try:
             self._writer = can.Logger(str(path))
         except OSError as error:
@@ -149,7 +149,7 @@ class LogBus(InProcessBus):
         return can_id, data
 
     def put(self, can_id: int, data: bytes) -> None:
-        raise BusFault(f"{self.channel_info}: a log cannot be sent to")
+        raise BusFault(f"{self.channel_info}: nothing can be sent to a frame log: give a bus")
 
     def shutdown(self) -> None:
         """Nothing to do: the file closes with its reader."""
@@ -161,11 +161,11 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         """Raises BadInput if the file does not exist or has another suffix."""
         if not path.is_file():
-            raise BadInput(f"no frame log {path}: give a {', '.join(READ_SUFFIXES)} file")
+            raise BadInput(f"there is no frame log {path}: give a {', '.join(READ_SUFFIXES)} file")
         if not is_log(path):
-            raise BadInput(f"{path}: not the suffix of a frame log, expected {', '.join(READ_SUFFIXES)}")
+            raise BadInput(f"{path}: this suffix is not the suffix of a frame log, expected {', '.join(READ_SUFFIXES)}")
         if _kind(path) == ".blf" and path.suffix.lower() == PACKED:
-            raise BadInput(f"{path}: BLF files are packed already: unpack it first (gunzip)")
+            raise BadInput(f"{path}: BLF files are compressed already: unpack this file first (gunzip)")
         self._path, self._timeless = path, 0
         self.count = 0
         """Frames read."""
@@ -179,7 +179,7 @@ class LogReader:
         first = None
         for message in self._messages():
             if not math.isfinite(message.timestamp):
-                self.warning = f"cut frame log, a time that is no number: loaded {self.count} frames up to there"
+                self.warning = f"cut frame log (a time is not a number): the first {self.count} frames were loaded"
                 return
             stamp = round(message.timestamp * 1e6)
             first = stamp if first is None else first
@@ -198,13 +198,13 @@ class LogReader:
             else:
                 why = yield from self._from_lines()
         except _BAD_CONTENT:
-            why = "what follows is not readable"
+            why = "the rest is not readable"
         except EOFError:
             why = "the file ends early"
         except OSError as error:
             raise BadInput(f"{self._path}: cannot read it: {error.strerror or error}") from None
         if why:
-            self.warning = f"cut frame log, {why}: loaded {self.count} frames up to there"
+            self.warning = f"cut frame log ({why}): the first {self.count} frames were loaded"
 
     def _from_blf(self) -> Generator[can.Message, None, str]:
         size = self._path.stat().st_size
@@ -233,7 +233,10 @@ class LogReader:
         if found is None:
             return line
         if found["time"] is None:
-            self.warning = f"it has no times (candump -L writes them): frames are taken as {1e3 * SPACING:g} ms apart"
+            self.warning = (
+                "the frame log has no times (`candump -L` writes times), so the frames are taken as "
+                f"{1e3 * SPACING:g} ms apart"
+            )
             time, self._timeless = SPACING * self._timeless, self._timeless + 1
         else:
             time = _seconds(found["time"])
@@ -259,9 +262,9 @@ def _require_containers(stream: Any, path: Path) -> None:
             return  # said by python-can
         _, _, _, length, kind = OBJ_HEADER_BASE_STRUCT.unpack(head)
         if length > MOST_CONTAINER:
-            raise BadInput(f"{path}: an object of {length} bytes, expected at most {MOST_CONTAINER}")
+            raise BadInput(f"{path}: contains an object of {length} bytes, expected at most {MOST_CONTAINER}")
         if kind == LOG_CONTAINER and _unpacks_to_more(_at(stream, place, length)[OBJ_HEADER_BASE_STRUCT.size :]):
-            raise BadInput(f"{path}: a container unpacks to more than {MOST_CONTAINER} bytes")
+            raise BadInput(f"{path}: an object unpacks to more than {MOST_CONTAINER} bytes")
         place += max(length + length % 4, OBJ_HEADER_BASE_STRUCT.size)
 
 

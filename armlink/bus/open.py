@@ -63,7 +63,7 @@ def open_bus(spec: str | None, section: Bus) -> MessageBus:
         if "msgpack" in str(error):  # python-can finds the interface, which lacks what it is made of
             require_extra(f"bus {name}", "simulator")
         known = bus.interface in can.VALID_INTERFACES
-        hint = "is its driver installed?" if known else "unknown interface of python-can"
+        hint = "install the driver of this interface" if known else "python-can does not know this interface"
         raise BadInput(f"bus {name}: {error}: {hint}") from None
     except TypeError as error:
         raise BadInput(

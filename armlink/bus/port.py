@@ -82,7 +82,10 @@ def interface_fault(error: Exception, name: str, doing: str) -> ArmlinkError:
     down = errno.ENETDOWN in numbers
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
     if isinstance(error, NameError | AttributeError | ImportError):  # its library is missed this late
-        reason = f"{reason}: is the interface's driver installed?"
+        reason = f"{reason}: is the driver of the interface installed?"
     if errno.EAFNOSUPPORT in numbers:
-        reason = f"{reason}: this kernel has no SocketCAN (modprobe can); for trials: --bus udp_multicast:239.74.163.2"
+        reason = (
+            f"{reason}: this kernel has no SocketCAN: load the module with `modprobe can`, or try without it: "
+            "`--bus udp_multicast:239.74.163.2`"
+        )
     return (InterfaceDown if down else BusFault)(f"bus {name}: cannot {doing}: {reason}")

@@ -42,7 +42,7 @@ class TappedBus(InProcessBus):
                 return as_frame(message)
 
     def put(self, can_id: int, data: bytes) -> None:
-        raise BusFault(f"bus {self.channel_info}: listen-only")
+        raise BusFault(f"bus {self.channel_info}: it is opened listen-only, so nothing can be sent")
 
     def shutdown(self) -> None:
         self._source.shutdown()

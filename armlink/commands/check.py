@@ -20,46 +20,50 @@ SCHEMA = "armlink.check/1"
 HOST_SCHEMA = "armlink.check-host/1"
 SCALES_SCHEMA = "armlink.check-scales/1"
 WARNING = (
-    "This test enables every joint of {arm} and lets it hold where it stands (at most its max_torque). One after the "
-    "other is then quick-stopped, and left without commands for {deadline:.0f} ms; then all are left without the "
-    "host's heartbeat for {heartbeat:.0f} ms. Nothing is moved on purpose, but a controller that does something else "
-    "than quick stop and hold may let its joint fall: put the arm where none can fall, keep clear, and keep a hand on "
-    "the emergency stop. In the end the joints are in quick stop, holding."
+    "This test enables every joint of {arm} and lets it hold where it stands (with at most its max_torque). "
+    "One joint after the other is then quick-stopped, and later gets no commands for {deadline:.0f} ms; at "
+    "last no joint gets the heartbeat of this host for {heartbeat:.0f} ms. Nothing is moved on purpose, but "
+    "a drive that does not hold after a quick stop may let its joint fall: put the arm where no joint can "
+    "fall, keep clear, and keep a hand on the emergency stop. At the end the joints hold, in quick stop."
 )
 
 
 def check(
     arm: Arm,
     bus: OtherBus = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the joints are enabled.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Enable the joints without asking first.")] = False,
     passive: Annotated[
-        bool, typer.Option("--passive", help="Only the checks that need no power: they read and configure.")
+        bool,
+        typer.Option(
+            "--passive", help="Do only the checks that need no power; these checks read and configure the drives."
+        ),
     ] = False,
     host: Annotated[
-        bool, typer.Option("--host", help="Measure how well this machine keeps the cycle instead; needs no bus.")
+        bool, typer.Option("--host", help="Measure instead how well this machine keeps the cycle; no bus is needed.")
     ] = False,
     scales: Annotated[
         str | None,
         typer.Option(
-            help="Judge the scales of position, velocity and torque instead: hand (you turn every joint from stop to "
-            "stop, without power), move (all joints by 0.35 rad) or listen (another host moves the arm)."
+            help="Judge instead the scales of position, velocity and torque: hand (you turn every joint from "
+            "stop to stop, without power), move (this program moves all joints by 0.35 rad) or listen "
+            "(another host moves the arm)."
         ),
     ] = None,
     seconds: Annotated[
-        float, typer.Option(min=1.0, max=3600.0, help="How long --host measures, and --scales hand or listen [s].")
+        float, typer.Option(min=1.0, max=3600.0, help="Duration of --host, --scales hand and --scales listen [s].")
     ] = 20.0,
     json: Json = None,
 ) -> int:
     """Check identity, objects, PDO mapping, limits, calibration; then, with power, quick stop, deadline and heartbeat.
 
-    It shows that each controller stops by itself when its host falls silent, and how long it takes. It says what it
-    does to the joints and asks first, unless --yes or on a simulated arm in this process. Exit status 1 where a check
-    fails; the joints are left in quick stop, holding.
+    The command shows that each drive stops by itself when its host falls silent, and how long that takes. It first says
+    what it will do to the joints and asks, except with --yes or on a simulated arm in this process. Exit status 1 if a
+    check fails; the joints are left in quick stop, holding.
 
-    With --host nothing is sent anywhere: cycles are made at the arm's rate while a job computes and writes beside them;
-    exit status 1 if this machine is too late for the arm's deadline or rate.
+    With --host nothing is sent: this machine makes cycles at the rate of the arm while a job computes and writes. Exit
+    status 1 if the machine is too slow for the deadline or the rate of the arm.
 
-    With --scales readings are judged while the arm moves: exit status 1 if a scale of a drive is off by a tenth.
+    With --scales the readings are judged while the arm moves. Exit status 1 if a scale of a drive is wrong by a tenth.
 
     Example: armlink check sarcos --bus socketcan:vcan0 --yes --json -
     """
@@ -85,7 +89,10 @@ def check(
             times = {"deadline": deadline, "heartbeat": 2 * deadline}
             console.print(WARNING.format(arm=described.name, **times))
             if not console.is_terminal:
-                raise BadInput("check: nobody to ask: give --yes, or --passive for what needs no power")
+                raise BadInput(
+                    "check: there is no terminal to ask for confirmation: give `--yes`, or `--passive` for the "
+                    "checks without power"
+                )
             confirm("Go on?")
         work.enabled = not passive
         with console.status("check") as status:
@@ -103,7 +110,10 @@ def check(
         )
     if failed:
         first = failed[0]
-        raise Refused(f"check: {len(failed)} of {len(found)} failed, first {first.joint}: {first.check}: {first.found}")
+        raise Refused(
+            f"check: {len(failed)} of {len(found)} checks failed, the first is {first.joint}: {first.check}: "
+            f"{first.found}"
+        )
     passed = sum(each.outcome == "passed" for each in found)
     out.print(f"all {passed} checks passed; the joints {'were not enabled' if passive else 'hold, in quick stop'}")
     suggest(command_line("sweep", arm, "--plan", bus=bus))
@@ -124,7 +134,10 @@ def _check_scales(
         raise BadInput(f"check --scales {how}: expected hand, move or listen")
     if how == "move" and not yes and not is_in_process(arm, bus):
         if not console.is_terminal:
-            raise BadInput("check --scales move: nobody to ask: give --yes, or --scales hand")
+            raise BadInput(
+                "check --scales move: there is no terminal to ask for confirmation: give `--yes`, or use "
+                "`--scales hand`"
+            )
         confirm(f"All joints of {arm.name} will turn by 0.35 rad to both sides. Is it clear?")
     with early_end(arm) as work:
         work.enabled = how == "move"
@@ -140,7 +153,10 @@ def _check_scales(
     if wrong:
         raise Refused(f"check --scales: {wrong[0][0]}: {wrong[0][1]}")
     if not any(each.evidence for each in found):
-        raise Refused("check --scales: no joint moved enough to judge a scale: move every joint by a third of a radian")
+        raise Refused(
+            "check --scales: no joint moved enough to judge its scales: move every joint by at least a third of "
+            "a radian"
+        )
     out.print("every scale that could be judged is right")
     return 0
 
@@ -187,7 +203,9 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     from armlink.link.lateness import WARN_SHARE
     from armlink.selftest.host import measure_host
 
-    with console.status(f"{arm.name}: cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, with a job beside"):
+    with console.status(
+        f"{arm.name}: running cycles at {arm.require_link().rate:g} Hz for {seconds:g} s, together with a job"
+    ):
         report = measure_host(arm, seconds)
     late, section = report.lateness.in_ms(), arm.require_link()
     answer = {
@@ -202,18 +220,20 @@ def _check_host(console: "Console", arm: "ArmFile", seconds: float, json: Path |
     write_json(json, answer)
     out = results(json)
     out.print(
-        f"cycles began late by {late['p50']:.2f} ms (median), {late['p99']:.2f} (99 %), {late['p99_9']:.2f} (99.9 %),"
-        f" {late['max']:.2f} (longest); {report.busy * 1e3:.2f} ms of processor time each; {report.realtime}",
+        f"cycles began late by {late['p50']:.2f} ms (median), {late['p99']:.2f} (99 %), {late['p99_9']:.2f} (99.9 %), "
+        f"{late['max']:.2f} (longest); each cycle took {report.busy * 1e3:.2f} ms of processor time; {report.realtime}",
     )
-    out.print(f"this machine holds {report.holds_hz:g} Hz; the arm file asks for {section.rate:g} Hz")
+    out.print(f"this machine can keep {report.holds_hz:g} Hz; the arm file asks for {section.rate:g} Hz")
     limit = WARN_SHARE * section.deadline * 1e3
     if late["p99_9"] > limit:
         raise Refused(
-            f"check --host: 99.9 % of the cycles are within {late['p99_9']:.1f} ms, expected {limit:g} (half of"
-            " link.deadline): lower link.rate, raise link.deadline, or stop what else runs here"
+            f"check --host: 99.9 % of the cycles begin at most {late['p99_9']:.1f} ms late, but the limit is {limit:g} "
+            "ms (half of link.deadline): lower link.rate, raise link.deadline, or stop other programs on this machine"
         )
     if report.holds_hz < section.rate:
-        raise Refused(f"check --host: this machine holds {report.holds_hz:g} Hz: lower link.rate ({section.rate:g})")
+        raise Refused(
+            f"check --host: this machine can only keep {report.holds_hz:g} Hz: lower link.rate (now {section.rate:g})"
+        )
     return 0
 
 

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 @reads_recordings
 def convert(
     source: Annotated[Path, typer.Argument(help="Recording: .csv, .csv.gz, .parquet or .mcap (bags of ROS too).")],
-    target: Annotated[Path, typer.Argument(help="File to write; its suffix says the format.")],
+    target: Annotated[Path, typer.Argument(help="File to write; its suffix gives the format.")],
     stated: "Corrections",
     json: Json = None,
 ) -> int:
-    """Convert a recording, with corrections if any; joint names are kept where the format has them (Parquet, MCAP).
+    """Convert a recording, with corrections if any; joint names are stored if the format has them (Parquet, MCAP).
 
     Example: armlink convert run.mcap run.csv.gz
     """
@@ -30,8 +30,8 @@ def convert(
 
     if stated.without_gravity:
         raise BadInput(
-            "--effort-is without-gravity: gravity is added from the arm's model, which convert does not have: convert "
-            "without this option, and give it to the diagnosis"
+            "--effort-is without-gravity: convert has no model of the arm to add the gravity: convert "
+            "without this option, and give the option to the diagnosis"
         )
     recording = load_recording(source, stated)
     try:
@@ -46,8 +46,11 @@ def convert(
     out.print(f"{target}: {rows} rows, {seconds:.1f} s, {recording.n} joints, {', '.join(channels)}")
     kept = recording.names if keeps_names(target) else default_names(recording.n)
     if kept != recording.names:
-        renamed = ", ".join(f"{name} is {other}" for name, other in zip(recording.names, kept, strict=True))
-        out.print(f"its format keeps no names of joints: {renamed} there (Parquet and MCAP keep them)", style="yellow")
+        renamed = ", ".join(f"{name} is called {other}" for name, other in zip(recording.names, kept, strict=True))
+        out.print(
+            f"this file format stores no joint names: in {target.name}, {renamed} (Parquet and MCAP store the names)",
+            style="yellow",
+        )
     answer = {"rows": rows, "seconds": seconds, "joints": list(recording.names), "channels": channels}
     write_json(json, {**answer, "warning": recording.warning})
     return 0

@@ -8,7 +8,9 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Stall
 
 HOLD = "the joints hold where they stand, in quick stop"
-PARKED = "the arm was parked or let down before its power went off, unless a line above says otherwise"
+PARKED = (
+    "unless a line above reports a fault, the arm was parked or slowly lowered, and then its power was switched off"
+)
 
 
 @dataclass

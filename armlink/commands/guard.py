@@ -10,14 +10,14 @@ from armlink.commands.options import OtherBus
 
 def guard(
     arm: Annotated[str | None, typer.Argument(help="Bundled arm or path of an arm file.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the policy here (JSON).")] = None,
-    path: Annotated[bool, typer.Option("--path", help="Print where the guard's file is, and nothing else.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Write the policy to this JSON file.")] = None,
+    path: Annotated[bool, typer.Option("--path", help="Print only the path of the guard's Python file.")] = False,
     bus: OtherBus = None,
 ) -> int:
-    """Write what a guard of this arm's bus may pass: identifiers, and bounds of torque, position and their rates.
+    """Write the policy of a guard of this arm's bus: which frames may pass, with bounds of torque and position.
 
     The drives are read for their scales and objects; nothing is set. The guard itself is one file without dependencies:
-    it has the wire for itself and gives programs another interface, whose frames it checks one by one.
+    it has the bus of the arm for itself and gives programs another interface, whose frames it checks one by one.
 
     Example: armlink guard sarcos --bus socketcan:vcan0 --out sarcos.guard.json
     """
@@ -32,14 +32,15 @@ def guard(
         write_out(f"{bus_guard.__file__}\n")
         return 0
     if arm is None or out is None:
-        raise BadInput("guard: give an arm file and --out POLICY, or --path")
+        raise BadInput("guard: give an arm file and `--out POLICY`, or `--path`")
     described = load_arm(arm)
     with Link.open(described, bus) as link:
         rules = link.guard_rules()
     write_json(out, {"schema": bus_guard.SCHEMA, "arm": described.name, "serial": described.serial, **rules})
-    results(out).print(f"{out}: {len(rules['frames'])} identifiers may pass")
+    results(out).print(f"{out}: the policy lets {len(rules['frames'])} identifiers pass")
     suggest(f"python3 -I {bus_guard.__file__} {out} arm0 can0")
     PlainConsole().print(
-        "It starts the guard between arm0, which programs use (ip link add arm0 type vcan), and can0, the arm's bus."
+        "This command starts the guard between arm0, the interface for programs (make it with `ip link add arm0 "
+        "type vcan`), and can0, the bus of the arm."
     )
     return 0

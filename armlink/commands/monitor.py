@@ -25,11 +25,16 @@ COLUMNS = ("joint", "node", "position [rad]", "torque [N·m]", "motor [N·m]", "
 def monitor(
     arm: Arm,
     bus: OtherBus = None,
-    once: Annotated[bool, typer.Option("--once", help="Show one table and end.")] = False,
-    cycles: Annotated[int, typer.Option(min=0, help="End after this many refreshes (5 a second); 0: Ctrl-C.")] = 0,
-    sync: Annotated[bool, typer.Option("--sync", help="Start the nodes and send SYNC, where no host does.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Show one table, then end.")] = False,
+    cycles: Annotated[
+        int, typer.Option(min=0, help="End after this many refreshes (5 a second); 0: run until Ctrl-C.")
+    ] = 0,
+    sync: Annotated[bool, typer.Option("--sync", help="Start the nodes and send SYNC, if no other host does.")] = False,
     stats: Annotated[
-        bool, typer.Option("--stats", help="Period, jitter, latency (p50, p99, p99.9), missed cycles, exact bus load.")
+        bool,
+        typer.Option(
+            "--stats", help="Show period, jitter, latency (p50, p99, p99.9), missed cycles and exact bus load."
+        ),
     ] = False,
     foxglove: Annotated[
         int | None,
@@ -39,15 +44,17 @@ def monitor(
         int | None,
         typer.Option(min=1, max=65535, metavar="PORT", help="Send readings to a Rerun viewer on this machine."),
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the last state here; - is standard output.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Write the last state as JSON to this file; for standard output give `-`.")
+    ] = None,
 ) -> int:
-    """Show what an arm's joints send; exit status 3 where no joint is heard.
+    """Show what an arm's joints send; exit status 3 if no joint is heard.
 
     It listens beside the host that runs the arm. Scales are the arm file's rated torques and 2^20 units a turn. With
-    --stats every frame's time stamp counts (the interface's own; the monitor's clock with --sync): latency is from SYNC
-    to the last joint's reading, and the load has its stuff bits. With --foxglove 8765 open ws://localhost:8765 in
-    Foxglove: /joint_states and /motor_states as in a recording, 50 times a second. With --rerun 9876 the same readings
-    go to the viewer that the command rerun starts.
+    --stats the time stamps of the interface are used (with --sync, the clock of the monitor); latency is the time from
+    SYNC to the reading of the last joint, and the load includes stuff bits. With --foxglove 8765 open
+    ws://localhost:8765 in Foxglove: /joint_states and /motor_states as in a recording, 50 times a second. With --rerun
+    9876 the same readings go to the viewer that the command rerun starts.
 
     Example: armlink monitor sarcos --bus socketcan:vcan0 --stats
     """

@@ -11,7 +11,7 @@ from typer.core import TyperCommand
 
 Arm = Annotated[str, typer.Argument(help="Bundled arm or path of an arm file.")]
 OtherBus = Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE], instead of the arm file's.")]
-Json = Annotated[Path | None, typer.Option(help="Write the answer here; - is standard output.")]
+Json = Annotated[Path | None, typer.Option(help="Write the answer as JSON to this file; for standard output give `-`.")]
 
 
 def _of_reading(help_text: str, *names: str) -> Any:
@@ -22,17 +22,17 @@ def _of_reading(help_text: str, *names: str) -> Any:
 UNITS = "q=deg, q=counts:4096 (a turn), q=percent:110 (degrees at 100), t=ms, tau_motor=A:12.5 (N·m/A)"
 Many, Text = list[str] | None, str
 OF_READING: dict[str, tuple[Any, Any]] = {
-    "columns": (Many, _of_reading("Column of the file for one of ours: t=time,q_1=pos_a or q_1=q_2,q_2=q_1.", "--map")),
+    "columns": (Many, _of_reading("Columns of the file, by our names: t=time,q_1=pos_a or q_1=q_2,q_2=q_1.", "--map")),
     "header": (
-        Text, _of_reading("Columns of a table without a header row: t,q_1,q_cmd_1; - is one to leave out.", "--columns")
+        Text, _of_reading("Columns of a table without a header row: t,q_1,q_cmd_1; - leaves one out.", "--columns")
     ),
-    "joints": (Text, _of_reading("Joints of the recordings to take, base to tip: a,b,c.")),
+    "joints": (Text, _of_reading("Joints to take from the recordings, from base to tip: a,b,c.")),
     "units": (Many, _of_reading(f"Unit of a channel: {UNITS}.")),
     "sign": (Many, _of_reading("Sign of a channel or column: tau_3=-1.")),
     "zero": (Many, _of_reading("Angle to add to a position [rad]: q_2=1.5708.")),
     "clock": (Many, _of_reading("Time to add to a channel [s]: tau=-0.02.")),
-    "effort_is": (Text, _of_reading("The efforts are: motor, link (sensor), without-gravity (or both).")),
-    "topic": (Text, _of_reading("Topic of a bag that holds the joint states.")),
+    "effort_is": (Text, _of_reading("The efforts: motor, link (sensor), without-gravity, or motor,without-gravity.")),
+    "topic": (Text, _of_reading("Topic of a bag with the joint states.")),
 }  # fmt: skip
 """Options that say how a recording is to be read: type and help of each."""
 

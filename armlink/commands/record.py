@@ -14,20 +14,22 @@ def record(
     arm: Arm,
     out: Annotated[
         Path | None,
-        typer.Argument(help="File to write (.mcap); convert makes other formats of it.", show_default=False),
+        typer.Argument(help="File to write (.mcap); convert makes other formats from this file.", show_default=False),
     ] = None,
     frames: Annotated[
-        Path | None, typer.Option(help="Write every frame here as it is: .asc, .blf or .log, by suffix.")
+        Path | None, typer.Option(help="Write every frame unchanged to this file: .asc, .blf or .log.")
     ] = None,
     bus: OtherBus = None,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Length; 0: until Ctrl-C or SIGTERM.")] = 0.0,
-    json: Annotated[Path | None, typer.Option(help="Write what was recorded here; - is standard output.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.0, help="How long to record [s]; 0: until Ctrl-C or SIGTERM.")] = 0.0,
+    json: Annotated[
+        Path | None, typer.Option(help="Write as JSON to this file what was recorded; for standard output give `-`.")
+    ] = None,
 ) -> int:
     """Record to MCAP, which opens in Foxglove, PlotJuggler and ROS 2; a kill loses at most the last second.
 
-    Raw frames (--frames) go through python-can's own loggers: Vector ASC, BLF, or candump's log. Times are then those
-    that the interface stamped, to the microsecond, and armlink replay makes the same samples of the log, bit for bit.
-    Ctrl-C ends the recording properly (exit status 0). Exit status 3 where no SYNC was heard.
+    Raw frames (--frames) are written by the loggers of python-can: Vector ASC, BLF, or the log of candump. Their times
+    are the time stamps of the interface, to the microsecond, and armlink replay makes the same samples from the log,
+    bit for bit. Ctrl-C ends the recording properly (exit status 0). Exit status 3 if no SYNC was heard.
 
     Example: armlink record sarcos run.mcap --frames run.blf --bus socketcan:vcan0 --seconds 60
     """
@@ -45,10 +47,10 @@ def record(
 
     arm_file = load_arm(arm)
     if out is None and frames is None:
-        raise BadInput("record: nothing to write: give a file to write (.mcap), or --frames with a .asc, .blf or .log")
+        raise BadInput("record: nothing to write: give a .mcap file, or `--frames` with a .asc, .blf or .log file")
     if out is not None and out.suffix != SUFFIX:
         first = out.with_suffix(SUFFIX)
-        raise BadInput(f"{out}: recordings are written as {SUFFIX}: record {first}, then armlink convert {first} {out}")
+        raise BadInput(f"{out}: record writes {SUFFIX} files: record {first}, then run `armlink convert {first} {out}`")
     if out is not None:
         require_extra(str(out), "bags")
         from armlink.recording.mcap import RecordingWriter
@@ -70,7 +72,7 @@ def record(
     if not rows:
         if out:
             out.unlink(missing_ok=True)
-        raise BusFault(f"{opened.channel_info}: no SYNC was heard: does a host run {arm_file.name}?")
+        raise BusFault(f"{opened.channel_info}: no SYNC was heard: is a host running {arm_file.name}?")
     written = " and ".join(str(path) for path in (out, frames) if path)
     results(json).print(f"{written}: {rows} rows, {last:.1f} s")
     answer = {"file": out and str(out), "frames": frames and str(frames), "rows": rows, "seconds": last}

@@ -14,22 +14,25 @@ def replay(
         Path, typer.Argument(help="Raw frames (.asc, .blf, .log) or a recording (.mcap, .parquet, .csv, .csv.gz).")
     ],
     target: Annotated[
-        Path | None, typer.Argument(help="Recording to write; its suffix says the format.", show_default=False)
+        Path | None, typer.Argument(help="Recording to write; its suffix gives the format.", show_default=False)
     ] = None,
     bus: Annotated[
-        str | None, typer.Option(help="Play onto this bus instead: virtual:…, udp_multicast:… or socketcan:vcan….")
+        str | None,
+        typer.Option(help="Send the frames to this bus instead: virtual:…, udp_multicast:… or socketcan:vcan…."),
     ] = None,
     speed: Annotated[
         float, typer.Option(min=0.0, help="Speed relative to the recording; 0: as fast as possible.")
     ] = 1.0,
-    json: Annotated[Path | None, typer.Option(help="Write what was replayed here; - is standard output.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Write as JSON to this file what was replayed; for standard output give `-`.")
+    ] = None,
 ) -> int:
     """Decode a raw log or a recording again; with neither TARGET nor --bus, show it as a live table at --speed.
 
     A raw log goes through the same decoding as live frames: its samples are those that armlink record --frames wrote,
-    bit for bit. One that was cut off is read up to there, with a warning. On a bus go only the joints' own
-    frames and SYNC, never a command, an SDO or NMT, and only on a virtual bus: for a listener such as
-    armlink daemon --listen-only or armlink monitor. Nothing is ever replayed as torque or motion.
+    bit for bit. A log that was cut off is read up to its end, with a warning. With --bus, only the frames of the joints
+    and SYNC are sent, never a command, an SDO or NMT, and only to a virtual bus: for a listener such as armlink daemon
+    --listen-only or armlink monitor. Nothing is ever replayed as torque or motion.
 
     Example: armlink replay sarcos run.blf run.csv
     """
@@ -43,14 +46,14 @@ def replay(
 
     arm_file = load_arm(arm)
     if bus is not None and target is not None:
-        raise BadInput("replay: give a file to write or --bus, not both")
+        raise BadInput("replay: give a file to write or `--bus`, not both")
     recording = recording_of_log(arm_file, source) if is_log(source) else load_recording(source)
     if recording.warning:
         PlainConsole().print(f"{source}: {recording.warning}", style="yellow")
     out = results(json)
     if bus is not None:
         sent = play_onto(arm_file, source, recording, bus, speed)
-        out.print(f"{source}: {sent} frames onto {bus}")
+        out.print(f"{source}: {sent} frames sent to {bus}")
     elif target is not None:
         try:
             save_recording(recording, target)

@@ -22,7 +22,7 @@ def scan(
 
     Without an arm file every family is looked for whose drives can be asked without harm to what else may be there.
 
-    Exit status 1 where a joint has another controller than the arm file states (link.joints, key identity).
+    Exit status 1 if a joint has another drive than the arm file states (link.joints, key identity).
 
     Example: armlink scan sarcos --bus socketcan:vcan0
     """
@@ -98,7 +98,9 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
         raise BusFault(f"no answer from {', '.join(missing)} on {channel}")
     wrong = [f"{link.names[each.joint]} ({each.address}): {each.mismatch}" for each in found if each.mismatch]
     if wrong:
-        raise Refused(f"{wrong[0]}: connect the right arm, or correct its drive under link.joints")
+        raise Refused(
+            f"{wrong[0]}: connect the right arm, or correct the entry of this joint under link.joints of the arm file"
+        )
     out.print(f"all {len(found)} joints answer")
     return 0
 

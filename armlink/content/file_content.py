@@ -19,7 +19,7 @@ MOST_NODES = 200_000
 def read_whole(path: Path, most: int) -> bytes:
     """The content of a file of at most `most` bytes; raises BadInput beyond that and for a device, OSError."""
     if path.exists() and not path.is_file():
-        raise BadInput(f"{path}: is no file: expected one of at most {most / 1e6:.0f} MB")
+        raise BadInput(f"{path}: is not a file: expected a file of at most {most / 1e6:.0f} MB")
     with path.open("rb") as file:
         content = file.read(most + 1)
     if len(content) > most:
@@ -36,7 +36,7 @@ def parse_yaml(content: bytes | str, path: Path) -> Any:
             _require_few_nodes(root, path)
         return None if root is None else yaml.SafeLoader("").construct_document(root)
     except RecursionError:
-        raise BadInput(f"{path}: not YAML that can be used: nested too deeply") from None
+        raise BadInput(f"{path}: the YAML is nested too deeply") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date or number that does not exist, for example
         raise BadInput(f"{path}: not YAML: {' '.join(str(error).split())}") from None
 

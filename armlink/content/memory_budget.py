@@ -34,7 +34,8 @@ def memory_budget(path: Path) -> Iterator[None]:
             yield
     except MemoryError:
         raise BadInput(
-            f"{path}: takes more than {budget / 1e9:.1f} GB of memory: not a file that this program reads"
+            f"{path}: reading it would take more than {budget / 1e9:.1f} GB of memory, which this program "
+            "does not allow"
         ) from None
 
 

@@ -87,7 +87,7 @@ class _Sizes:
         self._copies.pop()
 
     def _entity(self, name: str, *_: Any) -> None:
-        raise BadInput(f"{self._path}: declares the entity {name!r}: no model needs one; write out what it stands for")
+        raise BadInput(f"{self._path}: declares the entity {name!r}, which no model needs: write its text out instead")
 
     def _require(self, value: float, most: int, what: str) -> None:
         if value > most:

@@ -184,7 +184,7 @@ class BasicDrives(Generic[M]):
         """The limits that a drive was set up with; raises BusFault before that."""
         limits = self.memory[joint].limits
         if limits is None:
-            raise BusFault(f"{self.names[joint]}: a command before the set-up")
+            raise BusFault(f"{self.names[joint]}: a command came before the set-up")
         return limits
 
     # ---- the cycle
@@ -296,7 +296,7 @@ class BasicDrives(Generic[M]):
         if self.faults[joint]:
             return f"{self.where(joint)}: {self.faults[joint]}"
         found = self.powers[joint].value
-        return f"{self.where(joint)}: power stays {found}, expected {target.value} within {seconds:g} s"
+        return f"{self.where(joint)}: its power stays {found}; within {seconds:g} s it should be {target.value}"
 
     def forget(self, restarts: bool = False) -> None:
         """Forget alarms of the past: a walk to ON begins, or has succeeded; before a set-up also `restarts`."""
@@ -335,8 +335,8 @@ class BasicDrives(Generic[M]):
         Raises BusFault, BadInput.
         """
         raise BadInput(
-            f"{self.names[0]}: a guard cannot judge frames to {self.settings[0].family} drives: their bytes alone do "
-            "not say it"
+            f"{self.names[0]}: a guard cannot check frames to {self.settings[0].family} drives: the bytes "
+            "alone do not show what a frame orders"
         )
 
     def replayed(self, first: bool, readings: Sequence[Reading]) -> list[Frame]:

@@ -79,7 +79,7 @@ class MitDrives(BasicDrives[K]):
         """The grid of a drive that was set up."""
         grid = self.memory[joint].grid
         if grid is None:
-            raise BusFault(f"{self.names[joint]}: a command before the set-up")
+            raise BusFault(f"{self.names[joint]}: a command came before the set-up")
         return grid
 
     def command(self, joint: int, order: Order) -> Frame:
@@ -140,9 +140,9 @@ class MitDrives(BasicDrives[K]):
         most = grid.ranges.position
         if not (-most <= limits.lower and limits.upper <= most):
             raise BadInput(
-                f"{self.names[joint]}: its position window {limits.lower:.2f} to {limits.upper:.2f} rad at the drive "
-                f"exceeds the range ±{most:.2f} rad of its frames{where}: correct zero and direction, or limit the "
-                "joint"
+                f"{self.names[joint]}: its position window {limits.lower:.2f} to {limits.upper:.2f} rad at "
+                f"the drive exceeds the range ±{most:.2f} rad of its frames{where}: correct zero and "
+                "direction, or give the joint a smaller range"
             )
 
 

@@ -170,7 +170,7 @@ class ReadingRange(NamedTuple):
     """It tells from minus this to this."""
     where: str
     """Where the range is set, as people write it: `register 22 (VMAX)`."""
-    remedy: str = "set it to that or more in the drive"
+    remedy: str = "set a range of this size or more in the drive"
     """How it is made larger."""
 
 

@@ -86,7 +86,7 @@ class Field:
         self.age, self.first = _bound(found, "age", 0.0), frozenset(found.get("first", ()))
         self.leads_back = bool(found.get("leads_back", False))
         if self.values is None and not (math.isfinite(self.least) and math.isfinite(self.most)):
-            raise PolicyError(f"{self.name}: needs values, or least and most")
+            raise PolicyError(f"{self.name}: the field needs `values`, or `least` and `most`")
         self._last: float | None = None
         self._readings: list[tuple[float, float]] = []
         self._room, self._at = self.slack, -math.inf
@@ -98,19 +98,27 @@ class Field:
         """Why this frame's number is not allowed, or an empty text. Keeps nothing: see `keep`."""
         value = self.number.unpack_from(data, self.at)[0]
         if self.values is not None:
-            return "" if value in self.values else f"{self.name} {value}, not among the {len(self.values)} allowed"
+            return (
+                ""
+                if value in self.values
+                else f"{self.name} is {value}, which is not among the {len(self.values)} allowed values"
+            )
         known = [reading for reading, at in self._readings if now - at <= self.age]
         near = any(abs(value - reading) <= self.within for reading in known)
         began = [self._last] if power and self._last is not None else known
         if not (self.least <= value <= self.most or (self.leads_back and self._inwards(value, began))):
-            return f"{self.name} {value}, allowed {self.least:g} to {self.most:g}"
+            return f"{self.name} is {value}, allowed are {self.least:g} to {self.most:g}"
         if not power or self.rate == math.inf or near:
             return ""
         if self._last is None:
-            return "" if value in self.first else f"{self.name} {value} with power, where no reading shows the joint"
+            return (
+                ""
+                if value in self.first
+                else f"{self.name} is {value} in a frame that gives power, but no reading shows the joint near it"
+            )
         if abs(value - self._last) <= self._room_at(now):
             return ""
-        return f"{self.name} from {self._last} to {value} at once, allowed {self._room_at(now):g}"
+        return f"{self.name} goes from {self._last} to {value} at once, but may change by {self._room_at(now):g} only"
 
     def _inwards(self, value: float, began: list[float]) -> bool:
         """Whether a number outside the range is no further out than one of these, where the joint stands or was led."""
@@ -145,7 +153,7 @@ class Allowance:
         self._room = min(self._burst, self._room + self._rate * max(0.0, now - self._at))
         self._at = max(now, self._at)
         if self._room < 1.0:
-            return f"more often than {self._rate:g} times a second"
+            return f"is sent more often than {self._rate:g} times a second"
         self._room -= 1.0
         return ""
 
@@ -169,7 +177,7 @@ class Frame:
         shortest = min(self.lengths)
         for field in self.fields:
             if field.at < 0 or field.at + field.number.size > shortest:
-                raise PolicyError(f"{field.name}: beyond the {shortest} bytes of its frame")
+                raise PolicyError(f"{field.name}: the field ends beyond the {shortest} bytes of its frame")
 
     def powers(self, data: bytes) -> bool:
         """Whether the drive follows the numbers of a frame."""
@@ -237,7 +245,7 @@ class Policy:
         """From the file's content; raises PolicyError."""
         try:
             if content["schema"] != SCHEMA:
-                raise PolicyError(f"schema {content['schema']!r}, expected {SCHEMA}")
+                raise PolicyError(f"`schema` is {content['schema']!r}, expected {SCHEMA}")
             self.frames: dict[int, Frame | Requests] = {
                 int(key): Requests(each) if "sdo" in each else Frame(each) for key, each in content["frames"].items()
             }
@@ -276,15 +284,22 @@ class Policy:
         frame = self.frames.get(can_id)
         if frame is None and can_id in self._drives:
             return (
-                f"identifier {can_id:X}h, which only a drive may send: a second guard, or a program that plays a drive"
+                f"the program sent identifier {can_id:X}h, which only a drive may send: stop a second guard, or "
+                "a program that plays a drive"
             )
         if frame is None:
-            return f"identifier {can_id:X}h, which the policy does not name"
+            return f"the program sent identifier {can_id:X}h, which the policy does not name"
         fields = frame.pick(data)
         if fields is None:
-            return f"{can_id:X}h with {data.hex(' ') or 'no data'}: no request that the policy allows"
+            return (
+                f"the program sent {can_id:X}h with {data.hex(' ') or 'no data'}, which is no request that the "
+                "policy allows"
+            )
         if not frame.after <= self._acknowledged:
-            return f"{can_id:X}h before the drive has acknowledged what it means, since the guard or the drive started"
+            return (
+                f"the program sent {can_id:X}h, but since the guard or the drive started the drive has not "
+                "acknowledged what this frame means"
+            )
         power = frame.powers(data)
         for field in fields:
             why = field.refusal(data, now, power)
@@ -391,7 +406,7 @@ class BusGuard:
         elif not self.closed and frame.commands(data):  # a closed guard passes none on: two would do so for ever
             self.program.send(can_id, data, fd)
             self.close(
-                f"{can_id:X}h on the wire, which this guard did not send: another host commands the drives there"
+                f"{can_id:X}h came on the wire and is not from this guard: another host commands the drives there"
             )
 
     def _to_wire(self, can_id: int, data: bytes, fd: bool, came: float | None = None) -> None:
@@ -403,25 +418,36 @@ class BusGuard:
             self._tell_late(now - came)
             return
         self._late = False
-        why = "a remote or error frame" if can_id & (ERROR | REMOTE) else ""
+        why = "the program sent a remote or error frame" if can_id & (ERROR | REMOTE) else ""
         if not why and self.policy.fd not in (None, fd):
-            why = f"{can_id:X}h as {'CAN FD' if fd else 'classical CAN'}, which these drives do not speak"
+            why = (
+                f"the program sent {can_id:X}h as {'CAN FD' if fd else 'classical CAN'}, which these drives do not "
+                "understand"
+            )
         why = why or self.policy.refusal(can_id, data, came)
         if why:
             self.close(why)
         elif not self.wire.send(can_id, data, fd):
-            self.close("the wire takes no frames: is it up, does anything acknowledge, do others fill it?")
+            self.close(
+                "the wire takes no frames: is the interface up, does any node acknowledge, do other nodes fill the bus?"
+            )
 
     def _check_losses(self) -> None:
         """A lost frame may have been a drive's restart, or a stop."""
         for port, name in ((self.wire, "wire"), (self.program, "program")):
             if port.lost and not self.closed:
-                self.close(f"{port.lost} frames of the {name} were lost: a flood, or this guard gets too little time")
+                self.close(
+                    f"{port.lost} frames from the {name} were lost: too many frames were sent, or this guard gets "
+                    "too little processor time"
+                )
 
     def _tell_late(self, age: float) -> None:
         """The drives have stopped by themselves meanwhile; what the program said before counts no more."""
         if not self._late:
-            self._say(f"guard: it fell behind: frames {age:.3f} s old are not passed, limit {self.policy.deadline:g} s")
+            self._say(
+                f"guard: it is late: frames that are {age:.3f} s old are not passed, the limit is "
+                f"{self.policy.deadline:g} s"
+            )
         self._late = True
 
     def close(self, why: str) -> None:
@@ -430,20 +456,20 @@ class BusGuard:
         told = [self.wire.send(can_id, data) for can_id, data in self.policy.stop]
         then = "the joints were told to stop"
         if not all(told):
-            then = "the joints could not be told to stop, which their own watches do"
-        self._say(f"guard: closed: {why}; {then}, start the guard again to open it")
+            then = "the joints could not be told to stop, so they stop by their own watch of the bus"
+        self._say(f"guard: closed, it passes no more frames: {why}; {then}; start the guard again to open it")
 
 
 def _number(code: str) -> struct.Struct:
     if len(code) != 1 or code not in NUMBERS:
-        raise PolicyError(f"code {code!r}, expected one of {', '.join(NUMBERS)}")
+        raise PolicyError(f"number code {code!r} is unknown, expected one of {', '.join(NUMBERS)}")
     return struct.Struct("<" + code)
 
 
 def _bound(found: dict[str, Any], key: str, default: float) -> float:
     value = float(found.get(key, default))
     if math.isnan(value):
-        raise PolicyError(f"{found['name']}: {key} is no number")
+        raise PolicyError(f"{found['name']}: `{key}` is not a number")
     return value
 
 
@@ -462,20 +488,23 @@ def main(words: list[str]) -> int:
         return 2
     path, program, wire = words
     if program == wire:
-        _say(f"guard: {wire}: both interfaces: expected one for programs alone, such as a vcan, and the arm's")
+        _say(
+            f"guard: {wire} is given as both interfaces: give first an interface for programs alone (such as a "
+            "vcan), then the interface of the arm"
+        )
         return 2
     try:
         with open(path, encoding="utf-8") as file:
             policy = Policy(json.load(file))
     except (OSError, ValueError, RecursionError, PolicyError) as error:
-        _say(f"guard: {path}: {error}; how it is written: armlink guard --help")
+        _say(f"guard: {path}: {error}; `armlink guard --help` tells how to write this file")
         return 2
     ports = []
     for name in (program, wire):
         try:
             ports.append(GuardPort(name))
         except OSError as error:
-            _say(f"guard: {name}: {error.strerror}: expected a CAN interface that is up")
+            _say(f"guard: {name}: {error.strerror}: give a CAN interface that is up")
             return 2
     ports[0].patience = 0.0  # a program that takes no frames must not keep those to the wire waiting
     guard = BusGuard(policy, ports[0], ports[1])
@@ -485,7 +514,7 @@ def main(words: list[str]) -> int:
             signal.signal(number, lambda *_: ended.append(True))
     for number in (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU):  # a terminal must not suspend it
         signal.signal(number, signal.SIG_IGN)
-    _say(f"guard: {program} may command {wire} by {path}")
+    _say(f"guard: {program} may command {wire} as {path} allows")
     while not ended:
         try:
             guard.step(0.2)
@@ -493,10 +522,10 @@ def main(words: list[str]) -> int:
             continue
         except OSError as error:
             if not guard.closed:
-                guard.close(f"an interface failed: {error.strerror}")
+                guard.close(f"an interface failed ({error.strerror})")
             time.sleep(0.2)
     if not guard.closed:
-        guard.close("it was told to end")
+        guard.close("the guard was told to end")
     return 0
 
 

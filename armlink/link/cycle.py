@@ -313,7 +313,7 @@ class Commander:
         for drives, drive in self._drives:
             if drives.power(drive) is not target or (target is Power.ON and not drives.ready(drive)):
                 return drives.stuck(drive, target, ENABLE_SECONDS)
-        return f"no complete set of readings within {ENABLE_SECONDS} s of cycles: frames are lost"
+        return f"no complete set of readings came within {ENABLE_SECONDS} s of cycles: frames are lost"
 
     def restarted(self) -> bool:
         return any(drives.has_restarted(drive) for drives, drive in self._drives)
@@ -344,14 +344,18 @@ class Commander:
             shape, kind = getattr(values, "shape", None), getattr(getattr(values, "dtype", None), "kind", "?")
             if shape != (self.n,) or kind not in kinds:
                 raise Refused(
-                    f"gate: {field} of a command is an array {shape} of kind {kind!r}, expected ({self.n},) "
-                    f"{'whole ' if kinds == 'iu' else ''}numbers, one each of {', '.join(self.names)}"
+                    f"gate: field `{field}` of the command is an array of shape {shape} and kind {kind!r}: it "
+                    f"must have shape ({self.n},) and hold {'whole ' if kinds == 'iu' else ''}numbers, one for "
+                    f"each of {', '.join(self.names)}"
                 )
         modes: list[int] = command.mode.tolist()
         for joint, mode in enumerate(modes):
             if mode and mode not in self._modes_of[joint] and mode in Mode.__members__.values():
                 held = ", ".join(str(each) for each in sorted(self._modes_of[joint]) if each)
-                raise Refused(f"gate: {self.names[joint]}: mode {mode} is not supported: its drive has {held}")
+                raise Refused(
+                    f"gate: {self.names[joint]}: mode {mode} is not supported: the drive of this joint has the modes "
+                    f"{held}"
+                )
         return modes, command.torque.tolist(), command.position.tolist()
 
     def _seen(self, now: float, healthy: bool) -> list[Seen]:
@@ -394,8 +398,8 @@ class Commander:
         wrong = beyond(limits, passed, sent, self._seen_now[joint])
         if wrong:
             raise Refused(
-                f"gate: {self.names[joint]}: the frame would carry {wrong}, limits {limits.most_sent:.6g} N·m and "
-                f"{limits.lower:.4g} to {limits.upper:.4g} rad: nothing is sent"
+                f"gate: {self.names[joint]}: the frame would order {wrong}, the limits are {limits.most_sent:.6g} N·m "
+                f"and {limits.lower:.4g} to {limits.upper:.4g} rad: the frame is not sent"
             )
 
     def _fault(self, now: float, modes: Sequence[int]) -> BusFault | None:

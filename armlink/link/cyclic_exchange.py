@@ -226,7 +226,7 @@ class Loop:
         frames = self._encode(orders, ordered)
         now = self._clock.now()
         if now - decided > max_age:
-            raise HostLate(now - decided, max_age, "the command grew too old before its frames left")
+            raise HostLate(now - decided, max_age, "the command became too old before its frames were sent")
         if self._first is None:
             self._first = now
         board.awaited = self._expected

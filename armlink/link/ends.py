@@ -105,7 +105,7 @@ def end(link: Ended, cause: EndCause, tell: Tell) -> None:
     except BusFault as fault:
         link.let_go()
         with suppress(Dropped):
-            tell(f"not parked, {fault}: the drives let the arm go")
+            tell(f"the arm could not be parked ({fault}): the drives switch their power off, so the arm may fall")
 
 
 def _stow(link: Ended, tell: Tell) -> None:

@@ -28,8 +28,8 @@ def silence(names: Sequence[str], seen: Sequence[float], now: float, max_age: fl
     said = f"{who}{colon} {what} for {age * 1e3:.0f} ms, limit {max_age * 1e3:.0f} ms"
     if watch.crowding > len(names):
         said += (
-            f"; others fill the bus meanwhile with {watch.crowding:.0f} frames a cycle, most of them "
-            f"{_culprit(names, watch)}: a node babbles: disconnect it"
+            f"; meanwhile other nodes fill the bus with {watch.crowding:.0f} frames a cycle, most of them "
+            f"{_culprit(names, watch)}: a node babbles, disconnect this node"
         )
     return Silence(said)
 
@@ -47,7 +47,10 @@ def refusal(
     for joint, name in enumerate(names):
         why, limit, now, other = passed[joint].refused, limits[joint], seen[joint], others[joint]
         if why == gate.COMMAND_AGE:
-            return f"the command is {age * 1e3:.0f} ms old, expected 0 to {limit.max_age * 1e3:.0f} ms"
+            return (
+                f"the command is {age * 1e3:.0f} ms old: it must be 0 to {limit.max_age * 1e3:.0f} ms old when it "
+                "reaches the gate"
+            )
         if why == gate.BAD_MODE:
             return f"{name}: mode {command.mode[joint]}, expected {_MODES}"
         if why == gate.BAD_NUMBER and command.mode[joint] in gate.TORQUE_MODES:
@@ -55,43 +58,45 @@ def refusal(
         if why == gate.BAD_NUMBER:
             return f"{name}: target position is {command.position[joint]}, expected a finite number"
         if why == gate.VELOCITY and math.isnan(now.velocity):
-            return f"{name}: no velocity has come lately, and torque control needs it"
+            return f"{name}: torque control needs the joint's velocity, and none was received lately"
         if why == gate.CONTRADICTION:
             return (
-                f"{name}: its positions and its velocity ({now.velocity:.3g} rad/s) contradict each other: one of them "
-                "is false: a scale that is off (docs/safety.md, Scales), a second node, or its encoder"
+                f"{name}: its positions and its velocity ({now.velocity:.3g} rad/s) contradict each other, so "
+                "one of the two is false: check the scales in the arm file (docs/safety.md, Scales), whether a "
+                "second node has the same id, and the encoder"
             )
         if why == gate.FALSE_TORQUE:
             return (
-                f"{name}: reports a torque of {now.torque:.3g} N·m, but its gains and its command give "
-                f"{other.ordered_torque:.3g}: torque control would start from a false value (docs/safety.md, Scales)"
+                f"{name}: its drive reports a torque of {now.torque:.3g} N·m, but its gains and its command give "
+                f"{other.ordered_torque:.3g} N·m: torque control would start from a false value (docs/safety.md, "
+                "Scales)"
             )
         if why == gate.VELOCITY and command.mode[joint] in gate.POSITION_MODES:
             return (
-                f"{name}: turns at {_speed(now, other):.3g} rad/s under position control, limit "
-                f"{limit.servo_overspeed:.3g} (max_velocity and its margin){_by_positions(now, other)}: something else "
-                "moves it, or its servo is unstable"
+                f"{name}: turns at {_speed(now, other):.3g} rad/s under position control, the limit is "
+                f"{limit.servo_overspeed:.3g} (max_velocity and a margin){_by_positions(now, other)}: something "
+                "else moves the joint, or its position loop is unstable"
             )
         if why == gate.FOLLOWING:
             return (
                 f"{name}: reads {now.position:.4g} rad, more than {limit.following:g} rad from its target "
-                f"{passed[joint].position:.4g}: it is blocked or too weak, something else moves it, or its reading is "
-                "false"
+                f"{passed[joint].position:.4g} rad: the joint is blocked or too weak, something else moves it, "
+                "or its reading is false"
             )
         if why == gate.VELOCITY:
             return (
-                f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, limit "
-                f"{gate.speed_limit(limit, other):.3g} (max_velocity and its margin){_by_positions(now, other)}: "
+                f"{name}: turns at {_speed(now, other):.3g} rad/s under torque control, the limit is "
+                f"{gate.speed_limit(limit, other):.3g} (max_velocity and a margin){_by_positions(now, other)}: "
                 "command less torque, or raise max_velocity"
             )
         if why == gate.WINDOW:
             lower, upper = limit.lower - limit.outside, limit.upper + limit.outside
             return (
-                f"{name}: reads {now.position:.4g} rad under torque control, expected {lower:.4g} to {upper:.4g}: "
-                "its stop or its position sensor is not where the arm file has it"
+                f"{name}: reads {now.position:.4g} rad under torque control, but can only stand at {lower:.4g} "
+                f"to {upper:.4g} rad: one of its stops or its position sensor is not where the arm file says"
             )
         if why == gate.ENTRY:
-            return f"{name}: the torque now produced is not known, and torque control would start from zero"
+            return f"{name}: its present torque is not known, so torque control would start from zero"
     return None
 
 
@@ -103,7 +108,7 @@ def _speed(seen: Seen, other: Corroboration) -> float:
 def _by_positions(seen: Seen, other: Corroboration) -> str:
     """That its positions prove more speed than its drive tells, in words; empty where they do not."""
     if max(other.proven, other.ahead) > abs(seen.velocity):
-        return f", by its positions where its velocity reads {seen.velocity:.3g}"
+        return f" according to its positions (its drive reports {seen.velocity:.3g} rad/s)"
     return ""
 
 
@@ -112,21 +117,31 @@ def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None
     if watch.reception:
         return watch.reception
     if watch.intruder:
-        return f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
+        return (
+            f"another host is on this bus: it sends {watch.intruder}: stop that program, since only one program may "
+            "command an arm"
+        )
     doubled = watch.doubled
     if doubled is not None:
-        return f"{names[doubled]}: two readings in every cycle: a second node has its id: give every node its own"
+        return (
+            f"{names[doubled]}: two readings come in every cycle, so a second node has the same id: give every node "
+            "an id of its own"
+        )
     if watch.babbling:
         return (
-            f"more frames than these joints send, most of them {_culprit(names, watch)}: a node babbles: disconnect it"
+            f"the bus carries more frames than these joints send, most of them {_culprit(names, watch)}: a node "
+            "babbles, disconnect this node"
         )
     if watch.forged is not None:
         return (
-            f"{names[watch.forged]}: more readings than it sends: a second node sends torques, velocities "
-            "or states in its name: give every node its own id, and find out who sends"
+            f"{names[watch.forged]}: more readings come than this joint sends, so a second node sends torques, "
+            "velocities or states with the same id: find the sender, and give every node an id of its own"
         )
     if dropped:
-        return f"{dropped} frames lost: this host reads too slowly: give it more time or less to do"
+        return (
+            f"{dropped} frames were lost because this host reads too slowly: stop other programs on this host, or "
+            "give the job less to do in each cycle"
+        )
     return None
 
 

@@ -286,7 +286,7 @@ def beyond(limits: JointLimits, passed: Order, sent: Order, seen: Seen) -> str:
         return "" if not abs(torque) > most else f"torque {torque:.6g} N·m"
     velocity = seen.velocity if math.isfinite(seen.velocity) else 0.0
     total = kp * (position - seen.position) + kd * (rate - velocity) + torque  # NaN where any of them is: refused
-    return "" if abs(total) <= most else f"gains and targets for {total:.6g} N·m"
+    return "" if abs(total) <= most else f"{total:.6g} N·m (by its gains and targets)"
 
 
 def _towards(start: float, goal: float, step: float) -> float:

@@ -39,11 +39,13 @@ def joint_ranges(arm: ArmFile) -> tuple[tuple[float, float], ...]:
     for joint in arm.require_link().joints:
         index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint.name)
         if index < 0:
-            raise BadInput(f"{arm.path}: link.joints names {joint.name}, which {arm.model_path} has not")
+            raise BadInput(
+                f"{arm.path}: link.joints names the joint {joint.name}, but {arm.model_path} has no such joint"
+            )
         if joint.name not in arm.kinematics.stops and not model.jnt_limited[index]:
             raise BadInput(
-                f"{arm.model_path}: joint {joint.name} has no range: give its stops [rad] in the arm file, as"
-                f" kinematics: {{stops: {{{joint.name}: [-3.0, 3.0]}}}}"
+                f"{arm.model_path}: joint {joint.name} has no range: give its stops [rad] in the arm file, for "
+                f"example `kinematics: {{stops: {{{joint.name}: [-3.0, 3.0]}}}}`"
             )
         lower, upper = arm.kinematics.stops.get(joint.name, model.jnt_range[index])
         ranges.append((float(lower), float(upper)))
@@ -68,7 +70,7 @@ def require_ranges(
         "position": (
             max(map(abs, ends)) + gate.outside * gear,
             "rad",
-            "correct zero and direction, or limit the joint",
+            "correct zero and direction in the arm file, or give the joint a smaller range",
         ),
         "velocity": (max(gate.overspeed, gate.servo_overspeed) * gear, "rad/s", "lower max_velocity"),
         "torque": (gate.most_sent / gear, "N·m", "lower max_torque"),
@@ -77,8 +79,8 @@ def require_ranges(
         least, unit, otherwise = needed[quantity]
         if largest < least * (1 - RANGE_ROUNDING):
             raise Refused(
-                f"{name}: {where} ends {quantity} readings at {largest:.6g} {unit}, and the gate must see "
-                f"{least:.6g} {unit}: {remedy}, or {otherwise}"
+                f"{name}: {where} limits the {quantity} readings to {largest:.6g} {unit}, but the gate must be "
+                f"able to read {least:.6g} {unit}: {remedy}, or {otherwise}"
             )
 
 

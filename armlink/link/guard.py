@@ -41,8 +41,12 @@ class Crossed(Refused):
 
     def __init__(self, name: str, joint: int, bound: str, position: float, target: float) -> None:
         """Joint's name and index; `range` or `lag`; where it is and where it should be [rad]."""
-        what = "left the range that its command allows" if bound == "range" else f"does not follow to {target:.3f} rad"
-        super().__init__(f"{name}: at {position:.3f} rad it {what}")
+        what = (
+            "it left the range that the command allows"
+            if bound == "range"
+            else f"it does not follow its target {target:.3f} rad"
+        )
+        super().__init__(f"{name}: at {position:.3f} rad {what}")
         self.name, self.joint, self.bound, self.position, self.target = name, joint, bound, position, target
         self.sample: Any = None
         """The Sample that showed it."""

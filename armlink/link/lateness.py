@@ -44,8 +44,8 @@ class Lateness:
         if late <= WARN_SHARE * deadline:
             return ""
         return (
-            f"this host was up to {late * 1e3:.0f} ms late in 99.9 % of the cycles, near link.deadline"
-            f" ({deadline * 1e3:.0f} ms): see armlink check {arm} --host"
+            f"this host was up to {late * 1e3:.0f} ms late in 99.9 % of the cycles, which comes near "
+            f"link.deadline ({deadline * 1e3:.0f} ms): see `armlink check {arm} --host`"
         )
 
     def in_ms(self) -> dict[str, float]:

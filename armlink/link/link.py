@@ -211,7 +211,9 @@ class Link(Calibrations):
         ]
         if missing:
             channel = self.bus.channel_info
-            raise BusFault(f"no answer from {', '.join(missing)} on {channel}: is it powered, and its id right?")
+            raise BusFault(
+                f"no answer from {', '.join(missing)} on {channel}: check power and wiring, and the ids in the arm file"
+            )
         if self._overloaded:
             log.warning("%s: %s", self.arm.name, self._overloaded)
         self.require_alone()
@@ -241,7 +243,7 @@ class Link(Calibrations):
         """Raise BusFault where another host was heard or a controller has restarted."""
         for name, (group, number) in zip(self.names, by_joint(self.groups), strict=True):
             if group.drives.has_restarted(number):
-                raise BusFault(f"{name}: its controller has just restarted (boot-up message): start again")
+                raise BusFault(f"{name}: its drive has just restarted (boot-up message): repeat the command")
         fault = bus_fault(self.names, self._loop.watch, 0)
         if fault:
             raise BusFault(fault)
@@ -293,7 +295,10 @@ class Link(Calibrations):
         for group in self.groups:
             if group.tag:
                 name = self.names[group.places[0]]
-                raise BadInput(f"{name}: a guard has one bus, this arm has several: describe each in a file of its own")
+                raise BadInput(
+                    f"{name} is on another bus than the first joint, but a guard checks one bus only: write one arm "
+                    "file for each bus"
+                )
             own = [self.values.limits(place, self.limits[place]) for place in group.places]
             found = group.drives.guard_rules(self._ask(group), own)
             rules["frames"] |= found["frames"]
@@ -374,7 +379,7 @@ class Link(Calibrations):
 
     def _require_start(self) -> None:
         if not self._cycling:
-            raise BusFault("the nodes are not started: start() comes first")
+            raise BusFault("the nodes are not started: call start() first")
 
     def cycle(self, command: Command) -> Sample:
         """One cycle: wait for its time, gate, frames out, readings in.
@@ -384,7 +389,7 @@ class Link(Calibrations):
         the joints then keep the command until the next.
         """
         if not self._enabled:
-            raise BusFault("the joints are not enabled: start() and enable() come before cycle()")
+            raise BusFault("the joints are not enabled: call start() and enable() before cycle()")
         self._last = command
         try:
             sample = self.commander.command(command)

@@ -70,8 +70,8 @@ def require_deadman(link: Parked) -> None:
     for name, each in zip(link.names, traits, strict=True):
         if each.silence == "keeps on":
             raise Refused(
-                f"{name}: nothing stops its drive when this host dies (silence: keeps on): it is not driven; give it a "
-                "firmware or a setting that watches its host"
+                f"{name}: if this host dies, its drive keeps on with the last command (`silence: keeps on`), so "
+                "this joint is not driven: choose a firmware or a setting with which the drive watches its host"
             )
 
 
@@ -84,7 +84,9 @@ def park(link: Parked, tell: Tell) -> None:
     """
     stowed = link.section.park
     if stowed is None:
-        raise BadInput(f"{link.arm.path}: key link.park is missing: give the pose in which the arm rests without power")
+        raise BadInput(
+            f"{link.arm.path}: key `link.park` is missing: give the pose in which the arm can rest without power"
+        )
     goal = np.array(stowed.pose)
     link.keep()
     window = np.array([(each.lower, each.upper) for each in link.commander.limits]).T
@@ -95,14 +97,16 @@ def park(link: Parked, tell: Tell) -> None:
     for row, target in enumerate(path):
         if row % every == 0:
             left = (len(path) - row) * link.period + REST_SECONDS
-            tell(f"parking, {left:.0f} s left; Ctrl-C twice lets the arm fall")
+            tell(f"the arm moves to its parking pose, {left:.0f} s left; pressing Ctrl-C twice lets the arm fall")
         link.keep(target)
-        _require_following(link, target, LAG, "does not follow (something is in the way, or its drive is too weak)")
+        _require_following(
+            link, target, LAG, "stopped following its target (something is in the way, or its drive is too weak)"
+        )
     for _ in range(cycles(link, REST_SECONDS)):
         link.keep(goal)
-    _require_following(link, goal, STOWED, "has not arrived")
+    _require_following(link, goal, STOWED, "did not arrive at its parking position")
     _power_off(link)
-    tell("parked, the power is off")
+    tell("the arm is in its parking pose, and its power is off")
 
 
 def _power_off(link: Parked) -> None:
@@ -123,7 +127,8 @@ def _require_following(link: Parked, target: Array, most: float, how: str) -> No
     if off[joint] > most:
         link.keep(here)
         raise Refused(
-            f"park: {link.names[joint]}: at {here[joint]:.3f} rad it {how} to {target[joint]:.3f} rad; the joints hold"
+            f"park: {link.names[joint]} is at {here[joint]:.3f} rad, its target is {target[joint]:.3f} rad: it "
+            f"{how}; all joints hold where they stand"
         )
 
 
@@ -140,7 +145,10 @@ def let_down(link: Parked, tell: Tell, why: str) -> None:
     every, window = cycles(link, TELL_SECONDS), cycles(link, LOWERED_SECONDS)
     for row in range(cycles(link, LONGEST_LOWERING)):
         if row % every == 0:
-            tell(f"letting the arm down, {LONGEST_LOWERING - row * link.period:.0f} s at most: {why}")
+            tell(
+                f"the arm is being lowered, which takes {LONGEST_LOWERING - row * link.period:.0f} s at most, since "
+                f"it could not be parked: {why}"
+            )
         load = np.nan_to_num(np.array(link.commander.loop.latest_motor_torque))
         here = link.latest_position
         target = np.clip(
@@ -155,7 +163,7 @@ def let_down(link: Parked, tell: Tell, why: str) -> None:
                 break
             before = here
     _power_off(link)
-    tell("let down, the power is off")
+    tell("the arm has been lowered, and its power is off")
 
 
 def straight(start: Array, goal: Array, speed: Array, period: float) -> Array:

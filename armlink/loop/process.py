@@ -97,7 +97,7 @@ class DriveLoop:
         """The controller that is being run."""
         self._end: End | None = None
         """How the job wants the arm to end."""
-        self._fault: ArmlinkError = BusFault("the joints are not enabled: start() and enable() come before cycle()")
+        self._fault: ArmlinkError = BusFault("the joints are not enabled: call start() and enable() before cycle()")
         """Why the joints are not enabled."""
         self._beside = ThreadPoolExecutor(1)
         self._unpickled: Future[Controller] | None = None

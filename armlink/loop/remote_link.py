@@ -245,7 +245,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
 
     def _gone(self) -> BusFault:
         ended = f"the process that drives the arm has ended (status {self.exit_status})"
-        return BusFault(f"{ended}: the joints stop by their own deadline")
+        return BusFault(f"{ended}: each drive stops its joint at its own deadline")
 
     def _end(self, cause: EndCause) -> None:
         with Presses() as presses:

@@ -73,7 +73,9 @@ class RerunStream:
         try:
             socket.create_connection(("127.0.0.1", port), PATIENCE).close()
         except OSError as error:
-            raise BadInput(f"--rerun {port}: no viewer there ({error}): start it with rerun --port {port}") from None
+            raise BadInput(
+                f"--rerun {port}: there is no viewer on this port ({error}): start a viewer with rerun --port {port}"
+            ) from None
         self._scalars = rerun.Scalars
         self._stream = rerun.RecordingStream(f"armlink {name}")
         self._stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")

@@ -134,10 +134,11 @@ def _header(text: str) -> tuple[str, ...]:
     for name in names:
         if name not in ("t", "-") and channel_column(name) is None:
             raise BadInput(
-                f"--columns {name}: not a column of a recording: t, q_1, q_cmd_1, tau_1, …, or - to leave out"
+                f"--columns {name}: a recording has no such column: give t, q_1, q_cmd_1, tau_1, …, or - for "
+                "a column to leave out"
             )
         if name != "-" and names.count(name) > 1:
-            raise BadInput(f"--columns {name}: occurs twice")
+            raise BadInput(f"--columns {name}: this column is named twice")
     return tuple("" if name == "-" else name for name in names)
 
 
@@ -221,7 +222,7 @@ def _scale(
     channel, joints = _place(channels, column, source, option)
     width = channels[channel][:, joints].shape[1]
     if len(factors) not in (1, width):
-        raise BadInput(f"{option} {column}: {len(factors)} values for {width} joints of {source}")
+        raise BadInput(f"{option} {column}: {len(factors)} values are given, but {source} has {width} joints")
     values = np.broadcast_to(np.asarray(factors), width)
     if column == channel:
         values = np.where([f"{channel}_{j + 1}" in beside for j in range(width)], 1.0, values)

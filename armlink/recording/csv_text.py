@@ -65,8 +65,8 @@ def layout_of(content: bytes | bytearray, source: str, header: tuple[str, ...] =
     text = lines[above] if above < len(lines) else ""
     if _is_values(text):
         raise BadInput(
-            f"{source}: its first row holds numbers, expected a header row with the names of the columns"
-            ": state them with --columns t,q_1,…"
+            f"{source}: its first row holds numbers instead of the names of the columns: give the names with "
+            "--columns t,q_1,…"
         )
     text = text.lstrip("# ") if text.startswith("#") else text
     separator = _separator(text)
@@ -84,11 +84,14 @@ def layout_of(content: bytes | bytearray, source: str, header: tuple[str, ...] =
 def _layout_without_header(text: str, above: int, source: str, header: tuple[str, ...]) -> CsvLayout:
     """Layout of a file whose first row of values is `text`, below so many lines of comment."""
     if not _is_values(text):
-        raise BadInput(f"{source}: --columns: its first row holds no numbers, but names: leave it out, or use --map")
+        raise BadInput(
+            f"{source}: its first row holds the names of the columns: leave `--columns` out, or rename columns "
+            "with `--map`"
+        )
     separator = _separator(text)
     cells = tuple(_cells(text, separator, source))
     if len(cells) != len(header):
-        raise BadInput(f"{source}: --columns names {len(header)} columns, its rows have {len(cells)}")
+        raise BadInput(f"{source}: --columns names {len(header)} columns, but the rows of the file have {len(cells)}")
     comma = separator != "," and re.search(r"\d,\d", text) is not None
     return CsvLayout(header, above, separator, "," if comma else ".", cells)
 

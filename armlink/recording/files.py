@@ -53,10 +53,13 @@ def _loaded(path: Path, stated: Corrections) -> dict[str, Recording]:
     if path.is_dir():
         return _of_folder(path, stated)
     if path.suffix == ".zstd":
-        raise BadInput(f"{path}: give the folder of the bag, with its metadata.yaml, or unpack it: zstd -d {path.name}")
+        raise BadInput(
+            f"{path}: give the folder of the bag, with its metadata.yaml, or unpack this file first: zstd -d "
+            f"{path.name}"
+        )
     suffix = _suffix(path)
     if not path.is_file():
-        raise BadInput(f"no recording {path}: give a {', '.join(SUFFIXES)} file")
+        raise BadInput(f"there is no recording {path}: give a {', '.join(SUFFIXES)} file")
     if suffix == ".mcap":
         require_extra(str(path), "bags")
         from armlink.recording.mcap import has_our_topics, load_mcap
@@ -83,7 +86,7 @@ def _of_folder(path: Path, stated: Corrections) -> dict[str, Recording]:
         return {str(path): next(iter(_loaded(files[0], stated).values()))}
     if not files:
         raise BadInput(
-            f"{path}: neither the folder of a ROS 2 bag (.mcap or .db3 files) nor a LeRobot data set (meta/info.json)"
+            f"{path} is neither the folder of a ROS 2 bag (.mcap or .db3 files) nor a LeRobot data set (meta/info.json)"
         )
     require_extra(str(path), "bags")
     from armlink.recording.ros_bag import load_bag
@@ -134,4 +137,4 @@ def _suffix(path: Path) -> str:
     for suffix in sorted(SUFFIXES, key=len, reverse=True):
         if path.name.lower().endswith(suffix):
             return suffix
-    raise BadInput(f"{path}: not the suffix of a recording, expected {', '.join(SUFFIXES)}")
+    raise BadInput(f"{path}: this suffix is not the suffix of a recording, expected {', '.join(SUFFIXES)}")

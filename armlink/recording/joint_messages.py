@@ -42,7 +42,7 @@ def main_joints(messages: Sequence[JointMessage]) -> tuple[tuple[str, ...], list
 
 def left_out(joints: Sequence[str]) -> str:
     """Warning about joints that are not read, empty if there are none."""
-    return f"joints in messages of their own, left out: {', '.join(joints)}" if joints else ""
+    return f"joints left out because they come in other messages: {', '.join(joints)}" if joints else ""
 
 
 def recording_of_messages(

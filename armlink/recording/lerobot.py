@@ -48,7 +48,9 @@ def load_lerobot(path: Path) -> dict[str, Recording]:
             [_values(table[column], file, column, len(names) if column in (state, action) else 0) for column in columns]
         )
     if not sum(len(part[0]) for part in parts):
-        raise BadInput(f"{path}: no row in Parquet files under data/: download the data set with its data")
+        raise BadInput(
+            f"{path}: the Parquet files under data/ have no rows: download the data set together with its data"
+        )
     episodes, times, positions, commands = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = {}
     for episode in np.unique(episodes):
@@ -65,9 +67,11 @@ def _features(path: Path) -> dict[str, Any]:
     try:
         features = json.loads(read_whole(path / "meta" / "info.json", MOST_JSON))["features"]
     except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
-        raise BadInput(f"{path}/meta/info.json: no names of {STATES[0]} ({type(error).__name__} {error})") from None
+        raise BadInput(
+            f"{path}/meta/info.json: cannot read the joint names of {STATES[0]} ({type(error).__name__} {error})"
+        ) from None
     if not isinstance(features, dict) or not any(name in features for name in STATES):
-        raise BadInput(f"{path}/meta/info.json: no names of {' or '.join(STATES)} among its features")
+        raise BadInput(f"{path}/meta/info.json: its features have no joint names of {' or '.join(STATES)}")
     return features
 
 
@@ -107,7 +111,10 @@ def _values(column: pa.ChunkedArray, file: Path, name: str, width: int) -> Array
         lengths = _lengths(column)
         if (lengths != width).any():
             wrong = lengths[lengths != width].min()
-            raise BadInput(f"{file}: {name} has rows of {wrong:.0f} values for {width} names: expected one a joint")
+            raise BadInput(
+                f"{file}: {name} has rows of {wrong:.0f} values, but there are {width} names: expected one value "
+                "for each joint"
+            )
         column = pa.chunked_array([chunk.flatten() for chunk in column.chunks], column.type.value_type)
     try:
         values = numbers(column.cast(pa.float64())).reshape(-1, *([width] if width else []))

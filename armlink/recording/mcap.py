@@ -166,7 +166,7 @@ def _read(path: Path) -> tuple[dict[str, list[JointMessage]], str]:
     if complete:
         return found, ""
     rows = len(found.get(STATES, []))
-    return found, f"cut recording, {why}: loaded {rows} rows, up to about byte {position}"
+    return found, f"cut recording ({why}): the first {rows} rows were loaded, up to about byte {position}"
 
 
 def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:
@@ -183,7 +183,7 @@ def _records(stream: IO[bytes], path: Path) -> Iterator[Any]:
 def require_chunk_size(chunk: Chunk, path: Path) -> None:
     """Raise BadInput where a chunk states that it unpacks to more than a recording may hold."""
     if chunk.uncompressed_size > MOST_CHUNK:
-        raise BadInput(f"{path}: a chunk of {chunk.uncompressed_size} bytes, expected at most {MOST_CHUNK}")
+        raise BadInput(f"{path}: has a chunk of {chunk.uncompressed_size} bytes, expected at most {MOST_CHUNK}")
 
 
 def most_record(path: Path) -> int:
@@ -201,9 +201,9 @@ def _unpacked(chunk: Chunk) -> Chunk:
     elif chunk.compression == "lz4":
         data = LZ4FrameDecompressor().decompress(chunk.data, max_length=most)
     else:
-        raise ValueError(f"a chunk is packed as {chunk.compression}")
+        raise ValueError(f"a chunk is compressed as {chunk.compression}, which is not supported")
     if len(data) != chunk.uncompressed_size:
-        raise ValueError(f"a chunk unpacks to other than {chunk.uncompressed_size} bytes")
+        raise ValueError(f"a chunk does not unpack to {chunk.uncompressed_size} bytes")
     return replace(chunk, compression="", data=data)
 
 

@@ -90,7 +90,7 @@ def require_width(columns: Sequence[str], source: str) -> int:
         raise BadInput(f"{source}: {len(columns)} columns, expected at most {MOST_COLUMNS}")
     n = max((index for column in columns if (index := _joint_index(column)) is not None), default=1)
     if n > MOST_JOINTS:
-        raise BadInput(f"{source}: a column is of joint {n}, expected at most {MOST_JOINTS} joints")
+        raise BadInput(f"{source}: has a column of joint {n}, expected at most {MOST_JOINTS} joints")
     return n
 
 
@@ -132,9 +132,11 @@ def joint_count(columns: list[str], source: str) -> int:
         missing = [column for column in wanted if column not in present]
         if missing and (name == "position" or len(missing) < n):
             others = f" ({', '.join(wanted[:1] + wanted[-1:])} expected)" if n > 1 else ""
-            raise BadInput(f"{source}: missing column {missing[0]}: channel {name} needs one a joint{others}")
+            raise BadInput(
+                f"{source}: column {missing[0]} is missing: channel {name} needs one column for each joint{others}"
+            )
     if "t" not in present:
-        raise BadInput(f"{source}: missing column t: time [s], strictly increasing")
+        raise BadInput(f"{source}: column t is missing: it holds the time [s], which increases in every row")
     return n
 
 
@@ -177,9 +179,13 @@ def _check_time(t: Array, source: str) -> None:
     back = np.flatnonzero(np.diff(t) <= 0)
     if back.size:
         row = back[0] + 1
-        alike = " (more digits, or the times of sampling)" if t[row] == t[row - 1] else ""
+        alike = (
+            " (write times with more digits, or the times at which the values were sampled)"
+            if t[row] == t[row - 1]
+            else ""
+        )
         raise BadInput(
-            f"{source}: row {row + 1}: t {t[row]:.9g} does not follow {t[row - 1]:.9g}: time must increase{alike}"
+            f"{source}: row {row + 1}: t is {t[row]:.9g} after {t[row - 1]:.9g}, but time must increase{alike}"
         )
 
 

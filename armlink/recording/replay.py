@@ -46,7 +46,7 @@ def recording_of_log(arm: ArmFile, path: Path) -> Recording:
 def _why_no_cycle(arm: ArmFile, log: LogReader) -> str:
     """The frames of an arm that a log lacks, in words."""
     if not log.ids:
-        return f"no frame is read: it is none of {', '.join(READ_SUFFIXES)}, as their suffix says"
+        return f"no frame could be read: its content is not what its suffix says ({', '.join(READ_SUFFIXES)})"
     names, absent = [joint.name for joint in arm.require_link().joints], []
     for group in make_groups(arm):
         owners = group.drives.reading_ids()
@@ -59,7 +59,7 @@ def _why_no_cycle(arm: ArmFile, log: LogReader) -> str:
     if not absent:
         return "the frames of every joint are there, but never of all of them in one cycle"
     seen = ", ".join(f"{can_id & 0x1FFFFFFF:03X}h" for can_id in sorted(log.ids)[:12])
-    return f"none is of {', '.join(absent)}; there are frames {seen}{' …' if len(log.ids) > 12 else ''}"
+    return f"no frame comes from {', '.join(absent)}; the log has the frames {seen}{' …' if len(log.ids) > 12 else ''}"
 
 
 def play_onto(arm: ArmFile, source: Path, recording: Recording, spec: str, speed: float) -> int:
@@ -96,7 +96,7 @@ def frames_of_recording(arm: ArmFile, recording: Recording) -> Iterator[Stamped]
     """
     joints = arm.require_link().joints
     if recording.n != len(joints):
-        raise BadInput(f"recording of {recording.n} joints, but {arm.name} has {len(joints)}")
+        raise BadInput(f"the recording has {recording.n} joints, but {arm.name} has {len(joints)}")
     groups = make_groups(arm)
     for group in groups:
         group.drives.replayed(True, [])  # drives that cannot be replayed say so before anything is sent

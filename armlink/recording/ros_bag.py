@@ -79,9 +79,9 @@ def _state_connections(readable: Sequence[Any], topic: str, all_of_them: Iterabl
     chosen = topic or (STATES if STATES in topics else topics[0] if len(topics) == 1 else "")
     if not topics:
         there = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in all_of_them})) or "nothing"
-        raise BadInput(f"{path}: no sensor_msgs/msg/JointState on /joint_states or another topic: the bag has {there}")
+        raise BadInput(f"{path}: no topic has messages of type sensor_msgs/msg/JointState: the bag has {there}")
     if not chosen:
-        raise BadInput(f"{path}: joint states on {', '.join(topics)}: name one with --topic")
+        raise BadInput(f"{path}: there are joint states on {', '.join(topics)}: choose one with --topic")
     return [c for c in readable if c.topic == chosen]
 
 

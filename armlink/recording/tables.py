@@ -50,7 +50,7 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({}), stat
     arrays = read_numbers(content, layout, places, str(path))
     loaded = recording_of_columns(arrays, header, str(path), names_of_columns(columns, header))
     if cut:
-        cut = f"cut recording, {cut}: loaded {loaded.t.size} rows"
+        cut = f"cut recording ({cut}): the first {loaded.t.size} rows were loaded"
         loaded = replace(loaded, warning="; ".join(filter(None, (cut, loaded.warning))))
     return loaded
 
@@ -69,7 +69,10 @@ def renamed_header(header: list[str], columns: Mapping[str, str], path: Path) ->
     foreign = {other: column for column, other in columns.items() if channel_column(other) is None}
     missing = [name for name in foreign if name not in header]
     if missing:
-        raise BadInput(f"{path}: --map {foreign[missing[0]]}={missing[0]}: no such column; it has {', '.join(header)}")
+        raise BadInput(
+            f"{path}: --map {foreign[missing[0]]}={missing[0]}: the file has no column {missing[0]}; it has "
+            f"{', '.join(header)}"
+        )
     header = [foreign.get(name, name) for name in header]
     twins = sorted({column for column in header if column and header.count(column) > 1})
     if twins:
@@ -101,7 +104,7 @@ def recording_of_columns(
     """The recording that a table's columns hold; raises BadInput where some are missing."""
     channels = channels_of(columns, source)
     ignored = [column for column in header if column and not is_channel(column)]
-    warning = f"columns ignored because they are no channels: {', '.join(ignored)}" if ignored else ""
+    warning = f"columns that are no channels are ignored: {', '.join(ignored)}" if ignored else ""
     n = joint_count(header, source)
     if names and len(names) != n:
         raise BadInput(f"{source}: {len(names)} joint names for {n} joints")
@@ -142,7 +145,7 @@ def _unpacked(packed: bytes, source: str) -> tuple[bytearray, bool]:
             packed = member.unconsumed_tail
             require_size(len(content), source)
             if len(content) > _SURELY_MUCH and len(content) > _MOST_RATIO * whole:
-                raise BadInput(f"{source}: unpacks to more than {_MOST_RATIO} times its size: not a recording")
+                raise BadInput(f"{source}: unpacks to more than {_MOST_RATIO} times its size, so it is not a recording")
         ended, packed = member.eof, member.unused_data.lstrip(b"\0")
         if not ended:
             break

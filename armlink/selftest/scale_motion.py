@@ -107,7 +107,10 @@ def by_moving(link: Link, tell: Tell) -> list[JointScales]:
     pairs: dict[int, list[tuple[float, float]]] = {joint: [] for joint in range(link.n)}
     for side in (1.0, -1.0, 0.0):
         goal = np.clip(start + side * REACH, np.minimum(least, start), np.maximum(most, start))
-        tell(f"all joints by {REACH} rad to {'the upper side' if side > 0 else 'the lower side' if side else 'rest'}")
+        tell(
+            f"moving all joints by {REACH} rad to "
+            f"{'the upper side' if side > 0 else 'the lower side' if side else 'their first position'}"
+        )
         path = straight(link.position_sent, goal, speeds(link, SPEED), link.period)
         rest = np.tile(goal, (max(1, round(REST_SECONDS / link.period)), 1))
         with closing(link.play(Setpoints.follow(np.vstack([path, rest])))) as samples:
@@ -133,7 +136,7 @@ def by_listening(listener: Listener, tell: Tell, seconds: float) -> list[JointSc
             tell(f"{heard} cycles heard, {max(end - now, 0):.0f} s left")
     if not heard:
         raise BusFault(
-            f"{listener.bus.channel_info}: no cycle of another host was heard: does it run {listener.arm.name}?"
+            f"{listener.bus.channel_info}: no cycle of another host was heard: is a host running {listener.arm.name}?"
         )
     return _judged(listener.names, tracks, _ways(listener), False, {})
 

@@ -170,7 +170,7 @@ def integrated(track: ScaleTrack) -> Evidence | None:
         return None
     ratio = _median(summed / turned, np.abs(turned))
     scatter = 1.483 * _median(np.abs(summed / turned - ratio), np.abs(turned))
-    text = f"velocity integrated over {way:.2f} rad of motion gives {ratio * way:.2f}"
+    text = f"the velocity, integrated over {way:.2f} rad of motion, gives {ratio * way:.2f} rad"
     if ratio <= 0 or scatter > UNSTEADY * abs(ratio):
         return Evidence(f"{text}, unsteadily (± {scatter / max(abs(ratio), 1e-9):.0%})", -1.0, FLOOR, {"velocity": -1})
     sigma = max(FLOOR, scatter / abs(ratio) / math.sqrt(len(turned)))
@@ -218,7 +218,7 @@ def law(track: ScaleTrack) -> list[Evidence]:
         ("damping", damping, {"velocity": 1, "torque": -1}, DAMPING_FLOOR),
     ):
         if each.known:
-            text = f"torque follows {each.value:.3g} of the commanded {name}"
+            text = f"the torque follows {each.value:.3g} times the commanded {name}"
             found.append(Evidence(text, each.value, max(floor, 2 * each.sigma / each.value), exponents))
     return found
 
@@ -257,7 +257,7 @@ def between_stops(track: ScaleTrack, way: float, stop_to_stop: bool) -> Evidence
     covered = float(here.max() - here.min())
     if not stop_to_stop and covered <= PAST_STOP * way:
         return None
-    text = f"it read {covered:.2f} rad between its stops, the arm file has {way:.2f}"
+    text = f"the joint read {covered:.2f} rad between its stops, but the arm file has {way:.2f} rad"
     return Evidence(text, covered / way, FLOOR, {"position": -1})
 
 
@@ -272,5 +272,5 @@ def against_current(pairs: Sequence[tuple[float, float]]) -> Evidence | None:
     sigma = math.sqrt(float((left**2).mean()) / float((expected**2).sum())) / max(abs(ratio), 1e-9)
     if ratio <= 0 or sigma > LAW_SIGMA:
         return None
-    text = f"its torque is {ratio:.3g} of current times torque constant"
+    text = f"its torque is {ratio:.3g} times the product of current and torque constant"
     return Evidence(text, ratio, max(FLOOR, sigma), {"torque": -1})

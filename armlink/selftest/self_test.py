@@ -56,10 +56,10 @@ class SelfTest:
             link.correct_turns()
             limits = [link.values.limits(joint, limit) for joint, limit in enumerate(link.limits)]
             return own(link, link.groups[0].drives, limits, power, self.progress)
-        reason = "not asked for"
+        reason = "the checks with power were not requested"
         try:
             if not self._identified():
-                reason = "a drive does not answer, or is another"
+                reason = "a drive does not answer, or is not the drive of the arm file"
             elif not self._started():
                 reason = "a check without power failed"
             elif power:
@@ -139,7 +139,12 @@ class SelfTest:
                 continue
             held = link.read_calibration(joint)
             if name in link.uncalibrated:
-                self.checks.add(name, "calibration", "absent", "no record in force: torque is as the drive reports it")
+                self.checks.add(
+                    name,
+                    "calibration",
+                    "absent",
+                    "no calibration record is in force: the torque is used as the drive reports it",
+                )
             else:
                 told = f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
                 self.checks.add(name, "calibration", "passed", told)
@@ -150,12 +155,16 @@ class SelfTest:
         keeping = [name for name, traits in pairs if traits.silence == "keeps on"]
         for name in keeping:
             self.checks.add(name, "silence", "failed", KEEPS_ON)
-        return f"{keeping[0]} is not driven: it would keep on after its host died" if keeping else ""
+        return (
+            f"{keeping[0]} is not driven: if its host died, its drive would keep on with the last command"
+            if keeping
+            else ""
+        )
 
     def _with_power(self) -> str:
         """Enable, hold, silence of each drive, stow; returns why what is left is not run."""
         link, self._under_way = self.link, "enables and holds"
-        self.progress("enable, and hold")
+        self.progress("enabling the joints, which should hold")
         start = link.clock.now()
         standing = link.enable().position
         seconds = link.clock.now() - start
@@ -185,9 +194,14 @@ class SelfTest:
         letting_go = falling(link)
         if link.section.park is None and letting_go:
             for name in letting_go:
-                self.checks.add(name, "park", "absent", "link.park: the arm is let down slowly when the work ends")
+                self.checks.add(
+                    name,
+                    "park",
+                    "absent",
+                    "the arm file has no `link.park`: the arm is slowly lowered when the work ends",
+                )
         if link.section.park is None or not letting_go:
-            return "every drive holds on its own" if not letting_go else "no link.park"
+            return "every drive holds when its host is silent" if not letting_go else "the arm file has no `link.park`"
         start = link.clock.now()
         try:
             park(link, self.progress)
@@ -196,7 +210,7 @@ class SelfTest:
             return str(error)
         self._parked, seconds = True, link.clock.now() - start
         for name in link.names:
-            self.checks.add(name, "park", "passed", "stowed, power off", seconds)
+            self.checks.add(name, "park", "passed", "parked, power off", seconds)
         return ""
 
     def _silence(self, joint: int) -> None:
@@ -209,11 +223,15 @@ class SelfTest:
             does, seconds = self._left_alone(joint)
         if does is None:
             found = (
-                "its drive reports no state, and the joint carries no load here: repeat this where gravity pulls at it"
+                "its drive reports no state, and the joint carries no load in this pose: repeat the check "
+                "in a pose where gravity loads the joint"
             )
             self.checks.add(name, "silence", "not run", found)
             return
-        told = f"{does} within {seconds * 1e3:.0f} ms without a command, by its trait it {trait}"
+        told = (
+            f"{does} within {seconds * 1e3:.0f} ms without a command; the trait `silence` of its family says "
+            f"that it {trait}"
+        )
         if does == "keeps on":
             told += f": {KEEPS_ON}"
         good = does == trait or (does, trait) == ("holds", "damps")
@@ -232,7 +250,7 @@ class SelfTest:
         """The drive's reaction to no commands, None where it does not tell, and its delay [s]; then it is ON."""
         link, limit = self.link, self.link.section.deadline
         group, drive = by_joint(link.groups)[joint]
-        self.progress(f"{link.names[joint]}: no commands for {limit * 1e3:.0f} ms")
+        self.progress(f"{link.names[joint]}: sending no commands for {limit * 1e3:.0f} ms")
         loop, on = link.commander.loop, [Power.ON] * link.n
         standing = np.array(loop.latest_position)
         loop.withheld = frozenset([joint])
@@ -278,7 +296,9 @@ class SelfTest:
         moved = np.abs(np.array(link.commander.loop.latest_position) - standing)
         if (moved > most).any():
             joint = int(np.nanargmax(moved))
-            raise BusFault(f"{link.names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: test ended")
+            raise BusFault(
+                f"{link.names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: the test was ended"
+            )
         return sample
 
     def _cycles(self, seconds: float) -> int:

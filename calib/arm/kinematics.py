@@ -45,8 +45,8 @@ def model_arm(arm_file: ArmFile) -> ModelArm:
     model, kinematics = model_chain(arm_file).arm, arm_file.kinematics
     if arm_file.link is not None and arm_file.joint_names != model.arm.names:
         raise BadInput(
-            f"{arm_file.path}: link.joints are {list(arm_file.joint_names)}, but the model's chain has "
-            f"{list(model.arm.names)}: same names, same order"
+            f"{arm_file.path}: link.joints are {list(arm_file.joint_names)}, but the chain of the model is "
+            f"{list(model.arm.names)}: give link.joints the same names in the same order"
         )
     return replace(model, arm=_with_stops(arm_file, model.arm)) if kinematics.stops else model
 
@@ -55,7 +55,7 @@ def model_chain(arm_file: ArmFile) -> PlacedChain:
     """The arm file's chain in its model, with the bodies of each link; raises BadInput."""
     path, kinematics = arm_file.model_path, arm_file.kinematics
     if path is None:
-        raise BadInput(f"{arm_file.path}: key kinematics.model is missing: this needs a URDF or MJCF file")
+        raise BadInput(f"{arm_file.path}: key kinematics.model is missing: this command needs a URDF or MJCF file")
     gravity = kinematics.gravity if "gravity" in kinematics.model_fields_set else None
     ends = {"base": kinematics.base, "tip": kinematics.tip}
     try:
@@ -71,7 +71,9 @@ def _with_stops(arm_file: ArmFile, arm: Arm) -> Arm:
     for name in stops:
         if name not in arm.names:
             known = ", ".join(arm.names)
-            raise BadInput(f"{arm_file.path}: key kinematics.stops.{name}: no joint of that name; there are {known}")
+            raise BadInput(
+                f"{arm_file.path}: key kinematics.stops.{name}: there is no joint of this name; there are {known}"
+            )
     limits = [stops.get(name, own) for name, *own in zip(arm.names, arm.lower, arm.upper, strict=True)]
     return replace(arm, lower=np.array([low for low, _ in limits]), upper=np.array([high for _, high in limits]))
 

@@ -112,7 +112,7 @@ class SweepSection(Section):
     @model_validator(mode="after")
     def _one_bias_a_joint(self) -> "SweepSection":
         if self.bias_torque is not None and not self.bias_torque:
-            raise ValueError("bias_torque is empty: give one torque per joint, or leave it out")
+            raise ValueError("bias_torque is empty: give one torque for each joint, or leave bias_torque out")
         return self
 
     @property
@@ -134,11 +134,13 @@ def sweep_section(arm_file: ArmFile) -> SweepSection:
     n = len(arm_file.require_link().joints)
     if section.bias_torque is not None and len(section.bias_torque) != n:
         raise BadInput(
-            f"{arm_file.path}: key sweep.bias_torque: {len(section.bias_torque)} values, expected {n}, one per joint"
+            f"{arm_file.path}: key sweep.bias_torque has {len(section.bias_torque)} values, expected {n}, "
+            "one for each joint"
         )
     if section.beside and arm_file.model_path is None:
         raise BadInput(
-            f"{arm_file.path}: key sweep.beside: collisions need geometry: give a URDF or MJCF as kinematics.model"
+            f"{arm_file.path}: key sweep.beside: checking for collisions needs geometry: give a URDF or MJCF "
+            "as kinematics.model"
         )
     return section
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def calibrate(
     directories: Sweeps,
     arm: SweepsArm = None,
-    apply: Annotated[bool, typer.Option("--apply", help="Also write gains and offsets to the controllers.")] = False,
+    apply: Annotated[bool, typer.Option("--apply", help="Also write gains and offsets to the drives.")] = False,
     bus: Bus = None,
     check: Check = True,
     flash: Flash = False,
@@ -28,15 +28,17 @@ def calibrate(
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            help="Joint to write although the sensor model does not hold there; may be repeated.",
+            help="Write this joint although the sensor model does not hold for it; may be repeated.",
             rich_help_panel=APPLY,
         ),
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Also write a report: one self-contained HTML file.")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Also write a report to this file: one self-contained HTML page.")
+    ] = None,
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Fit all sensors to sweeps, all directories in one problem, and keep the result as a calibration record.
+    """Fit all sensors to the sweeps of all directories together, and store the result as a calibration record.
 
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
@@ -78,7 +80,7 @@ def calibrate(
         if felt is not None and felt.contradicts:
             records.add(record.model_copy(update={"note": f"not made current: {felt}"}))
             write_json(json_file, _answer(fit, record, False))
-            raise Refused(f"{felt} Record {record.id} is kept, and not made current")
+            raise Refused(f"{felt} Record {record.id} is stored, but not made current")
     out = results(json_file)
     _show(fit, out)
     user = getpass.getuser()
@@ -97,7 +99,7 @@ def calibrate(
         by=user, bus=bus, replaced=tuple(replaced or ()), accepted=tuple(accept or ()), check=check, flash=flash
     )
     again = command_line("calibrate", *map(str, directories), "--apply", arm=arm, bus=bus, store=store)
-    kept = "the controllers keep what they hold until --apply writes it to them"
+    kept = "the drives keep their old calibration until `--apply` writes this record to them"
     if not isinstance(fit, SensorFit):
         with early_end(arm_file, again) as work:
             work.enabled = apply and check
@@ -206,11 +208,11 @@ def _show(fit: "Calibrated", console: "PlainConsole") -> None:
     if isinstance(fit, SensorFit):
         columns["locked friction [N·m]"] = (fit.friction, 0 * fit.friction)
         doubts = (f"{name} {each.level:.3g}" for name, each in zip(fit.names, fit.goodness.discrepancy, strict=True))
-        lines.append(f"at new poses, sensors and gravity model still disagree by [N·m]: {', '.join(doubts)}")
+        lines.append(f"at new poses, sensors and gravity model still differ by [N·m]: {', '.join(doubts)}")
         lines += [*fit.imprecise.values(), *([fit.attachment_text] if fit.attachment is not None else [])]
         if fit.gain_ratio is not None:
             ratios = ", ".join(f"{name} {ratio:.4f}" for name, ratio in zip(fit.names, fit.gain_ratio, strict=True))
-            lines.append(f"gains relative to the last joint's: {ratios}")
+            lines.append(f"gains relative to the gain of the last joint: {ratios}")
     title = "Sensors" if isinstance(fit, SensorFit) else "Drives"
     print_intervals(f"{title}, ± half of the 95 % interval", fit.names, columns, console)
     print_lines(lines, console=console)
@@ -219,5 +221,5 @@ def _show(fit: "Calibrated", console: "PlainConsole") -> None:
         return
     worst = max(fit.goodness.left_out, key=lambda each: each.ratio, default=None)
     if worst is not None:
-        worst_sweep = f"worst sweep ({worst.sweep}) at {worst.ratio:.1f} times its expected error"
+        worst_sweep = f"the worst sweep is {worst.sweep}, with {worst.ratio:.1f} times its expected error"
         console.print(f"cross-validation: {worst_sweep}")

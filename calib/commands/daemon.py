@@ -12,24 +12,27 @@ TAKE_OVER_SECONDS = 3.0
 
 
 def daemon(
-    arm: Annotated[str, typer.Argument(help="A bundled arm's name, or the path of an arm file.")],
-    bus: Annotated[str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; default the arm file's.")] = None,
+    arm: Annotated[str, typer.Argument(help="Name of a bundled arm, or path of an arm file.")],
+    bus: Annotated[
+        str | None, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; by default the bus of the arm file.")
+    ] = None,
     listen_only: Annotated[
         bool,
         typer.Option(
             "--listen-only",
-            help="Another controller commands the bus: send no SYNC and no commands. A recalibration that is applied"
-            " is still written to controllers that keep their calibration.",
+            help="Only listen: another program commands the arm, so the daemon sends no SYNC and no commands. "
+            "Exception: an applied recalibration is still written to drives that store their calibration.",
         ),
     ] = False,
     socket: Annotated[
         Path | None,
         typer.Option(
-            help="Unix socket of API and page; default api.sock in the state directory.", rich_help_panel="Page and API"
+            help="Unix socket of API and page; by default api.sock in the state directory.",
+            rich_help_panel="Page and API",
         ),
     ] = None,
     tcp: Annotated[
-        str | None, typer.Option(help="Serve on HOST:PORT too; needs --token-file.", rich_help_panel="Page and API")
+        str | None, typer.Option(help="Also serve on HOST:PORT; needs --token-file.", rich_help_panel="Page and API")
     ] = None,
     token_file: Annotated[
         Path | None,
@@ -37,14 +40,14 @@ def daemon(
     ] = None,
     policy: Annotated[
         Literal["observe", "propose", "apply"] | None,
-        typer.Option(help="What to do about a drift, instead of the arm file's daemon.policy."),
+        typer.Option(help="What to do about a drift; overrides daemon.policy of the arm file."),
     ] = None,
     state: Annotated[
-        Path | None, typer.Option(help="Directory of journal and recordings; default the user's state directory.")
+        Path | None, typer.Option(help="Directory of journal and recordings; by default the user's state directory.")
     ] = None,
     store: Store = None,
     work: Annotated[
-        bool, typer.Option("--work", help="Move the arm among random poses: for trying it on a simulated arm.")
+        bool, typer.Option("--work", help="Move the arm to random poses, to try the daemon on a simulated arm.")
     ] = False,
 ) -> int:
     """Watch an arm for months, until SIGTERM; SIGHUP reads the arm file anew, SIGUSR1 asks for a sweep.
@@ -99,7 +102,7 @@ def _token(path: Path | None) -> str | None:
     except (OSError, UnicodeDecodeError) as error:
         raise BadInput(f"--token-file {path}: cannot be read: {error}") from None
     if not token:
-        raise BadInput(f"--token-file {path}: it is empty; expected one line with the token")
+        raise BadInput(f"--token-file {path}: the file is empty; expected one line with the token")
     return token
 
 
@@ -110,5 +113,5 @@ def _address(text: str, token: str | None) -> tuple[str, int]:
     if not (colon and host and port.isdigit() and 0 < int(port) < 65536):
         raise BadInput(f"--tcp {text}: expected HOST:PORT, for example 127.0.0.1:8080")
     if token is None:
-        raise BadInput("--tcp needs --token-file: whoever has the token may decide on proposals")
+        raise BadInput("--tcp needs --token-file, since whoever has the token may decide on proposals")
     return host.strip("[]"), int(port)

@@ -18,8 +18,10 @@ STRIKING = 3.0
 
 
 def diff(
-    before: Annotated[str, typer.Argument(metavar="A", help="Id of a record, or a record's YAML file.")],
-    after: Annotated[str, typer.Argument(metavar="B", help="The same, for the record that is compared with A.")],
+    before: Annotated[str, typer.Argument(metavar="A", help="Record A: its id, or its YAML file.")],
+    after: Annotated[
+        str, typer.Argument(metavar="B", help="Record B, which is compared with A: its id, or its YAML file.")
+    ],
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:

@@ -18,7 +18,8 @@ def hold_afloat(
     bus: OtherBus = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="Duration [s]; 0: until Ctrl-C.")] = 0.0,
     record: Annotated[
-        str | None, typer.Option(help="Id of a gravity record; default: the current one, else the model's inertials.")
+        str | None,
+        typer.Option(help="Id of a gravity record; by default the current one, or else the inertials of the model."),
     ] = None,
     store: Store = None,
     yes: WithoutAsking = False,
@@ -45,13 +46,13 @@ def hold_afloat(
     beta, calibration, source = _model(arm_file, record, store)
     screen = PlainConsole()
     if not yes:
-        confirm(f"{arm_file.name} will be held by its gravity model alone. Is a hand on it?")
+        confirm(f"{arm_file.name} will be held by its gravity model alone. Do you hold it with your hand?")
     resume = command_line("float", arm, bus=bus, record=record, store=store)
     with early_end(arm_file, resume) as work, open_arm(arm_file, bus) as link:
         link.start()
         work.enabled = True
         link.enable()
-        screen.print(f"{arm_file.name}: floating by {source}; Ctrl-C ends it")
+        screen.print(f"{arm_file.name} floats by {source}; end with Ctrl-C")
         try:
             result = run_float(link, arm_file, beta, calibration, seconds=seconds or float("inf"))
         finally:  # Ctrl-C is its usual end

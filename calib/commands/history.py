@@ -19,12 +19,14 @@ def history(
     store: Store = None,
     record: Annotated[str | None, typer.Option(help="Print only this record, as YAML.")] = None,
     import_file: Annotated[
-        Path | None, typer.Option("--import", help="First add the record in this YAML file.")
+        Path | None, typer.Option("--import", help="First add the record of this YAML file.")
     ] = None,
-    activate: Annotated[bool, typer.Option("--activate", help="With --import: also make it current.")] = False,
+    activate: Annotated[
+        bool, typer.Option("--activate", help="With --import: also make the added record current.")
+    ] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """List the records of an arm, oldest first, what became current and what was written to controllers.
+    """List the records of an arm, oldest first, what became current and what was written to drives.
 
     Example: armlink history sarcos --json -
     """
@@ -36,7 +38,7 @@ def history(
 
     arm_file, records = load_arm(arm), RecordStore(store)
     if activate and import_file is None:
-        raise BadInput(f"--activate: only with --import FILE; kept records are listed by armlink history {arm}")
+        raise BadInput(f"--activate works only with --import FILE; `armlink history {arm}` lists the stored records")
     if import_file is not None:
         imported = records.import_yaml(import_file, arm_file)
         if activate:
@@ -81,7 +83,7 @@ def _print(
     from rich.table import Table
 
     if not rows:
-        console.print(f"{title}: no records yet")
+        console.print(f"{title}: there are no records yet")
         return
     table = Table("record", "", "kind", "created", "replaces", "confirmed by", "note", title=title)
     for row in rows:

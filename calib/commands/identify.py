@@ -15,12 +15,13 @@ def identify(
     directories: Sweeps,
     arm: SweepsArm = None,
     calibration: Annotated[
-        str | None, typer.Option(help="Id of the calibration record to use; default: fitted from the same sweeps.")
+        str | None,
+        typer.Option(help="Id of the calibration record to use; by default sensors are fitted from the same sweeps."),
     ] = None,
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Identify the mass moments that gravity compensation needs, and keep them as a gravity record.
+    """Identify the mass moments that gravity compensation needs, and store them as a gravity record.
 
     Example: armlink identify unloaded loaded --json gravity.json
     """
@@ -43,10 +44,10 @@ def identify(
         used = current if current is not None and current.sources == sensors.sources else None
     else:
         if all_creep(data):
-            raise BadInput("--calibration: creep sweeps tell drives and gravity in one fit: leave the option out")
+            raise BadInput("--calibration: creep sweeps give drives and gravity in one fit: leave this option out")
         kept = records.usable(calibration, arm_file)
         if not isinstance(kept, CalibrationRecord):
-            raise BadInput(f"--calibration {calibration}: that is a {kept.kind} record, expected a calibration record")
+            raise BadInput(f"--calibration {calibration}: this is a {kept.kind} record, expected a calibration record")
         sensors = used = kept
     fit = identified(arm_file, data, sensors)
     record = fit.record(arm_file, used)

@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from calib.records.store import RecordStore
     from gcomp.arrays import Array
 
-Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweep, without and with load.")]
-SweepsArm = Annotated[str | None, typer.Option("--arm", help="Arm file, if it is no longer where sweep found it.")]
+Sweeps = Annotated[list[Path], typer.Argument(help="Data sets of sweep, with and without a reference mass.")]
+SweepsArm = Annotated[
+    str | None, typer.Option("--arm", help="Arm file, if it is no longer where it was during the sweep.")
+]
 APPLY = "With --apply"
 """Group of the options that only count when a record is written to the controllers, in a command's help."""
 Bus = Annotated[
@@ -22,12 +24,14 @@ Bus = Annotated[
 Check = Annotated[
     bool,
     typer.Option(
-        help="Move every joint a little before and after the write; roll back if the arm then holds worse.",
+        help="Move every joint a little before and after writing; write the old calibration back if the new one "
+        "fits worse.",
         rich_help_panel=APPLY,
     ),
 ]
 Flash = Annotated[
-    bool, typer.Option("--flash", help="Also store the values in the controllers' flash.", rich_help_panel=APPLY)
+    bool,
+    typer.Option("--flash", help="Also store the values in the flash memory of the drives.", rich_help_panel=APPLY),
 ]
 Replaced = Annotated[
     list[str] | None,
@@ -47,7 +51,9 @@ def _use_store(store: str | None) -> str | None:
 Store = Annotated[
     str | None,
     typer.Option(
-        envvar="ARMLINK_STORE", callback=_use_store, help="Record store: file or database URL; default: state folder."
+        envvar="ARMLINK_STORE",
+        callback=_use_store,
+        help="Record store: file or database URL; by default in the user's state folder.",
     ),
 ]
 KeepGoing = Annotated[
@@ -58,8 +64,10 @@ KeepGoing = Annotated[
         rich_help_panel="Run",
     ),
 ]
-WithoutAsking = Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.", rich_help_panel="Run")]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the answer here; - is standard output.")]
+WithoutAsking = Annotated[bool, typer.Option("--yes", help="Move the arm without asking first.", rich_help_panel="Run")]
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", help="Write the answer as JSON to this file; for standard output give `-`.")
+]
 
 
 def gravity_model(arm_file: "ArmFile", record: str | None, records: "RecordStore") -> "tuple[Array, str] | None":
@@ -76,7 +84,7 @@ def gravity_model(arm_file: "ArmFile", record: str | None, records: "RecordStore
     if kept is None:
         return None
     if not isinstance(kept, GravityRecord):
-        raise BadInput(f"--record {record}: that is a {kept.kind} record, expected a gravity record")
+        raise BadInput(f"--record {record}: this is a {kept.kind} record, expected a gravity record")
     return np.array(kept.beta), f"gravity record {kept.id}"
 
 

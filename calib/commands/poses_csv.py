@@ -16,7 +16,7 @@ def load_poses(path: Path, n: int) -> Array:
     Raises BadInput naming the file and the column, or the line and what stands there.
     """
     if not path.is_file():
-        raise BadInput(f"no file {path}: give a CSV file with columns q_1 … q_{n} [rad]")
+        raise BadInput(f"there is no file {path}: give a CSV file with the columns q_1 … q_{n} [rad]")
     try:
         with memory_budget(path), path.open(encoding="utf-8-sig", newline="") as file:
             rows = [row for row in csv.reader(file) if row]
@@ -25,9 +25,11 @@ def load_poses(path: Path, n: int) -> Array:
     header = [name.strip() for name in rows[0]] if rows else []
     for column in range(1, n + 1):
         if f"q_{column}" not in header:
-            raise BadInput(f"{path}: missing column q_{column}: one column a joint, q_1 … q_{n} [rad]")
+            raise BadInput(
+                f"{path}: column q_{column} is missing: expected one column for each joint, q_1 … q_{n} [rad]"
+            )
     if len(rows) < 2:
-        raise BadInput(f"{path}: no pose below the header row")
+        raise BadInput(f"{path}: there is no pose below the header row")
     places = [header.index(f"q_{column}") for column in range(1, n + 1)]
     return np.array([[_number(path, line, row, place) for place in places] for line, row in enumerate(rows[1:], 2)])
 

@@ -19,14 +19,17 @@ if TYPE_CHECKING:
 
 def recalibrate(
     arm: Arm,
-    data: Annotated[list[Path], typer.Argument(help="Recordings of slow motion or rests, or sweep directories.")],
+    data: Annotated[
+        list[Path], typer.Argument(help="Recordings of slow motion or of an arm at rest, or sweep directories.")
+    ],
     held: Annotated[
         Literal["record", "raw"],
         typer.Option(
-            help="What the controllers held while recording: the current record's pairs, or gain 1, offset 0."
+            help="Calibration in the drives during the recording: the gains and offsets of the current record, "
+            "or gain 1 and offset 0."
         ),
     ] = "record",
-    apply: Annotated[bool, typer.Option("--apply", help="Also write them to the controllers.")] = False,
+    apply: Annotated[bool, typer.Option("--apply", help="Also write gains and offsets to the drives.")] = False,
     bus: Bus = None,
     check: Check = True,
     flash: Flash = False,
@@ -34,7 +37,7 @@ def recalibrate(
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Find gains and offsets from the current gravity record, and keep them; --apply also makes them current.
+    """Find gains and offsets from the current gravity record, and store them; --apply also makes them current.
 
     The arm must carry nothing, and every joint must move slowly (below 0.1 rad/s), in both directions, or rest.
 
@@ -75,10 +78,13 @@ def recalibrate(
         with early_end(arm_file, apply_it) as work:
             work.enabled = check
             written = apply_record(record, arm_file, records, how, np.array(gravity.beta), "slow motion")
-        out.print(f"record {record.id} is current, written to {len(written)} controllers and read back")
+        out.print(f"record {record.id} is current; it was written to {len(written)} drives and read back")
     else:
         records.add(record)
-        out.print(f"record {record.id} is kept; the controllers keep what they hold until --apply writes it to them")
+        out.print(
+            f"record {record.id} is stored; the drives keep their old calibration until `--apply` writes this "
+            "record to them"
+        )
         suggest(apply_it)
     write_json(json_file, _answer(fit, record, gravity.id, apply))
 
@@ -107,12 +113,12 @@ def _rows(
         else:
             recording = load_recording(path)
             if recording.n != n:
-                raise BadInput(f"{path}: {recording.n} joints, but {arm_file.name} has {n}")
+                raise BadInput(f"{path}: the recording has {recording.n} joints, but {arm_file.name} has {n}")
             parts.append(rows_of_recording(recording, installed, number, str(path)))
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
         if digest in sources.values():
             twin = next(name for name, known in sources.items() if known == digest)
-            raise BadInput(f"{path}: the same data as {twin}, which would count twice: give one of them")
+            raise BadInput(f"{path} holds the same data as {twin}, which would count twice: give one of the two")
         sources[label] = digest
     return parts[0].joined(*parts[1:]), sources
 
@@ -148,7 +154,7 @@ def _show(fit: "FieldFit", console: "PlainConsole") -> None:
     print_intervals("Sensors in the field, ± half of the 95 % interval", fit.names, columns, console)
     lines = [f"{joint} {parameter}: {reason}" for (joint, parameter), reason in fit.reasons.items()]
     lines.append(
-        f"a factor common to all gains is known to ± {1.96 * fit.common_scale_std:.2%} only (within the intervals): in"
-        " these readings it cannot be separated from the scale of the gravity record"
+        f"a factor common to all gains is known to ± {1.96 * fit.common_scale_std:.2%} only (this is part of "
+        "the intervals), since these readings do not separate it from the scale of the gravity record"
     )
     print_lines(lines, console=console)

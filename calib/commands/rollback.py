@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 def rollback(
     arm: Arm,
-    to: Annotated[str, typer.Option(help="Id of a record that was current before; history lists them.")],
-    reason: Annotated[str, typer.Option(help="Why; kept in the log.")] = "rollback",
+    to: Annotated[str, typer.Option(help="Id of a record that was current before; `history` lists them.")],
+    reason: Annotated[str, typer.Option(help="Reason for the roll-back, written to the log.")] = "rollback",
     apply: Annotated[
-        bool, typer.Option("--apply", help="Also write its gains and offsets to the controllers.")
+        bool, typer.Option("--apply", help="Also write gains and offsets of the record to the drives.")
     ] = False,
     bus: Bus = None,
     check: Check = True,
     replaced: Replaced = None,
     store: Store = None,
 ) -> None:
-    """Return to an earlier record: a new line of the log, nothing is deleted.
+    """Make an earlier record current again; this adds a line to the log, and nothing is deleted.
 
     Example: armlink rollback sarcos --to 1f0c9a2b --reason "sensor exchanged" --apply
     """
@@ -49,7 +49,8 @@ def rollback(
     results().print(f"{line.kind} record {to} is current on {arm_file.name} {arm_file.serial} since {line.at}")
     if line.kind == "calibration" and not apply:
         PlainConsole().print(
-            "The controllers keep what they hold. A daemon with policy apply writes it to them within seconds."
+            "The drives keep their present calibration. A daemon with policy `apply` writes this record to "
+            "them within seconds."
         )
         suggest(command_line("rollback", arm, "--apply", to=to, bus=bus, store=store))
 
@@ -62,9 +63,9 @@ def _apply(arm_file: "ArmFile", to: str, records: "RecordStore", how: "Apply", r
 
     record = records.usable(to, arm_file)
     if not isinstance(record, CalibrationRecord):
-        raise BadInput(f"--apply: record {to} is a {record.kind} record; controllers hold calibrations only")
+        raise BadInput(f"--apply: record {to} is a {record.kind} record, but drives store calibrations only")
     if record != records.current(CalibrationRecord, arm_file):  # the current one may be written once more
         records.former(arm_file, to)
     written = apply_rollback(record, arm_file, records, how, reason)
-    gate = "a roll-back is checked for nothing but its distance from what they held"
-    results().print(f"written to {len(written)} controllers and read back; {gate}")
+    gate = "a roll-back is checked only for its distance from what the drives held before"
+    results().print(f"written to {len(written)} drives and read back; {gate}")

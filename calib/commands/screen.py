@@ -68,7 +68,9 @@ class SweepScreen:
             self.say(f"{stall}: the joints were stopped")
             if left > 0:
                 left -= 1
-                self.say(f"enabling them again and repeating the reading ({left} more times by itself)")
+                self.say(
+                    f"enabling the joints again and repeating the reading (up to {left} more times without asking)"
+                )
                 return True
             if sys.stdin is None or not sys.stdin.isatty():
                 return False
@@ -145,7 +147,7 @@ def print_plan(arm: ArmFile, plan: SweepPlan, console: PlainConsole) -> None:
     if signs & {"▲", "▼"}:
         legend.append("▲ ▼ rests on its upper or lower stop" + ", pressed with the torque [N·m]" * pressed)
     if "=" in signs:
-        legend.append("= held by its servo [rad]")
+        legend.append("= held by its position loop [rad]")
     console.print("; ".join(legend))
     for note in plan.notes:
         console.print(note, style="yellow")
@@ -157,8 +159,10 @@ def unsettled_lines(data: "SweepData") -> list[str]:
         return []
     places = list(dict.fromkeys(reading.sweep for reading in data.unsettled))
     return [
-        f"{len(data.unsettled)} of {len(data.readings)} readings had not settled when their time was up, in"
-        f" {', '.join(places)}: they count less. Does a joint swing under its position loop?"
+        (
+            f"{len(data.unsettled)} of {len(data.readings)} readings had not settled when their time was up, in "
+            f"{', '.join(places)}: these readings count less. Does a joint swing under its position loop?"
+        )
     ]
 
 
@@ -167,7 +171,7 @@ def stall_lines(data: "SweepData") -> list[str]:
     if not data.stalls:
         return []
     places = list(dict.fromkeys(stall.reading for stall in data.stalls))
-    return [f"the joints were stopped {len(data.stalls)} times and the reading was repeated: {', '.join(places)}"]
+    return [f"the joints were stopped {len(data.stalls)} times, and these readings were repeated: {', '.join(places)}"]
 
 
 def warn_late(arm: ArmFile, lateness: Lateness) -> None:

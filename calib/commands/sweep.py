@@ -19,41 +19,47 @@ if TYPE_CHECKING:
 
 def sweep(
     arm: Arm,
-    out: Annotated[Path | None, typer.Option(help="Directory of the data set, new or empty.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Directory of the data set; new or empty.")] = None,
     bus: OtherBus = None,
     reference_mass: Annotated[
-        float, typer.Option(min=0.0, help="Mass now attached to the tip [kg]; 0 for the pass without.")
+        float, typer.Option(min=0.0, help="Mass that is now attached to the tip [kg]; 0 for the pass without a mass.")
     ] = 0.0,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the data set in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the data set in --out.")] = False,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Print the plan from the arm file alone; nothing moves.")
+        bool, typer.Option("--plan", help="Only print the plan, from the arm file; nothing moves.")
     ] = False,
     picture: Annotated[
-        Path | None, typer.Option(help="With --plan: draw the poses into this HTML file.", rich_help_panel="Plan")
+        Path | None, typer.Option(help="With --plan: draw the poses to this HTML file.", rich_help_panel="Plan")
     ] = None,
     hold: Annotated[
-        str | None, typer.Option(help="stops or servo: how resting joints are held.", rich_help_panel="Plan")
+        str | None,
+        typer.Option(
+            help="How joints at rest are held: stops (pressed on a stop) or servo (by their position loops).",
+            rich_help_panel="Plan",
+        ),
     ] = None,
     check_stops: Annotated[
         bool,
         typer.Option(
-            help="Before the pass without load, push every joint slowly onto both its stops.", rich_help_panel="Run"
+            help="Before the pass without load, push every joint slowly onto both of its stops.", rich_help_panel="Run"
         ),
     ] = True,
     dry_run: Annotated[
         bool,
         typer.Option(
             "--dry-run",
-            help="Run the whole plan on the simulated arm of the arm file's sim section.",
+            help="Run the whole plan on the simulated arm that the key sim of the arm file describes.",
             rich_help_panel="Run",
         ),
     ] = False,
     keep_going: KeepGoing = 0,
     yes: WithoutAsking = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the plan's search.", rich_help_panel="Plan")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the random search for the plan.", rich_help_panel="Plan")
+    ] = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Sweep every joint, tip to base, and write each reading to disk before the next.
+    """Sweep every joint, from tip to base, and write each reading to disk before the next reading.
 
     One pass without a load, one with a reference mass attached: two directories for `armlink calibrate`.
 
@@ -90,10 +96,13 @@ def sweep(
         )
         return
     if out is None:
-        raise BadInput("sweep: give --out DIR for the data set, or --plan to print the plan alone")
+        raise BadInput("sweep: give `--out DIR` for the data set, or `--plan` to print only the plan")
     require_vacant(out, resume)
     if not dry_run and not yes:
-        confirm(f"{arm_file.name} will move through its whole range, {reference_mass:g} kg attached. Is it clear?")
+        confirm(
+            f"{arm_file.name} will move through its whole range, with {reference_mass:g} kg attached. Is its "
+            "space clear?"
+        )
     load = reference_mass if dry_run else 0.0
 
     def going_on() -> str:
@@ -135,17 +144,17 @@ def _plan(
     from calib.plan.sweep_plan import plan_sweep
 
     answer: dict[str, Any] = {"picture": None if picture is None else str(picture)}
-    drawn = "" if picture is None else f"; drawn in {picture}"
+    drawn = "" if picture is None else f"; the poses are drawn in {picture}"
     if sweep_motion(arm_file) == "creep":
         planned = plan_creep(arm_file, seed=seed)
         took = answer["seconds"] = creep_seconds(planned)
-        told = f"{len(planned.sweeps)} creeps both ways, about {_minutes(took)} a pass{drawn}"
+        told = f"{len(planned.sweeps)} creep sweeps in both directions, about {_minutes(took)} for each pass{drawn}"
     else:
         planned = plan_sweep(arm_file, guess_of_file(arm_file), seed=seed, reference_mass=reference_mass)
         took, checked = pass_seconds(arm_file, planned), check_plan(arm_file, planned)
         answer |= {"seconds": took, "collisions": checked}
-        before = f"{_minutes(stops_seconds(arm_file))} more for its stops before the first"
-        told = f"about {_minutes(took)} a pass, {before}; {checked}{drawn}"
+        before = f"{_minutes(stops_seconds(arm_file))} more for pushing the stops before the first pass"
+        told = f"about {_minutes(took)} for each pass, {before}; {checked}{drawn}"
     print_plan(arm_file, planned, console)
     if picture is not None:
         draw_plan(arm_file, planned, picture)
@@ -212,7 +221,7 @@ def _show(
     print_preflight(found, console)
     print_plan(arm_file, data.plan, console)
     print_lines([*unsettled_lines(data), *stall_lines(data)], "yellow", console)
-    complete = f"{data.path} is complete, {len(data.readings)} readings"
+    complete = f"{data.path} is complete with {len(data.readings)} readings"
     if not data.manifest.reference_mass:
         mass = data.plan.reference_mass
         loaded = data.path.with_name(f"{data.path.name}-loaded")

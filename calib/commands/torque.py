@@ -16,19 +16,19 @@ def torque(
     arm: Annotated[str, typer.Argument(help="Bundled arm, path of an arm file, or a URDF or MJCF file.")],
     q: Annotated[Path, typer.Option(help="CSV file of poses: a header row with columns q_1 … q_n [rad].")],
     base: Annotated[
-        str | None, typer.Option(help="Body of the model file that carries the chain; default: the world.")
+        str | None, typer.Option(help="Body of the model file that carries the chain; by default the world.")
     ] = None,
     tip: Annotated[
-        str | None, typer.Option(help="Last body of the chain in the model file; default: the last that moves.")
+        str | None, typer.Option(help="Last body of the chain in the model file; by default the last body that moves.")
     ] = None,
     record: Annotated[
         str | None,
-        typer.Option(help="Id of a gravity record; default: a model's inertials, else the current record."),
+        typer.Option(help="Id of a gravity record; by default the inertials of the model, or else the current record."),
     ] = None,
     store: Store = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Holding torque against gravity at each pose of a file, one row per pose [N·m].
+    """Compute the holding torque against gravity at each pose of a file, one row for each pose [N·m].
 
     Example: armlink torque arm.urdf --q poses.csv --json -
     """
@@ -51,7 +51,7 @@ def torque(
         out.print(table)
         pose, joint = divmod(int(np.argmax(np.abs(answer))), described.n)
         largest = f"{answer[pose, joint]:+.4f} N·m at {described.names[joint]} in pose {pose + 1}"
-        out.print(f"{len(poses)} poses; largest holding torque {largest}")
+        out.print(f"{len(poses)} poses; the largest holding torque is {largest}")
     write_json(json_file, {"joints": list(described.names), "source": source, "torque": answer.tolist()})
 
 
@@ -69,14 +69,14 @@ def _model(
 
     if Path(arm).suffix.lower() in MODEL_SUFFIXES:
         if record is not None:
-            raise BadInput(f"--record {record}: only with an arm file; {arm} is a model file")
+            raise BadInput(f"--record {record} needs an arm file, but {arm} is a model file")
         if not Path(arm).is_file():
-            raise BadInput(f"no model file {arm}: give the path of a URDF or MJCF file, or of an arm file")
+            raise BadInput(f"there is no model file {arm}: give the path of a URDF or MJCF file, or of an arm file")
         with model_budget(Path(arm)):
             model = load_model(Path(arm), base=base, tip=tip)
         return model.arm, model.beta, f"inertials of {arm}"
     if base is not None or tip is not None:
-        raise BadInput("--base, --tip: only with a URDF or MJCF file; an arm file has its chain under kinematics")
+        raise BadInput("--base, --tip: only for a URDF or MJCF file; an arm file describes its chain under kinematics")
     arm_file = load_arm(arm)
     if record is None and arm_file.model_path is not None:
         model = model_arm(arm_file)
@@ -84,7 +84,7 @@ def _model(
     found = gravity_model(arm_file, record, RecordStore(store))
     if found is None:
         raise Refused(
-            f"{arm_file.name} {arm_file.serial}: its description has no inertials, and there is no gravity record yet:"
-            f" {way_to(arm_file, 'gravity')}"
+            f"{arm_file.name} {arm_file.serial}: its model has no inertials, and there is no gravity record "
+            f"yet: {way_to(arm_file, 'gravity')}"
         )
     return gcomp_arm(arm_file), *found

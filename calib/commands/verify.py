@@ -18,17 +18,19 @@ def verify(
     arm: Arm,
     bus: OtherBus = None,
     record: Annotated[
-        list[str] | None, typer.Option(help="Id of a gravity or calibration record; default: the current ones.")
+        list[str] | None, typer.Option(help="Id of a gravity or calibration record; by default the current records.")
     ] = None,
     store: Store = None,
-    poses: Annotated[int, typer.Option(min=1, help="Poses to drive to.")] = 24,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the poses.")] = 0,
+    poses: Annotated[int, typer.Option(min=1, help="Number of poses to drive to.")] = 24,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random poses.")] = 0,
     keep_going: KeepGoing = 0,
     yes: WithoutAsking = False,
-    report: Annotated[Path | None, typer.Option(help="Also write a page to file: one self-contained HTML.")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Also write a report to this file: one self-contained HTML page.")
+    ] = None,
     json_file: JsonFile = None,
 ) -> int:
-    """Drive to random poses and compare; exit status 1 where a joint's RMS exceeds its tolerance.
+    """Drive to random poses and compare model and sensor; exit status 1 if the RMS of a joint is too large.
 
     Example: armlink verify sarcos --bus socketcan:vcan0 --poses 40 --json -
     """
@@ -47,7 +49,7 @@ def verify(
         require_extra("--report", "reports")
     arm_file = load_arm(arm)
     if not yes:
-        confirm(f"{arm_file.name} will drive to {poses} poses all over its range. Is it clear?")
+        confirm(f"{arm_file.name} will drive to {poses} poses all over its range. Is its space clear?")
     with (
         early_end(arm_file, command_line("verify", arm, bus=bus, store=store)) as work,
         open_arm(arm_file, bus) as link,
@@ -117,5 +119,5 @@ def _show(result: "Verification", console: "PlainConsole") -> None:
         table.add_row(name, *(f"{torque:.3f}" for torque in torques))
     console.print(table)
     beyond = [name for name, off in zip(result.names, result.rms > result.tolerance, strict=True) if off]
-    agree = "passed: model and sensor agree at every joint within its allowed RMS"
-    console.print(f"failed: RMS above the allowed one at {', '.join(beyond)}" if beyond else agree)
+    agree = "passed: at every joint the RMS difference between model and sensor is within the limit"
+    console.print(f"failed: the RMS difference is beyond the limit at {', '.join(beyond)}" if beyond else agree)

@@ -16,8 +16,10 @@ def assumed_lines(text: str) -> list[int]:
 def arm_text(draft: Draft, out: Path) -> str:
     """The YAML text of the draft, to stand at `out`: the model's path is relative to it."""
     lines = [
-        yaml_comment(f"{draft.name}, from {draft.model.name}, by the command new."),
-        yaml_comment("Comments mark what was guessed: check it before a real arm moves, then remove the comment."),
+        yaml_comment(f"{draft.name}: made from {draft.model.name} by `armlink new`."),
+        yaml_comment(
+            "Comments mark guessed values: check each value before a real arm moves, then remove its comment."
+        ),
         yaml_entry("name", draft.name),
         yaml_entry("serial", draft.serial),
         "kinematics:",
@@ -28,11 +30,11 @@ def arm_text(draft: Draft, out: Path) -> str:
     if draft.tip is not None:
         lines.append(yaml_entry("tip", draft.tip, 2))
     if draft.locked:
-        lines.append("  locked:  # held by other means than these drives [rad, m]")
+        lines.append("  locked:  # joints that these drives do not move [rad, m]")
         lines += [yaml_entry(name, position, 4) for name, position in draft.locked.items()]
     lines.append(yaml_entry("gravity", list(draft.gravity), 2, "m/s² in the model's frame"))
     lines += [
-        yaml_comment(f"{name} {why}: set aside, it keeps the model's position", 2)
+        yaml_comment(f"joint {name} {why}: not part of the arm, it stays at its position in the model", 2)
         for name, why in draft.aside
         if name not in draft.locked
     ]
@@ -46,8 +48,8 @@ def arm_text(draft: Draft, out: Path) -> str:
     if draft.servo is not None:
         lines += ["sweep:", yaml_entry("hold", "servo", 2), yaml_comment(f"assumed: {draft.servo}", 2)]
     lines += [
-        "sim:  # the simulated arm, for the command demo: masses are the model's",
-        f"  effects:  # assumed: friction of {FRICTION:.0%} of the torque that its drives need, and a rotor",
+        "sim:  # the simulated arm, for example for `armlink demo`; its masses are the masses of the model",
+        f"  effects:  # assumed: friction of {FRICTION:.0%} of the torque that the drives need, and rotor inertias",
     ]
     effects = [("friction.coulomb", joint.name, "torque", joint.friction) for joint in draft.joints]
     effects += [("actuator.rotor_inertia", joint.name, "inertia", joint.rotor) for joint in draft.joints if joint.rotor]
@@ -60,7 +62,7 @@ def _bus(draft: Draft, out: Path) -> list[str]:
     if draft.bus is None:
         simulated = {"interface": "armlink_sim", "channel": out.name, "bitrate": 1000000}
         real = "{interface: socketcan, channel: can0}"
-        note = f"assumed: no bus yet, this is the simulated arm; a real one: {real}"
+        note = f"assumed: there is no bus yet, this is the simulated arm; for a real arm write {real}"
         return [yaml_entry("bus", simulated, 2), yaml_comment(note, 2)]
     return [yaml_entry("bus", draft.bus, 2)]
 

@@ -62,9 +62,9 @@ def _by_hand(drives: FoundDrives, channel: str, ask: Ask) -> tuple[list[Match], 
     matches, stops = [], []
     for number in range(1, len(free) + 1):
         joint = f"joint_{number}"
-        ask(f"{joint}, counted from the base: turn it by hand to one stop")
+        ask(f"{joint}, counted from the base: turn this joint by hand to one of its stops")
         before = drives.positions()
-        ask(f"{joint}: now to its other stop")
+        ask(f"{joint}: now turn it to its other stop")
         after = drives.positions()
         moved = moved_drive(joint, {each: after[each] - before[each] for each in free}, channel)
         matches.append(Match(joint, free.pop(moved), by_hand=True))
@@ -81,21 +81,24 @@ def _text(
 ) -> str:
     known = matches[0].by_hand
     lines = [
-        yaml_comment(f"{name}: the drives on {channel}, by the command new, without a model."),
-        yaml_comment("Comments mark what was guessed: check it before a real arm moves, then remove the comment."),
+        yaml_comment(f"{name}: made from the drives on {channel} by `armlink new`, without a model."),
+        yaml_comment(
+            "Comments mark guessed values: check each value before a real arm moves, then remove its comment."
+        ),
         yaml_entry("name", name),
         yaml_entry("serial", "unknown", note="assumed"),
         "kinematics:",
-        yaml_entry("gravity", list(STANDARD_GRAVITY), 2, "m/s² in the base frame, assumed: the arm stands upright"),
-        "  joints:  # a, alpha, d assumed: unknown; give them, or make the file of the arm's URDF or MJCF",
+        yaml_entry("gravity", list(STANDARD_GRAVITY), 2, "m/s² in the base frame; assumed: the arm stands upright"),
+        "  joints:  # a, alpha, d are not known (assumed 0): give them, or make the arm file from the arm's URDF or "
+        "MJCF",
     ]
     for match, (lower, upper) in zip(matches, stops, strict=True):
-        stop = "stops found by hand" if known else "stops assumed: a full turn"
+        stop = "stops found by hand" if known else "stops assumed: one full turn"
         row = {"name": match.joint, "a": 0.0, "alpha": 0.0, "d": 0.0}
         lines.append(yaml_item({**row, "lower": round(lower, 4), "upper": round(upper, 4)}, 4, stop))
     lines += ["link:", yaml_entry("bus", dict(bus), 2), yaml_entry("rate", 250, 2, "Hz, assumed"), "  joints:"]
     for match in matches:
-        place = "by turning the joint by hand" if known else "assumed: in the order of node ids"
+        place = "found by turning the joint by hand" if known else "assumed: taken in the order of the node ids"
         lines += [yaml_item(_joint(match), 4), yaml_comment(f"node {place}; max_velocity assumed", 6)]
         lines += [yaml_comment(note, 6) for note in drive_notes(match.drive)]
     if not known:

@@ -34,7 +34,8 @@ def bus_findings(arm_file: ArmFile, spec: str | None = None) -> Iterator[SetupFi
     except ArmlinkError as error:
         what, _, reason = str(error).partition(": ")
         remedy = (
-            f"check its name, its driver and that it is up; without it: armlink doctor {arm_file.argument} --offline"
+            "check the name and the driver of the interface, and that the interface is up; to check without "
+            f"the bus: armlink doctor {arm_file.argument} --offline"
         )
         yield SetupFinding("error", reason or what, name, remedy)
         return
@@ -45,12 +46,12 @@ def bus_findings(arm_file: ArmFile, spec: str | None = None) -> Iterator[SetupFi
             "error",
             str(error),
             name,
-            f"check power, wiring and bit rate; more is shown by armlink scan {arm_file.argument}",
+            f"check power, wiring and bit rate; `armlink scan {arm_file.argument}` shows more",
         )
     finally:
         opened.shutdown()
     if bus.interface == SIMULATED:
-        real = "set link.bus for the real arm, such as {interface: socketcan, channel: can0}"
+        real = "for the real arm, write its bus under link.bus, such as {interface: socketcan, channel: can0}"
         yield SetupFinding("hint", "the bus is a simulated arm in this process", f"{arm_file.path}: link.bus", real)
 
 
@@ -73,10 +74,11 @@ def turn_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     if found:
         yield SetupFinding(
             "hint",
-            f"a drive that wakes a whole turn of its output off may still read between the stops: {', '.join(found)}",
+            "after power-on, the drives of these joints may count one turn too many or too few, and the "
+            f"reading may still lie between the stops: {', '.join(found)}",
             f"{arm_file.path}: link.joints",
-            "nothing here can tell it: such a joint needs an encoder that knows its turn, or a look at its position "
-            "before it moves",
+            "armlink cannot detect this error: use an encoder that knows its turn, or check the reading of "
+            "such a joint after each power-on, before it moves",
         )
 
 
@@ -89,7 +91,7 @@ def _absent_interface(bus: Bus) -> SetupFinding | None:
         there = [each.name for each in INTERFACES.iterdir() if "can" in each.name]
         known = f"there are {', '.join(sorted(there))}" if there else "this machine has no CAN interface"
         make = f"sudo ip link add {bus.channel} type vcan" if bus.channel.startswith("vcan") else "connect the adapter"
-        return SetupFinding("error", f"no interface {bus.channel}: {known}", name, make)
+        return SetupFinding("error", f"there is no interface {bus.channel}: {known}", name, make)
     if int((folder / "flags").read_text(), 16) & 1:
         return None
     set_up = "" if bus.channel.startswith("vcan") else f" type can bitrate {bus.bitrate} restart-ms 100"
@@ -98,7 +100,12 @@ def _absent_interface(bus: Bus) -> SetupFinding | None:
 
 def another_drive(mismatch: str, where: str) -> SetupFinding:
     """A drive that is not the one of the arm file."""
-    return SetupFinding("error", mismatch, where, "connect the right arm, or correct its drive under link.joints")
+    return SetupFinding(
+        "error",
+        mismatch,
+        where,
+        "connect the right arm, or correct the entry of this joint under link.joints of the arm file",
+    )
 
 
 def _drives(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFinding]:
@@ -135,4 +142,6 @@ def _places(link: Link) -> Iterator[SetupFinding]:
         if each.joint in after:
             yield SetupFinding("error", each.what, where, each.remedy)
         else:
-            yield SetupFinding("hint", each.what, where, f"corrected at each start: {link.turns.note(each.joint)}")
+            yield SetupFinding(
+                "hint", each.what, where, f"this is corrected at each start: {link.turns.note(each.joint)}"
+            )

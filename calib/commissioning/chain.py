@@ -9,7 +9,7 @@ from armlink.errors import BadInput
 from calib.commissioning.model_joints import ModelJoint
 from gcomp.arm.model_file import HAND
 
-OF_A_HAND = "belongs to the hand by its name"
+OF_A_HAND = "belongs to the hand, according to its name"
 """Why a joint that grasps is set aside."""
 
 
@@ -38,15 +38,15 @@ def find_chains(
     """
     if base is not None and not any(base in joint.carried_by for joint in joints):
         carriers = ", ".join(dict.fromkeys(name for joint in joints for name in reversed(joint.carried_by)))
-        raise BadInput(f"{path}: --base {base}: no such body carries a joint; there are {carriers}")
+        raise BadInput(f"{path}: --base {base}: there is no such body that carries a joint; there are {carriers}")
     if tip is not None:
         ends = [place for place, joint in enumerate(joints) if joint.body == tip]
         if not ends:
             moving = ", ".join(dict.fromkeys(joint.body for joint in joints))
-            raise BadInput(f"{path}: --tip {tip}: no joint moves that body; the bodies that move are {moving}")
+            raise BadInput(f"{path}: --tip {tip}: there is no such body that moves; the bodies that move are {moving}")
         way = _after(joints, [*joints[ends[-1]].parents, ends[-1]], base)
         if not way:
-            raise BadInput(f"{path}: --base {base} --tip {tip}: no revolute joint between them")
+            raise BadInput(f"{path}: --base {base} --tip {tip}: there is no revolute joint between these bodies")
         return [_chain(joints, way, path, base)]
     inner = {parent for joint in joints for parent in joint.parents}
     ways = []
@@ -61,7 +61,7 @@ def find_chains(
             ways.append(way)
     if not ways:
         reasons = "; ".join(f"{joint.name} {_aside(joint)}" for joint in joints)
-        raise BadInput(f"{path}: no joint of an arm in this model: {reasons}")
+        raise BadInput(f"{path}: none of the joints of this model belongs to an arm: {reasons}")
     longest = max(map(len, ways))
     return [_chain(joints, way, path, base) for way in ways if len(way) == longest]
 
@@ -95,17 +95,17 @@ def _chain(joints: Sequence[ModelJoint], way: list[int], path: Path, base: str |
     for number, joint in enumerate(chain, start=1):
         if joint.kind != "revolute":
             raise BadInput(
-                f"{path}: joint {joint.name or number} is {joint.kind} and lies between the base and the arm: "
-                f"begin after it (--base {joint.body}), or calibrate around it (--lock {joint.name}:POSITION)"
+                f"{path}: joint {joint.name or number} is {joint.kind} and lies between the base and the arm: begin "
+                f"the arm after this joint (--base {joint.body}), or lock the joint (--lock {joint.name}:POSITION)"
             )
         if not joint.name:
             raise BadInput(
-                f"{path}: joint {number} of the chain (body {joint.body!r}) has no name: name it in the model"
+                f"{path}: joint {number} of the chain (body {joint.body!r}) has no name: name this joint in the model"
             )
     others = [joint for place, joint in enumerate(joints) if place not in way]
     aside = tuple((joint.name, _aside(joint) or "is not on the chain") for joint in others)
     if aside and not chain[-1].body:
         raise BadInput(
-            f"{path}: the body of joint {chain[-1].name} has no name: name it, so that the chain can end there"
+            f"{path}: the body of joint {chain[-1].name} has no name: name this body, so that the chain can end there"
         )
     return Chain(tuple(chain), aside, base)

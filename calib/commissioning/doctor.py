@@ -31,11 +31,13 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
     except BadKeys as error:
         for key, message in error.keys:
             what, _, hint = message.partition("; did you mean ")
-            remedy = f"did you mean {hint} Rename it" if hint else f"correct it in the arm file: {FORMATS}"
+            remedy = f"did you mean {hint} Rename it" if hint else f"correct this key in the arm file: {FORMATS}"
             yield SetupFinding("error", what, f"{arm}: {key}", remedy)
         return
     except ArmlinkError as error:
-        yield SetupFinding("error", str(error), arm, "correct the arm file, or make one of a model: armlink new --help")
+        yield SetupFinding(
+            "error", str(error), arm, "correct the arm file, or make a new one from a model (see new --help)"
+        )
         return
     impossible = list[SetupFinding]()
     try:
@@ -48,7 +50,10 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
         yield _as_finding(error, arm_file)
     if arm_file.link is None:
         yield SetupFinding(
-            "error", "key link is missing: no bus and no joint controllers", arm, f"add the section link: {FORMATS}"
+            "error",
+            "key `link` is missing: the bus and the drives of the joints are not known",
+            arm,
+            f"add the key `link`: {FORMATS}",
         )
     else:
         yield from _serial(arm_file)
@@ -70,10 +75,10 @@ def _serial(arm_file: ArmFile) -> Iterator[SetupFinding]:
     if not arm_file.has_serial:
         yield SetupFinding(
             "warning",
-            f"serial is {arm_file.serial}: an arm of the same name would get this one's calibrations, so none is"
-            " written to its drives",
+            f"serial is {arm_file.serial}: another arm of this name would share the calibrations of this "
+            "arm, so no calibration is written to its drives",
             str(arm_file.path),
-            "give it a serial number before its first sweep (serial: …)",
+            "give the arm a serial number before its first sweep (`serial: …`)",
         )
 
 
@@ -85,7 +90,7 @@ def _assumed(arm: str, arm_file: ArmFile) -> Iterator[SetupFinding]:
     if assumed:
         yield SetupFinding(
             "hint",
-            f"{len(assumed)} values are marked as assumed, first in line {assumed[0]}",
+            f"{len(assumed)} values are marked as assumed, the first is in line {assumed[0]}",
             str(arm_file.path),
-            "check each, then remove its comment",
+            "check each of these values, then remove its comment",
         )

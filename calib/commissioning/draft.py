@@ -107,7 +107,7 @@ def draft_of_model(
     notes = []
     if not np.any(gravity):
         gravity = STANDARD_GRAVITY
-        notes.append("gravity: the model has none, assumed to point down")
+        notes.append("gravity: the model gives none, so it is assumed to point down")
     need = _load_torque(path, [joint.name for joint in chain.joints], gravity, locked or {})
     rated = _ratings(chain, need, ratings or {})
     doubted: dict[str, list[str]] = {}
@@ -116,10 +116,13 @@ def draft_of_model(
             doubted.setdefault(rating.doubt, []).append(joint.name)
     for doubt, names in doubted.items():
         who = "every joint" if len(names) == len(rated) else ", ".join(names)
-        notes.append(f"rated torques assumed ({who}): {doubt}; a drive's own: --rated-torque JOINT:TORQUE")
+        notes.append(
+            f"rated torques assumed ({who}): {doubt}; if you know the rating of a drive, give --rated-torque "
+            "JOINT:TORQUE"
+        )
     joints = [_joint(place, chain, stops.get(joint.name), rated[place]) for place, joint in enumerate(chain.joints)]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
-    servo = f"{', '.join(free)}: no stop to press on" if free else None
+    servo = f"{', '.join(free)} have no stop to be pressed on" if free else None
     ends = path.stem, path, tip, gravity, joints, chain.aside, notes
     return Draft(*ends, base=chain.base, servo=servo, locked=locked or {})
 
@@ -148,9 +151,9 @@ class Rating:
     def note(self) -> str:
         """Where it comes from, as a comment of the arm file."""
         if self.source == "load":
-            return f"rated_torque assumed: {LOAD_FACTOR:g} times the load, {self.doubt}"
+            return f"rated_torque assumed: {LOAD_FACTOR:g} times the load, since {self.doubt}"
         if self.source == "model":
-            return "rated_torque assumed to be the model's effort limit: the drive's own rating must be the same"
+            return "rated_torque assumed to be the effort limit of the model: compare it with the rating of the drive"
         return ""
 
 
@@ -197,13 +200,16 @@ def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rating: 
     stops = given
     if given is None and joint.limits is None:
         stops = (-ASSUMED_STOP, ASSUMED_STOP)
-        notes.append(f"stops assumed: ±{ASSUMED_STOP} rad, the model has no limits")
+        notes.append(f"stops assumed: ±{ASSUMED_STOP} rad, since the model has no limits")
     elif given is None and joint.limits is not None and joint.limits[1] - joint.limits[0] > TURN:
         middle = sum(joint.limits) / 2
         stops = (round(middle - ASSUMED_STOP, 4), round(middle + ASSUMED_STOP, 4))
-        notes.append(f"stops assumed: {ASSUMED_STOP} rad to either side, the model's limits are more than a turn apart")
+        notes.append(
+            f"stops assumed: {ASSUMED_STOP} rad to either side, since the limits of the model are more than a "
+            "turn apart"
+        )
     elif given is None:
-        notes.append("stops assumed to be the model's limits")
+        notes.append("stops assumed to be the limits of the model")
     speed = SPEED if joint.speed is None else min(SPEED, joint.speed)
     if joint.speed is None or joint.speed > SPEED:
         notes.append(f"max_velocity assumed: {SPEED:g} rad/s")

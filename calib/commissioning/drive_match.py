@@ -12,7 +12,7 @@ LEAST_MOTION_RATIO = 3.0
 """The turned joint's drive must read so many times the motion of any other; a choice."""
 SCALE_TOLERANCE = 0.1
 """Share by which the angle between the stops may read differently: calibration corrects a few per cent; a choice."""
-POLARITY_REMEDY = "turn the direction round in the drive (its polarity), or the axis in the model"
+POLARITY_REMEDY = "reverse the direction in the drive (its polarity), or the axis in the model"
 
 Ask = Callable[[str], None]
 """Shows a person what to do and returns when it is done."""
@@ -65,9 +65,9 @@ def match_by_hand(
     free = {each.address: each for each in drives.found}
     matches, findings = [], []
     for joint in joints:
-        ask(f"{joint.name}: turn it by hand to its lower stop ({joint.lower:+.2f} rad)")
+        ask(f"{joint.name}: turn this joint by hand to its lower stop ({joint.lower:+.2f} rad)")
         before = drives.positions()
-        ask(f"{joint.name}: now to its upper stop ({joint.upper:+.2f} rad)")
+        ask(f"{joint.name}: now turn it to its upper stop ({joint.upper:+.2f} rad)")
         after = drives.positions()
         turned = {each: after[each] - before[each] for each in free}
         moved = moved_drive(joint.name, turned, bus)
@@ -97,8 +97,8 @@ def moved_drive(joint: str, turned: dict[str, float], bus: str) -> str:
     order = sorted(turned, key=lambda each: -abs(turned[each]))
     if abs(turned[order[0]]) < LEAST_TURN:
         raise BusFault(
-            f"{bus}: no drive read the motion of {joint}: release its brake and turn it further, or look for its"
-            " drive on another bus"
+            f"{bus}: no drive read the motion of {joint}: release the brake of this joint and turn it "
+            "further, or look for its drive on another bus"
         )
     if len(order) > 1 and abs(turned[order[0]]) < LEAST_MOTION_RATIO * abs(turned[order[1]]):
         raise BusFault(
@@ -112,10 +112,13 @@ def _judge(joint: TurnedJoint, drive: FoundDrive, turned: float) -> list[SetupFi
     ratio, where = turned / expected, f"{joint.name} ({drive.address})"
     findings = []
     if ratio < 0 and drive.family == "canopen":
-        what = f"its position counts the other way: from lower to upper stop it read {turned:+.2f} rad"
+        what = f"its position counts in the wrong direction: from the lower to the upper stop it read {turned:+.2f} rad"
         findings.append(SetupFinding("error", what, where, POLARITY_REMEDY))
     if abs(abs(ratio) - 1) > SCALE_TOLERANCE:
-        what = f"from stop to stop it read {abs(turned):.2f} rad, the model has {expected:.2f} ({abs(ratio):.3g} times)"
+        what = (
+            f"from stop to stop it read {abs(turned):.2f} rad, but the model has {expected:.2f} rad (factor "
+            f"{abs(ratio):.3g})"
+        )
         remedy = f"correct the drive's gear ratio by the factor {abs(ratio):.3g}, or the stops in the arm file"
         if drive.family != "canopen":
             remedy = f"give the drive gear: {abs(ratio) * joint.gear:.3g} in the arm file, or correct the stops there"

@@ -37,8 +37,8 @@ def _massless_links(arm_file: ArmFile) -> Iterator[SetupFinding]:
     model = model_arm(arm_file)
     lacking = [name for name, mass in zip(model.arm.names, model.mass, strict=True) if mass < NO_MASS]
     if lacking:
-        what = f"the model states no mass for what turns with {', '.join(lacking)}"
-        remedy = "give these links their masses and centres of mass: until then demo and torque lack them"
+        what = f"the model gives no mass to what turns with {', '.join(lacking)}"
+        remedy = "give these links their masses and centres of mass: demo and torque leave the missing masses out"
         yield SetupFinding("warning", what, str(arm_file.model_path), remedy)
 
 
@@ -50,24 +50,25 @@ def file_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
     if model.unphysical:
         yield SetupFinding(
             "warning",
-            f"inertia with a negative principal moment, ignored: {', '.join(model.unphysical)}",
+            f"these inertias have a negative principal moment and are ignored: {', '.join(model.unphysical)}",
             where,
             "correct the inertia of these links: until then their torque under acceleration is not modelled",
         )
     if model.left_out:
         reasons = {reason for _, reason in model.unused_meshes}
-        remedy = "convert them to binary STL or OBJ, or keep the workspace clear"
+        remedy = "convert these meshes to binary STL or OBJ, or keep the workspace clear"
         if NOT_FOUND in reasons:
             remedy = (
-                "put the meshes where the model names them (package://NAME/… is looked for in the folders above it)"
+                "put the meshes where the model names them (package://NAME/… is looked for in the folders "
+                "above the model)"
             )
         elif UNFETCHED in reasons:
-            remedy = "run git lfs pull where the model was cloned"
-        yield SetupFinding("warning", f"collision geometry incomplete: {model.left_out}", where, remedy)
+            remedy = "run `git lfs pull` in the folder where the model was cloned"
+        yield SetupFinding("warning", f"the collision geometry is incomplete: {model.left_out}", where, remedy)
     elif not model.shapes:
         yield SetupFinding(
             "warning",
-            "no collision geometry in the model: collisions are not checked",
+            "the model has no collision geometry, so collisions are not checked",
             where,
             "add collision shapes to the model, or keep the workspace clear",
         )
@@ -85,14 +86,16 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             axis = "its axis is vertical" if joint == 0 else "its axis is vertical in every pose"
             yield SetupFinding(
                 "warning",
-                f"gravity does not load it (Γ/g {lever[joint]:.2f}): {axis}, and its torque gain cannot be found",
+                f"gravity does not load this joint, since {axis}, so its torque gain cannot be found (lever "
+                f"of gravity at most {lever[joint]:.2f} m·kg per kg)",
                 name,
-                "incline the base for the sweeps, or do without its gain",
+                "incline the base for the sweeps, or accept that this gain stays unknown",
             )
         elif lever[joint] < SMALL_LEVER:
             yield SetupFinding(
                 "hint",
-                f"gravity loads it little (Γ/g at most {lever[joint]:.2f}): its torque gain will be imprecise",
+                "gravity loads this joint only a little (Γ/g, the share of gravity that it feels, is at most "
+                f"{lever[joint]:.2f}), so its torque gain will be imprecise",
                 name,
                 "incline the base for the sweeps, or widen the ranges of the joints before it",
             )

@@ -50,12 +50,18 @@ def arm_errors(arm_file: ArmFile) -> list[SetupFinding]:
     if found:
         return found
     if arm_file.model_path is None and not any(row.a or row.alpha or row.d for row in arm_file.kinematics.joints):
-        remedy = "give a, alpha and d of every joint, or make the arm file of its URDF or MJCF: armlink new --help"
-        return [SetupFinding("error", "its geometry is not known: nothing can be swept or identified", where, remedy)]
+        remedy = (
+            "give a, alpha and d of every joint, or make the arm file from the arm's URDF or MJCF: armlink new --help"
+        )
+        return [
+            SetupFinding(
+                "error", "the geometry of the arm is not known, so nothing can be swept or identified", where, remedy
+            )
+        ]
     if (largest_levers(gcomp_arm(arm_file)) < DEAD_LEVER).all():
         what, remedy = (
-            "gravity loads no joint in any pose: nothing to calibrate by",
-            "incline the base, then say how here",
+            "gravity loads no joint in any pose, so nothing can be calibrated",
+            "incline the base, then give the inclined gravity here",
         )
         return [SetupFinding("error", what, f"{where}: kinematics.gravity", remedy)]
     return []
@@ -103,20 +109,21 @@ def _mass_error(arm_file: ArmFile, model: ModelArm) -> SetupFinding | None:
     if mass < NO_MASS:
         return SetupFinding(
             "error",
-            "the model states no masses: no gravity, nothing to calibrate or to simulate",
+            "the model states no masses, so there is no gravity to calibrate with or to simulate",
             where,
-            "give its links the maker's masses and centres of mass (URDF: inertial), or take a model that has them",
+            "give the links the masses and centres of mass that the maker states (URDF: inertial), or use a "
+            "model that has them",
         )
     last = 2 * float(np.linalg.norm(model.beta[-2:])) / max(float(model.mass[-1]), NO_MASS)
     length = float(reach(model.arm, max(HAND, last))[0])
     if LIGHTEST < mass / length**3 < HEAVIEST:
         return None
-    usual = f"arms of its size weigh {_usual(LIGHTEST, length)} to {_usual(HEAVIEST, length)} kg"
+    usual = f"arms of this size weigh {_usual(LIGHTEST, length)} to {_usual(HEAVIEST, length)} kg"
     return SetupFinding(
         "error",
-        f"its moving links weigh {mass:.3g} kg at a reach of {length:.2g} m, but {usual}",
+        f"the moving links weigh {mass:.3g} kg at a reach of {length:.2g} m, but {usual}",
         where,
-        "state masses in kg and lengths in m",
+        "write masses in kg and lengths in m",
     )
 
 
@@ -129,5 +136,8 @@ def _strength_errors(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFindin
     most = DriveLimits.of(arm_file).max_torque
     for name, need, limit in zip(model.arm.names, gravity_need(model), most, strict=True):
         if need > limit:
-            what = f"by the model, gravity needs up to {need:.3g} N·m, but max_torque is {limit:g}: the arm would fall"
+            what = (
+                f"according to the model, gravity needs up to {need:.3g} N·m, but max_torque is {limit:g} N·m: "
+                "the arm would fall"
+            )
             yield SetupFinding("error", what, name, "check the model's masses and max_torque, or narrow the ranges")

@@ -33,10 +33,15 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         return
     for joint in arm_file.link.joints:
         if joint.max_torque > 3 * joint.rated_torque:
-            what = f"max_torque {joint.max_torque:g} N·m is more than three times rated_torque {joint.rated_torque:g}"
-            yield SetupFinding("warning", what, joint.name, "check both against the drive's own rating and limit")
+            what = (
+                f"max_torque {joint.max_torque:g} N·m is more than three times rated_torque {joint.rated_torque:g} N·m"
+            )
+            yield SetupFinding("warning", what, joint.name, "compare both with the rating and the limit of the drive")
         if joint.max_torque_rate > FASTEST_RATE * joint.max_torque:
-            what = f"max_torque_rate {joint.max_torque_rate:g} N·m/s: full torque within {1e3 / FASTEST_RATE:.0f} ms"
+            what = (
+                f"with max_torque_rate {joint.max_torque_rate:g} N·m/s the full torque comes within "
+                f"{1e3 / FASTEST_RATE:.0f} ms"
+            )
             yield SetupFinding("hint", what, joint.name, f"about {2.5 * joint.max_torque:.3g} N·m/s is usual")
     guess, creeping = None, sweep_motion(arm_file) == "creep"
     if arm_file.model_path is not None:
@@ -59,7 +64,7 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
         what, _, remedy = note.partition(": ")
         yield SetupFinding("warning", what, str(arm_file.path), remedy or "see docs/sweeps.md")
     if "not checked" not in checked and "without" in checked:
-        yield SetupFinding("hint", checked, str(arm_file.path), "give the missing meshes")
+        yield SetupFinding("hint", checked, str(arm_file.path), "provide the missing meshes")
 
 
 def _strength(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
@@ -67,7 +72,10 @@ def _strength(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
     limits = DriveLimits.of(arm_file)
     for name, need, most in zip(model.arm.names, gravity_need(model), limits.max_torque, strict=True):
         if need <= most < TORQUE_RESERVE * need:
-            what = f"by the model, gravity needs up to {need:.3g} N·m of max_torque {most:g}: little is left"
+            what = (
+                f"according to the model, gravity needs up to {need:.3g} N·m of max_torque {most:g} N·m, so "
+                "little torque is left"
+            )
             yield SetupFinding("warning", what, name, "narrow the ranges, or allow more torque if the drive has it")
 
 
@@ -98,7 +106,8 @@ def _damping(arm_file: ArmFile) -> Iterator[SetupFinding]:
             softer = square * (drive.kd / (2 * LEAST_DAMPING)) ** 2 / inertia
             what = f"kd {drive.kd:g} gives a damping ratio of only {ratio:.2f} at an inertia of {inertia:.2g} kg·m²"
             remedy = (
-                f"set kd to {enough:.2g} or more, or kp to {softer:.2g} or less: the ratio is then {LEAST_DAMPING:g}"
+                f"set kd to {enough:.2g} or more, or kp to {softer:.2g} or less, which gives a damping ratio "
+                f"of {LEAST_DAMPING:g}"
             )
             yield SetupFinding("warning", what, joint.name, remedy)
 
@@ -115,7 +124,7 @@ def _stops(arm_file: ArmFile, guess: GravityGuess) -> Iterator[SetupFinding]:
             continue
         yield SetupFinding(
             "warning",
-            "it cannot be pressed on a stop within max_torque",
+            "this joint cannot be pressed on a stop within max_torque",
             name,
-            "hold resting joints by their servos (sweep: {hold: servo}), or allow more torque",
+            "hold joints at rest by their position loops (`sweep: {hold: servo}`), or allow more torque",
         )

@@ -86,7 +86,7 @@ def new_arm(
     if model.suffix.lower() not in MODEL_SUFFIXES:
         raise BadInput(f"{model}: expected a URDF or MJCF model ({', '.join(MODEL_SUFFIXES)})")
     if not model.is_file():
-        raise BadInput(f"no model file {model}: give the path of a URDF or MJCF file")
+        raise BadInput(f"there is no model file {model}: give the path of a URDF or MJCF file")
     joints, gravity = model_joints(model, locked)
     _refuse_other_joints("--lock", locked or {}, [joint.name for joint in joints], f"in {model}")
     chains = find_chains(joints, model, base, tip)
@@ -97,7 +97,9 @@ def new_arm(
     draft = draft_of_model(model, chain, gravity, given, ratings, locked)
     if len(chains) > 1 and questions is None:
         others = ", ".join(each.tip for each in chains if each is not chain)
-        draft.notes.append(f"tip assumed: the model has {len(chains)} arms; the others end in {others} (--tip)")
+        draft.notes.append(
+            f"tip assumed: the model has {len(chains)} arms; choose another arm by its last body, {others} (--tip)"
+        )
     draft.name = name or draft.name
     made = NewArm(out, draft)
     for found in model_errors(made.parsed()):
@@ -136,7 +138,7 @@ def _given_stops(
 def _refuse_other_joints(option: str, given: Mapping[str, object], names: Sequence[str], place: str) -> None:
     for name in given:
         if name not in names:
-            raise BadInput(f"{option} {name}: no joint {place}; there are {', '.join(names)}")
+            raise BadInput(f"{option} {name}: there is no such joint {place}; there are {', '.join(names)}")
 
 
 def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -> list[Match]:
@@ -164,7 +166,9 @@ def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -
             joint.max_torque = min(joint.max_torque, drive.max_torque)
         joint.max_torque_rate = float(f"{2.5 * joint.max_torque:.3g}")
         joint.notes.append(
-            "node found by turning the joint by hand" if match.by_hand else "node assumed: in the order of node ids"
+            "node found by turning the joint by hand"
+            if match.by_hand
+            else "node assumed: taken in the order of the node ids"
         )
     return matches
 
@@ -184,8 +188,10 @@ def _take_ratings(made: NewArm, joint: JointDraft, match: Match) -> None:
 
 def _doubtful_rating(match: Match, effort: float) -> SetupFinding:
     drive = match.drive
-    remedy = "check that this drive moves this joint" + ("" if match.by_hand else ": --by-hand finds out")
-    what = f"the drive is rated {drive.rated_torque:g} N·m, the model's effort limit is {effort:g} N·m"
+    remedy = "check that this drive moves this joint" + (
+        "" if match.by_hand else " (--by-hand finds the drive of each joint)"
+    )
+    what = f"the drive is rated {drive.rated_torque:g} N·m, but the effort limit of the model is {effort:g} N·m"
     return SetupFinding("warning", what, f"{match.joint} ({drive.address})", remedy)
 
 

@@ -54,11 +54,11 @@ def own_copy(arm: ArmFile, out: Path, bus: dict[str, str | int], opened: CanBus,
     if arm.model_path is not None:
         content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
     parse_arm(dict(content), out)
-    title = f"{arm.name} with the drives on {opened.channel_info}, from {arm.path.name}, by the command new."
+    title = f"{arm.name} with the drives on {opened.channel_info}: made from {arm.path.name} by `armlink new`."
     text = yaml_comment(title) + "\n"
     for key, value in content.items():
         if key == "serial" and new_serial:
-            text += yaml_entry(key, value, note="assumed: that of the first drive") + "\n"
+            text += yaml_entry(key, value, note="assumed: the serial of the first drive") + "\n"
         else:
             text += yaml_document({key: value})
     drives = [(there.names[each.joint], each.address, each.serial) for each in found]

@@ -202,7 +202,7 @@ class Daemon:
         try:
             self.process = self.options.keep(self.arm)
         except OSError as error:
-            log.error(f"no bus process: {error}")
+            log.error(f"the bus process cannot be started: {error}")
             self._heard = time.monotonic() - SILENT_SECONDS + AGAIN_SECONDS
             return
         self._heard = time.monotonic() + BEGIN_SECONDS
@@ -221,12 +221,12 @@ class Daemon:
             arm, settings = read
             self.service.reload(arm, settings)
         except (ArmlinkError, OSError, ValueError, ArithmeticError) as error:
-            self.service.events.say("refused", None, f"configuration not reloaded: {error}", {})
+            self.service.events.say("refused", None, f"the configuration was not reloaded: {error}", {})
         else:
             bus_changed = arm.link != self.arm.link or settings.work != before.work
             self.arm = arm
             if bus_changed:
-                self._restart("the arm file's link section or the work has changed")
+                self._restart("the key `link` of the arm file or the work has changed")
         finally:
             self._notify("READY=1")
 
@@ -237,7 +237,7 @@ class Daemon:
 
         arm = load_arm(self.options.arm)
         if arm.name != self.arm.name or arm.serial != self.arm.serial or arm.kinematics != self.arm.kinematics:
-            raise BadInput(f"{arm.path}: another arm, serial or kinematics: restart the daemon for that")
+            raise BadInput(f"{arm.path}: this is another arm, serial or kinematics: restart the daemon to use it")
         resolve_bus(self.options.bus, arm.require_link().bus)
         try_limits(arm)
         return arm, self.options.settings(arm)

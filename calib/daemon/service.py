@@ -157,7 +157,7 @@ class Service:
             configuration.arm, configuration.settings = before
             raise
         evidence = {"policy": settings.policy}
-        self.events.say("configuration", None, "configuration reloaded", evidence)
+        self.events.say("configuration", None, "the configuration was reloaded", evidence)
         self.records.load()
 
     def save(self, history: bool = False) -> None:
@@ -173,7 +173,9 @@ class Service:
         disk = self.environment.disk
         written = disk.drain(FLUSH_SECONDS)
         if self.journal.waiting:
-            log.error(f"ends with {self.journal.waiting} entries not in the journal: {self.journal.trouble}")
+            log.error(
+                f"the daemon ends, and {self.journal.waiting} entries are not in the journal: {self.journal.trouble}"
+            )
         self.diagnosis.close()
         if written:
             disk(self.journal.close, lambda outcome: None)
@@ -182,7 +184,7 @@ class Service:
     def _say_set_aside(self) -> None:
         aside, self.journal.set_aside = self.journal.set_aside, ""
         if aside:
-            text = f"the journal was damaged: it is kept as {aside}, and a new one was begun"
+            text = f"the journal was damaged: it was moved to {aside}, and a new journal was begun"
             self.events.say("fault", None, text, {"file": aside})
 
     def _report_found(self, found: Path | Exception | None) -> None:

@@ -74,10 +74,10 @@ class DaemonSection(Section):
                 log.warning("daemon.observer.%s is no setting any more: left out", name)
                 del given[name]
             elif name not in known:
-                raise ValueError(f"no threshold {name!r}; there are {', '.join(known)}")
+                raise ValueError(f"there is no threshold {name!r}; there are {', '.join(known)}")
         for name, value in given.items():
             if value < (1 if name in _WHOLE else 0):
-                least = "a whole number from 1" if name in _WHOLE else "a number from 0"
+                least = "a whole number of at least 1" if name in _WHOLE else "a number of at least 0"
                 raise ValueError(f"threshold {name} is {value:g}, expected {least}")
         return given
 

@@ -80,7 +80,7 @@ class CreepFit(FittedCalibration):
             return np.ones(self.arm.n), np.zeros(self.arm.n)
         place = self.slices.get(family_of(parameter))
         if place is None:
-            raise BadInput(f"no value {parameter!r} of creep sweeps; there are {', '.join(VALUES)}")
+            raise BadInput(f"creep sweeps give no value {parameter!r}; there are {', '.join(VALUES)}")
         return self.solution.x[place], np.sqrt(np.diag(self.solution.covariance)[place])
 
     def covariance_of(self, wanted: Sequence[tuple[int, Parameter]]) -> Array:
@@ -125,22 +125,25 @@ class CreepFit(FittedCalibration):
             elif not self.found_gain[joint]:
                 reasons[name, "gain"] = self._no_gain(joint)
             if offset[joint] >= SEEN:
-                reasons[name, "offset"] = "no sweep of this joint shows it"
+                reasons[name, "offset"] = "no sweep of this joint determines it"
             if joint == self.arm.n - 1 and doubt["zero"][joint] <= LAST_ZERO:
                 reasons[name, "position_offset"] = (
                     "turning the last link's frame is the same as turning its centre of mass"
                 )
             elif zero[joint] >= MOST_ZERO_DOUBT:
-                reasons[name, "position_offset"] = "the sweeps add nothing to what was known before"
+                reasons[name, "position_offset"] = "the sweeps add nothing to what was known before about this value"
         return reasons
 
     def _no_gain(self, joint: int) -> str:
         if is_vertical(self.arm, joint):
             return VERTICAL
         if not (self.rows.swept == joint).any():
-            return "no sweep of this joint was free of disturbance"
+            return "every sweep of this joint was disturbed"
         if not (self.rows.readings.load > 0).any():
-            return "without a reference mass only the product of torque constant and mass shows: sweep again with one"
+            return (
+                "without a reference mass only the product of torque constant and mass is determined: sweep "
+                "again with a reference mass"
+            )
         if not self.found_gain.any() and known_lever(self.arm) < SHORTEST:
             return NO_LEVER
         return "gravity loads this joint too little in these sweeps: attach the mass further out, or add poses"

@@ -32,8 +32,8 @@ class FeltMass:
 
     def __str__(self) -> str:
         return (
-            f"the loaded pass feels {self.felt:.1f} kg where {self.stated:g} kg were stated (--reference-mass): was the"
-            " mass attached, and is the number right?"
+            f"the loaded pass feels {self.felt:.1f} kg, but --reference-mass was {self.stated:g} kg: was the "
+            "mass attached, and is the number right?"
         )
 
 

@@ -235,8 +235,8 @@ def _refuse_payload(problem: FieldProblem, noise: Array, chi2: float) -> None:
     as_installed = problem.solve(base, noise).chi2
     if as_installed > as_load + PAYLOAD_EVIDENCE and mass > 0 and as_load < as_new + PAYLOAD_EVIDENCE:
         raise Refused(
-            f"a payload of {mass:.2f} kg explains these readings as well as other gains do: take it off and record"
-            " again; if there is none, sweep with a reference mass"
+            f"a payload of {mass:.2f} kg explains these readings as well as other gains do: if there is a "
+            "payload, take it off and record again; if there is none, sweep with a reference mass"
         )
 
 
@@ -251,13 +251,14 @@ def _report(
         counted = rows.counted[:, j]
         here, sides = model[counted, j], set(np.sign(rows.direction[counted, j])) - {0.0}
         if len(here) == 0:
-            reasons[name, "gain"] = reasons[name, "offset"] = "none of these rows has a usable reading of its sensor"
+            reasons[name, "gain"] = reasons[name, "offset"] = "its sensor has no usable reading in these rows"
         elif unseen[j]:
             reasons[name, "gain"] = _no_gain(here)
         if len(here) and len(sides) < 2:
             hysteresis[j] = np.nan
             reasons[name, "offset"] = (
-                "it was approached from one side only, so friction and hysteresis look the same: move it both ways"
+                "the joint was approached from one side only, so its offset looks like friction or "
+                "hysteresis: move it in both directions"
             )
         elif len(here) and offset_std[j] > OFFSET_STD * problem.rated[j]:
             reasons[name, "offset"] = (
@@ -271,10 +272,10 @@ def _report(
 def _no_gain(torque: Array) -> str:
     spread = float(np.std(torque))
     if np.abs(torque).max() < 1e-3:
-        return "gravity does not act on it: its axis is vertical in all these poses"
+        return "gravity does not load this joint, since its axis is vertical in all these poses"
     return (
-        f"it cannot be separated from the offset: gravity torque varies by only {spread:.2g} N·m (standard deviation)"
-        " in these poses: move it, or the joints beyond it, further"
+        f"it cannot be separated from the offset, since gravity torque varies only by {spread:.2g} N·m "
+        "(standard deviation) in these poses: move this joint, or the joints beyond it, further"
     )
 
 

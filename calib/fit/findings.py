@@ -59,17 +59,21 @@ def effect_finding(
     value = float(coefficient[0])
     if effect.id == "transmission.spring":
         text = (
-            f"{name}: torque linear in position that gravity does not explain, {value / gain:+.3g} N·m/rad: a cable or"
-            " spring over the joint? It is taken out; its pull at 0 rad is part of the offset"
+            f"{name}: part of the torque is linear in position, {value / gain:+.3g} N·m/rad, and gravity "
+            "does not explain it: does a cable or a spring cross the joint? This part is taken out; its "
+            "pull at 0 rad counts as offset"
         )
         return FitFinding(name, "spring", value / gain, "N·m/rad", text)
     if effect.each_sweep:
         size = size_of(coefficient)
-        text = f"{name}: readings differ by {2 * size:.3g} N·m with the side of approach; taken out"
+        text = (
+            f"{name}: readings differ by {2 * size:.3g} N·m between the two directions of approach; this is taken out"
+        )
         return FitFinding(name, "direction", size, "N·m", text)
     if effect.id == "torque.hysteresis":
         text = (
-            f"{name}: the torque sensor lags by {abs(value):.3g} N·m behind changes of torque (hysteresis); taken out"
+            f"{name}: the torque sensor lags by {abs(value):.3g} N·m behind changes of torque (hysteresis); "
+            "this is taken out"
         )
         return FitFinding(name, "hysteresis", abs(value), "N·m", text)
     if effect.id == "torque.saturation":
@@ -107,7 +111,11 @@ def outlier_findings(names: tuple[str, ...], rows: SweepReadings, outliers: Mask
         places = ", ".join(f"{rows.sweeps[series[k]]} at {angle[k]:.3f} rad" for k in range(min(len(at), 4)))
         more = f" and {len(at) - 4} more" if len(at) > 4 else ""
         run = len(at) >= 2 and len(set(series.tolist())) == 1
-        cause = "it touched something there, or a resting joint slipped" if run else "a knock or a bad contact"
+        cause = (
+            "did the joint touch something there, or did a joint at rest slip"
+            if run
+            else "was there a knock or a bad contact"
+        )
         text = f"{names[joint]}: {len(at)} readings left out, {places}{more}: {cause}?"
         found.append(FitFinding(names[joint], "outliers", float(len(at)), "readings", text))
     return found
@@ -124,8 +132,8 @@ def scatter_findings(names: tuple[str, ...], refined: Refined, rated: Array, nam
         rms = float(np.sqrt(np.mean(rest[here] ** 2)))
         if refined.factor[joint] > SCATTER and rms > MATERIAL_SCATTER * rated[joint]:
             text = (
-                f"{name}: readings scatter by {rms:.3g} N·m, {refined.factor[joint]:.0f} times what their noise"
-                " explains, and no known effect accounts for it: the model does not hold here"
+                f"{name}: readings scatter by {rms:.3g} N·m, which is {refined.factor[joint]:.0f} times what their "
+                "noise explains, and no known effect explains the rest: the model does not hold for this joint"
             )
             found.append(FitFinding(name, "scatter", rms, "N·m", text))
     return found

@@ -135,8 +135,9 @@ def _require_scale(names: tuple[str, ...], lost: Mask) -> None:
     """Raise Refused if no joint's gain is known: mass moments are then known up to a factor only."""
     if lost.all():
         raise Refused(
-            f"no torque gain of {', '.join(names)} is known, so mass moments are known up to a common factor only:"
-            " sweep with --reference-mass on an arm whose links have levers, or give a calibration record"
+            f"no torque gain of {', '.join(names)} is known, so mass moments are known only up to a common "
+            "factor: sweep with --reference-mass on an arm whose links have levers, or give a calibration "
+            "record"
         )
 
 

@@ -26,8 +26,8 @@ WIDE = 0.005
 """Half width of a gain's 95 % interval, as a share of it, from which it is listed as imprecise: the error that
 tests/campaigns/random_arms.py allows a gain."""
 COMMON = (
-    "the common scale of the gains comes from the levers between the axes before the last, which are too short here;"
-    " measure where it hangs (sweep.reference_point), or use a heavier one"
+    "the common scale of the gains comes from the levers between the axes before the last axis, which are too short on "
+    "this arm; measure where the reference mass hangs (sweep.reference_point), or use a heavier mass"
 )
 """Reason for a low precision of all gains together."""
 
@@ -93,7 +93,8 @@ class SensorFit(FittedCalibration):
         place = ", ".join(_value_text(at, f" ± {by:.4f}") for at, by in zip(point, half, strict=True))
         moments = [f"{mass:g} kg: {_triple(mass * point)} kg·m" for mass in self.rows.masses if mass]
         return (
-            f"the reference mass hung at ({place}) m of the last joint's frame; its mass moment, {'; '.join(moments)}"
+            f"the reference mass hung at ({place}) m in the frame of the last joint; its mass moment is "
+            f"{'; '.join(moments)}"
         )
 
     @property
@@ -101,9 +102,9 @@ class SensorFit(FittedCalibration):
         """Joint → why its gain, though determined, is less precise than `WIDE`."""
         half = self.half95("gain") / np.abs(self.value("gain"))
         common = bool(np.all(half[np.isfinite(half)] > WIDE))
-        why = COMMON if common else "give its sweeps more poses, or the arm a heavier reference mass"
+        why = COMMON if common else "use more poses in its sweeps, or a heavier reference mass"
         return {
-            name: f"{name} gain: known to ± {width:.1%} only: {why}"
+            name: f"{name} gain: it is known only to ± {width:.1%}: {why}"
             for name, width in zip(self.names, half, strict=True)
             if width > WIDE
         }
@@ -213,13 +214,13 @@ def missing_values(fit: GlobalFit, rows: SweepReadings) -> dict[tuple[str, Param
 def _reason(name: str, fit: GlobalFit, rows: SweepReadings) -> str:
     if name in fit.hopeless:
         spread = float(np.sqrt(fit.covariance_of(name)[0, 0]))
-        return f"these sweeps determine it to ± {2 * spread:.2g} only: gravity hardly acts on it in these poses"
+        return f"these sweeps determine it only to ± {2 * spread:.2g}, since gravity hardly loads it in these poses"
     for sentence in fit.null_space:
         if name in sentence:
             if "common factor" in sentence and not any(rows.masses):
                 return "no readings with a reference mass: only ratios of gains are determined"
             remedy = WHERE_IT_HANGS if "load_point" in sentence and name.startswith("gain") else ""
             if sentence.count(",") > 6:  # too many parameters to name
-                return f"not identifiable: the data fit equally well with other values{remedy}"
+                return f"not identifiable: other values fit the data equally well{remedy}"
             return f"{sentence}{remedy}"
     return "the readings do not determine it"

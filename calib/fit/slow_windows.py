@@ -33,7 +33,10 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
     BadInput if there is no joint torque, or nothing slow enough.
     """
     if recording.torque is None:
-        raise BadInput(f"{source}: no joint torque (columns tau_1 …): calibration needs the torque sensors' readings")
+        raise BadInput(
+            f"{source}: there is no joint torque (columns tau_1 …), but calibration needs the readings of the "
+            "torque sensors"
+        )
     keep = np.isfinite(recording.position).all(axis=1) & np.isfinite(recording.torque).all(axis=1)
     t, position = recording.t[keep], recording.position[keep]
     torque = held.apply(recording.torque[keep])
@@ -48,8 +51,8 @@ def rows_of_recording(recording: Recording, held: TorqueCalibration[Array], numb
     slow = (np.abs(slopes).max(axis=1) <= SLOW) & steady
     if slow.sum() < FEWEST_ROWS:
         raise BadInput(
-            f"{source}: {int(slow.sum())} windows of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are needed:"
-            f" record rests, or motion below {SLOW} rad/s without jerks"
+            f"{source}: only {int(slow.sum())} windows of {WINDOW} s are slow enough, at least {FEWEST_ROWS} are "
+            f"needed: record an arm that stands still in several poses, or moves smoothly below {SLOW} rad/s"
         )
     means = np.array([position[each].mean(axis=0) for each in windows])
     chosen = [each for each, fine in zip(windows, slow, strict=True) if fine]
@@ -70,8 +73,8 @@ def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
         raise BadInput(f"{data.path}: creep sweeps: they belong to armlink calibrate {data.path}")
     if data.manifest.reference_mass > 0:
         raise BadInput(
-            f"{data.path}: swept with a reference mass of {data.manifest.reference_mass:g} kg: the field"
-            f" calibration needs the arm without a mass; sweeps with one belong to armlink calibrate {data.path}"
+            f"{data.path} was swept with a reference mass of {data.manifest.reference_mass:g} kg, but the field "
+            f"calibration needs the arm without a mass; sweeps with a mass are for armlink calibrate {data.path}"
         )
     readings = sweep_readings([data]).readings
     return replace(readings, series=np.full(len(readings), number))

@@ -171,11 +171,11 @@ def _warmth(temperature: Array, creeping: Mask, time: Array) -> tuple[Array, Arr
 
 def _require_one_arm(data: Sequence[SweepData]) -> None:
     if not any(each.readings for each in data):
-        raise BadInput("no sweep readings: give the directories that sweep wrote")
+        raise BadInput("there are no sweep readings: give the directories that sweep wrote")
     first = data[0].manifest
     for each in data[1:]:
         if (each.manifest.names, each.manifest.description_hash) != (first.names, first.description_hash):
-            raise BadInput(f"{each.path}: swept on another arm or description than {data[0].path}")
+            raise BadInput(f"{each.path} was swept on another arm or with another arm file than {data[0].path}")
 
 
 def _sigma(taken: Sequence[StaticReading], rated: Array) -> Array:

@@ -119,9 +119,10 @@ class _Float:
         worst = int(np.nanargmax(away / rated))
         if not away[worst] <= AGREEMENT * rated[worst]:
             raise Refused(
-                f"{self._link.names[worst]}: its sensor reads {sensor[worst]:.2f} N·m, but the gravity model says"
-                f" {model[worst]:.2f}; floating is safe only within {AGREEMENT * rated[worst]:.2f} of it: is a load on"
-                " the arm, a joint on its stop, or the calibration not written to the controllers?"
+                f"{self._link.names[worst]}: its sensor reads {sensor[worst]:.2f} N·m, but the gravity model "
+                f"gives {model[worst]:.2f} N·m; floating is safe only if the two differ by less than "
+                f"{AGREEMENT * rated[worst]:.2f} N·m: is a load on the arm, is a joint on its stop, or was "
+                "the calibration not written to the drives?"
             )
 
     def follow(self, floating: Floating, seconds: float) -> None:

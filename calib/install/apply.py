@@ -128,7 +128,7 @@ def _keep(record: CalibrationRecord, arm: ArmFile, store: RecordStore, how: Appl
 def _check_names(arm: ArmFile, how: Apply) -> None:
     for option, joints in (("--replaced", how.replaced), ("--accept", how.accepted)):
         for unknown in sorted(set(joints) - set(arm.joint_names)):
-            raise BadInput(f"{option} {unknown}: no such joint; the arm has {', '.join(arm.joint_names)}")
+            raise BadInput(f"{option} {unknown}: there is no such joint; the arm has {', '.join(arm.joint_names)}")
 
 
 def _write(

@@ -79,7 +79,7 @@ class CheckMotion:
                 readings.append(mover.rest(np.ones(self._link.n, dtype=bool)))
             mover.travel(begin, ACCELERATION)
         except Stalled as error:
-            raise Refused(f"check motion: {error}") from None
+            raise Refused(f"check motion after the write: {error}") from None
         return readings
 
     def _not_converted(
@@ -92,7 +92,8 @@ class CheckMotion:
             away = float(np.mean(after[:, j] - expected))
             if abs(away) > self._floor[j]:
                 return (
-                    f"{name}: its readings differ by {away:+.3f} N·m from the old ones converted by its new calibration"
+                    f"{name}: its readings after the write differ by {away:+.3f} N·m from what the new "
+                    "calibration makes of its readings before the write"
                 )
         return None
 
@@ -104,7 +105,10 @@ class CheckMotion:
         if not worse.any():
             return None
         j = int(np.argmax(np.where(worse, after - before, -np.inf)))
-        return f"{self._names[j]}: in the check motion {after[j]:.3f} N·m RMS against the model, {before[j]:.3f} before"
+        return (
+            f"{self._names[j]}: in the check motion the RMS difference to the model is {after[j]:.3f} N·m, but "
+            f"{before[j]:.3f} N·m before the write"
+        )
 
     def _rms(self, readings: list[StaticReading], beta: Array) -> Array:
         q = self._record.angle(stack(readings, "position"))

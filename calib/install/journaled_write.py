@@ -57,7 +57,7 @@ def install(
         _write(record, controllers, before)
         complaint = check() if check is not None else None
         if complaint:
-            raise Refused(f"record {record.id}: {complaint}: the controllers hold the old calibration again")
+            raise Refused(f"record {record.id}: {complaint}: the old calibration was written back to the drives")
         if flash:
             stored = True
             _write(record, controllers, before, flash=True)
@@ -89,8 +89,8 @@ def recover(arm: ArmFile, store: RecordStore, controllers: Controllers) -> Contr
             _restore(controllers, entry, store=False)
         else:
             strangers.append(str(entry["name"]))
-    left = f"; {', '.join(strangers)} held another calibration since, left as it is" if strangers else ""
-    store.undo_write(line, arm, f"was cut off before it ended{left}")
+    left = f"; {', '.join(strangers)} got another calibration since and was left as it is" if strangers else ""
+    store.undo_write(line, arm, f"the write was cut off before it ended{left}")
     return line
 
 
@@ -107,8 +107,8 @@ def _write(
         now = controllers.write_calibration(j, Calibration(wanted.gain, wanted.offset, record.number, date), flash)
         if not wanted.matches(now):
             raise BusFault(
-                f"{record.joints[j].name}: its controller holds gain {now.gain:.6g} and offset {now.offset:.6g} N·m"
-                f" after gain {wanted.gain:.6g} and offset {wanted.offset:.6g} N·m were written"
+                f"{record.joints[j].name}: its drive holds gain {now.gain:.6g} and offset {now.offset:.6g} "
+                f"N·m, although gain {wanted.gain:.6g} and offset {wanted.offset:.6g} N·m were written"
             )
 
 

@@ -23,8 +23,9 @@ def require_own_arm(
     """
     if not arm.has_serial and not all(drive.simulated for drive in found):
         raise Refused(
-            f"{arm.name}: its serial is {arm.serial}: another arm of that name could be meant, so nothing is written"
-            f" to its drives: give it one in {arm.path.name} (serial: …), then calibrate its sweeps again"
+            f"{arm.name}: its serial is {arm.serial}, so the calibration may belong to another arm of this "
+            f"name, and nothing is written to its drives: give this arm a serial in {arm.path.name} "
+            "(`serial: …`), then calibrate again from its sweeps"
         )
     drives = tuple(drive.number for drive in found)
     _require_shared(arm, drives, record.drives, f"on which record {record.id} was measured")
@@ -52,7 +53,7 @@ def _require_shared(arm: ArmFile, drives: Sequence[str], known: Sequence[str], w
     here, there = sorted({*drives} - {""}), sorted({*known} - {""})
     if here and there and not {*here} & {*there}:
         raise Refused(
-            f"{arm.name} {arm.serial}: none of its drives ({here[0]} …) is one of the drives {what} ({there[0]} …):"
-            f" another arm has this name and serial: give each its own serial in its arm file ({arm.path.name}) and"
-            " calibrate it; nothing was written"
+            f"{arm.name} {arm.serial}: none of its drives ({here[0]} …) is one of the drives {what} "
+            f"({there[0]} …), so another arm has the same name and serial, and nothing was written: give "
+            f"each arm a serial of its own in its arm file ({arm.path.name}) and calibrate it"
         )

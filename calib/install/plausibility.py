@@ -40,21 +40,21 @@ WORSE = 1.05
 class Refusal(Enum):
     """Why a gate refuses a record; the value is the message that follows the joint's name."""
 
-    MODEL = "the sensor model does not hold: {why}; fix the problem, then sweep again, or give --accept {joint}"
+    MODEL = "the sensor model does not hold: {why}; correct the cause and sweep again, or give --accept {joint}"
     GAIN = "gain {value:.4f} is not between {lower:g} and {upper:g}: check the sensor's wiring and the arm file"
     OFFSET = "offset {value:.3f} N·m is beyond ± {limit:.3f}, half of rated torque: check the sensor"
     CHANGE = (
-        "{parameter} {value:.4f} differs by {change:+.1%}{of} from record {record}, and covariance and history allow"
-        " {limit:.1%}: check the sensor; if it was exchanged: --replaced {joint}"
+        "{parameter} {value:.4f} differs by {change:+.1%}{of} from record {record}, but covariance and "
+        "history allow only {limit:.1%}: check the sensor; if it was exchanged, give --replaced {joint}"
     )
-    DRIFT = "{difference} from record {record}, but a drift is at most {limit}: check the sensor, then sweep"
+    DRIFT = "{difference} away from record {record}, but a drift is at most {limit}: check the sensor, then sweep"
     FAR = (
-        "{difference} from what its controller holds, but a roll-back may change at most {limit}: check the record;"
-        " if the sensor was exchanged: --replaced {joint}"
+        "{difference} away from what its drive holds, but a roll-back may change at most {limit}: check the "
+        "record; if the sensor was exchanged, give --replaced {joint}"
     )
     HELD_OUT = (
-        "held-out data is predicted with {ratio:.2f} times the error of record {record}: the sweeps or recordings do"
-        " not agree with one another"
+        "the error on held-out data is {ratio:.2f} times the error of record {record}, so the sweeps or "
+        "recordings do not agree with one another"
     )
 
 

@@ -99,8 +99,8 @@ class EncoderFault(Refused):
 
     def __init__(self, name: str, seen: str, bit: int | None) -> None:
         """Joint's name, what its readings did, and the bit that would do it."""
-        cause = "its encoder or cable" if bit is None else f"bit {bit} of its encoder, which is stuck or lost"
-        super().__init__(f"{name}: {seen}: repair {cause}: no calibration with it is valid")
+        cause = "the encoder or its cable" if bit is None else f"the encoder, since its bit {bit} is stuck or lost"
+        super().__init__(f"{name}: {seen}: repair {cause}; until then no calibration of this joint is valid")
 
 
 class EncoderCheck:
@@ -131,7 +131,10 @@ class EncoderCheck:
         self._delay = sample.delay
         if np.count_nonzero(jumped):  # never of a reading that did not come: NaN
             joint = int(np.argmax(jumped))
-            what = f"its position reading jumped by {moved[joint]:+.3g} rad between two cycles, which no motion does"
+            what = (
+                f"its position reading jumped by {moved[joint]:+.3g} rad between two cycles, which no real "
+                "motion can do"
+            )
             raise EncoderFault(self._names[joint], what, bit_of(float(abs(moved[joint]) / self._step[joint])))
         came = np.isfinite(sample.position)
         np.copyto(self._read_at, sample.t, where=came)
@@ -150,6 +153,8 @@ class EncoderCheck:
             counts = np.rint(seen[:, joint] / step[joint])
             bit = missing_bit(counts[np.isfinite(counts)], path[:, joint] / step[joint])
             if bit is not None:
-                what = f"its position reading skips every other {2.0**bit * step[joint]:.3g} rad"
+                what = (
+                    f"every second step of its position reading is missing (steps of {2.0**bit * step[joint]:.3g} rad)"
+                )
                 unused = round(float(np.log2(step[joint] / self._step[joint])))
                 raise EncoderFault(self._names[joint], what, bit + unused)

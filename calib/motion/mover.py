@@ -54,8 +54,8 @@ class Stalled(Refused):
         """Joint's name, where it stands and where it should go [rad], and its index."""
         self.name, self.position, self.joint = name, position, joint
         super().__init__(
-            f"{name}: stopped at {position:.3f} rad on the way to {target:.3f}: its drive is too weak there,"
-            " its position loop yields to the load, or something is in the way"
+            f"{name} stopped at {position:.3f} rad on the way to {target:.3f} rad: its drive is too weak "
+            "there, its position loop yields to the load, or something is in the way"
         )
 
 
@@ -63,7 +63,7 @@ class Slipped(Refused):
     """A pressed joint left its stop."""
 
     def __init__(self, name: str, joint: int) -> None:
-        super().__init__(f"{name}: slipped off its stop")
+        super().__init__(f"{name} slipped off its stop")
         self.joint = joint
 
 
@@ -330,8 +330,8 @@ class Mover:
         beyond = side * (target - limit)
         if beyond > 2 * STOP_TOLERANCE + 0.03 * abs(limit):
             raise Refused(
-                f"{self.link.names[joint]}: no stop found at {limit:.3f} rad (went to {self.position[joint]:.3f}):"
-                " check lower and upper in the arm file"
+                f"{self.link.names[joint]}: no stop was found at {limit:.3f} rad (the joint went to "
+                f"{self.position[joint]:.3f} rad): check lower and upper in the arm file"
             )
 
     def _check_stop(self, joint: int, side: int) -> None:
@@ -340,8 +340,8 @@ class Mover:
         found = float(self.position[joint])
         if abs(found - limit) > STOP_TOLERANCE + 0.025 * abs(limit):
             raise Refused(
-                f"{self.link.names[joint]}: blocked at {found:.3f} rad, but its stop should be at {limit:.3f} rad:"
-                " is something in the way, or the arm file's range wrong?"
+                f"{self.link.names[joint]} was blocked at {found:.3f} rad, but its stop should be at "
+                f"{limit:.3f} rad: is something in the way, or is the range in the arm file wrong?"
             )
         self.contacts[joint, side] = found
 

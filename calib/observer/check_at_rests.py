@@ -71,7 +71,7 @@ class AfterWrite:
         counted = worse if worse.any() else np.ones(len(worse), dtype=bool)
         k = int(np.argmax(np.where(counted, (after - before) / self._floor, -np.inf)))
         why = (
-            f"{self._names[k]}: RMS against the model {after[k]:.3f} N·m at {ROWS} rests, {before[k]:.3f} with the old"
-            " pair"
+            f"{self._names[k]}: RMS difference between sensor and model at {ROWS} rests: {after[k]:.3f} N·m "
+            f"with the new gain and offset, {before[k]:.3f} N·m with the old gain and offset"
         )
         return Checked("worse" if worse.any() else "kept", self._joints[k], why)

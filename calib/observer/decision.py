@@ -94,24 +94,31 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     gain_std = float(np.hypot(config.gain_std, of_model / test.belief.kernel.typical[joint]))
     offset_std = float(np.hypot(config.offset_std, of_model))
     if cause != "offset" and (weak_lever or covariance[0, 0] > gain_std**2):
-        std = f"gain known to {np.sqrt(covariance[0, 0]):.2%} only, {gain_std:.2%} is required: sweep this joint"
+        std = (
+            f"the gain is known only to ± {np.sqrt(covariance[0, 0]):.2%}, but ± {gain_std:.2%} is required: "
+            "sweep this joint"
+        )
         if test.loss(joint, "offset", cause, beside) < config.evidence:
             cause = "offset"  # explained as well without the gain, which keeps its value
             change, covariance = test.drift(joint, cause, beside)
         else:
-            refused.append("gravity's lever too short for a gain" if weak_lever else std)
+            refused.append("the lever of gravity is too short to find a gain" if weak_lever else std)
     if covariance[1, 1] > offset_std**2:
-        refused.append(f"offset known to {np.sqrt(covariance[1, 1]):.3f} N·m only, {offset_std:.3g} is required")
+        refused.append(
+            f"the offset is known only to ± {np.sqrt(covariance[1, 1]):.3f} N·m, but ± {offset_std:.3g} N·m is required"
+        )
     if _distance(change, covariance) < config.significance:
-        refused.append(f"change is less than {config.significance:g} standard deviations")
+        refused.append(f"the change is less than {config.significance:g} standard deviations")
     if len(set(np.sign(test.window.direction[:, joint])) - {0.0}) < 2:
-        refused.append("joint approached from one side only: friction looks like an offset")
+        refused.append("the joint was approached from one side only, so friction looks like an offset")
     alike = _joints_alike(test, joint, config.significance)
     if alike >= config.common_joints:
-        refused.append(f"{alike} joints changed by the same factor: gravity, payload or supply voltage")
+        refused.append(
+            f"{alike} joints changed by the same factor, so the cause may be gravity, a payload or the supply voltage"
+        )
     moved = _moved_zeros(test, verdict, joint, config.significance)
     if cause != "gain" and moved >= config.common_joints - 1:
-        refused.append(f"the zeros of {moved} other joints moved as well: temperature")
+        refused.append(f"the zeros of {moved} other joints moved as well, so the cause may be the temperature")
     rows = len(test.window.position)
     return DriftFinding(
         joint,

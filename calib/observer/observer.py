@@ -230,13 +230,19 @@ class Observer:
             return []
         for joint in verdict.joints:
             if not windows_agree(first.test, test, joint, verdict.other(joint), self.config.agreement):
-                return self._undecided(t, joint, "two windows disagree: still drifting")
+                return self._undecided(
+                    t, joint, "two windows of readings disagree, so the sensor may still be drifting"
+                )
         rows = (first.rows + window)[-self.config.longest_window :]
         together = self._tracking.cause_test(rows)
         self._investigation.first = Agreeing(rows, together, first.joints)
         verdict = together.verdict()
         if not verdict.is_drift or frozenset(verdict.joints) != first.joints:
-            return self._undecided(t, None, "all windows together point to another cause")
+            return self._undecided(
+                t,
+                None,
+                "each window of readings shows a drift of the sensor, but all windows together show another cause",
+            )
         return [event for joint in verdict.joints for event in self._decide(t, together, verdict, joint)]
 
     def _decide(self, t: float, test: CauseTest, verdict: Verdict, joint: int) -> list[Event]:
@@ -263,7 +269,7 @@ class Observer:
         if state.repeated < self.config.patience:
             return []
         state.clear()
-        return self._undecided(t, None, "too few different poses to tell a cause: sweep, or move more")
+        return self._undecided(t, None, "the arm stood in too few different poses to find a cause: sweep, or move more")
 
     def _undecided(self, t: float, joint: int | None, *reasons: str) -> list[Event]:
         """The reasons why nothing is proposed, reported when they change."""

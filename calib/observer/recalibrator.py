@@ -63,7 +63,8 @@ def recalibrated_record(
         covariance=matrix(_propagated(record, finding, installed.gain)),
         confirmed_by=by,
         parent=record.id,
-        note=f"{joint.name}: {finding.cause} drift found in {finding.rows} poses, confidence {finding.confidence:.3f}",
+        note=f"{joint.name}: a drift of the {finding.cause} was found in {finding.rows} poses, with confidence "
+        f"{finding.confidence:.3f}",
     )
 
 
@@ -123,7 +124,10 @@ class Recalibrator:
         refuses it, or the controller's calibration is not the current record's; BusFault.
         """
         if new.parent != self.record.id:
-            raise Refused(f"record {new.id} follows from {new.parent}, but {self.record.id} is current: superseded")
+            raise Refused(
+                f"record {new.id} follows from record {new.parent}, but record {self.record.id} is current now: "
+                "it is superseded"
+            )
         self._require_current()
         recover(self._arm, self._store, self._controllers)
         old = require_installed(self.record, self._controllers, j)
@@ -142,7 +146,7 @@ class Recalibrator:
         held = [self._controllers.read_calibration(j) for j in range(len(self.record.joints))]
         admitted = admit(self.record, self._arm, self._store, held=held)
         check = self._check_of(self.record, dict(enumerate(held)))
-        written = self._install(admitted, RESTORED_BY, "the controllers held another calibration")
+        written = self._install(admitted, RESTORED_BY, "the drives held another calibration")
         if admitted.before is not None:
             self._installed(self.record, admitted.before.id, tuple(range(len(held))), check)
         return written
@@ -163,7 +167,7 @@ class Recalibrator:
         Raises Refused if there is no record to go back to, BusFault.
         """
         if self._before is None:
-            raise Refused(f"record {self.record.id} has none before it to go back to")
+            raise Refused(f"there is no record before {self.record.id} to go back to")
         parent, j, joints = self._store.get(self._before), checked.joint, self._written or (checked.joint,)
         assert isinstance(parent, CalibrationRecord)
         recover(self._arm, self._store, self._controllers)
@@ -185,7 +189,7 @@ class Recalibrator:
         if current is None or current.id != self.record.id:
             now = "none" if current is None else current.id
             raise Refused(
-                f"record {self.record.id} is not current in {self._store.url} any more ({now} is): superseded"
+                f"record {self.record.id} is superseded: it is not current in {self._store.url} any more ({now} is)"
             )
 
     def _install(
@@ -227,8 +231,8 @@ def require_installed(record: CalibrationRecord, controllers: Controllers, j: in
     for what, value, found in (("gain", wanted.gain, held.gain), ("offset", wanted.offset, held.offset)):
         if not same_real32(value, found):
             raise Refused(
-                f"{joint.name}: the controller holds {what} {found:.6g}, record {record.id} has {value:.6g}:"
-                " write the record to the controllers first"
+                f"{joint.name}: the drive holds {what} {found:.6g}, but record {record.id} has {value:.6g}: "
+                "write the record to the drives first"
             )
     return held
 

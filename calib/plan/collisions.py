@@ -78,8 +78,15 @@ class Geometry:
             known = f"{PARKED}{name}" if parked.model else name
             place = self._mujoco.mj_name2id(self.model, self._mujoco.mjtObj.mjOBJ_JOINT, known)
             if place < 0 or known in moving:
-                what = "moves itself" if known in moving else f"is not in {parked.model or arm_file.kinematics.model}"
-                raise BadInput(f"{arm_file.path}: key sweep.beside: pose: joint {name!r} {what}: give joints at rest")
+                what = (
+                    "is moved by a drive of this arm"
+                    if known in moving
+                    else f"is not in {parked.model or arm_file.kinematics.model}"
+                )
+                raise BadInput(
+                    f"{arm_file.path}: key sweep.beside: pose: joint {name!r} {what}: give only joints of other "
+                    "arms, which rest"
+                )
             self.data.qpos[self.model.jnt_qposadr[place]] = angle
 
     def contacts(self, pose: Array) -> list[Contact]:
@@ -114,10 +121,10 @@ class Geometry:
 def check_plan(arm_file: ArmFile, plan: SweepPlan) -> str:
     """Check all poses along a plan; raises Collided naming bodies, sweep and pose. Returns a sentence on the check."""
     if arm_file.model_path is None:
-        return "collisions not checked: the arm file has no kinematics.model with geometry"
+        return "collisions are not checked: the arm file has no kinematics.model with geometry"
     geometry = Geometry(arm_file)
     if geometry.model.ngeom == 0:
-        return f"collisions not checked: {geometry.left_out or 'the model has no geometry'}"
+        return f"collisions are not checked: {geometry.left_out or 'the model has no geometry'}"
     count = 0
     for place, pose in poses_along(plan):
         count += 1
@@ -132,7 +139,7 @@ def check_creeps(arm_file: ArmFile, geometry: Geometry, plan: SweepPlan, here: A
     Raises Collided naming bodies, sweep and pose.
     """
     home = np.array(plan.scout[0])
-    for where, pose in _between(here, home, "on the way from where it stands to the first pose"):
+    for where, pose in _between(here, home, "on the way from its present pose to the first pose"):
         _require_free(arm_file, geometry, where, pose)
     for sweep in plan.sweeps:
         begin, end = sweep_ends(sweep)

@@ -156,12 +156,15 @@ def _unfit(ground: CreepGround, plan: SweepPlan, ends: Array) -> Iterator[str]:
     for sweep in plan.sweeps:
         speed, (lower, upper) = creep_speed(sweep), creep_ends(sweep)
         if speed > min(fastest, ground.limits.speed[sweep.joint]) * (1 + ROUNDING):
-            yield f"sweep {sweep.name}: speed {speed:g} rad/s, expected at most {fastest:g}"
+            yield f"sweep {sweep.name}: speed is {speed:g} rad/s, expected at most {fastest:g} rad/s"
         low, high = ends[:, sweep.joint]
         if lower < low - ROUNDING or upper > high + ROUNDING:
-            yield f"sweep {sweep.name}: from {lower:.4g} to {upper:.4g} rad, expected {low:.4g} to {high:.4g}"
+            yield (
+                f"sweep {sweep.name} goes from {lower:.4g} to {upper:.4g} rad: it must stay between {low:.4g} "
+                f"and {high:.4g} rad"
+            )
         if not ground.bearable(CreepCandidate(sweep.joint, np.array(sweep.rest), lower, upper), mass):
-            yield f"sweep {sweep.name}: a drive cannot hold its joint there within max_torque, with {mass:g} kg"
+            yield f"sweep {sweep.name}: with {mass:g} kg, a drive cannot hold its joint in this sweep within max_torque"
 
 
 def creep_seconds(plan: SweepPlan) -> float:
@@ -177,7 +180,7 @@ def creep_seconds(plan: SweepPlan) -> float:
 def creep_speed(sweep: Sweep) -> float:
     """Of a planned creep [rad/s]; raises BadInput for a sweep that has none."""
     if sweep.speed is None:
-        raise BadInput(f"sweep {sweep.name}: no speed: this is a plan of steps at rest, not of creep sweeps")
+        raise BadInput(f"sweep {sweep.name} has no speed, so this is a plan of steps at rest, not of creep sweeps")
     return sweep.speed
 
 
@@ -224,7 +227,7 @@ def _home(ground: CreepGround, random: np.random.Generator) -> Array:
         pose = random.uniform(*ends.T)
         if ground.free(pose[None]):
             return np.asarray(pose)
-    raise BadInput("almost every pose within the joint range collides: narrow lower and upper in the arm file")
+    raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
 
 
 def _candidates(
@@ -244,8 +247,8 @@ def _candidates(
                 break
     if not found:
         raise BadInput(
-            f"joint {ground.arm.names[joint]}: no creep of {span:.2f} rad is free of collisions and within max_torque"
-            f" with {mass:g} kg: shorten sweep.creep.span, choose a smaller sweep.reference_mass, or narrow lower and"
-            " upper of the others in the arm file"
+            f"joint {ground.arm.names[joint]}: no creep of {span:.2f} rad is free of collisions and within "
+            f"max_torque with {mass:g} kg: shorten sweep.creep.span, choose a smaller sweep.reference_mass, "
+            "or narrow lower and upper of the other joints in the arm file"
         )
     return found

@@ -7,12 +7,12 @@ from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_levers, gravity_regressor
 
 VERTICAL = (
-    "its axis is vertical in every pose, so that gravity does not load it: its torque constant cannot be seen; mount"
-    " the base tilted by 10° or more and state kinematics.gravity accordingly"
+    "its axis is vertical in every pose, so gravity does not load it and its torque constant cannot be "
+    "determined; mount the base tilted by 10° or more and write the tilt as kinematics.gravity"
 )
 NO_LEVER = (
-    "the axes of all joints that gravity loads meet in one point, or nearly, so that a mass at an unknown place has no"
-    " known lever: torque constants share one unknown factor; measure where the mass hangs (sweep.reference_point)"
+    "the axes of all joints that gravity loads meet (nearly) in one point, so a mass at an unknown place has no known "
+    "lever, and all torque constants share one unknown factor; measure where the mass hangs (sweep.reference_point)"
 )
 SHORTEST = 0.005
 """Lever below which the place of the mass hides it [m], root mean square over poses."""

@@ -47,7 +47,7 @@ def check_limits(arm_file: ArmFile, plan: SweepPlan) -> None:
 
 def check_bias(arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused where a plan does not say how resting joints are pressed, as one from before the scout."""
-    refuse_unfit(arm_file, (f"sweep {sweep.name}: bias is missing" for sweep in plan.sweeps if sweep.bias is None))
+    refuse_unfit(arm_file, (f"sweep {sweep.name}: `bias` is missing" for sweep in plan.sweeps if sweep.bias is None))
 
 
 def require_bounds(arm_file: ArmFile, plan: SweepPlan, bounds: PoseBounds) -> None:
@@ -61,14 +61,14 @@ def refuse_unfit(arm_file: ArmFile, found: Iterator[str]) -> None:
     first = next(found, None)
     if first is not None:
         raise Refused(
-            f"{arm_file.name}: the plan does not fit the arm file: {first}: has one of them been changed since it was"
-            " made? Begin a new pass in another directory"
+            f"{arm_file.name}: the plan of this data set does not fit the arm file: {first}: was the plan or "
+            "the arm file changed since the plan was made? Begin a new pass in another directory"
         )
 
 
 def _of_shape(plan: SweepPlan, n: int) -> Iterator[str]:
     if not plan.scout:
-        yield "it has no scout pose, expected at least one"
+        yield "the plan has no scout pose, expected at least one"
     for number, pose in enumerate(plan.scout, start=1):
         if len(pose) != n:
             yield f"scout pose {number} has {len(pose)} joints, expected {n}"
@@ -81,13 +81,13 @@ def _of_shape(plan: SweepPlan, n: int) -> Iterator[str]:
         if names.count(sweep.name) > 1:
             yield f"two sweeps are called {sweep.name!r}"
         elif wrong:
-            yield f"sweep {sweep.name}: {wrong} has {len(each[wrong])} values, expected one a joint ({n})"
+            yield f"sweep {sweep.name}: {wrong} has {len(each[wrong])} values, expected one for each joint ({n})"
         elif not 0 <= sweep.joint < n:
-            yield f"sweep {sweep.name}: joint {sweep.joint}, expected 0 to {n - 1}"
+            yield f"sweep {sweep.name}: joint is {sweep.joint}, expected 0 to {n - 1}"
         elif len(sweep.steps) < 2 or (np.diff(sweep.steps) <= 0).any():
             yield f"sweep {sweep.name}: its steps do not increase"
         elif any(not (sweep.stops[k] or sweep.servo[k]) for k in range(n) if k != sweep.joint):
-            yield f"sweep {sweep.name}: a joint that rests neither on a stop nor in its servo"
+            yield f"sweep {sweep.name}: one joint is held neither on a stop nor by its position loop"
 
 
 def _of_poses(plan: SweepPlan, bounds: PoseBounds, names: Sequence[str]) -> Iterator[str]:
@@ -106,7 +106,7 @@ def _of_poses(plan: SweepPlan, bounds: PoseBounds, names: Sequence[str]) -> Iter
 
 def _beyond(where: str, pose: Array, lower: Array, upper: Array, names: Sequence[str]) -> Iterator[str]:
     for k in np.flatnonzero((pose < lower - ROUNDING) | (pose > upper + ROUNDING)).tolist():
-        yield f"{where}: {names[k]} at {pose[k]:.4g} rad, expected {lower[k]:.4g} to {upper[k]:.4g}"
+        yield f"{where}: {names[k]} is at {pose[k]:.4g} rad, expected {lower[k]:.4g} to {upper[k]:.4g} rad"
 
 
 def _of_drives(plan: SweepPlan, section: SweepSection, limits: DriveLimits, names: Sequence[str]) -> Iterator[str]:
@@ -115,9 +115,9 @@ def _of_drives(plan: SweepPlan, section: SweepSection, limits: DriveLimits, name
     fastest = max(section.acceleration, SLOWEST)
     for sweep in plan.sweeps:
         if sweep.speed is not None:
-            yield f"sweep {sweep.name} creeps, and a plan of static readings does not"
+            yield f"sweep {sweep.name} is a creep sweep, but this is a plan of readings at rest"
         if not 0 < sweep.acceleration <= fastest * (1 + ROUNDING):
-            yield f"sweep {sweep.name}: acceleration {sweep.acceleration:g} rad/s², expected at most {fastest:g}"
+            yield f"sweep {sweep.name}: acceleration is {sweep.acceleration:g} rad/s², expected at most {fastest:g}"
         yield from _of_bias(sweep, limits, names)
 
 
@@ -126,6 +126,9 @@ def _of_bias(sweep: Sweep, limits: DriveLimits, names: Sequence[str]) -> Iterato
         pressed = k != sweep.joint and not sweep.servo[k]
         most, side = limits.max_torque[k] * (1 + ROUNDING), sweep.stops[k]
         if abs(bias) > most:
-            yield f"sweep {sweep.name}: {names[k]} pressed with {bias:g} N·m, expected at most {limits.max_torque[k]:g}"
+            yield (
+                f"sweep {sweep.name}: {names[k]} is pressed with {bias:g} N·m, expected at most "
+                f"{limits.max_torque[k]:g} N·m"
+            )
         elif bias * side < 0 or (bias and not pressed):
-            yield f"sweep {sweep.name}: {names[k]} pressed with {bias:g} N·m, not towards the stop that it rests on"
+            yield f"sweep {sweep.name}: {names[k]} is pressed with {bias:g} N·m away from the stop that it rests on"

@@ -42,7 +42,7 @@ def scout_poses(
     if geometry is not None:
         poses = poses[geometry.free(poses)]
         if len(poses) < 2 * (n + 3):
-            raise BadInput("almost every pose within the joint range collides: narrow lower and upper in the arm file")
+            raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
     regressor = gravity_regressor(kinematics, poses)
     offsets = np.broadcast_to(np.eye(n), (len(poses), n, n))
     rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
@@ -69,6 +69,7 @@ def require_range(section: SweepSection, limits: DriveLimits, kinematics: Arm) -
         first, last = sweep_range(section, limits, joint)
         if not np.isfinite([first, last]).all() or last - first < 0.2:
             raise BadInput(
-                f"joint {name}: its range {limits.lower[joint]} to {limits.upper[joint]} rad leaves nothing to sweep"
-                f" within range_margin {section.range_margin} rad: check lower and upper, or reduce the margin"
+                f"joint {name}: range_margin {section.range_margin} rad leaves nothing of its range "
+                f"{limits.lower[joint]} to {limits.upper[joint]} rad to sweep: check lower and upper, or "
+                "reduce range_margin"
             )

@@ -68,10 +68,13 @@ def _options(planned: PlannedArm, joint: int) -> tuple[Candidates, list[str]]:
     if not (pressed | holdable).any():
         needed = " ".join(f"{torque:.1f}" for torque in strongest.min(axis=0))
         raise BadInput(
-            f"joint {name}: no combination of stops can be held within max_torque: gravity needs up to"
-            f" {needed} N·m; sweep a lighter arm, or allow more torque"
+            f"joint {name} cannot be swept: gravity needs up to {needed} N·m, so in no combination of stops "
+            "can max_torque hold the arm; sweep a lighter arm, or allow more torque"
         )
-    note = f"{name}: too few stop combinations can be pressed within max_torque: some joints are servo-held instead"
+    note = (
+        f"in sweeps of {name}, max_torque can press the other joints on their stops in too few poses, so in some "
+        "sweeps their position loops hold them"
+    )
     return with_lever(everything.kept(pressed | holdable)), [note]
 
 
@@ -85,6 +88,6 @@ def _without_collision(candidates: Candidates, geometry: Geometry, name: str) ->
         return candidates.kept(free)
     first, second = next(found for pose in flat for found in geometry.contacts(pose)).bodies
     raise Collided(
-        f"joint {name}: in every combination of stops something touches, for example {first} and {second}:"
-        " narrow lower and upper in the arm file"
+        f"joint {name}: in every combination of stops two bodies touch, for example {first} and {second}: "
+        "narrow lower and upper in the arm file"
     )

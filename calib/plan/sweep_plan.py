@@ -87,8 +87,9 @@ def plan_sweep(
     finer = 1.0 if gain_std is None else float(np.clip(gain_std / goal, 1.0, FINEST))
     if gain_std is not None and gain_std > ENOUGH * FINEST * goal:
         notes.append(
-            f"gains will be known to ± {200 * gain_std / finer:.2g} % only, not ± {200 * goal:.2g} %, even with long"
-            " averages: use a heavier reference mass or more sweep.poses, or measure its place (sweep.reference_point)"
+            f"even with long averages, gains will be known to ± {200 * gain_std / finer:.2g} % only instead "
+            f"of ± {200 * goal:.2g} %: use a heavier reference mass or more sweep.poses, or measure where "
+            "the mass hangs (sweep.reference_point)"
         )
     return SweepPlan(
         sweeps=sweeps,
@@ -115,10 +116,10 @@ def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess |
         most[planned.kinematics.names[options.joint]] = max(float(bearable.max()), 0.0)
     name = min(most, key=lambda joint: most[joint])
     if mass > most[name]:
-        unit = f"; is it {mass / 1000:g} kg?" if mass >= GRAMS and mass / 1000 < most[name] else ""
+        unit = f"; or do you mean {mass / 1000:g} kg?" if mass >= GRAMS and mass / 1000 < most[name] else ""
         raise BadInput(
-            f"--reference-mass {mass:g}: with it no sweep of {name} stays within max_torque: attach at most "
-            f"{float(f'{most[name]:.2g}'):g} kg{unit}"
+            f"--reference-mass {mass:g}: with this mass no sweep of {name} stays within max_torque: attach "
+            f"at most {float(f'{most[name]:.2g}'):g} kg{unit}"
         )
 
 

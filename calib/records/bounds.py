@@ -78,7 +78,7 @@ def require_sound(record: R, arm: ArmFile, now: datetime | None = None) -> R:
     """
     joints = record.joints if isinstance(record, CalibrationRecord) else record.names
     if arm.joint_names and len(joints) != len(arm.joint_names):
-        raise _unsound(record, f"it has {len(joints)} joints, the arm {len(arm.joint_names)}")
+        raise _unsound(record, f"it has {len(joints)} joints, but the arm has {len(arm.joint_names)}")
     _require_date(record, now)
     values = _of_calibration(record, arm) if isinstance(record, CalibrationRecord) else _of_gravity(record, arm)
     for each in values:
@@ -90,7 +90,7 @@ def require_sound(record: R, arm: ArmFile, now: datetime | None = None) -> R:
 
 def _unsound(record: R, why: str) -> Refused:
     return Refused(
-        f"record {record.id}: {why}: no working arm has such values: calibrate again, or go back to another record"
+        f"record {record.id}: {why}, which no working arm has: calibrate again, or go back to another record"
     )
 
 
@@ -99,8 +99,8 @@ def _require_date(record: R, now: datetime | None) -> None:
         raise _unsound(record, f"created is {record.created:%Y-%m-%d}, not {EARLIEST:%Y} to {LATEST:%Y}")
     if now is not None and record.created > now + CLOCK_TOLERANCE:
         raise Refused(
-            f"record {record.id}: created is {record.created:%Y-%m-%d %H:%M %Z}, but this machine's clock says"
-            f" {now:%Y-%m-%d %H:%M %Z}: set the clock that is wrong; a record of the future is not put into force"
+            f"record {record.id} was created on {record.created:%Y-%m-%d %H:%M %Z}, but the clock of this machine says "
+            f"{now:%Y-%m-%d %H:%M %Z}, and a record from the future is not put into force: set the clock that is wrong"
         )
 
 

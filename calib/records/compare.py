@@ -52,7 +52,7 @@ def differences(
     if isinstance(before, GravityRecord) and isinstance(after, GravityRecord):
         return _of_gravity(before, after)
     raise BadInput(
-        f"records {before.id} and {after.id}: a {before.kind} and a {after.kind} record: give two of one kind"
+        f"{before.id} is a {before.kind} record and {after.id} a {after.kind} record: give two records of one kind"
     )
 
 

@@ -118,7 +118,7 @@ def _file_of(engine: sa.Engine) -> FileIdentity:
         found = os.stat(str(engine.url.database))
     except OSError as error:
         engine.dispose()
-        raise StoreFault(f"{_store_name(engine)}: its file is gone ({error.strerror}): put it back") from None
+        raise StoreFault(f"{_store_name(engine)}: the file is gone ({error.strerror}): put it back") from None
     return found.st_dev, found.st_ino
 
 
@@ -145,10 +145,10 @@ def _replaced(engine: sa.Engine) -> StoreFault:
     try:
         _migrate(engine)
     except sa.exc.SQLAlchemyError as error:
-        return _fault(engine, "was replaced by another file, which cannot be opened", error)
+        return _fault(engine, "it was replaced by another file, which cannot be opened", error)
     return StoreFault(
-        f"{_store_name(engine)}: was replaced by another file while it was in use: nothing was written; that one is"
-        " used from now on"
+        f"{_store_name(engine)} was replaced by another file while it was in use. Nothing was written, and the new "
+        "file is used from now on: try again"
     )
 
 
@@ -156,7 +156,7 @@ def _fault(engine: sa.Engine, what: str, error: sa.exc.SQLAlchemyError) -> Store
     """A failure of the database in one line; its connections are closed, since they may hold a lost server or file."""
     engine.dispose()
     reason = first_line(getattr(error, "orig", None) or error)
-    return StoreFault(f"{_store_name(engine)}: {what}: {reason}: fix that and run the command again")
+    return StoreFault(f"{_store_name(engine)}: {what}: {reason}: correct the cause and repeat the command")
 
 
 def _store_name(engine: sa.Engine) -> str:
@@ -176,8 +176,8 @@ def _migrate(engine: sa.Engine) -> None:
             return
         if found is not None and found not in MIGRATIONS:
             raise BadInput(
-                f"{_store_name(engine)}: its schema {found} is newer than this armlink knows ({HEAD}): install a newer"
-                " armlink; nothing was changed"
+                f"{_store_name(engine)}: its schema {found} is newer than schema {HEAD} of this armlink, so "
+                "nothing was changed: install a newer armlink"
             )
         _upgrade(connection, stamp=found is None and sa.inspect(connection).has_table("records"))
 

@@ -27,7 +27,9 @@ def lock_file(descriptor: int, what: str, patience: float = 0.0) -> None:
             return
         except BlockingIOError:
             if time.monotonic() >= end:
-                raise BadInput(f"{what}: in use by {_holder(descriptor)}: stop that, or choose another") from None
+                raise BadInput(
+                    f"{what}: in use by {_holder(descriptor)}: stop that process, or choose another one"
+                ) from None
             time.sleep(RETRY_SECONDS)
 
 

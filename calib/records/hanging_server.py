@@ -36,7 +36,7 @@ class ImpatientConnection(psycopg.Connection[Any]):
             return super().wait(*given, **options)
         except psycopg.OperationalError:
             if silent.is_set():
-                raise psycopg.OperationalError(f"the server has answered nothing for {seconds:g} s") from None
+                raise psycopg.OperationalError(f"the server has not answered for {seconds:g} s") from None
             raise
         finally:
             timer.cancel()

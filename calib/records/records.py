@@ -87,7 +87,7 @@ class ArmRecord(_Frozen):
         for what, (ours, wanted) in differing.items():
             if ours != wanted:
                 raise Refused(
-                    f"record {self.id}: {what} is {ours}, but {wanted} is wanted: the record is of another arm"
+                    f"record {self.id}: {what} is {ours}, but must be {wanted}: the record belongs to another arm"
                 )
         return self
 
@@ -160,11 +160,11 @@ class JointCalibration(_Frozen):
         missing = {parameter for parameter in PARAMETERS if getattr(self, parameter) is None}
         if missing != set(self.not_identifiable):
             raise ValueError(
-                f"joint {self.name}: {sorted(missing)} have no value, {sorted(self.not_identifiable)} have a reason:"
-                " give a reason for each missing value and for no other"
+                f"joint {self.name}: {sorted(missing)} have no value, but {sorted(self.not_identifiable)} "
+                "have a reason: give a reason for each missing value, and for no other value"
             )
         if self.gain == 0.0 or self.position_gain == 0.0:
-            raise ValueError(f"joint {self.name}: a gain of 0 is not a sensor")
+            raise ValueError(f"joint {self.name}: the gain is 0, which no sensor has")
         return self
 
     def torque_calibration(self, missing: TorqueCalibration[float] = UNKNOWN) -> TorqueCalibration[float]:
@@ -214,7 +214,7 @@ class CalibrationRecord(ArmRecord):
         known = {f"{joint.name}.{parameter}" for joint in self.joints for parameter in PARAMETERS}
         for name in self.covariance_of:
             if name not in known:
-                raise ValueError(f"covariance_of: {name!r} is none of this record's parameters")
+                raise ValueError(f"covariance_of: {name!r} is not a parameter of this record")
         return self
 
     def values(self, parameter: Parameter, missing: float = np.nan) -> Array:
@@ -275,7 +275,7 @@ class GravityRecord(ArmRecord):
         size = 2 * len(self.names)
         for key in ("beta", "identifiable"):
             if len(getattr(self, key)) != size:
-                raise ValueError(f"{key}: {len(getattr(self, key))} values, expected {size} (two a joint)")
+                raise ValueError(f"{key} has {len(getattr(self, key))} values, expected {size} (two for each joint)")
         _square(self.covariance, size, "twice the joints")
         return self
 
@@ -316,14 +316,16 @@ def parse_record(content: Any, origin: str) -> CalibrationRecord | GravityRecord
     }
     kind = content.get("kind") if isinstance(content, dict) else None
     if not isinstance(kind, str) or kind not in kinds:
-        raise BadInput(f"{origin}: key kind: expected calibration or gravity (value {kind!r})")
+        raise BadInput(f"{origin}: `kind` is {kind!r}, expected calibration or gravity")
     body = {key: value for key, value in content.items() if key != "id"}
     try:
         record = kinds[kind].model_validate(body)
     except ValidationError as error:
         raise BadInput(f"{origin}: {describe(error)}") from None
     if content.get("id", record.id) != record.id:
-        raise BadInput(f"{origin}: content was changed: its id is {content['id']}, but the content gives {record.id}")
+        raise BadInput(
+            f"{origin}: the content was changed, since its id is {content['id']}, but the content gives {record.id}"
+        )
     return record
 
 

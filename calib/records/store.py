@@ -75,7 +75,7 @@ class RecordStore:
         with reading(self._engine) as connection:
             body = connection.execute(sa.select(RECORDS.c.body).where(RECORDS.c.id == record_id)).scalar()
         if body is None:
-            raise Refused(f"no record {record_id} in {self.url}; the history of an arm lists its records")
+            raise Refused(f"there is no record {record_id} in {self.url}; `history` lists the records of an arm")
         return self._record(record_id, body)
 
     def usable(self, record_id: str, arm: ArmFile, now: datetime | None = None) -> AnyRecord:
@@ -101,7 +101,9 @@ class RecordStore:
         record = self.usable(record_id, arm)
         log = [line.record for line in self.activations(arm) if line.kind == record.kind]
         if record_id not in log:
-            raise Refused(f"record {record_id} was never current on {arm.name} {arm.serial}: nothing to go back to")
+            raise Refused(
+                f"record {record_id} was never current on {arm.name} {arm.serial}, so it cannot become current again"
+            )
         if log[-1] == record_id:
             raise Refused(f"record {record_id} is current on {arm.name} {arm.serial} already")
         return record
@@ -126,7 +128,9 @@ class RecordStore:
     def _record(self, record_id: str, body: str) -> AnyRecord:
         """The record of a row; raises StoreFault where the row is not what was stored under its id."""
         if digest_id(body) != record_id:
-            raise StoreFault(f"record store {self.url}: record {record_id} was changed: restore the store from a copy")
+            raise StoreFault(
+                f"record store {self.url}: the content of record {record_id} was changed: restore the store from a copy"
+            )
         return parse_record(self._parsed(body), f"record {record_id}")
 
     def _parsed(self, body: str) -> Any:
@@ -260,7 +264,7 @@ MAKERS = {"calibration": "calibrate", "gravity": "identify"}
 
 def no_record(arm: ArmFile, kind: str) -> Refused:
     """The refusal of work that needs a record of the `kind`, with the commands that lead to one."""
-    return Refused(f"{arm.name} {arm.serial}: no {kind} record yet: {way_to(arm, kind)}")
+    return Refused(f"{arm.name} {arm.serial}: there is no {kind} record yet: {way_to(arm, kind)}")
 
 
 def way_to(arm: ArmFile, *kinds: str) -> str:

@@ -64,7 +64,7 @@ def _identity(done: Calibrated) -> ReportSection:
         html += paragraphs(each.text for each in fit.findings)
         chi2 = f"χ² {fit.fit.chi2:.0f} at {fit.fit.dof} degrees of freedom"
         rows += [
-            ["confirmed by", record.confirmed_by or "not confirmed: kept, not written to controllers"],
+            ["confirmed by", record.confirmed_by or "not confirmed: stored, but not written to the drives"],
             ["readings", f"{len(fit.rows.swept)}, {chi2}"],
         ]
     for data in done.data:
@@ -86,16 +86,17 @@ def _advice(done: Calibrated, fit: SensorFit, broken: list[str]) -> Markup:
     exactly = (
         f"Torque gains are known to ± {known.min():.2%} to ± {known.max():.2%}" if known.size else "No gain is known"
     )
-    without = f"; not of {', '.join(unknown)}, see below" if unknown else ""
+    without = f"; the gains of {', '.join(unknown)} are not known, see below" if unknown else ""
     if broken:
         return paragraph(
-            f"Do not write it yet: look at {', '.join(broken)} first, then sweep again. {exactly}{without}."
+            f"Do not write it to the drives yet: look at {', '.join(broken)} first, then sweep again. "
+            f"{exactly}{without}."
         )
     if done.record.confirmed_by:
-        next_step, command = "It is confirmed for the controllers; verify it:", f"armlink verify {done.arm.argument}"
+        next_step, command = "It is confirmed for the drives; verify it with:", f"armlink verify {done.arm.argument}"
     else:
         sweeps = shlex.join(str(data.path) for data in done.data)
-        next_step, command = "It can be written to the controllers:", f"armlink calibrate {sweeps} --apply"
+        next_step, command = "It can be written to the drives with:", f"armlink calibrate {sweeps} --apply"
     return paragraph(f"{exactly}{without}. {next_step}") + html_of("<p><code>{}</code></p>", command)
 
 
@@ -119,14 +120,14 @@ def _comparison(done: Calibrated, fit: SensorFit) -> ReportSection:
     n = len(names)
     if before is None:
         manifest = done.data[0].manifest
-        old, label = manifest.installed, "the controllers' values"
+        old, label = manifest.installed, "the calibration in the drives"
     else:
         old, label = before.torque_calibration(UNCALIBRATED), f"record {before.id}"
     rms = [_rms_of_pair(done, fit, pair) for pair in (old, record.torque_calibration(old))]
     shown = np.isfinite(rms[0]) & np.isfinite(rms[1])
     text = (
-        "Calibrated torque minus model torque over all readings without load, with the calibration in use until now and"
-        " with the new one."
+        "Calibrated torque minus model torque over all readings without load, with the calibration used "
+        "until now and with the new calibration."
     )
     figures = []
     if shown.any():
@@ -155,7 +156,9 @@ def _changes(before: CalibrationRecord, record: CalibrationRecord) -> ReportTabl
         if each.before is not None or each.after is not None
     ]
     header = ("joint", "parameter", before.id, record.id, "change", "in standard deviations")
-    return ReportTable(header, rows, f"Against record {before.id} of {before.created:%Y-%m-%d %H:%M} UTC.", texts=2)
+    return ReportTable(
+        header, rows, f"Compared with record {before.id} of {before.created:%Y-%m-%d %H:%M} UTC.", texts=2
+    )
 
 
 def _rms_of_pair(done: Calibrated, fit: SensorFit, pair: TorqueCalibration[Array]) -> Array:
@@ -206,7 +209,10 @@ def _sweeps(done: Calibrated, fit: SensorFit) -> list[ReportSection]:
             "largest [N·m]",
             "cross-validation RMS [N·m]",
         )
-        caption = "Cross-validation: RMS of this sweep minus a fit without it, and its ratio to the expected error."
+        caption = (
+            "Cross-validation: RMS error of a fit without this sweep on this sweep, and its ratio to the "
+            "expected error."
+        )
         figures = [joint_figure(arm, fit, joint)] if rows else []
         made.append(
             ReportSection(
@@ -227,8 +233,8 @@ def _left_out(done: Calibrated, fit: SensorFit) -> ReportSection:
     sensor = np.where(own, pair.invert(rows.readings.torque), np.nan)
     model = sensor - np.where(own, score * rows.readings.sigma, np.nan) / complete.gain
     text = (
-        "Torque at held-out steps (every second step of each sweep, then the others): the model fitted without them,"
-        " solid, and the sensor, dashed. For poses that are in no sweep: "
+        "Torque at held-out steps (every second step of each sweep, then the other steps): the model, "
+        "fitted without these steps, is solid, the sensor is dashed. For poses that are in no sweep, run: "
         f"armlink verify {done.arm.argument} --report verify.html"
     )
     return ReportSection(
@@ -243,7 +249,10 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _creeps(fit: CreepFit) -> ReportSection:
-    text = "Half the sum of both ways of a creep, up (▸) and down (◂), is gravity, half the difference friction."
+    text = (
+        "At each position, half the sum of the readings up (▸) and down (◂) is gravity, and half their "
+        "difference is friction."
+    )
     return ReportSection(
         "Creep sweeps", paragraph(text) + paragraphs(each.text for each in fit.findings), [creep_figure(fit)]
     )

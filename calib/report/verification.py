@@ -15,13 +15,20 @@ def write_report(
 ) -> None:
     """Write one self-contained HTML file; raises OSError."""
     verdict = "passed" if result.passed else "not passed"
-    sensors = "the controllers' own calibration" if calibration is None else f"calibration record {calibration.id}"
-    skipped = f" {result.skipped} poses were out of the drives' reach and were skipped." if result.skipped else ""
+    sensors = "the calibration in the drives" if calibration is None else f"calibration record {calibration.id}"
+    skipped = f" {result.skipped} poses were skipped, since the drives cannot reach them." if result.skipped else ""
     html = verdict_line(verdict) + paragraph(
-        f"Gravity record {gravity.id} against the torque sensors with {sensors}, at {len(result.sensor)} random poses"
-        f" that were not used for a fit.{skipped}"
+        f"Gravity record {gravity.id} compared with the torque sensors with {sensors}, at "
+        f"{len(result.sensor)} random poses that were used for no fit.{skipped}"
     )
-    header = ("joint", "RMS [N·m]", "allowed RMS", "largest [N·m]", "model's own standard deviation", "largest torque")
+    header = (
+        "joint",
+        "RMS [N·m]",
+        "allowed RMS",
+        "largest [N·m]",
+        "standard deviation of the model",
+        "largest torque",
+    )
     numbers = (
         result.rms,
         result.tolerance,

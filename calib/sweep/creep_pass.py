@@ -113,15 +113,15 @@ class CreepPass(SweepPass):
         self._contacts += 1
         mover.come_to_rest()
         text = (
-            f"contact: {stalled.name}: met something at {stalled.position:.2f} rad: the surroundings, the arm"
-            " itself or a cable"
+            f"contact: {stalled.name} met something at {stalled.position:.2f} rad: the surroundings, the arm "
+            "itself or a cable"
         )
         line = StallLine(t=mover.seen_at, late_ms=None, reading=sweep.name, reason=text, contact=True)
         self.writer.append(line)
         self.progress(len(self._made), len(self._plan.sweeps), 0.0, text)
         if self._contacts > MOST_CONTACT_SHARE * len(self._plan.sweeps):
             raise Refused(
-                f"{text}; {self._contacts} sweeps ended like this: clear the workspace, or narrow lower and upper"
+                f"{text}; {self._contacts} sweeps ended with a contact: clear the workspace, or narrow lower and upper"
             )
         goal = mover.command.position.copy()
         goal[sweep.joint] = sweep.rest[sweep.joint]

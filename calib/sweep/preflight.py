@@ -74,8 +74,8 @@ def listen(link: ArmDriver, arm: ArmFile) -> Preflight:
         noise = _noise(torque[:, joint])
         if noise > LOUD * limits.rated[joint]:
             raise Refused(
-                f"{name}: its torque sensor's noise is {noise:.3g} N·m, expected below {LOUD:.0%} of rated torque"
-                f" ({LOUD * limits.rated[joint]:.3g}): check shielding and mounting, or that the arm stands still"
+                f"{name}: the noise of its torque sensor is {noise:.3g} N·m, expected below {LOUD:.0%} of rated torque "
+                f"({LOUD * limits.rated[joint]:.3g} N·m): check shielding and mounting, and that the arm stands still"
             )
     nowhere = np.full((link.n, 2), np.nan)
     expected = np.column_stack([limits.lower, limits.upper])
@@ -105,8 +105,8 @@ def _check_readings(
                     raise Refused(f"{name}: {count} of {of} {what} readings are missing: check its drive and cable")
             if (~here).sum() > LATE * len(here):
                 raise Refused(
-                    f"{name}: {(~here).sum()} of {len(here)} {what} readings came after their cycle was over: the arm"
-                    " or this machine does not keep pace: lower link.rate, or give them more processor time"
+                    f"{name}: {(~here).sum()} of {len(here)} {what} readings came after the end of their cycle, so the "
+                    "arm or this machine is too slow: lower link.rate, or stop other programs on this machine"
                 )
 
 
@@ -120,7 +120,10 @@ def read_temperatures(link: ArmDriver) -> Array:
     temperature = link.read_temperatures()
     for name, degrees in zip(link.names, temperature, strict=True):
         if degrees >= HOT:
-            raise Refused(f"{name}: its drive is at {degrees:.0f} °C, a sweep begins below {HOT:.0f}: let it cool down")
+            raise Refused(
+                f"{name}: its drive is at {degrees:.0f} °C, but a sweep begins only below {HOT:.0f} °C: let it "
+                "cool down"
+            )
     return temperature
 
 

@@ -136,8 +136,9 @@ class StepPass(SweepPass):
         more[joint] = np.clip(1.2 * bias[joint], -limit, limit)
         if retries > RETRIES:
             raise Refused(
-                f"{name}: slips off its stop in sweep {sweep.name} at {bias[joint]:.1f} N·m of {limit:.1f} allowed:"
-                " lessen sweep.acceleration, or hold by servo (sweep.hold: servo)"
+                f"{name} slips off its stop in sweep {sweep.name} although it is pressed with "
+                f"{bias[joint]:.1f} N·m ({limit:.1f} N·m are allowed): reduce sweep.acceleration, or hold "
+                "joints by their position loops (`sweep.hold: servo`)"
             )
         if more[joint] == bias[joint]:
             self.acceleration *= SLOWER

@@ -112,7 +112,7 @@ def run_verify(
     if calibration is not None:
         calibration.require(arm_file)
     elif creeping:
-        raise BadInput(f"{arm_file.name}: its drives keep no calibration: verify needs a calibration record")
+        raise BadInput(f"{arm_file.name}: its drives store no calibration, so verify needs a calibration record")
     installed = per_joint(link.read_calibration(joint) for joint in range(link.n))
     wanted = installed if calibration is None else calibration.torque_calibration(installed)
     beta = np.array(gravity.require(arm_file).beta)
@@ -137,7 +137,7 @@ def run_verify(
         if progress is not None:
             progress(number, len(held_out))
     if not angles:
-        raise Refused("no pose was reached: the drives stalled at every one; is the arm free to move?")
+        raise Refused("no pose was reached, since the drives stalled on every way: is the arm free to move?")
     q = np.array(angles)
     model = gravity_torque(kinematics, beta, q)
     variance = np.diagonal(torque_covariance(kinematics, np.array(gravity.covariance), q), axis1=-2, axis2=-1)
@@ -245,7 +245,7 @@ def _half_sum(up: list[Sample], down: list[Sample], pose: Array) -> Array:
             q, v = position[:, joint], torque[:, joint]
             kept = np.isfinite(q) & np.isfinite(v) & (np.abs(q - at) < CREEP_WAY / 2 - CREEP_LEAD / 2)
             if kept.sum() < 4:
-                raise Refused(f"joint {joint + 1}: too few samples in a creep of {CREEP_WAY} rad")
+                raise Refused(f"joint {joint + 1}: there are too few samples in a creep of {CREEP_WAY} rad")
             line[joint] = np.polynomial.polynomial.polyfit(q[kept] - at, v[kept], 1)[0]
         means.append(line)
     half_sum: Array = (means[0] + means[1]) / 2

@@ -40,7 +40,7 @@ class Arm:
     def __post_init__(self) -> None:
         n = len(self.names)
         if n == 0 or len(set(self.names)) != n:
-            raise BadArray(f"joint names are {list(self.names)}, expected at least one, each different")
+            raise BadArray(f"joint names are {list(self.names)}: expected at least one name, and no name twice")
         for key in ("alpha", "a", "d", "theta_offset"):
             frozen(self, **{key: as_array(key, getattr(self, key), (n,))})
         frozen(self, b=as_array("b", np.full(n, self.b) if np.ndim(self.b) == 0 else self.b, (n,)))

@@ -107,7 +107,7 @@ def compile_model(path: Path) -> "mujoco.MjModel":
         _drop_absent_meshes(spec, path.parent / spec.compiler.meshdir)
         return spec.compile()
     except (ValueError, RuntimeError) as error:  # the latter where it gets no memory
-        raise BadModel(f"{path}: MuJoCo refuses it: {' '.join(str(error).split())}") from None
+        raise BadModel(f"{path}: MuJoCo refuses this file: {' '.join(str(error).split())}") from None
 
 
 def _drop_absent_meshes(spec: "mujoco.MjSpec", folder: Path) -> None:
@@ -149,7 +149,7 @@ def _joint(model: "mujoco.MjModel", name: str, path: Path) -> int:
     joint = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name))
     if joint < 0:
         names = ", ".join(model.joint(joint).name for joint in range(model.njnt))
-        raise BadModel(f"{path}: no joint {name!r} to lock; there are {names}")
+        raise BadModel(f"{path}: there is no joint {name!r} to lock; there are {names}")
     return joint
 
 
@@ -161,13 +161,15 @@ def _chain(
 
     joints = [joint for joint in range(model.njnt) if joint not in locked]
     if not joints:
-        raise BadModel(f"{path}: no joint: an arm has at least one revolute joint")
+        raise BadModel(f"{path}: the model has no joint, but an arm has at least one revolute joint")
     last = int(model.jnt_bodyid[joints[-1]]) if tip is None else _body(model, tip, path, "tip")
     way = upwards(model, last)
     if base is not None:
         first = _body(model, base, path, "base")
         if first not in way:
-            raise BadModel(f"{path}: body {base!r} does not carry {model.body(last).name!r}: give a base that does")
+            raise BadModel(
+                f"{path}: body {base!r} does not carry {model.body(last).name!r}: give as base a body that carries it"
+            )
         way = way[: way.index(first)]
     chain = [joint for joint in joints if model.jnt_bodyid[joint] in way]
     carriers = upwards(model, int(model.jnt_bodyid[chain[0]])) if chain else []
@@ -181,9 +183,12 @@ def _chain(
             raise BadModel(f"{path}: joint {model.joint(joint).name} is {kind}: only revolute joints can be identified")
     if aside and tip is None:
         name = model.joint(aside[0]).name
-        raise BadModel(f"{path}: joint {name} branches off the chain: name the body at the chain's end with tip")
+        raise BadModel(
+            f"{path}: joint {name} is on a side branch: name the last body of the chain with `tip` (under "
+            "kinematics in an arm file, `--tip` on the command line)"
+        )
     if not chain:
-        raise BadModel(f"{path}: no joint between the base and tip {tip!r}")
+        raise BadModel(f"{path}: there is no joint between the base and the tip {tip!r}")
     return chain
 
 
@@ -194,7 +199,7 @@ def _body(model: "mujoco.MjModel", name: str, path: Path, what: str) -> int:
     body = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name))
     if body < 0:
         names = ", ".join(model.body(body).name for body in range(1, model.nbody))
-        raise BadModel(f"{path}: no body {name!r} for {what}; there are {names}")
+        raise BadModel(f"{path}: there is no body {name!r} for the {what}; there are {names}")
     return body
 
 
@@ -205,7 +210,10 @@ def _refuse_couplings(model: "mujoco.MjModel", chain: list[int], path: Path) -> 
         coupled = int(model.eq_obj1id[equality])
         if model.eq_type[equality] == mujoco.mjtEq.mjEQ_JOINT and coupled in chain:
             name = model.joint(coupled).name
-            raise BadModel(f"{path}: joint {name} mimics another: one drive per joint is needed, or lock it")
+            raise BadModel(
+                f"{path}: joint {name} follows another joint (mimic), but each joint needs its own drive: lock "
+                f"joint {name} if it has none"
+            )
 
 
 def _place(

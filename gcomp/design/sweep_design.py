@@ -59,7 +59,7 @@ def stop_combinations(arm: Arm, joint: int) -> Array:
     """
     for name, low, high in zip(arm.names, arm.lower, arm.upper, strict=True):
         if not (np.isfinite(low) and np.isfinite(high)):
-            raise BadArray(f"joint {name} has no limits ({low} to {high} rad): there is no stop to rest on")
+            raise BadArray(f"joint {name} has no limits ({low} to {high} rad), so it has no stop to rest on")
     others = np.delete(np.arange(arm.n), joint)
     numbers = np.arange(2 ** len(others))
     if len(numbers) > MOST_COMBINATIONS:

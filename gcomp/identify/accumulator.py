@@ -71,7 +71,7 @@ class MomentAccumulator:
         """Estimate, covariance for the given sigma, and residual of all samples; raises BadArray if there are none."""
         n, counts = self.arm.n, self._gram[:, -2, -2]
         if not counts.any():
-            raise BadArray("no torque reading counts: nothing was added, or all are NaN")
+            raise BadArray("no torque reading counts: none was added, or all readings are NaN")
         gram = self._gram / self.sigma[:, None, None] ** 2
         system, target = np.zeros((3 * n, 3 * n)), np.zeros(3 * n)
         system[n:, n:], target[n:] = gram[:, :-2, :-2].sum(axis=0), gram[:, :-2, -1].sum(axis=0)

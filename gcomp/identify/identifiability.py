@@ -78,10 +78,11 @@ def describe_null_space(basis: Array, names: tuple[str, ...]) -> tuple[str, ...]
         moments = [name for name in taking_part if name.startswith("mass_moment")]
         gains = [name for name in taking_part if name.startswith("gain")]
         if len(taking_part) == 1:
-            sentences.append(f"{taking_part[0]} changes no reading: gravity does not act on it in these poses")
+            sentences.append(f"{taking_part[0]} changes no reading, since gravity does not act on it in these poses")
         elif len(gains) > 1 and moments and len(gains) + len(moments) == len(taking_part):
             sentences.append(
-                f"common factor of {', '.join(gains)} against all mass moments: readings with a reference mass fix it"
+                f"{', '.join(gains)} can change by one common factor together with all mass moments: "
+                "readings with a reference mass fix this factor"
             )
         else:
             sentences.append(f"{', '.join(taking_part)} can change together without changing any reading")

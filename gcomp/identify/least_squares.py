@@ -54,7 +54,7 @@ class LeastSquaresProblem:
     ) -> "LeastSquaresProblem":
         """Check and convert to vectors; raises BadArray on an unknown loss or family and on wrong shapes."""
         if loss != "linear" and loss not in TUNING:
-            raise BadArray(f"loss is {loss!r}, expected linear, {' or '.join(TUNING)}")
+            raise BadArray(f"loss is {loss!r}, expected one of linear, {' or '.join(TUNING)}")
         noise = as_array("position_sigma", np.broadcast_to(position_sigma, (arm.n,)), (arm.n,))
         mean, std = prior_vectors(arm.n, priors)
         return cls(arm, readings, free_mask(arm.n, unknown), mean, std, loss, noise, unit)

@@ -44,7 +44,7 @@ class StaticReadings:
         count, n = position.shape
         torque = as_array("torque", self.torque, (count, n), finite=False)
         if np.isinf(torque).any():
-            raise BadArray("torque has infinite readings; NaN is for a reading that does not count")
+            raise BadArray("torque has infinite readings: write NaN for a reading that does not count")
         sigma = np.array(np.broadcast_to(as_array("sigma", np.atleast_2d(self.sigma), (None, n)), (count, n)))
         if np.any(sigma <= 0):
             raise BadArray(f"sigma is {sigma.min()}, expected every standard deviation above zero [N·m]")
@@ -94,7 +94,7 @@ class StaticReadings:
     def require_arm(self, arm: Arm) -> None:
         """Raise BadArray unless these are readings of the arm's n joints, and at least one counts."""
         if self.position.shape[1] != arm.n:
-            raise BadArray(f"readings of {self.position.shape[1]} joints, but the arm has {arm.n}")
+            raise BadArray(f"the readings have {self.position.shape[1]} joints, but the arm has {arm.n}")
         if not self.counted.any():
             raise BadArray("no torque reading can be used: all are NaN")
 

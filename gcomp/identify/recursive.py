@@ -44,7 +44,7 @@ def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool =
         rows = readings.counted[:, i]
         if not rows.any():
             raise BadArray(
-                f"joint {arm.names[i]}: its torque counts in no reading: sweep it, or leave it out of the arm"
+                f"joint {arm.names[i]}: no torque reading of this joint counts: sweep it, or leave it out of the arm"
             )
         weight = 1 / readings.sigma[rows, i]
         regressor = gravity_regressor(arm, readings.position[rows])[:, i] * weight[:, None]
@@ -62,7 +62,8 @@ def identify_recursive(arm: Arm, readings: StaticReadings, *, fit_offset: bool =
         solver, enough = _solver(columns)
         if not enough:
             raise BadArray(
-                f"joint {arm.names[i]}: {len(weight)} steps do not determine its moment: take more, over a wider range"
+                f"joint {arm.names[i]}: {len(weight)} steps do not determine its moment: take more steps, "
+                "over a wider range"
             )
         solution = solver @ target
         beta[own], offset[i] = (solution[:2] if found[2 * i] else 0.0), (solution[-1] if fit_offset else 0.0)

@@ -65,7 +65,7 @@ def _turn(text: str) -> tuple[str, float]:
             raise ValueError
         return joint, float(angle)
     except ValueError:
-        raise BadInput(f"hand {text!r}: expected JOINT:ANGLE in rad, such as hand joint_2:0.5") from None
+        raise BadInput(f"hand {text!r}: expected JOINT:ANGLE in rad, for example: hand joint_2:0.5") from None
 
 
 class ControlPipe:

@@ -35,9 +35,9 @@ def parse_effect(text: str, joints: Sequence[str]) -> EffectEntry:
     if not (colon and second and effect_id and values):
         raise BadInput(f"--effect {text!r}: expected {EFFECT_FORM}")
     if effect_id not in effects():
-        raise BadInput(f"--effect {text!r}: no effect {effect_id!r}; there are {', '.join(effects())}")
+        raise BadInput(f"--effect {text!r}: there is no effect {effect_id!r}; there are {', '.join(effects())}")
     if joint and joint not in joints:
-        raise BadInput(f"--effect {text!r}: no joint {joint!r}; there are {', '.join(joints)}")
+        raise BadInput(f"--effect {text!r}: there is no joint {joint!r}; there are {', '.join(joints)}")
     given: dict[str, Any] = {"effect": effect_id, **_parameters(text, effect_id, values.split(","))}
     if joint:
         given["joint"] = joint
@@ -61,7 +61,7 @@ def _parameters(text: str, effect_id: str, items: list[str]) -> dict[str, Any]:
         found[parameter.name] = remaining[:size] if size else remaining[0]
         remaining = remaining[max(size, 1) :]
     if remaining:
-        raise BadInput(f"--effect {text!r}: {len(remaining)} too many values; expected {EFFECT_FORM}")
+        raise BadInput(f"--effect {text!r}: {len(remaining)} values too many; expected {EFFECT_FORM}")
     return found
 
 
@@ -85,7 +85,7 @@ def parse_drift(text: str, joints: Sequence[str]) -> SensorDrift:
     except ValueError:
         raise BadInput(f"--drift {text!r}: expected {DRIFT_FORM}") from None
     if drift.joint not in joints:
-        raise BadInput(f"--drift {text!r}: no joint {drift.joint!r}; there are {', '.join(joints)}")
+        raise BadInput(f"--drift {text!r}: there is no joint {drift.joint!r}; there are {', '.join(joints)}")
     if drift.gain == 0.0:
-        raise BadInput(f"--drift {text!r}: a gain factor of 0 removes the signal; expected {DRIFT_FORM}")
+        raise BadInput(f"--drift {text!r}: a gain factor of 0 would remove the signal; expected {DRIFT_FORM}")
     return drift

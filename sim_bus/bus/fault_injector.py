@@ -57,7 +57,7 @@ class Injector:
             device = self.arm.device(self.arm.names.index(fault.joint))
             if fault.id in (CANOPEN_FAULTS if isinstance(device, SimulatedDrive) else DRIVE_KINDS):
                 family = self.arm.arm.require_link().joints[self.arm.names.index(fault.joint)].settings.family
-                raise BadInput(f"fault {fault.id}: {fault.joint} has a {family} drive, which cannot have it")
+                raise BadInput(f"fault {fault.id}: {fault.joint} has a {family} drive, which cannot have this fault")
         self._planned.append(fault)
         self._planned.sort(key=lambda planned: planned.time)
         self._begin()

@@ -59,19 +59,22 @@ def parse_fault(text: str, joints: Sequence[str]) -> Fault:
     parts = what.split(":")
     kind = ALL_KINDS.get(parts[0])
     if kind is None:
-        raise BadInput(f"fault {text!r}: no fault {parts[0]!r}; there are {', '.join(ALL_KINDS)}")
+        raise BadInput(f"fault {text!r}: there is no fault {parts[0]!r}; there are {', '.join(ALL_KINDS)}")
     joint, value = [*parts[1:], "", ""][:2]
     if len(parts) > 3 or bool(joint) != kind.per_joint:
         raise BadInput(
-            f"fault {text!r}: {'a joint is missing' if kind.per_joint else 'it takes no joint'}; expected {FORM}"
+            f"fault {text!r}: {'a joint is missing' if kind.per_joint else 'this fault takes no joint'}; "
+            f"expected {FORM}"
         )
     if joint and joint not in joints:
-        raise BadInput(f"fault {text!r}: no joint {joint!r}; there are {', '.join(joints)}")
+        raise BadInput(f"fault {text!r}: there is no joint {joint!r}; there are {', '.join(joints)}")
     try:
         amount = float(value) if value else math.nan
         instant = float(time) if at else 0.0
         if amount < 0 or math.isinf(amount) or not math.isfinite(instant) or (value and not kind.value):
             raise ValueError
     except ValueError:
-        raise BadInput(f"fault {text!r}: value {kind.value or 'none'}; expected {FORM}") from None
+        raise BadInput(
+            f"fault {text!r}: its value is wrong (expected: {kind.value or 'none'}); expected {FORM}"
+        ) from None
     return Fault(kind.id, joint, amount, instant)

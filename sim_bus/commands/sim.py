@@ -10,19 +10,21 @@ if TYPE_CHECKING:
 
 
 def sim(
-    arm: Annotated[str, typer.Argument(help="Bundled arm, or path of an arm file with a sim section.")],
-    bus: Annotated[str, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; default the arm file's.")] = "",
+    arm: Annotated[str, typer.Argument(help="Bundled arm, or path of an arm file with the key sim.")],
+    bus: Annotated[str, typer.Option(help="INTERFACE:CHANNEL[@BITRATE]; by default the bus of the arm file.")] = "",
     effect: Annotated[
         list[str] | None,
         typer.Option(help="ID:JOINT:VALUE[,VALUE…] or ID:JOINT:NAME=VALUE[,…]; ID::VALUE for all."),
     ] = None,
     drift: Annotated[
         list[str] | None,
-        typer.Option(help="JOINT:GAIN:OFFSET@T: torque sensor drift at T s, a factor and an offset in N·m."),
+        typer.Option(
+            help="JOINT:GAIN:OFFSET@T: from T s on the torque sensor drifts, by a factor and by an offset in N·m."
+        ),
     ] = None,
     fault: Annotated[
         list[str] | None,
-        typer.Option(help="ID:JOINT[:VALUE][@T] or ID::VALUE[@T]: a fault at T s (see docs/faults.md)."),
+        typer.Option(help="ID:JOINT[:VALUE][@T] or ID::VALUE[@T]: a fault from T s on (see docs/faults.md)."),
     ] = None,
     control: Annotated[
         Path | None,
@@ -31,12 +33,13 @@ def sim(
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Draw the true sensor parameters from this seed; default: from the arm file.")
+        int | None,
+        typer.Option(help="Seed from which the true sensor parameters are drawn; by default the arm file gives them."),
     ] = None,
     realism: Annotated[
         float | None,
         typer.Option(
-            min=0, help="Small imperfections of a real arm: 1 for a good one, 3 for a bad one; --seed draws them."
+            min=0, help="Small imperfections of a real arm, drawn from --seed: 1 for a good arm, 3 for a bad arm."
         ),
     ] = None,
     lockstep: Annotated[
@@ -78,7 +81,7 @@ def sim(
     simulated.set_effects([*simulated.effects, *entries])
     if resolve_bus(bus or None, described.require_link().bus).interface == "armlink_sim":
         raise BadInput(
-            "sim: bus armlink_sim is itself a simulated arm: choose another, for example --bus socketcan:vcan0"
+            "sim: bus armlink_sim is itself a simulated arm: choose another bus, for example --bus socketcan:vcan0"
         )
     endpoint = open_link_bus(bus or None, described.require_link())
     if not lockstep:
@@ -94,7 +97,7 @@ def sim(
         server = ArmServer(simulated, endpoint, drifts, lockstep, faults=faults, control=pipe)
         server.on_wrong = lambda wrong: console.print(f"sim: {wrong}")
         server.on_late = lambda lag, at: console.print(
-            f"sim: this process was {1000 * lag:.0f} ms late at {at:.1f} s: a host may take its drives for silent"
+            f"sim: this process was {1000 * lag:.0f} ms late at {at:.1f} s, so a host may take its drives for silent"
         )
         return server.run()
     finally:

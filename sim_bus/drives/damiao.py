@@ -42,7 +42,8 @@ class DamiaoDrive(WrappingDrive):
         settings = joint.settings
         if settings.model not in MODELS:
             raise BadInput(
-                f"{arm.path}: {joint.name}: drive.model is {settings.model!r}; simulated are {', '.join(MODELS)}"
+                f"{arm.path}: {joint.name}: drive.model {settings.model!r} cannot be simulated; the "
+                f"simulated models are {', '.join(MODELS)}"
             )
         position, velocity, torque, _, _ = MODELS[settings.model]
         drive, reply, serial = settings.id, settings.reply, serial_of(arm, joint)

@@ -50,8 +50,8 @@ def build_fronts(arm: ArmFile, motors: Sequence[Motor], send: Callable[[str], Se
             continue
         if family not in known:
             raise BadInput(
-                f"{arm.path}: {joint.name}: drives of family {family!r} are not simulated; there are canopen, "
-                f"{', '.join(known)}"
+                f"{arm.path}: {joint.name}: drives of family {family!r} cannot be simulated; the simulated "
+                f"families are canopen, {', '.join(known)}"
             )
         groups.setdefault((joint.bus, family), []).append((joint, motor))
     return [(bus, known[family](arm, joints, send(bus))) for (bus, family), joints in groups.items()]

@@ -81,7 +81,7 @@ def effect(effect_id: str, apply: Apply, **domains: Domain) -> SimulatedEffect:
     """The forward form of a catalogue entry; `domains` restricts the values of some of its parameters."""
     entry, free = catalogue.CATALOGUE[effect_id], Domain()
     if unknown := set(domains) - {parameter.name for parameter in entry.parameters}:
-        raise ValueError(f"{effect_id}: no parameter {', '.join(sorted(unknown))} in the catalogue")
+        raise ValueError(f"{effect_id}: the catalogue has no parameter {', '.join(sorted(unknown))}")
     parameters = tuple(
         SimulatedParameter(each.name, each.unit, domain.sizes or (len(each.components),), domain)
         for each in entry.parameters

@@ -51,7 +51,7 @@ def _elasticity(state: Imperfections, joint: int, values: Values) -> None:
 
 def _coupling(state: Imperfections, joint: int, values: Values) -> None:
     if values["source"] == joint:
-        raise ValueError("transmission.coupling: source: expected another joint than the motor's own")
+        raise ValueError("transmission.coupling: `source` must be another joint than the joint of this motor")
     state.coupling[joint, values["source"]] += values["coefficient"]
 
 

@@ -42,27 +42,27 @@ def _value(names: Sequence[str], parameter: SimulatedParameter, value: Any) -> A
 
 def _index(names: Sequence[str], joint: Any) -> int:
     if joint not in names:
-        raise ValueError(f"no joint {joint!r}; there are {', '.join(names)}")
+        raise ValueError(f"there is no joint {joint!r}; there are {', '.join(names)}")
     return list(names).index(joint)
 
 
 def check_entry(effect_id: str, joint: str | None, parameters: Mapping[str, Any]) -> None:
     """Check one effect's id, joint and parameters. Raises ValueError with what was expected."""
     if effect_id not in _EFFECTS:
-        raise ValueError(f"no effect {effect_id!r}; there are {', '.join(_EFFECTS)}")
+        raise ValueError(f"there is no effect {effect_id!r}; there are {', '.join(_EFFECTS)}")
     effect = _EFFECTS[effect_id]
     if effect.per_joint and joint is None:
-        raise ValueError(f"{effect_id}: key joint is missing: name the joint it acts on")
+        raise ValueError(f"{effect_id}: key `joint` is missing: name the joint that has this effect")
     if not effect.per_joint and joint is not None:
-        raise ValueError(f"{effect_id}: acts on the whole arm; remove joint {joint!r}")
+        raise ValueError(f"{effect_id}: this effect belongs to the whole arm: remove joint {joint!r}")
     names = {parameter.name for parameter in effect.parameters}
     for unknown in sorted(set(parameters) - names):
-        raise ValueError(f"{effect_id}: no parameter {unknown!r}; it has {described(effect)}")
+        raise ValueError(f"{effect_id}: this effect has no parameter {unknown!r}; it has {described(effect)}")
     for parameter in effect.parameters:
         if parameter.name in parameters:
             _check_value(effect, parameter, parameters[parameter.name])
         elif parameter.domain.default is None:
-            raise ValueError(f"{effect_id}: parameter {parameter.name} is missing; it has {described(effect)}")
+            raise ValueError(f"{effect_id}: parameter {parameter.name} is missing; this effect has {described(effect)}")
 
 
 def described(effect: SimulatedEffect) -> str:
@@ -74,7 +74,7 @@ def _check_value(effect: SimulatedEffect, parameter: SimulatedParameter, value: 
     expected = f"{effect.id}: parameter {parameter.name} [{parameter.unit}]: expected"
     if parameter.joint:
         if not isinstance(value, str):
-            raise ValueError(f"{expected} a joint's name, not {value!r}")
+            raise ValueError(f"{expected} the name of a joint, not {value!r}")
         return
     numbers = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     size = len(numbers) if isinstance(value, Sequence) else 0

@@ -87,7 +87,7 @@ def _from_model(arm: ArmFile, section: SimSection) -> Any:
     names = set(arm.joint_names)
     missing = names - {joint.name for joint in spec.joints}
     if missing or not names:
-        raise BadInput(f"{path}: no joint {', '.join(sorted(missing)) or 'named in link.joints'} in the model")
+        raise BadInput(f"{path}: the model has no joint {', '.join(sorted(missing)) or 'named in link.joints'}")
     for unwanted in (*spec.actuators, *spec.sensors, *spec.equalities, *spec.tendons, *spec.keys):
         spec.delete(unwanted)
     for joint in spec.joints:
@@ -101,7 +101,7 @@ def _from_model(arm: ArmFile, section: SimSection) -> Any:
         if joint.name in arm.kinematics.stops:
             joint.range = np.array(arm.kinematics.stops[joint.name]) / (DEGREE if joint.compiler.degree else 1.0)
         if joint.type != mujoco.mjtJoint.mjJNT_HINGE or joint.range[0] >= joint.range[1]:
-            raise BadInput(f"{path}: joint {joint.name}: expected a hinge with a range")
+            raise BadInput(f"{path}: joint {joint.name} must be a hinge with a range")
     if section.links is not None:
         for name, link in zip(arm.joint_names, section.links, strict=True):
             _set_inertial(spec.joint(name).parent, link)

@@ -132,8 +132,8 @@ def rotor_inertia(names: tuple[str, ...], state: Imperfections, inertia: Array) 
     for name, stiffness, most in zip(names, state.elasticity, stiffest, strict=True):
         if np.isfinite(stiffness) and stiffness > most:
             raise ValueError(
-                f"transmission.elasticity: {name}: {stiffness:g} N·m/rad is as good as rigid, at most "
-                f"{most:.3g} can be simulated: leave the effect out"
+                f"transmission.elasticity: {name}: {stiffness:g} N·m/rad is nearly rigid, and at most "
+                f"{most:.3g} N·m/rad can be simulated: leave the effect out"
             )
     return np.asarray(rotors)
 

@@ -29,11 +29,11 @@ def groups_of(given: Sequence[str], labels: Sequence[str]) -> list[tuple[str, ..
     for one in given:
         name, found, members = one.partition("=")
         if not (name and found and members):
-            raise BadInput(f"--group {one}: expected NAME=REC[,REC…], such as loaded=a.csv,b.csv")
+            raise BadInput(f"--group {one}: expected NAME=REC[,REC…], for example loaded=a.csv,b.csv")
         for member in members.split(","):
             numbers = [k for k, label in enumerate(labels) if member in _names(label)]
             if not numbers:
-                raise BadInput(f"--group {one}: {member} is none of the recordings {', '.join(labels)}")
+                raise BadInput(f"--group {one}: {member} is not one of the recordings {', '.join(labels)}")
             for k in numbers:
                 out[k].append(name)
     return [tuple(names) for names in out]

@@ -50,7 +50,7 @@ OWN_HELDOUT = 0.3
 """Share at the end of each training recording that is held out if no held-out recording is given."""
 OWN_HELDOUT_S = 3.0
 """Least length of it [s], up to half of a short recording."""
-LENT = "since no training recording shows the body that it carries, or lacks: the first half is fitted"
+LENT = "since no training recording shows the body that it carries or lacks, and the first half was used for the fit"
 """Why half of a held-out recording is fitted."""
 MOUNTED = 2
 """How often the ways in which a body is mounted are looked at."""
@@ -93,7 +93,7 @@ def diagnose(
     Raises BadInput if the recordings cannot be used with the model.
     """
     if not train:
-        raise BadInput("no training recording: give at least one (--train FILE)")
+        raise BadInput("there is no training recording: give at least one (--train FILE)")
     labels = list(labels) or [f"recording {i + 1}" for i in range(len(train) + len(heldout))]
     sim, recordings, findings = checked_recordings(model, [*train, *heldout], labels, stated, base, tip, known_gains)
     train, heldout = recordings[: len(train)], recordings[len(train) :]
@@ -131,7 +131,9 @@ def diagnose(
         other, again = _fitted(more, library)
         if body_of(again) is not None:
             search, estimate, judge, heldout = other, again, _placed(again, rest), recordings
-            heldout_is += f"; of {', '.join(judge.signals[k].label for k in lent)} only the second half, {LENT}"
+            heldout_is += (
+                f"; of {', '.join(judge.signals[k].label for k in lent)} only the second half is held out, {LENT}"
+            )
     fit = estimate.store.data
     quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
     within = is_within(judge) and is_within(fit)
@@ -225,7 +227,10 @@ def checked_recordings(
         checked, found = check_position_only(sim.arm, matched, labels[: len(matched)], stated)
         sim = sim if known_gains is None else with_gains(sim, known_gains)
     elif known_gains is not None:
-        raise BadInput("--gains: the recordings have a torque channel, which is compared with the model's torque")
+        raise BadInput(
+            "--gains: leave this option out, since the recordings have a torque channel, which is compared with "
+            "the model's torque"
+        )
     else:
         checked, found = check_recordings(sim.arm, matched, labels[: len(matched)], stated)
     return sim, checked, (*findings, *found)
@@ -249,6 +254,6 @@ def _split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recor
 def _require_motion(data: ResidualSet) -> None:
     if not any(s.moving.mean(0).max() > 0.02 for s in data.signals):
         raise BadInput(
-            f"{data.signals[0].label}: no joint moves in the training recordings: they cannot tell what causes a gap; "
-            "record every joint in motion"
+            f"{data.signals[0].label}: no joint moves in the training recordings, so the cause of a gap "
+            "cannot be found: record every joint in motion"
         )

@@ -65,9 +65,9 @@ class Compensation:
             )
         beside = "" if self.usual is None else f" ({self.usual:.2g} in the other recordings)"
         return (
-            f"{self.recording}: {self.joint} shows {self.torque:.2g} N·m of friction{beside}: the controller "
-            f"compensates friction with a torque that {self.channel} lacks; "
-            "leave this recording out, or record the whole command"
+            f"{self.recording}: {self.joint} shows only {self.torque:.2g} N·m of friction{beside}: the "
+            f"controller compensates friction with a torque that {self.channel} does not contain; leave this "
+            "recording out, or record the whole command"
         )
 
     def to_json(self) -> dict[str, Any]:

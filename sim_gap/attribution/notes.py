@@ -48,8 +48,8 @@ def notes(
 def _noisy(data: ResidualSet) -> tuple[str, ...]:
     layout, names = data.layout, data.signals[0].arm.names
     return tuple(
-        f"{names[j]}: {' and '.join(layout.chain[: layout.beyond(j)])} too noisy; the command is compared with "
-        f"{layout.reference((str(layout.command), j)) or 'the model'} instead"
+        f"{names[j]}: the noise of {' and '.join(layout.chain[: layout.beyond(j)])} is too large; the "
+        f"command is compared with {layout.reference((str(layout.command), j)) or 'the model'} instead"
         for j in range(layout.n)
         if layout.beyond(j)
     )
@@ -74,8 +74,9 @@ def _spiked(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
         count, readings = (sum(getattr(one, part) for _, one in ours) for part in ("count", "readings"))
         joints = {name: sum(one.count for other, one in ours if other == name) for name, _ in ours}
         lines.append(
-            f"{channel}: {count} of {readings} samples ({count / readings:.2%}) are left out as spikes, far from the "
-            f"samples before and after ({', '.join(f'{name} {number}' for name, number in joints.items())})"
+            f"{channel}: {count} of {readings} samples ({count / readings:.2%}) are left out as spikes, "
+            "since they are far from the samples before and after "
+            f"({', '.join(f'{name} {number}' for name, number in joints.items())})"
         )
     return tuple(lines)
 
@@ -90,9 +91,9 @@ def _impacts(data: ResidualSet) -> tuple[str, ...]:
 
 def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
     lines = (
-        f"{s.label}: at {one.start:.1f} s, and at no other time, several joints leave the fit at once, "
-        f"{s.arm.names[one.joint]} by {one.torque:.2g} N·m: something touched the arm, or torques were misread; "
-        f"{one.end - one.start + 2.0 * AROUND_S:.1f} s are left out"
+        f"{s.label}: at {one.start:.1f} s, and at no other time, several joints differ suddenly from the "
+        f"fit, {s.arm.names[one.joint]} by {one.torque:.2g} N·m: something touched the arm, or torques were "
+        f"misread; {one.end - one.start + 2.0 * AROUND_S:.1f} s are left out"
         for data in sets
         for s in data.signals
         for one in s.disturbances
@@ -103,8 +104,8 @@ def _disturbed(sets: Sequence[ResidualSet]) -> tuple[str, ...]:
 def _at_bounds(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[str, ...]:
     names = fit.signals[0].arm.names
     return tuple(
-        f"{term.effect} of {'the arm' if term.form.signature.whole_arm else names[term.place]} is the largest or least "
-        "that can exist there: these recordings do not determine its size"
+        f"{term.effect} of {'the arm' if term.form.signature.whole_arm else names[term.place]} has reached "
+        "the largest or least value that can exist: these recordings do not determine its size"
         for term in (estimate.at_bounds() if estimate is not None else ())
     )
 
@@ -114,15 +115,15 @@ def _common_factor(estimate: EffectEstimate | None, fit: ResidualSet) -> tuple[s
     if estimate is not None and masses_may_be_constants(fit.layout, estimate.terms):
         return (
             f"{MASSES}: {fit.layout.motor} alone shows only the products of masses and torque constants: if all "
-            "constants were off by one factor, the recordings would look the same; creep sweeps with a weighed mass "
-            "tell which it is",
+            "constants were wrong by one factor, the recordings would look the same; creep sweeps with a weighed mass "
+            "show whether the masses or the constants are wrong",
         )
     if estimate is None or not shares_a_factor(fit.layout, estimate.terms):
         return ()
     return (
-        f"{CONSTANT}: {fit.layout.motor} alone does not determine the scale of all masses and torque constants "
-        "together: if all links are 1 % heavier than in the model, all constants, friction and rotor inertias are 1 % "
-        f"larger; the intervals allow for masses that are {2 * NOMINAL:.0%} off; creep sweeps with a weighed mass "
+        f"{CONSTANT}: {fit.layout.motor} alone does not determine the common scale of masses and torque constants: if "
+        "all links are 1 % heavier than in the model, then all constants, friction and rotor inertias are 1 % larger; "
+        f"the intervals allow for masses that are wrong by {2 * NOMINAL:.0%}; creep sweeps with a weighed mass "
         "determine the scale",
     )
 
@@ -135,13 +136,13 @@ def _bound(estimate: EffectEstimate | None, fit: ResidualSet, judge: ResidualSet
             lines.append(f"{term.effect} is present only in {' and '.join(alone)}")
         elif term.effect == "link.payload":
             lines.append(
-                "link.payload: includes mass errors of the links themselves; to separate them, add recordings of the "
-                "arm without the payload (--train)"
+                "link.payload: this payload includes mass errors of the links; to separate the two, add "
+                "recordings of the arm without the payload (--train)"
             )
         if term.effect == "link.payload":
             lines += _turned((fit, judge))
         if term.effect == "link.payload" and estimate is not None and estimate.of(term)[0] < 0.0:
-            lines.append("link.payload: its mass is negative: the model has a body at its tip that the arm lacks")
+            lines.append("link.payload: its mass is negative, so the model has a body at its tip that the arm lacks")
     return tuple(lines)
 
 
@@ -167,7 +168,7 @@ def _remaining(data: ResidualSet, left: dict[Row, Array]) -> tuple[str, ...]:
     """A note for the rows with the largest remaining gaps, and the regime of motion of each."""
     above = [row for row, rms in row_rms(data, left).items() if rms > data.margin[row]]
     return tuple(
-        f"{at.joint}: {at.rms:.2g} N·m of {at.channel} remain (noise {at.noise:.2g}), "
+        f"{at.joint}: a gap of {at.rms:.2g} N·m in {at.channel} remains (noise {at.noise:.2g}), "
         + ("without a known regime" if at.regime == "other" else f"correlated with {at.regime} ({at.share:.0%})")
         for at in (locate(data, left, above)[:3] if above else [])
     )
@@ -176,8 +177,8 @@ def _remaining(data: ResidualSet, left: dict[Row, Array]) -> tuple[str, ...]:
 def worse_notes(names: Sequence[str], before: Array, after: Array, margin: Array) -> list[str]:
     """Joints whose held-out gap [N·m] (n,) grows by what was fitted."""
     return [
-        f"{name}: what was fitted makes the held-out gap larger, {old:.2g} to {new:.2g} N·m: leave it out of the model "
-        "for this joint, and record more of its motion"
+        f"{name}: the fitted effects increase the held-out gap, from {old:.2g} to {new:.2g} N·m: leave these "
+        "effects of this joint out of the model, and record more of its motion"
         for name, old, new, least in zip(names, before, after, margin, strict=True)
         if new > WORSE * old and new > least
     ]
@@ -195,9 +196,13 @@ def aside_notes(aside: Sequence[Location]) -> tuple[str, ...]:
     """A note for each gap at rest, in creep or above the band that nothing known accounts for."""
     where = {"rest": "at rest", "creep": "in creep and around reversals"}
     return tuple(
-        f"{at.joint}: {at.rms:.2g} N·m of {at.channel} "
-        + (f"at {at.hz:.3g} Hz: a hum or a resonance above the comparison's band" if at.hz else where[at.regime])
-        + ("" if at.hz else ", more than known friction: breakaway, hysteresis or backlash")
+        f"{at.joint}: a gap of {at.rms:.2g} N·m in {at.channel} "
+        + (
+            f"at {at.hz:.3g} Hz, a hum or a resonance above the frequencies that are compared"
+            if at.hz
+            else where[at.regime]
+        )
+        + ("" if at.hz else ", more than known friction explains: breakaway, hysteresis or backlash")
         for at in aside
         if at.clear
     )
@@ -206,7 +211,10 @@ def aside_notes(aside: Sequence[Location]) -> tuple[str, ...]:
 def law_notes(laws: Sequence[ResidualLaw], names: Sequence[str]) -> tuple[str, ...]:
     return tuple(
         f"{names[law.joint]}: the remaining {law.channel} is a function of the joint's {law.quantity}"
-        + (", against the motion" if law.directed else "")
-        + f" ({law.before:.2g} to {law.after:.2g} N·m on held-out data); its cause is not in the library"
+        + (", directed against the motion" if law.directed else "")
+        + (
+            f" (which reduces the gap on held-out data from {law.before:.2g} to {law.after:.2g} N·m); its cause "
+            "is not in the library"
+        )
         for law in laws
     )

@@ -25,28 +25,35 @@ def notes(found: Identified) -> list[str]:
     """Notes on the controller, on limits that were not reached, and on effects that the exported model leaves out."""
     names = found.sim.arm.names
     kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
-    out = [f"no torque channel: controller ({kind}) and effects follow from q_cmd and q; the gap is in rad"]
+    out = [
+        f"there is no torque channel, so controller ({kind}) and effects are fitted to q_cmd and q, and the gap is in "
+        "rad"
+    ]
     if loose := undecided_scale(found.fit, found.spread):
         listed = ", ".join(names[j] for j in loose)
         out.append(
-            f"{listed}: positions show only the ratios of gain, friction and inertia here; their scale is that of the "
-            "model's inertia: hold a known load or record the current to measure it"
+            f"{listed}: positions show only the ratios of gain, friction and inertia of these joints; the scale is "
+            "taken from the inertia of the model: to measure the scale, hold a known load or record the current"
         )
     if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
         out.append(
-            "viscous friction, back-EMF and velocity feedback act alike on positions: only their sum is given"
-            + (", as part of the controller" if found.search.open_controller else "")
+            "viscous friction, back-EMF and velocity feedback have the same effect on positions, so only their sum is "
+            "given" + (", as part of the controller" if found.search.open_controller else "")
         )
     if found.search.resting:
         listed = ", ".join(names[j] for j in sorted(found.search.resting))
-        assumed = "a controller that holds it is assumed" if found.search.open_controller else "the model's values stay"
-        out.append(f"{listed}: no training recording commands a motion here, so nothing can be fitted: {assumed}")
+        assumed = (
+            "the model assumes that a controller holds them still"
+            if found.search.open_controller
+            else "the values of the model are kept"
+        )
+        out.append(f"{listed}: no training recording moves these joints, so nothing can be fitted for them: {assumed}")
     if limits := describe(found.spread.limits, names):
-        out.append(f"limits that the training motion does not reach: {limits}")
+        out.append(f"the training motion does not reach these limits: {limits}")
     out += [*_early(found), *_held(found), *_ranges(found), *_beyond(found), *_faster(found), *_released(found)]
     left = effects_left_out(found.search, found.fit) if found.sim.path is not None else []
     if left:
-        module = f"; a module beside a model of its own applies {_in_module(found.beside)}" if found.beside else ""
+        module = f"; a separate model with a module applies {_in_module(found.beside)}" if found.beside else ""
         out.append(f"the corrected model leaves out: {', '.join(left)}{module}")
     return out
 
@@ -64,16 +71,16 @@ def running_free(found: Identified, rollout: Rollout | None, *, gap: bool) -> li
     if rollout.worse:
         before, after = (float(np.sqrt(np.mean(x**2))) for x in (rollout.before, rollout.after))
         out.append(
-            f"running free, the corrected model leaves a larger gap ({after:.3g} rad) than the nominal one "
+            f"running free, the corrected model leaves a larger gap ({after:.3g} rad) than the nominal model "
             f"({before:.3g} rad): "
-            + ("do not train with it, and record other motion" if gap else "use the nominal model")
+            + ("do not train with the corrected model, and record other motion" if gap else "use the nominal model")
         )
     left, least = rollout.after, np.maximum(found.heldout_after, found.margin)
     far = [
         f"{found.sim.arm.names[j]} {left[j]:.3g} rad (fit {found.heldout_after[j]:.3g})"
         for j in np.flatnonzero(left > FAR * least)
     ]
-    told = "the corrected model, running free in MuJoCo along the held-out commands, leaves more than the fit"
+    told = "running free in MuJoCo along the held-out commands, the corrected model leaves a larger gap than the fit"
     return [*out, f"{told}: {', '.join(far)}"] if far else out
 
 
@@ -93,8 +100,8 @@ def _early(found: Identified) -> list[str]:
     time = rows * period if rows and abs(time / period - rows) < NEAR_A_ROW else time
     listed = ", ".join(f"{name} {value:.3g} s" for name, value in early.items())
     return [
-        f"commands take effect before the time of their rows ({listed}), which no controller can do: the rows hold "
-        f"the position of a later time, or two clocks differ; state it with --clock q_cmd={time:.3g}"
+        f"commands take effect before the time of their rows ({listed}), which no controller can do: the rows hold the "
+        f"position of a later time, or two clocks differ; correct the time with --clock q_cmd={time:.3g}"
     ]
 
 
@@ -103,7 +110,9 @@ def _held(found: Identified) -> list[str]:
     if not found.held:
         return []
     some = ", ".join(found.held[:MOST_NAMED]) + (", …" if len(found.held) > MOST_NAMED else "")
-    return [f"held where the model has it, and touching nothing: {some} (not between --base and --tip)"]
+    return [
+        (f"these parts of the model do not move and touch nothing, since they are not between --base and --tip: {some}")
+    ]
 
 
 def _ranges(found: Identified) -> list[str]:
@@ -114,7 +123,16 @@ def _ranges(found: Identified) -> list[str]:
         for j in widened_joints(found.sim)
         for low, high in [found.sim.arm.range[j]]
     ]
-    return [f"moves beyond the model's joint range, where a simulation would stop: {', '.join(out)}"] if out else []
+    return (
+        [
+            (
+                "these joints move beyond the joint range of the model, where a simulation would stop them: "
+                f"{', '.join(out)}"
+            )
+        ]
+        if out
+        else []
+    )
 
 
 def _beyond(found: Identified) -> list[str]:
@@ -127,7 +145,7 @@ def _beyond(found: Identified) -> list[str]:
         outside = float(np.mean((other < fitted.min()) | (other > fitted.max())))
         if outside > 1.0 - SHARE:
             out.append(f"{name}: {outside:.0%} of the held-out motion")
-    told = "moves outside the range of the training recordings, where the band may be too narrow"
+    told = "these joints move outside of the range of the training recordings, where the band may be too narrow"
     return [f"{told}: {', '.join(out)}"] if out else []
 
 
@@ -153,7 +171,7 @@ def _released(found: Identified) -> list[str]:
         if off[0][j] == 0.0 < off[1][j]
     ]
     told = "the servo is off in part of the held-out motion, but never in training, so the fit may not hold there"
-    return [f"{told}: {', '.join(out)}: add such a swing to --train"] if out else []
+    return [f"{told}: {', '.join(out)}: add such a recording, with the servo off, to --train"] if out else []
 
 
 def _speeds(data: Windows, joint: int) -> Array:

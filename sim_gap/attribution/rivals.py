@@ -23,29 +23,32 @@ TRIED = 4
 SEPARATING_MOTION = {
     frozenset(
         {"friction.coulomb", "friction.load"}
-    ): "both directions at the same speed under clearly different loads (stretched out, folded, with a payload)",
-    frozenset({"friction.coulomb", "friction.stribeck"}): "constant speeds from creeping to fast, both directions",
-    frozenset({"friction.coulomb", "friction.viscous"}): "constant speeds from slow to fast, both directions",
+    ): "record both directions at the same speed under clearly different loads (stretched out, folded, with a payload)",
+    frozenset(
+        {"friction.coulomb", "friction.stribeck"}
+    ): "record constant speeds from creeping to fast, in both directions",
+    frozenset({"friction.coulomb", "friction.viscous"}): "record constant speeds from slow to fast, in both directions",
     frozenset(
         {"friction.asymmetric", "torque.offset"}
-    ): "a rest under a known load, and both directions at several loads",
-    frozenset({"actuator.gain", "link.mass_moment"}): "the same poses with a known payload attached",
-    frozenset({"torque.gain", "link.payload"}): "the same poses with and without the payload",
-    frozenset({"torque.gain", "link.mass_moment"}): "the same poses with a known payload attached",
-    frozenset({"actuator.lag", "actuator.delay"}): "steps or a chirp to 10 Hz, logged fast",
-    frozenset({"transmission.backlash", "transmission.elasticity"}): "slow reversals under load",
-    frozenset({"transmission.elasticity", "actuator.rotor_inertia"}): "fast motion with a payload",
+    ): "record a rest under a known load, and both directions at several loads",
+    frozenset({"actuator.gain", "link.mass_moment"}): "record the same poses with a known payload attached",
+    frozenset({"torque.gain", "link.payload"}): "record the same poses with and without the payload",
+    frozenset({"torque.gain", "link.mass_moment"}): "record the same poses with a known payload attached",
+    frozenset({"actuator.lag", "actuator.delay"}): "record steps or a chirp up to 10 Hz at a high rate",
+    frozenset({"transmission.backlash", "transmission.elasticity"}): "record slow reversals under load",
+    frozenset({"transmission.elasticity", "actuator.rotor_inertia"}): "record fast motion with a payload",
     frozenset(
         {"position.offset", "base.tilt"}
-    ): "a turn of joint 1 with the arm stretched out, and a level on the base",
-    frozenset({"position.offset", "link.mass_moment"}): "the same motion with a known payload attached",
+    ): "record a turn of joint 1 with the arm stretched out, and measure the tilt of the base with a level",
+    frozenset({"position.offset", "link.mass_moment"}): "record the same motion with a known payload attached",
     frozenset(
         {"actuator.rotor_inertia", "link.inertia"}
-    ): "fast motion of the joint with the links beyond it stretched out and folded",
-    frozenset({"torque.hysteresis", "friction.coulomb"}): "a slow change of load with the joint at rest",
+    ): "record fast motion of the joint with the links beyond it stretched out and folded",
+    frozenset({"torque.hysteresis", "friction.coulomb"}): "record a slow change of load with the joint at rest",
 }
 GENERAL_MOTION = (
-    "each joint alone through its whole range, slow and fast, both directions, with the other joints in two poses"
+    "record each joint alone through its whole range, slow and fast, in both directions, with the other "
+    "joints in two poses"
 )
 
 

@@ -204,7 +204,7 @@ def spec_of(sim: SimModel) -> Any:
     Raises BadInput if the model did not come from a file.
     """
     if sim.path is None:
-        raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+        raise BadInput("--out-model needs a model that came from a file: give MJCF, URDF or an arm file with --sim")
     return named_spec(sim)
 
 

@@ -72,7 +72,10 @@ def model_files(
     spec.compile()
     left = [t for t in corrected.not_held if t.effect not in DRIVE or sim.arm.names[t.place] not in motors]
     lines = [] if estimate is None else [_line(sim, estimate, term) for term in left]
-    lines += [f"{name}: its link as fitted cannot exist; the file has one that can" for name in corrected.changed]
+    lines += [
+        f"{name}: no body can have the fitted inertia of its link, so the file has the nearest possible inertia"
+        for name in corrected.changed
+    ]
     lines += [f"{law} {joint}: a torque without a known cause" for law, joint, _ in laws]
     module = module_path(Path(name)).name
     comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""

@@ -40,7 +40,7 @@ def urdf_of(model: Any, source: Path | None, effects: Sequence[str] = ()) -> tup
     root = _changed(model, source) if source is not None else _made(model)
     lines = [*effects, *_left_out(model), *(_moved_zeros(model) if source is not None else ())]
     ET.indent(root)
-    text = xml_comment(["Not in URDF, so that the simulator has to be told:", *lines]) if lines else ""
+    text = xml_comment(["These values have no place in URDF, so set them in the simulator:", *lines]) if lines else ""
     return '<?xml version="1.0"?>\n' + text + ET.tostring(root, encoding="unicode") + "\n", lines
 
 
@@ -66,7 +66,11 @@ def _left_out(model: Any) -> list[str]:
 def _moved_zeros(model: Any) -> list[str]:
     """Joints that the arm reads otherwise than the file counts them, a line each."""
     zeros = [(model.joint(joint).name, float(model.qpos0[model.jnt_qposadr[joint]])) for joint in range(model.njnt)]
-    return [f"zero of {name}: the arm reads {zero:.6g} rad more than this file" for name, zero in zeros if zero != 0.0]
+    return [
+        f"zero of {name}: the arm reads {zero:.6g} rad more than a simulation of this file"
+        for name, zero in zeros
+        if zero != 0.0
+    ]
 
 
 def _changed(model: Any, source: Path) -> ET.Element:
@@ -90,7 +94,7 @@ def _made(model: Any) -> ET.Element:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     if {int(kind) for kind in model.jnt_type} - set(KINDS):
-        raise BadInput("--out-model: URDF has hinges and slides alone: write MJCF (.xml)")
+        raise BadInput("--out-model: URDF can hold only hinges and slides: write MJCF (.xml)")
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(model, data)
     root, name = ET.Element("robot", name="corrected"), {0: "world"}

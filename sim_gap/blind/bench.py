@@ -24,7 +24,7 @@ SCHEMA = "armlink.blind-seal/1"
 def write_answer(folder: Path, name: str, answer: Mapping[str, Any]) -> None:
     """Write one answer as `folder/NAME.json`. Raises Refused once the folder is sealed."""
     if (folder / MANIFEST).exists():
-        raise Refused(f"{folder}: answers are sealed, answer {name} is too late: use another folder")
+        raise Refused(f"{folder}: the answers are sealed already, so answer {name} comes too late: use another folder")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(answer, indent=1, ensure_ascii=False), encoding="utf-8")
 
@@ -32,10 +32,10 @@ def write_answer(folder: Path, name: str, answer: Mapping[str, Any]) -> None:
 def seal(folder: Path) -> str:
     """Hash every answer into `folder/manifest.json` and return the manifest's own SHA-256 (hex)."""
     if (folder / MANIFEST).exists():
-        raise Refused(f"{folder}: answers are sealed already")
+        raise Refused(f"{folder}: the answers are sealed already")
     hashes = _hashes(folder)
     if not hashes:
-        raise BadInput(f"{folder}: no answers to seal")
+        raise BadInput(f"{folder}: there are no answers to seal")
     content = json.dumps({"schema": SCHEMA, "sha256": hashes}, indent=1, sort_keys=True)
     (folder / MANIFEST).write_text(content, encoding="utf-8")
     return hashlib.sha256(content.encode()).hexdigest()
@@ -48,10 +48,10 @@ def verify(folder: Path, digest: str | None = None) -> dict[str, dict[str, Any]]
     """
     manifest = folder / MANIFEST
     if not manifest.is_file():
-        raise Refused(f"{folder}: answers are not sealed: seal them before opening the labels")
+        raise Refused(f"{folder}: the answers are not sealed: seal them before you open the labels")
     content = manifest.read_bytes()
     if digest is not None and hashlib.sha256(content).hexdigest() != digest:
-        raise Refused(f"{manifest}: not the manifest that was sealed")
+        raise Refused(f"{manifest}: this is not the manifest that was sealed")
     sealed, now = json.loads(content)["sha256"], _hashes(folder)
     for name in sorted(set(sealed) | set(now)):
         if sealed.get(name) != now.get(name):
@@ -103,7 +103,7 @@ def run_bench(
     """
     _require_range(effects)
     if positions and effects:
-        raise BadInput(f"--effects {effects}: cases of positions alone have one effect at most: leave it out")
+        raise BadInput(f"--effects {effects}: cases of positions alone have at most one effect: leave this option out")
     if cases < 1:
         raise BadInput(f"--cases {cases}: expected at least 1")
     if any((out / name).exists() for name in ("answers", "cases", "labels")):

@@ -36,12 +36,12 @@ def run_real(
     bench.
     """
     if (out / "answers").exists():
-        raise BadInput(f"{out}: holds an earlier check: give another --out, or remove it")
+        raise BadInput(f"{out} holds an earlier check: give another folder with --out, or remove this folder")
     cases = read_cases(known)
     missing = [case["case"] for case in cases if not all((folder / name).is_file() for name in _files(case))]
     here = [case for case in cases if case["case"] not in missing]
     if not here:
-        raise BadInput(f"{folder}: holds none of the recordings of {known}: expected for example {_files(cases[0])[0]}")
+        raise BadInput(f"{folder} holds none of the recordings of {known}: expected for example {_files(cases[0])[0]}")
     tasks = [(case, effect) for case in here for effect in ("", *case.get("withhold", ()))]
     for done, (case, effect) in enumerate(tasks, start=1):
         write_answer(out / "answers", answer_name(case["case"], effect), _answer(folder, case, effect))
@@ -61,7 +61,9 @@ def read_cases(known: Path) -> list[Json]:
         if isinstance(case, dict) and not case.get("refused"):
             lacking += [key for key in ("first", "has") if key not in case]
         if lacking:
-            raise BadInput(f"{known}: entry {number}: {', '.join(lacking)} missing: write it as in {KNOWN.name}")
+            raise BadInput(
+                f"{known}: entry {number}: {', '.join(lacking)} is missing: write the entry as in {KNOWN.name}"
+            )
     return list(cases)
 
 

@@ -14,13 +14,23 @@ ROWS = (
     ("joints: F1", "label_withheld", "joints", "f1"),
     ("no effect: false alarms", "label_withheld", "no_effect", "false_alarms"),
     ("two effects: both found", "label_withheld", "two", "both_found"),
-    ("many effects: true ones named", "label_withheld", "several", "named"),
-    ("many effects: false among the causes claimed with confidence", "label_withheld", "several", "false_confident"),
+    ("many effects: true effects that are named", "label_withheld", "several", "named"),
+    (
+        "many effects: false causes among the causes claimed with confidence",
+        "label_withheld",
+        "several",
+        "false_confident",
+    ),
     ("parameters: median error", "label_withheld", "parameters", "median_error"),
     ("parameters: within 10 %", "label_withheld", "parameters", "within_10_percent"),
     ("parameters: 95 % intervals that hold", "label_withheld", "parameters", "inside_ci95"),
-    ("decrease of the gap relative to the true effect's: median", "label_withheld", "shrink", "median_ratio"),
-    ("effect withheld: a wrong one blamed", "effect_withheld", "false_blame"),
+    (
+        "decrease of the gap relative to the decrease by the true effect: median",
+        "label_withheld",
+        "shrink",
+        "median_ratio",
+    ),
+    ("effect withheld: a wrong effect is named", "effect_withheld", "false_blame"),
 )
 
 
@@ -46,7 +56,7 @@ def show_positions(result: Mapping[str, Any], console: Console) -> None:
 
 
 def _show_effects(result: Mapping[str, Any], console: Console) -> None:
-    table = Table("effect", "cases", "right first", "named", "median error", "first named instead")
+    table = Table("effect", "cases", "right first", "named", "median error", "first effect named instead")
     for effect, line in result["by_effect"].items():
         others = {name: k for name, k in result["confusion"].get(effect, {}).items() if name != effect}
         instead = ", ".join(f"{name} {k}" for name, k in others.items())

@@ -71,8 +71,8 @@ def unchecked_note(recordings: Sequence[Recording]) -> tuple[str, ...]:
     if not all(goes_one_way(recording) for recording in recordings):
         return ()
     return (
-        "order, signs, zeros, units and clocks of the columns could not be checked: the joints move one way only, or "
-        "hardly at all; record motion to and fro",
+        "order, signs, zeros, units and clocks of the columns could not be checked, since the joints move in one "
+        "direction only, or hardly at all: record motion in both directions",
     )
 
 
@@ -109,10 +109,10 @@ def check_recording(
 ) -> tuple[Recording, list[RecordingFinding]]:
     """Check and correct one recording, as `check_recordings`; `known` are options that corrected others."""
     for finding in [*find_time_unit(recording, stated), *find_counts(recording, stated)]:
-        raise BadInput(f"{label}: {finding.sentence()}")
+        raise BadInput(f"{label}: {finding.refusal()}")
     recording, wrapped = unwrap(recording)
     for finding in find_jumps(recording, stated):
-        raise BadInput(f"{label}: {finding.sentence()}")
+        raise BadInput(f"{label}: {finding.refusal()}")
     recording, repeated = drop_repeats(recording)
     recording, held = drop_held(recording)
     recording, jitter = even_times(recording, stated)
@@ -129,10 +129,10 @@ def check_recording(
         found += wrong
     beyond = find_beyond_range(arm, recording, stated)
     if beyond and all(finding.corrected for finding in found):  # else it is what the doubt is about
-        raise BadInput(f"{label}: {beyond[0].sentence()}")
+        raise BadInput(f"{label}: {beyond[0].refusal()}")
     recording, velocity = sound_velocity(recording, stated)
     for finding in find_seam(recording, stated):
-        raise BadInput(f"{label}: {finding.sentence()}")
+        raise BadInput(f"{label}: {finding.refusal()}")
     return recording, [*found, *velocity]
 
 

@@ -166,6 +166,6 @@ def _finding(arm: RigidArm, test: HypothesisTest, alike: Sequence[HypothesisTest
     joint = "all" if len(own.joints) == arm.n > 1 else arm.names[own.joints[0]]
     options = list(dict.fromkeys(each.hypothesis.option for each in (test, *alike)))
     shown, more = options[:MOST_OPTIONS], ["another correction"] if len(options) > MOST_OPTIONS else []
-    evidence = own.what + ("; other corrections would explain as much" if len(options) > 1 else "")
+    evidence = own.what + ("; other corrections would explain the recording as well" if len(options) > 1 else "")
     corrected = own.corrects and len(options) == 1
     return RecordingFinding(own.kind, own.channels[0], joint, evidence, ", or ".join([*shown, *more]), corrected)

@@ -24,11 +24,23 @@ class RecordingFinding:
     corrected: bool
     """Whether it was corrected; where it was not, the recording is diagnosed as it stands."""
 
+    @property
+    def evidence_at(self) -> str:
+        """The evidence after its channel and joint."""
+        joint = "all joints" if self.joint == "all" else self.joint
+        return f"{'the time t' if self.channel == 't' else f'{self.channel} of {joint}'}: {self.evidence}"
+
     def sentence(self) -> str:
-        where = f"{self.channel} of {'all joints' if self.joint == 'all' else self.joint}"
-        if self.corrected:
-            return f"{where}: {self.evidence} ({self.finding}, corrected: {self.option})"
-        return f"{where}: {self.evidence} ({self.finding}; diagnosed as recorded; otherwise: {self.option})"
+        """For a recording that is diagnosed."""
+        kind = self.finding.replace("_", " ")
+        if not self.corrected:
+            return f"{self.evidence_at} ({kind}; diagnosed as recorded; to change this: {self.option})"
+        other = f"option: {self.option}" if self.option.startswith("--") else f"next time, {self.option}"
+        return f"{self.evidence_at} ({kind}; this was corrected; {other})"
+
+    def refusal(self) -> str:
+        """For a recording that is not diagnosed until this is settled."""
+        return f"{self.evidence_at} To continue: {self.option}"
 
     def to_json(self) -> dict[str, Any]:
         return dict(vars(self))

@@ -74,7 +74,7 @@ def _option(kind: str, channels: Sequence[str], value: str, joint: int | None = 
 
 
 def _signs(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
-    channel, every, opposite = motion.channel, tuple(range(arm.n)), "has the opposite sign"
+    channel, every, opposite = motion.channel, tuple(range(arm.n)), "the sign is opposite"
     positions = ("q", *follows)
     for joints in [every, *((j,) for j in every if arm.n > 1)]:
         own = None if len(joints) == arm.n else joints[0]
@@ -93,8 +93,8 @@ def _signs(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: S
             and LEAST_SIGN_SHARE < turns < 1.0 - LEAST_SIGN_SHARE
             and not _settled(stated, "sign", channel, (j,))
         ):
-            option = f"record signed torque, or --sign {channel}_{j + 1}=1 if it is right"
-            what = "never changes its sign, though the model's torque does"
+            option = f"record signed torque, or give --sign {channel}_{j + 1}=1 if this is right"
+            what = "the torque never changes its sign, but the torque of the model does"
             yield Hypothesis("unsigned", (channel,), (j,), what, option, _signed(arm, j), corrects=False)
 
 
@@ -102,13 +102,15 @@ def _zeros(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: S
     positions, every = ("q", *follows), tuple(range(arm.n))
     far = np.median(np.abs(motion.q).max(axis=0)) > math.pi  # as angles in degrees are, and those of one joint are not
     if far and not _settled(stated, "units", "q", every):
-        yield Hypothesis("scale", ("q",), every, "is in degrees", _option("units", positions, "deg"), _degrees)
+        yield Hypothesis(
+            "scale", ("q",), every, "the positions are in degrees", _option("units", positions, "deg"), _degrees
+        )
     for j in every:
         if _settled(stated, "zero", "q", (j,)):
             continue
         for angle in (0.5 * math.pi, -0.5 * math.pi, math.pi):
             text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
-            what = f"has its zero off by {angle:+.2f} rad"
+            what = f"the zero is off by {angle:+.2f} rad"
             yield Hypothesis("zero", ("q",), (j,), what, text, _moved(j, angle), POSITION_CHOICES)
 
 
@@ -119,10 +121,10 @@ def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterato
         if _settled(stated, "units", channel, joints):
             continue
         column = channel if len(joints) == arm.n else f"{channel}_{joints[0] + 1}"
-        constant = "N·m/A at the joint" + (", or one each: K1;K2;…" if len(joints) == arm.n > 1 else "")
-        option = f"--units {column}=A:K ({constant}), or {column}=N·m if it is right"
+        constant = "N·m/A at the joint" + (", or one for each joint: K1;K2;…" if len(joints) == arm.n > 1 else "")
+        option = f"--units {column}=A:K ({constant}), or {column}=N·m if this is right"
         for factor in UNIT_FACTORS.tolist():
-            what = f"is {factor:.2g} times what the model explains: is it in amperes, or another unit?"
+            what = f"the torque is {factor:.2g} times what the model explains: is it in amperes, or in another unit?"
             change = _in_unit(joints, factor)
             yield Hypothesis("scale", (channel,), joints, what, option, change, choices=2, corrects=False)
 
@@ -130,10 +132,17 @@ def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterato
 def _sources(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
     every, channel = tuple(range(arm.n)), motion.channel
     if not stated.without_gravity and arm.n > 1:
-        what, option = "lacks the model's gravity: it was subtracted", f"--effort-is {WITHOUT_GRAVITY}"
+        what, option = (
+            "the torque contains no gravity, so the program that recorded it has probably subtracted the gravity of "
+            "the model",
+            f"--effort-is {WITHOUT_GRAVITY}",
+        )
         yield Hypothesis("effort_source", (channel,), every, what, option, _weighed(arm))
     if not (motion.rubs or stated.effort) and arm.n > 1:
-        what = "contains friction, which a link-side sensor does not feel: it is a motor's effort"
+        what = (
+            "the torque contains friction, which a sensor on the link side does not feel, so it is the torque "
+            "of the motors"
+        )
         yield Hypothesis("effort_source", (channel,), every, what, "--effort-is motor", _of_motor)
 
 
@@ -148,7 +157,7 @@ def _delays(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterat
         lag = rows / rate
         if early <= lag <= late or 4 * abs(rows) > len(motion.q):
             continue
-        what = f"is {abs(lag):.2f} s {'late' if lag > 0 else 'early'} against the positions"
+        what = f"the torque is {abs(lag):.2f} s {'later' if lag > 0 else 'earlier'} than the positions"
         yield Hypothesis(
             "clock", (channel,), every, what, f"--clock {channel}={-lag:.3f}", _delayed(rows), choices=2, late=rows
         )
@@ -164,15 +173,15 @@ def _orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Ite
         whole = put_in_order(arm, order, (channel,), channel)
         for late in (False, True):
             for share in ORDER_CHANGES:
-                part = f"{'after' if late else 'before'} {share:.0%} of the recording"
+                part = f"in the part {'after' if late else 'before'} {share:.0%} of the recording"
                 option = (
-                    f"give both parts as recordings of their own, the {'later' if late else 'earlier'} with "
+                    f"give both parts as separate recordings, the {'later' if late else 'earlier'} part with "
                     f"{whole.option}"
                 )
                 change = _in_part(order, late, float(share))
                 yield replace(
                     whole,
-                    what=f"{whole.what} only {part}: with that the model explains more",
+                    what=f"{whole.what}, but only {part}, since the model then explains more",
                     option=option,
                     change=change,
                     choices=3,
@@ -198,7 +207,10 @@ def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str],
     """Columns of some channels in another order."""
     touched = tuple(j for j, other in enumerate(order) if j != other)
     names = ", ".join(arm.names[j] for j in touched)
-    what = f"is in another order ({names} hold {', '.join(arm.names[order[j]] for j in touched)})"
+    what = (
+        f"the columns are in another order (the columns of {names} hold "
+        f"{', '.join(arm.names[order[j]] for j in touched)})"
+    )
     option = "--map " + ",".join(f"{name}_{j + 1}={name}_{order[j] + 1}" for name in channels for j in touched)
     values = [
         *(("q", "v", "a") if "q" in channels else ()),

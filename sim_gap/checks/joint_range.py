@@ -26,8 +26,14 @@ def find_counts(recording: Recording, stated: Corrections) -> list[RecordingFind
         if stated.states("units", f"q_{j + 1}") or not q.size or np.ptp(q) < FAR or np.any(q != np.round(q)):
             continue
         follows = ",q_cmd=counts:TURN" if recording.position_command is not None else ""
-        evidence = f"holds whole numbers from {q.min():.0f} to {q.max():.0f}: counts of an encoder, or degrees?"
-        option = f"--units q=counts:TURN{follows} (counts a turn of the joint), or q=deg, or q=rad if it is right"
+        evidence = (
+            f"the column holds whole numbers from {q.min():.0f} to {q.max():.0f}: are these counts of an "
+            "encoder, or degrees?"
+        )
+        option = (
+            f"--units q=counts:TURN{follows} (TURN: counts in one turn of the joint), or q=deg, or q=rad if this "
+            "is right"
+        )
         found.append(RecordingFinding("scale", "q", recording.names[j], evidence, option, False))
     return found
 
@@ -42,10 +48,10 @@ def find_far(arm: RigidArm, recording: Recording, stated: Corrections) -> list[R
             or np.nanmax(q) - np.nanmin(q) < FAR
         ):
             continue
-        evidence = f"runs from {np.nanmin(q):.1f} to {np.nanmax(q):.1f} rad: degrees?"
+        evidence = f"the position goes from {np.nanmin(q):.1f} to {np.nanmax(q):.1f} rad: are these degrees?"
         found.append(
             RecordingFinding(
-                "scale", "q", arm.names[j], evidence, f"{_degrees(recording)}, or q=rad if it is right", False
+                "scale", "q", arm.names[j], evidence, f"{_degrees(recording)}, or q=rad if this is right", False
             )
         )
     return found
@@ -71,7 +77,9 @@ def _percent(arm: RigidArm, recording: Recording) -> str:
     units = ",".join(f"{channel}=percent:{angles}" for channel in channels)
     ends = [f"{channel}_{j + 1}={low[j]:.4g}" for channel in channels for j in np.flatnonzero(one_sided)]
     zero = f" --zero {','.join(ends)}" if ends else ""
-    return f'or per cent of the ranges, as LeRobot records them unless use_degrees is set: --units "{units}"{zero}, '
+    return (
+        f'or for per cent of the ranges, which LeRobot records unless use_degrees is set, --units "{units}"{zero}, or '
+    )
 
 
 def beyond_range(arm: RigidArm, position: Array) -> Mask:
@@ -89,11 +97,13 @@ def find_beyond_range(arm: RigidArm, recording: Recording, stated: Corrections) 
         if stated.joints or stated.order or any(stated.states(k, column) for k in ("sign", "zero", "units")):
             continue
         evidence = (
-            f"runs from {least:.2f} to {most:.2f} rad, the model's joint from {low:.2f} to {high:.2f} rad: another "
-            "zero, sign, unit or joint?"
+            f"the recorded position goes from {least:.2f} to {most:.2f} rad, but the joint of the model can "
+            f"only go from {low:.2f} to {high:.2f} rad: does the recording have another zero, sign or unit, "
+            "or is this another joint?"
         )
         option = (
-            f"--zero {column}=ANGLE, --sign {column}=-1 or --map, or --zero {column}=0 if the model's range is wrong"
+            f"--zero {column}=ANGLE, --sign {column}=-1 or --map, or --zero {column}=0 if the range of the "
+            "model is wrong"
         )
         if most - least > 2.0 * np.pi:
             option = f"{_degrees(recording)}, {_percent(arm, recording)}{option}"

@@ -40,12 +40,13 @@ def match_joints(
         return replace(recording, names=default_names(recording.n)), []  # the order is that of --map
     if matched is None:
         raise BadInput(
-            f"{label}: its joints {', '.join(own)} are not those of the model, {', '.join(model)}: give them in the "
-            f"model's order, --joints {','.join(own[: len(model)])}"
+            f"{label}: the recording has the joints ({', '.join(own)}), but the model has "
+            f"({', '.join(model)}): name the joints of the recording in the order of the model, for example "
+            f"--joints {','.join(own[: len(model)])}"
         )
     pairs = ", ".join(f"{name} as {to}" for to, name in matched.items())
     finding = RecordingFinding(
-        "order", "q", "all", f"taken by name: {pairs}", "--joints " + ",".join(matched.values()), True
+        "order", "q", "all", f"the joints were matched by name: {pairs}", "--joints " + ",".join(matched.values()), True
     )
     return _taken(recording, list(matched.values()), list(matched)), [finding]
 
@@ -53,7 +54,7 @@ def match_joints(
 def _taken(recording: Recording, names: Sequence[str], called: Sequence[str]) -> Recording:
     left = [name for name in recording.names if name not in names]
     taken = take_joints(recording, [recording.names.index(name) for name in names], tuple(called))
-    note = f"joints that the model has not, left out: {', '.join(left)}" if left else ""
+    note = f"joints left out because the model does not have them: {', '.join(left)}" if left else ""
     return replace(taken, warning="; ".join(filter(None, (recording.warning, note))))
 
 

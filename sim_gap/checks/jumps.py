@@ -30,7 +30,7 @@ else, by the first factor, as their velocities jump by the second; anywhere else
 LEAST_BEYOND, LEAST_KICK = 0.005, 0.05
 """Least distance [rad] and velocity [rad/s] of that: a sound recording misses single rows, too (0.002 and 0.002)."""
 TOGETHER = "were separate pieces joined here, or are rows missing?"
-SETTLED = "give each piece as a recording of its own, or --clock t=0 if it is right"
+SETTLED = "give each piece as a separate recording, or --clock t=0 if this is right"
 
 
 def unwrap(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
@@ -43,9 +43,13 @@ def unwrap(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
             if not turns.any() or np.any(np.abs(jumps / turn - turns)[jumps != 0.0] > WRAPPED):
                 continue
             position[:, j] = q - turn * np.concatenate([[0.0], np.cumsum(turns)])
-            evidence = f"wraps around a whole turn, {np.count_nonzero(turns)} times: unwrapped"
+            evidence = (
+                f"the position jumps by a whole turn, {np.count_nonzero(turns)} times; these jumps were taken out"
+            )
             found.append(
-                RecordingFinding("zero", "q", recording.names[j], evidence, "record it without wrapping", True)
+                RecordingFinding(
+                    "zero", "q", recording.names[j], evidence, "record the position without wrapping", True
+                )
             )
             break
     return (replace(recording, position=position), found) if found else (recording, [])
@@ -62,7 +66,8 @@ def find_jumps(recording: Recording, stated: Corrections) -> list[RecordingFindi
         if jumps[row] == 0.0:
             continue
         evidence = (
-            f"jumps by {jumps[row]:.2f} rad from one row to the next at t = {recording.t[row + 1]:.2f} s: {TOGETHER}"
+            f"the position jumps by {jumps[row]:.2f} rad from one row to the next at t = "
+            f"{recording.t[row + 1]:.2f} s: {TOGETHER}"
         )
         found.append(RecordingFinding("dropped", "q", recording.names[j], evidence, SETTLED, False))
     return found
@@ -103,8 +108,8 @@ def find_seam(recording: Recording, stated: Corrections) -> list[RecordingFindin
     if len(joints) < 2:
         return []
     evidence = (
-        f"and {', '.join(joints[1:])} move farther than their velocities allow, and these jump as well, at "
-        f"t = {t[row + 3]:.2f} s: {TOGETHER}"
+        f"this joint and {', '.join(joints[1:])} move farther than their velocities allow, and their "
+        f"velocities jump as well, at t = {t[row + 3]:.2f} s: {TOGETHER}"
     )
     return [RecordingFinding("dropped", "q", joints[0], evidence, SETTLED, False)]
 

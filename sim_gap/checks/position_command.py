@@ -45,7 +45,7 @@ def check_position_only(
     for recording, label in zip(recordings, labels, strict=True):
         if recording.position_command is None or not np.isfinite(recording.position_command).any():
             raise BadInput(
-                f"{label}: neither a torque channel nor a commanded position holds a number: record tau_1 …, "
+                f"{label}: no torque channel and no commanded position holds a number: record tau_1 …, "
                 "tau_motor_1 … or tau_cmd_1 …, or q_cmd_1 …"
             )
         looks = (
@@ -54,7 +54,7 @@ def check_position_only(
             find_far(arm, recording, stated),
         )
         for finding in chain(*looks):
-            raise BadInput(f"{label}: {finding.sentence()}")
+            raise BadInput(f"{label}: {finding.refusal()}")
         recording, repeated = drop_repeats(recording)
         recording, jitter = even_times(recording, stated)
         dropped = [] if repeated else find_dropped(recording)
@@ -92,20 +92,28 @@ def _require_pairs(recording: Recording, label: str, stated: Corrections) -> Non
         column = f"q_cmd_{j + 1}"
         if (other := holds.get(j)) is not None:
             order = exchange_option("q_cmd", holds)
-            remedy = f"give the order, {order}" if order else f"--map {column}=COLUMN, or ={column} if it is right"
+            remedy = (
+                f"give the order with {order}"
+                if order
+                else (
+                    f"name the right column with --map {column}=COLUMN; if {column} is right, confirm it with --map "
+                    f"{column}={column}"
+                )
+            )
             raise BadInput(
                 f"{label}: {name}: {column} is followed by q_{other + 1} (correlation {match[j, other]:.2f}), not by "
                 f"q_{j + 1} ({match[j, j]:.2f}): {remedy}"
             )
         if match[j, j] < -FOLLOWS and not stated.states("sign", column):
             raise BadInput(
-                f"{label}: {name}: q_{j + 1} moves against {column} (correlation {match[j, j]:.2f}): --sign {column}=-1"
+                f"{label}: {name}: q_{j + 1} moves in the direction opposite to {column} (correlation "
+                f"{match[j, j]:.2f}): give --sign {column}=-1"
             )
         if match[j, j] > CLEARLY and not SCALE[0] < slope[j] < SCALE[1] and not stated.states("units", column):
             unit = f"q_cmd_{j + 1}=deg" if slope[j] < 1.0 else f"q_{j + 1}=deg"
             raise BadInput(
-                f"{label}: {name}: q_{j + 1} moves {slope[j]:.3g} times as far as {column}: if the unit differs, "
-                f"--units {unit}"
+                f"{label}: {name}: q_{j + 1} moves {slope[j]:.3g} times as far as {column}: if their units "
+                f"differ, give --units {unit}"
             )
 
 

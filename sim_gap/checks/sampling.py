@@ -40,10 +40,18 @@ def find_time_unit(recording: Recording, stated: Corrections) -> list[RecordingF
     if travel < TRAVEL or fastest > CREEP:
         return []
     unit = next((unit for unit, seconds in TIME_UNITS.items() if fastest / seconds > CREEP), "ns")
-    what = f"positions travel {travel:.2g} rad in {np.ptp(recording.t):.3g} s, none faster than {fastest:.2g} rad/s"
+    what = (
+        f"the joints travel {travel:.2g} rad in {np.ptp(recording.t):.3g} s, but none is faster than "
+        f"{fastest:.2g} rad/s, which is too slow to be true"
+    )
     return [
         RecordingFinding(
-            "clock", "t", "all", f"{what}: times in {unit}?", f"--units t={unit}, or t=s if it is right", False
+            "clock",
+            "t",
+            "all",
+            f"{what}: are the times in {unit}?",
+            f"--units t={unit}, or t=s if this is right",
+            False,
         )
     ]
 
@@ -64,12 +72,14 @@ def even_times(recording: Recording, stated: Corrections) -> tuple[Recording, li
         return recording, []
     scatter = float(np.std(recording.t - sampled))
     evidence = (
-        f"time steps scatter by {scatter * 1e3:.1f} ms; at even steps of "
+        f"the time steps scatter by {scatter * 1e3:.1f} ms; with even steps of "
         f"{1e3 * float(np.median(np.diff(sampled))):.2f} ms the positions are "
-        f"{before / max(after, 1e-12):.1f} times smoother: these are times of receipt"
+        f"{before / max(after, 1e-12):.1f} times smoother, so these are times of receipt"
     )
     values = {**vars(recording), "t": sampled}
-    return Recording(**values), [RecordingFinding("jitter", "t", "all", evidence, "--clock t=0 (keep the times)", True)]
+    return Recording(**values), [
+        RecordingFinding("jitter", "t", "all", evidence, "--clock t=0 (to keep the times)", True)
+    ]
 
 
 def _sample_times(t: Array) -> Array | None:
@@ -133,7 +143,9 @@ def drop_repeats(recording: Recording) -> tuple[Recording, list[RecordingFinding
     share = float(same[moving].mean()) if moving.any() else 0.0
     if share < REPEATED:
         return recording, []
-    evidence = f"{share:.0%} of the rows in motion repeat the row before in every channel: old messages read again"
+    evidence = (
+        f"{share:.0%} of the rows in motion repeat the row before in every channel, so old messages were read again"
+    )
     kept = slice_rows(recording, ~(same & moving))
     return kept, [RecordingFinding("duplicate", "t", "all", evidence, "record each message once", True)]
 
@@ -150,7 +162,9 @@ def find_dropped(recording: Recording) -> list[RecordingFinding]:
     if missing < DROPPED or np.mean(np.abs(periods - whole) < NEAR) < EVEN:
         return []
     evidence = f"{missing:.0%} of the samples are missing, up to {whole.max() - 1.0:.0f} in a row"
-    return [RecordingFinding("dropped", "t", "all", evidence, "record every message; the gaps are interpolated", True)]
+    return [
+        RecordingFinding("dropped", "t", "all", evidence, "record every message (the gaps were interpolated)", True)
+    ]
 
 
 def fast_rows(position: Array) -> Mask:
@@ -180,7 +194,10 @@ def drop_held(recording: Recording) -> tuple[Recording, list[RecordingFinding]]:
     if velocity is not None and np.mean(_repeats(velocity)[same]) > 0.5:
         velocity = fill(recording.t, velocity, known)
     position = fill(recording.t, recording.position, known)
-    evidence = f"repeats in {share:.0%} of the rows in motion while torques change: it is read less often; interpolated"
+    evidence = (
+        f"the positions repeat in {share:.0%} of the rows in motion while torques change, so they are read less "
+        "often; the values between were interpolated"
+    )
     found = RecordingFinding("duplicate", "q", "all", evidence, "record at the rate at which positions are read", True)
     return replace(recording, position=position, velocity=velocity), [found]
 

@@ -29,7 +29,10 @@ def find_same(recording: Recording, stated: Corrections) -> list[RecordingFindin
     link, motor = recording.torque, recording.motor_torque
     if stated.effort or link is None or motor is None or not np.array_equal(link, motor, equal_nan=True):
         return []
-    evidence = "equals tau_motor in every sample: these drives have one torque reading, that of their motors"
+    evidence = (
+        "the channel equals tau_motor in every sample, so these drives have only one torque reading, the torque "
+        "of their motors"
+    )
     return [RecordingFinding("effort_source", "tau", "all", evidence, "--effort-is motor", True)]
 
 
@@ -52,5 +55,8 @@ def find_gain_command(recording: Recording, stated: Corrections) -> list[Recordi
         lawful += bool(np.var(law @ steps[1:]) > LAWFUL * np.var(steps[0]) and law[0] > 0.0)
     if 2 * lawful <= recording.position.shape[1]:
         return []
-    evidence = "is kp (q_cmd − q) of its own row, but the drive acts at another time within the cycle; left out"
-    return [RecordingFinding("clock", "tau_cmd", "all", evidence, "--clock tau_cmd=0 (keep it)", True)]
+    evidence = (
+        "the torque was computed as kp (q_cmd − q) from the values of the same row, but the drive computes it "
+        "at another time in the cycle, so the channel is left out"
+    )
+    return [RecordingFinding("clock", "tau_cmd", "all", evidence, "--clock tau_cmd=0 (to keep the channel)", True)]

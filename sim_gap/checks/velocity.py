@@ -67,11 +67,14 @@ def _findings(recording: Recording, velocity: Array, stated: Corrections) -> lis
     own = clear & (best == np.arange(moves.size))
     low, high = SCALE
     wrong = {
-        "order": (clear & (best != np.arange(moves.size)) & (np.abs(np.diag(match)) < 0.5), "belongs to another joint"),
-        "sign": (own & (scale < 0.0), "has the opposite sign of the position's derivative"),
+        "order": (
+            clear & (best != np.arange(moves.size)) & (np.abs(np.diag(match)) < 0.5),
+            "the velocity belongs to another joint",
+        ),
+        "sign": (own & (scale < 0.0), "the velocity has the opposite sign of the derivative of the position"),
         "scale": (
             own & (scale > 0.0) & ~((low < scale) & (scale < high)),
-            "differs in size from the position's derivative",
+            "the velocity differs in size from the derivative of the position",
         ),
     }
     found = []
@@ -79,15 +82,21 @@ def _findings(recording: Recording, velocity: Array, stated: Corrections) -> lis
         names = [j for j in moves[joints] if not stated.states("sign" if kind == "sign" else "units", f"dq_{j + 1}")]
         if names:
             evidence = (
-                f"{what} ({_listed(kind, names, moves, best, scale, recording.names)}): left out of the diagnosis"
+                f"{what} ({_listed(kind, names, moves, best, scale, recording.names)}), so it is left out of "
+                "the diagnosis"
             )
             joint = "all" if len(names) == len(moves) else recording.names[names[0]]
             found.append(RecordingFinding(kind, "dq", joint, evidence, _option(kind, names, moves, best), True))  # type: ignore[arg-type]
     if not found and own.any() and not stated.states("units", "dq_1"):
         late = _delay(recording, rate[:, moves], velocity[:, moves])
         if late:
-            evidence = f"lags {late * 1e3:.0f} ms behind the position's derivative, as after a filter: left out"
-            found.append(RecordingFinding("filter", "dq", "all", evidence, "--units dq=rad (keep it)", True))
+            evidence = (
+                f"the velocity lags {late * 1e3:.0f} ms behind the derivative of the position, as after a "
+                "filter, so it is left out"
+            )
+            found.append(
+                RecordingFinding("filter", "dq", "all", evidence, "--units dq=rad (to keep the velocity)", True)
+            )
     return found
 
 
@@ -104,7 +113,7 @@ def _option(kind: str, joints: list[int], moves: NDArray[np.int_], best: NDArray
     place = {int(j): i for i, j in enumerate(moves)}
     if kind == "order":
         option = exchange_option("dq", {j: int(moves[best[place[j]]]) for j in joints})
-        return option or "--units " + ",".join(f"dq_{j + 1}=rad" for j in joints) + " (keep it)"
+        return option or "--units " + ",".join(f"dq_{j + 1}=rad" for j in joints) + " (to keep the velocity)"
     return f"--{'sign' if kind == 'sign' else 'units'} " + ",".join(
         f"dq_{j + 1}={'-1' if kind == 'sign' else 'deg'}" for j in joints
     )

@@ -7,28 +7,30 @@ import typer
 
 
 def demo(
-    target: Annotated[
-        str | None, typer.Argument(metavar="[ARM]", help="The same as --arm.", show_default=False)
-    ] = None,
+    target: Annotated[str | None, typer.Argument(metavar="[ARM]", help="Same as --arm.", show_default=False)] = None,
     arm: Annotated[
         str | None,
-        typer.Option(help="Bundled arm, arm file with a sim section, or URDF or MJCF model; default: sarcos."),
+        typer.Option(help="Bundled arm, arm file with the key sim, or URDF or MJCF model; by default sarcos."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the hidden truth.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the hidden true values.")] = 0,
     realism: Annotated[
         float | None,
         typer.Option(
-            min=0, help="Small imperfections of a real arm: 1 for a good one, 3 for a bad one; default: the arm file's."
+            min=0,
+            help="Small imperfections of a real arm: 1 for a good arm, 3 for a bad arm; by default the value of "
+            "the arm file.",
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for report.html, summary.json and the data.")] = Path(
         "armlink-demo"
     ),
-    json: Annotated[Path | None, typer.Option(help="Also write the summary here; - is standard output.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Also write the summary as JSON to this file; for standard output give `-`.")
+    ] = None,
 ) -> None:
     """Run the whole job on a simulated arm on an in-process CAN bus and write report.html and summary.json.
 
-    Of a model (armlink demo --arm my-arm.urdf) an arm file is made first, as armlink new does; it lies in the folder.
+    For a model (armlink demo --arm my-arm.urdf), an arm file is made first in the folder, as armlink new makes it.
 
     Example: armlink demo --arm sarcos --seed 1 --out armlink-demo
     """
@@ -39,5 +41,5 @@ def demo(
     from sim_gap.demo.run import run_demo
 
     if target is not None and arm is not None and target != arm:
-        raise BadInput(f"demo: two arms, {target} and --arm {arm}: give one")
+        raise BadInput(f"demo: two arms are given, {target} and --arm {arm}: give one arm")
     run_demo(target or arm or "sarcos", seed=seed, realism=realism, out=out, json_path=json)

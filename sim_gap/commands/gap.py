@@ -23,9 +23,9 @@ def gap() -> None:
 
 
 SUMMARIES: dict[Callable[..., object], str] = {
-    diagnose: "Find the causes of the gap and how far they close it.",
+    diagnose: "Find the causes of the gap, and how much of the gap they explain.",
     compare: "Rank several models on the same recordings.",
-    plan: "Plan the motion that separates effects; nothing moves.",
+    plan: "Plan a motion that separates effects; nothing moves.",
     collect: "Move the arm along a plan and record it.",
     diagnose_fleet: "Diagnose the recordings of many arms.",
     trend: "Find what changes over the recordings of one arm.",

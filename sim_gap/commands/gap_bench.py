@@ -13,14 +13,14 @@ def bench(
         str,
         typer.Option(
             metavar="LOW-HIGH",
-            help="Number of effects in every case; default: none, one or two.",
+            help="Number of effects in every case; by default none, one or two.",
             rich_help_panel="Other cases",
         ),
     ] = "",
     channels: Annotated[
         str,
         typer.Option(
-            help="q,q_cmd: cases with position servos and no torques; default: with torques.",
+            help="q,q_cmd: cases with position servos and without torques; by default cases with torques.",
             rich_help_panel="Other cases",
         ),
     ] = "",
@@ -28,19 +28,21 @@ def bench(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Diagnose the recordings of real arms in DIR instead; see --known.",
+            help="Diagnose instead the recordings of real arms in this folder; see --known.",
             rich_help_panel="Other cases",
         ),
     ] = None,
     known: Annotated[
         Path | None,
         typer.Option(
-            help="Known effects of these arms (YAML); default: those of the published arms.",
+            help="YAML file with the known effects of these arms; by default of the published arms.",
             rich_help_panel="Other cases",
         ),
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the score here; - is standard output.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Keep cases, answers and labels in this new folder.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Write the score as JSON to this file; for standard output give `-`.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Store cases, answers and labels in this new folder.")] = None,
     workers: Annotated[int, typer.Option(help="Number of processes.")] = 2,
 ) -> None:
     """Make sealed cases, diagnose them, then open the labels and score (label withheld and effect withheld).
@@ -65,9 +67,9 @@ def bench(
     from sim_gap.blind.tables import show, show_positions, show_real
 
     if json is not None and str(json) != "-" and not json.resolve().parent.is_dir():
-        raise BadInput(f"--json {json}: its folder does not exist: create it first")
+        raise BadInput(f"--json {json}: the folder of this file does not exist: create it first")
     if channels and {*channels.split(",")} != {"q", "q_cmd"}:
-        raise BadInput(f"--channels {channels}: expected q,q_cmd; leave it out for arms with torque sensors")
+        raise BadInput(f"--channels {channels}: expected q,q_cmd; leave the option out for arms with torque sensors")
     positions = bool(channels)
     console = PlainConsole()
     with TemporaryDirectory(prefix="armlink-bench-") as scratch, Progress(console=console) as bars:

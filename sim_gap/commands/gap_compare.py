@@ -36,7 +36,7 @@ def compare(
     from sim_gap.model.known_gains import parse_known_gains
 
     if len(sim) < 2:
-        raise BadInput("--sim: give two models or more")
+        raise BadInput("--sim: give two or more models")
     with PlainConsole().status("moving the models along the recordings"):
         judged = {name: each for path in heldout for name, each in load_recordings(path, stated.of_reading()).items()}
         found = compare_models(
@@ -69,8 +69,8 @@ def compare(
     for model, finding in found.checks:
         out.print(f"{model}: {finding.sentence()}", style="yellow")
     if found.unit == "rad":
-        out.print("in brackets: running free")
+        out.print("in brackets: the gap of a simulation that runs free")
     write_json(json, found.to_json())
     alike = ", ".join(each.model for each in found.models[1:] if each.alike)
-    told = f"; these recordings do not tell it from {alike}" if alike else ""
-    out.print(f"{found.models[0].model} leaves the least{told}", style="bold")
+    told = f"; these recordings do not show a difference from {alike}" if alike else ""
+    out.print(f"{found.models[0].model} leaves the smallest gap{told}", style="bold")

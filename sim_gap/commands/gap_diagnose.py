@@ -19,13 +19,13 @@ def _about(help_text: str, **more: Any) -> Any:
     return typer.Option(help=help_text, rich_help_panel="About the arm and the recordings", **more)
 
 
-Base = Annotated[str | None, _about("Body of the model that carries the recorded arm; default: the world.")]
-Tip = Annotated[str | None, _about("Body of the model that the recorded arm ends in, where it has several arms.")]
+Base = Annotated[str | None, _about("Body of the model that carries the recorded arm; by default the world.")]
+Tip = Annotated[str | None, _about("Last body of the recorded arm, if the model has several arms.")]
 KnownGain = Annotated[
     str,
     _about(
-        "Gains of the position controllers, where the model lacks them: kp=20,kd=1.5 or kp=A;B;… by joint "
-        "(N·m/rad, N·m·s/rad).",
+        "Gains of the position controllers, if the model does not have them: kp=20,kd=1.5, or by joint "
+        "kp=A;B;… (N·m/rad, N·m·s/rad).",
         metavar="kp=…,kd=…",
     ),
 ]
@@ -38,7 +38,10 @@ def diagnose(
     stated: "Corrections",
     heldout: Annotated[
         list[Path] | None,
-        typer.Option(help="Held-out recording to judge on; may be repeated. Default: the end of each --train."),
+        typer.Option(
+            help="Held-out recording, on which causes are judged; may be repeated. By default the end of each "
+            "--train recording."
+        ),
     ] = None,
     base: Base = None,
     tip: Tip = None,
@@ -47,19 +50,21 @@ def diagnose(
         list[str] | None,
         typer.Option(
             metavar="NAME=REC[,REC…]",
-            help="Recordings (held-out ones too) with a common body such as a payload; may be repeated. "
-            "Default: found by itself.",
+            help="Recordings, also held-out ones, in which the arm carries the same body, such as a payload; may "
+            "be repeated. By default the diagnosis finds these groups.",
             rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the result here; - is standard output.")] = None,
-    report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report here.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Write the result as JSON to this file; for standard output give `-`.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report to this file.")] = None,
     gain: Annotated[
         list[str] | None,
         typer.Option(
             metavar="REC=VALUE",
-            help="Gain of the position controller in a recording (patterns allowed), in any unit; only if there is no "
-            "torque channel and recordings differ in it.",
+            help="Gain of the position controller in a recording (patterns allowed), in any unit; only needed if "
+            "there is no torque channel and the gain differs between recordings.",
             rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
@@ -67,40 +72,40 @@ def diagnose(
         int,
         typer.Option(
             min=0,
-            help="Number of draws of all parameters to write, for domain randomisation.",
+            help="Write this number of random draws of all parameters, for domain randomisation.",
             rich_help_panel="For training in simulation",
         ),
     ] = 0,
     out_samples: Annotated[
         Path | None,
         typer.Option(
-            help="Where the draws go: .csv, .json or .parquet. Default: samples.csv.",
+            help="File for the draws: .csv, .json or .parquet; by default samples.csv.",
             rich_help_panel="For training in simulation",
         ),
     ] = None,
     out_actuators: Annotated[
         Path | None,
         typer.Option(
-            help="Write actuator entries for Isaac Lab and mjlab here (.py).",
+            help="Write actuator entries for Isaac Lab and mjlab to this file (.py).",
             rich_help_panel="For training in simulation",
         ),
     ] = None,
     physics_step: Annotated[
         float,
         typer.Option(
-            help="Step of the training simulation, in which the entries count delays [s].",
+            help="Physics step of the training simulation [s]; the actuator entries count delays in these steps.",
             rich_help_panel="For training in simulation",
         ),
     ] = 0.005,
     out_model: Annotated[
         Path | None,
         typer.Option(
-            help="Write the corrected model here (MJCF, or URDF if the name ends so), and beside it a module for "
-            "effects that MJCF cannot hold."
+            help="Write the corrected model to this file (MJCF, or URDF if the name ends in .urdf), and a module "
+            "beside it for effects that MJCF cannot hold."
         ),
     ] = None,
 ) -> None:
-    """Find where the gap is, which effects cause it, and how far they close it on held-out data.
+    """Find where the gap is, which effects cause it, and how much of it they explain on held-out data.
 
     Example: armlink gap diagnose --sim arm.xml --train slow.csv --train fast.csv --heldout other.csv --json -
     """
@@ -118,7 +123,7 @@ def diagnose(
     paths = [*train, *(heldout or [])]
     for target in (None if str(json) == "-" else json, report, out_model, out_samples, out_actuators):
         if target is not None and not target.resolve().parent.is_dir():
-            raise BadInput(f"{target}: its folder does not exist: create it first")
+            raise BadInput(f"{target}: the folder of this file does not exist: create it first")
     if report is not None:
         require_extra("--report", "reports")
     if out_samples is not None and out_samples.suffix == ".parquet":
@@ -171,14 +176,16 @@ def _suggest(answer: "Diagnosis", sim: str, json: Path | None, out_model: Path |
     from armlink.commands.plain_console import PlainConsole, command_line, suggest
 
     if answer.doubts:
-        PlainConsole().print(f"next: the same command with {' and '.join(each.option for each in answer.doubts)}")
+        PlainConsole().print(f"next: repeat this command with {' and '.join(each.option for each in answer.doubts)}")
     elif answer.verdict == "ambiguous":
         arm = sim if sim in bundled_arms() or sim.endswith((".yaml", ".yml")) else "ARM.yaml"
         kept = json is not None and str(json) != "-"
         plan = command_line("gap", "plan", arm, answer=json if kept else "gap.json", out="motion.csv")
-        suggest(plan if kept else f"the same command with --json gap.json, then {plan}")
+        suggest(plan if kept else f"repeat this command with --json gap.json, then run {plan}")
     elif answer.verdict == "explained" and out_model is None:
-        PlainConsole().print("next: the same command with --out-model corrected.xml writes the corrected model")
+        PlainConsole().print(
+            "next: repeat this command with --out-model corrected.xml, which writes the corrected model"
+        )
 
 
 def _progress(console: "Console", status: "Status", stage: str) -> None:
@@ -206,11 +213,11 @@ def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: 
     if answer.unit == "rad":
         write_samples(answer.internals, count, target)
     elif answer.internals.estimate is None:
-        console.print("no draws written: there is no gap for parameters to explain", style="yellow")
+        console.print("no draws were written, since there is no gap that parameters could explain", style="yellow")
         return
     else:
         write_rows(drawn_parameters(answer.internals.estimate, answer.names, count), target)
-    console.print(f"{count} draws of all parameters: {target}")
+    console.print(f"{count} draws of all parameters were written to {target}")
 
 
 def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
@@ -224,9 +231,11 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
             console.print(f"not in {kind}: {line}", style="yellow")
         console.print(f"corrected model{with_actuators}: {path}")
         if batch_path(path).is_file():
-            console.print(f"the same without PID actuators, for MuJoCo Warp: {batch_path(path)}")
+            console.print(f"the same model without PID actuators, for MuJoCo Warp: {batch_path(path)}")
         if kind == "MJCF" and module_model(path).is_file():
-            console.print(f"with friction that {module_path(path)} applies: {module_model(path)}")
+            console.print(
+                f"corrected model for use with {module_path(path)}, which applies its friction: {module_model(path)}"
+            )
         return
     from sim_gap.attribution.residual_laws import as_effects
     from sim_gap.better_model.export import module_path, write_model

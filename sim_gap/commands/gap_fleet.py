@@ -15,19 +15,23 @@ if TYPE_CHECKING:
 
 @reads_recordings
 def diagnose_fleet(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of cases, or of recordings with --sim.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of cases, or of recordings (with --sim).")],
     stated: "Corrections",
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a dask scheduler; default: workers on this machine.")
+        str | None, typer.Option(help="Address of a dask scheduler; by default workers run on this machine.")
     ] = None,
-    sim: Annotated[Path | None, typer.Option(help="Nominal model of cases without one of their own.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Number of workers of the local cluster.")] = 2,
+    sim: Annotated[Path | None, typer.Option(help="Nominal model for cases without a model of their own.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Number of workers on this machine.")] = 2,
     out: Annotated[
-        Path | None, typer.Option(help="Results, one JSON line each; cases already in it are not repeated.")
+        Path | None,
+        typer.Option(help="File of results, one JSON line each; cases that are already in this file are not repeated."),
     ] = None,
-    table: Annotated[Path | None, typer.Option(help="Also write the table by case and effect here (.parquet).")] = None,
+    table: Annotated[
+        Path | None, typer.Option(help="Also write a table by case and effect to this file (.parquet).")
+    ] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write all results here; - is standard output.")
+        Path | None,
+        typer.Option("--json", help="Write all results as JSON to this file; for standard output give `-`."),
     ] = None,
     base: Base = None,
     tip: Tip = None,
@@ -115,8 +119,8 @@ def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], c
         console.print(shown)
     for one in outliers:
         console.print(
-            f"{one['arm']}: {one['effect']} of {one['joint']}: {one['parameter']} {one['value']:.3g} {one['unit']}, "
-            f"{one['others']:.3g} on the other arms"
+            f"{one['arm']}: {one['effect']} of {one['joint']}: {one['parameter']} is {one['value']:.3g} "
+            f"{one['unit']}, but {one['others']:.3g} on the other arms"
         )
 
 
@@ -143,18 +147,24 @@ def trend(
     sim: Annotated[Path, typer.Option(help="Nominal model: MJCF, URDF or arm file.")],
     stated: "Corrections",
     out: Annotated[
-        Path | None, typer.Option(help="Answers, one JSON line each; recordings already in it are not repeated.")
+        Path | None,
+        typer.Option(
+            help="File of answers, one JSON line each; recordings that are already in this file are not repeated."
+        ),
     ] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write newest answer and changes here; - is standard output.")
+        Path | None,
+        typer.Option(
+            "--json", help="Write the newest answer and the changes as JSON to this file; for standard output give `-`."
+        ),
     ] = None,
     base: Base = None,
     tip: Tip = None,
     gains: KnownGain = "",
 ) -> int:
-    """Diagnose an arm's recordings that are new, and show what changes; exit status 1 if the newest cannot be used.
+    """Diagnose the new recordings of an arm, and show what changes; exit status 1 if the newest one cannot be used.
 
-    A recording that was diagnosed may be deleted: its answer is kept.
+    A recording that was diagnosed may be deleted, since its answer is stored.
 
     Example: armlink gap trend recordings/ --sim arm.yaml
     """
@@ -190,7 +200,8 @@ def _say_other_options(answers: Any, console: Any) -> None:
     if answers.of_other_options:
         made = "was made" if answers.of_other_options == 1 else "were made"
         console.print(
-            f"{answers.path}: {_count(answers.of_other_options, 'answer')} {made} with other options: kept, not used"
+            f"{answers.path}: {_count(answers.of_other_options, 'answer')} {made} with other options; they "
+            "stay in the file, but are not used"
         )
 
 

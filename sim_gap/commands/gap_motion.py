@@ -10,15 +10,22 @@ from armlink.commands.options import Arm, OtherBus
 
 def plan(
     arm: Arm,
-    out: Annotated[Path, typer.Option(help="Write the motion here (.csv with t and q_cmd_i).")],
+    out: Annotated[Path, typer.Option(help="Write the motion to this file (.csv with columns t and q_cmd_i).")],
     answer: Annotated[
-        Path | None, typer.Option(help="Result of gap diagnose --json: its undecided joints are moved.")
+        Path | None, typer.Option(help="Result of gap diagnose --json; the joints whose cause is undecided are moved.")
     ] = None,
-    joint: Annotated[list[str] | None, typer.Option(help="Joint to move alone; may be repeated. Default: all.")] = None,
-    poses: Annotated[int, typer.Option(min=1, help="Number of poses of the other joints, for different loads.")] = 2,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of poses and sines; another one gives held-out motion.")] = 0,
+    joint: Annotated[
+        list[str] | None, typer.Option(help="Joint to move alone; may be repeated. By default every joint.")
+    ] = None,
+    poses: Annotated[
+        int, typer.Option(min=1, help="Number of poses of the other joints, which give different loads.")
+    ] = 2,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of poses and sines; another seed gives a held-out motion.")
+    ] = 0,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write length and pieces here; - is standard output.")
+        Path | None,
+        typer.Option("--json", help="Write length and pieces as JSON to this file; for standard output give `-`."),
     ] = None,
 ) -> int:
     """Plan motion within the arm's limits that separates effects; nothing moves.
@@ -35,7 +42,7 @@ def plan(
     save_motion(motion, out)
     console = results(json_file)
     for sentence in sentences:
-        console.print(f"requested by the diagnosis: {sentence}")
+        console.print(f"the diagnosis asks for this motion: {sentence}")
     for piece in motion.pieces:
         console.print(piece)
     console.print(f"{out}: {motion.seconds:.0f} s of motion")
@@ -52,7 +59,8 @@ def collect(
     out: Annotated[Path, typer.Option(help="Recording to write (.mcap).")],
     bus: OtherBus = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write rows and seconds here; - is standard output.")
+        Path | None,
+        typer.Option("--json", help="Write rows and seconds as JSON to this file; for standard output give `-`."),
     ] = None,
 ) -> int:
     """Move the arm along a planned motion under position control and record every cycle; Ctrl-C stops it safely.

@@ -18,7 +18,7 @@ from calib.report.page import bullets, paragraph, render
 from calib.report.tables import ReportTable, interval_table
 from gcomp.arrays import Array
 
-OPENED = "The fit saw only what came over the bus. What is called true was opened after everything was estimated."
+OPENED = "The fit saw only what came over the bus. The true values were opened only after everything was estimated."
 
 
 class Account:
@@ -59,7 +59,7 @@ class Account:
         summary = {"schema": "armlink.demo/1", **self.summary}
         for path in (out / "summary.json", self._json):
             write_json(path, summary)
-        self.say(f"done: open {out / 'report.html'}; numbers in {out / 'summary.json'}", console=self._results)
+        self.say(f"done: open {out / 'report.html'}; the numbers are in {out / 'summary.json'}", console=self._results)
 
 
 def _rounded(value: Any) -> Any:

@@ -61,7 +61,10 @@ DRIFT_GAIN, DRIFT_OFFSET, DRIFT_OFFSET_SHARE = 1.03, 0.3, 0.05
 """Factor on the sensor's readings; offset added to them [N·m], at most this share of rated torque."""
 QUIET_SECONDS, WORK_SECONDS, WATCHED_SECONDS = 30.0, 300.0, 15.0
 """Ordinary work before the drift begins, at most, and after a recalibration [s]."""
-WATCHED = "At every stop the observer compares gravity and sensors. Estimates: against the calibration then in force."
+WATCHED = (
+    "At every stop the observer compares gravity and sensors. Estimates are relative to the calibration in "
+    "force at that time."
+)
 
 
 def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, realism: float | None = None) -> None:
@@ -71,16 +74,19 @@ def run_demo(arm_name: str, *, seed: int, out: Path, json_path: Path | None, rea
         made = new_arm(Path(arm_name), out / f"{Path(arm_name).stem}.yaml")
         made.write()
         arm_name, joints, assumed = str(made.out), len(made.draft.joints), len(assumed_lines(made.text))
-        account.say(f"{arm_name} made of the model: {joints} joints, {assumed} assumed values, each says so there")
+        account.say(
+            f"{arm_name} was made from the model: {joints} joints; {assumed} values are assumed, each is marked "
+            "in the file"
+        )
     arm = load_arm(arm_name)
     if realism is not None:
         arm = with_realism(arm, realism, seed)
     refuse_impossible_model(arm)
     bench, data = Bench(quick(arm), seed), _fresh(out)
-    account.say(f"arm {arm.name}, hidden truth of seed {seed}, results in {out}")
+    account.say(f"arm {arm.name} with the hidden true values of seed {seed}; the results are in {out}")
     account.note(arm=arm.name, seed=seed, joints=arm.joint_names)
     Demo(bench, seed, data, account).run()
-    account.write(out, f"simulated arm {arm.name}, hidden truth of seed {seed}")
+    account.write(out, f"simulated arm {arm.name} with the hidden true values of seed {seed}")
     suggest(command_line("check", arm_name) if Path(arm_name).suffix else "armlink new MODEL.urdf --out my-arm.yaml")
 
 
@@ -96,7 +102,7 @@ def _fresh(out: Path) -> Path:
     """The folder for the data, empty; an earlier demo's is replaced, anything else is not touched."""
     data = out / "data"
     if data.exists() and not (data / ".armlink-demo").exists():
-        raise BadInput(f"{data}: exists and is not an earlier demo's: choose another folder with --out")
+        raise BadInput(f"{data} exists and was not written by an earlier demo: choose another folder with --out")
     try:
         shutil.rmtree(data, ignore_errors=True)
         data.mkdir(parents=True)
@@ -141,7 +147,7 @@ class Demo:
         with link:
             link.start()
             link.enable()
-            account.say(f"{link.n} drives found on the bus, set up and enabled; {link.rate:g} cycles a second")
+            account.say(f"{link.n} drives were found on the bus, set up and enabled; {link.rate:g} cycles a second")
             passes = self._passes()
             truth = bench.simulated.true_sensors  # as they are now: zeros move as the arm warms up
             account.say("fitting sensors and mass moments, all joints together", "bold")
@@ -154,7 +160,7 @@ class Demo:
             plan = passes[0].plan if bench.creeping and arm.model_path is not None else None
             sags = {} if plan is None else self._sag(plan, "nominal", model_arm(arm).beta, np.zeros(link.n))
             install(admit(record, arm, self.store), self.store, link, by=BY, reason="sweeps", check=None)
-            kept = "kept by the host" if bench.creeping else f"written to {link.n} controllers and read back"
+            kept = "stored by the host" if bench.creeping else f"written to {link.n} drives and read back"
             account.say(f"record {record.id} {kept}")
             if bench.creeping:
                 recordings, check = self._recordings(record, 30.0, 20.0), self._verified(model, record, 8)
@@ -182,9 +188,9 @@ class Demo:
     def _passes(self) -> list[SweepData]:
         """Without, with and, of drives that warm up, again without the mass, which hangs where the fit is not told."""
         bench, passes = self.bench, list[SweepData]()
-        held = "held by their servos" if sweep_section(bench.arm).hold == "servo" else "pressed on their stops"
-        steps = f"sweeping each joint, tip to base, the others {held}"
-        motion = "creeping through each joint's range both ways" if bench.creeping else steps
+        held = "held by their position loops" if sweep_section(bench.arm).hold == "servo" else "pressed on their stops"
+        steps = f"sweeping each joint, from tip to base, with the other joints {held}"
+        motion = "moving each joint slowly through its range, in both directions" if bench.creeping else steps
         for name in ("unloaded", "loaded", "unloaded-again")[: 3 if bench.creeping else 2]:
             plan, folder = passes[0].plan if passes else None, self.folder / name
             mass = plan.reference_mass if plan is not None and name == "loaded" else 0.0
@@ -207,7 +213,7 @@ class Demo:
         return passes
 
     def _sag(self, plan: SweepPlan, model: str, beta: Array, zero: Array) -> dict[str, Array]:
-        self.account.say(f"holding poses by a tenth of the gains and the {model} model", "bold")
+        self.account.say(f"holding poses with a tenth of the gains and the {model} model", "bold")
         return {model: self.bench.mean_sag(plan, beta, zero)}
 
     def _verified(self, model: GravityRecord, record: CalibrationRecord, poses: int) -> Verification:
@@ -249,7 +255,7 @@ class Demo:
 
         observer = Observer.of_records(described, record, model, section.rated_torques)
         recalibrator = Recalibrator(bench.arm, link, self.store, "apply")
-        with account.stage("ordinary work: a torque sensor will drift") as screen:
+        with account.stage("ordinary work, during which a torque sensor will drift") as screen:
             history = watch(link, observer, targets, WORK_SECONDS, recalibrator, course)
         times = [t - began for kind in ("alarm", "outliers") if (t := history.first(kind, name, began)) is not None]
         noticed = min(times, default=None)
@@ -257,13 +263,13 @@ class Demo:
         written = made[0][0] if made else None
         after, ended = bench.sensor_error(joint), history.t[-1] if written is None else began + written
         seen = "not noticed" if noticed is None else f"noticed after {noticed:.1f} s"
-        drifted = f"{name} drifted by {DRIFT_GAIN - 1:+.0%} gain and {offset:+.2f} N·m: {seen}"
-        error = f"error now {after[0]:+.2%} and {after[1]:+.3f} N·m"
+        drifted = f"{name} drifted by {DRIFT_GAIN - 1:+.0%} in gain and {offset:+.2f} N·m in offset: {seen}"
+        error = f"the error is now {after[0]:+.2%} and {after[1]:+.3f} N·m"
         if made:
             half = [1.96 * float(made[-1][1].std(of)[joint]) for of in ("gain", "offset")]
             inside = "inside" if np.all(np.abs(after) <= half) else "outside"
             error += f", {inside} its 95 % interval of ±{half[0]:.2%} and ±{half[1]:.3f} N·m"
-        right = "not recalibrated" if written is None else f"recalibrated by itself after {written:.0f} s of work"
+        right = "not recalibrated" if written is None else f"recalibrated automatically after {written:.0f} s of work"
         account.find(f"{drifted}, {right}; {error}")
         truth = np.repeat([(1.0, 0.0), (1.0 + before[0], before[1]), (1.0 + after[0], after[1])], 2, axis=0).T
         marks = [(began, f"drifts, {seen}"), *([] if written is None else [(ended, "recalibrated")])]
@@ -280,7 +286,7 @@ class Demo:
         account.note(not_identifiable={f"{joint}.{name}": why for (joint, name), why in fit.reasons.items()})
         swept = "was swept without and with"
         if isinstance(fit, CreepFit):
-            swept = "crept through its range without, with and again without"
+            swept = "moved slowly through its range without, with and again without"
             friction = {name: _estimate(fit, name) for name in ("coulomb", "load", "viscous", "asymmetry")}
             friction["coulomb"]["true"] = true["coulomb"]
             account.note(friction=friction, disturbed=[each.text for each in fit.findings], sag=None)
@@ -291,14 +297,18 @@ class Demo:
             columns[name.replace("_", " ")] = fit.value(name), fit.ci95(name)[:, 1] - fit.value(name)
             if name in true:
                 columns["true " + name.replace("_", " ")] = true[name], 0 * true[name]
-        table = account.table("torque gain, offset [N·m] and the like: estimated ± 95 %, and true", fit.names, columns)
+        table = account.table(
+            "torque gain, offset [N·m] and other parameters: estimate ± half of the 95 % interval, and true value",
+            fit.names,
+            columns,
+        )
         text = f"Each joint {swept} a reference mass; the true values were hidden from the fit."
         truths = ReportSection("Sensor calibration and the truth", paragraph(text), (), [table])
         account.sections += [*parts[:1], truths, *parts[1:]]
         error = np.abs(fit.value("gain") / truth.gain - 1)
         unseen = ", ".join(name for name, each in zip(fit.names, error, strict=True) if np.isnan(each))
-        known = f"Torque gains found to {np.nanmax(error, initial=0.0):.2%} at worst"
-        account.find(f"{known}; not observable on {unseen}" if unseen else known)
+        known = f"Torque gains found with an error of at most {np.nanmax(error, initial=0.0):.2%}"
+        account.find(f"{known}; the gain is not observable on {unseen}" if unseen else known)
 
     def _tell_gravity(self, check: Verification, errors: dict[str, Any], sags: dict[str, Array]) -> None:
         account, poses, largest = self.account, len(check.position), errors["max_torque"]
@@ -306,15 +316,23 @@ class Demo:
         columns = {"RMS to sensor": check.rms, "RMS to truth": errors["rms_error"]}
         columns |= {"largest error": errors["max_abs_error"], "largest torque": largest}
         columns |= {f"sag, {model} model [°]": np.degrees(sag) for model, sag in sags.items()}
-        title = f"gravity model [N·m]: at {poses} poses of the arm; at {errors['poses']} against the truth"
+        title = (
+            f"gravity model [N·m], compared with the sensors at {poses} poses and with the truth at "
+            f"{errors['poses']} poses"
+        )
         table = account.table(title, check.names, {name: (each, 0 * each) for name, each in columns.items()})
         html = paragraph(f"Torque of model and arm at {poses} poses that were not used for any fit.")
         account.sections.append(ReportSection("Gravity model", html, [verify_figure(check)], [table]))
         share = errors["rms_error"].max() / largest.max()
-        account.find(f"Gravity torque of the model within {share:.2%} RMS of the arm's largest, at every joint")
+        account.find(
+            f"At every joint, the RMS error of the model's gravity torque is within {share:.2%} of the arm's "
+            "largest gravity torque"
+        )
         if sags:
             before, after = (np.degrees(sag.max()) for sag in sags.values())
-            account.find(f"Held by a tenth of the gains, the worst joint sags by {after:.1f}° instead of {before:.1f}°")
+            account.find(
+                f"Held with a tenth of the gains, the worst joint sags by {after:.1f}° instead of {before:.1f}°"
+            )
 
 
 def _estimate(fit: Any, name: str) -> dict[str, Any]:

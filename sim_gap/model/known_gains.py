@@ -23,7 +23,9 @@ class KnownGains:
         """The same for so many joints. Raises BadInput where there are values for another number."""
         for name, values in (("kp", self.kp), ("kd", self.kd)):
             if len(values) not in (1, count):
-                raise BadInput(f"--gains {name}: {len(values)} values for {count} joints: give one, or one a joint")
+                raise BadInput(
+                    f"--gains {name}: {len(values)} values for {count} joints: give one value, or one for each joint"
+                )
         return replace(self, **{name: np.resize(x, count) for name, x in (("kp", self.kp), ("kd", self.kd))})
 
 

@@ -47,7 +47,7 @@ def nominal_model(path: Path) -> Any:
         for joint in spec.joints:
             joint.frictionloss = 0.0  # the simulated arm sets its friction at run time
         return spec
-    raise BadInput(f"{path}: has no masses: give kinematics.model (URDF or MJCF), a sim section, or --sim MJCF")
+    raise BadInput(f"{path} has no masses: give kinematics.model (URDF or MJCF), the key sim, or --sim MJCF")
 
 
 def hinges_of(model: Any) -> dict[str, int]:
@@ -64,14 +64,16 @@ def hinges_between(model: Any, base: str | None, tip: str | None) -> dict[str, i
     first = 0 if base is None else _body(model, base, "base")
     last = None if tip is None else upwards(model, _body(model, tip, "tip"))
     if last is not None and first not in last:
-        raise BadInput(f"--base {base} --tip {tip}: the one does not carry the other: give the bodies of one arm")
+        raise BadInput(
+            f"--base {base} --tip {tip}: the base body does not carry the tip body: give the bodies of one arm"
+        )
     found = {}
     for name, joint in hinges_of(model).items():
         body = int(model.jnt_bodyid[joint])
         if first in upwards(model, body)[1:] and (last is None or body in last):
             found[name] = joint
     if not found:
-        raise BadInput(f"--base {base or 'world'} --tip {tip or 'any'}: no hinge between them")
+        raise BadInput(f"--base {base or 'world'} --tip {tip or 'any'}: there is no hinge between these bodies")
     return found
 
 
@@ -94,7 +96,7 @@ def arm_hinges(model: Any, hinges: dict[str, int], label: str) -> dict[str, int]
     if longest and len(arms) > 1:
         tips = ", ".join(model.body(int(model.jnt_bodyid[hinges[way[-1]]])).name for way in arms)
         raise BadInput(
-            f"{label}: has {len(arms)} arms of {longest} joints: name the body that it ends in, --tip: {tips}"
+            f"{label}: has {len(arms)} arms of {longest} joints: choose an arm by its last body with --tip: {tips}"
         )
     return {name: hinges[name] for way in arms for name in way}
 
@@ -105,7 +107,7 @@ def _body(model: Any, name: str, option: str) -> int:
     body = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name))
     if body < 0:
         names = ", ".join(model.body(each).name for each in range(1, model.nbody))
-        raise BadInput(f"--{option} {name}: no such body in the model; there are {names}")
+        raise BadInput(f"--{option} {name}: the model has no such body; there are {names}")
     return body
 
 
@@ -148,12 +150,13 @@ def load_model(
             hinges = list(arm_hinges(model, known, label).values())
         if count is not None and count != len(hinges):
             raise BadInput(
-                f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), the recording {count}: "
-                "give the model of the recorded arm, or a recording with the model's joint names"
+                f"{label}: has {len(hinges)} hinge joints ({', '.join(map(str, known))}), but the recording "
+                f"has {count}: give the model of the recorded arm, or a recording with the joint names of "
+                "the model"
             )
         joints = hinges
     if not joints:
-        raise BadInput(f"{label}: no hinge joint in the model: expected the arm as a chain of hinges")
+        raise BadInput(f"{label}: the model has no hinge joint: expected the arm as a chain of hinges")
     arm = rigid_arm(model, joints)
     if any(up >= j for j, up in enumerate(arm.parent)):
         raise BadInput(f"{label}: joints {', '.join(arm.names)} do not run from base to tip: reorder them")
@@ -164,7 +167,7 @@ def load_model(
 def with_gains(sim: SimModel, gains: KnownGains) -> SimModel:
     """The model with position controllers of these gains at its joints. Raises BadInput for a model without a file."""
     if sim.path is None:
-        raise BadInput("--gains: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+        raise BadInput("--gains needs a model that came from a file: give MJCF, URDF or an arm file with --sim")
     sim = replace(sim, gains=gains.of_joints(sim.n))
     return replace(sim, mujoco_model=named_spec(sim).compile())
 
@@ -201,7 +204,7 @@ def read_spec(path: Path) -> Any:
             return nominal
         path, locked = nominal, load_arm(str(path)).kinematics.locked
     if not path.is_file():
-        raise BadInput(f"no model file {path}: give an MJCF, URDF or arm file")
+        raise BadInput(f"there is no model file {path}: give an MJCF, URDF or arm file")
     return read_model(path, locked).spec
 
 
@@ -316,8 +319,8 @@ def _check(model: Any, joints: list[int], arm: RigidArm, label: str) -> None:
             if abs(ours[worst] - data.qfrc_inverse[dof][worst]) > 1e-6 * (1.0 + np.abs(ours).max()):
                 raise BadInput(
                     f"{label}: joint {arm.names[worst]}: the model's torque is {data.qfrc_inverse[dof][worst]:.6g} "
-                    f"N·m, its rigid chain gives {ours[worst]:.6g}: expected a plain hinge chain (no springs between "
-                    "joints, fluid forces or joint equalities)"
+                    f"N·m, but the torque of its rigid chain is {ours[worst]:.6g} N·m: expected a plain chain of "
+                    "hinges (no springs between joints, fluid forces or joint equalities)"
                 )
     finally:
         model.opt.disableflags = flags

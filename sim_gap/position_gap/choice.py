@@ -242,7 +242,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     levels = {name: best_level(search, fit, name) for name in LEVELS}
     best, most = fit, worth(search, fit)
     for number in range(ROUNDS):
-        progress(f"round {number + 1}: {len(names)} effects of joints and arm")
+        progress(f"round {number + 1}: testing {len(names)} effects of joints and arm")
         about = look_about(search, fit, looked, levels)
         found = choose(about.terms, list(about.effects.values()), names, kept)
         if number == 0:

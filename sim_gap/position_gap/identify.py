@@ -131,7 +131,7 @@ def identify(
             for some, gain in ((train, scale[: len(train)]), (heldout, scale[len(train) :]))
         )
     search, fit, about = _fitted(search, own.complete, progress)
-    progress("each effect on held-out data")
+    progress("testing each effect on held-out data")
     margin = _margin(search, fit)
     split = split_gap(search, judged, margin) if own.complete else None
     matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
@@ -176,7 +176,7 @@ def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None])
     unexplained = left > np.maximum(EXPLAINED * rms_on(search.data, bare), QUIET * search.floor)
     unexplained &= ~np.isin(np.arange(search.data.joints), sorted(search.resting))
     if complete and unexplained.any():
-        progress("servos with limits to begin with")
+        progress("fitting servos with limits as a start")
         starts = limited_servo_starts(search, best, unexplained)
         other, beside = select(search, max(starts, key=lambda each: worth(search, each)), progress)
         if worth(search, other) > worth(search, best):
@@ -202,10 +202,10 @@ def gain_scales(gains: Sequence[str], labels: Sequence[str]) -> list[float]:
             raise BadInput(f"--gain {text}: expected RECORDING=VALUE with a value above 0, such as *kp100*=100")
         hits = [i for i, label in enumerate(labels) if fnmatch(label, pattern) or fnmatch(Path(label).name, pattern)]
         if not hits:
-            raise BadInput(f"--gain {text}: no recording of that name: {', '.join(labels)}")
+            raise BadInput(f"--gain {text}: there is no recording of this name: {', '.join(labels)}")
         found |= dict.fromkeys(hits, value)
     if missing := [label for i, label in enumerate(labels) if i not in found]:
-        raise BadInput(f"--gain: none given for {missing[0]}: state the gain of every recording")
+        raise BadInput(f"--gain: no gain is given for {missing[0]}: give the gain of every recording")
     return [found[i] / found[0] for i in range(len(labels))]
 
 

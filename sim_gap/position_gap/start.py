@@ -79,7 +79,7 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
 
     Where the model has position actuators and moves as the arm does, the fit begins there.
     """
-    progress("gains and friction to begin with")
+    progress("fitting gains and friction as a start")
     at_rest = rests(search.data)
     search = replace(search, resting=frozenset(np.flatnonzero(at_rest).tolist()))
     if not own.complete:

@@ -145,7 +145,8 @@ def windows_of(
         recording = recordings[number]
         if recording.position_command is None or not np.isfinite(recording.position_command).any():
             raise BadInput(
-                f"{labels[number]}: neither a torque channel nor a commanded position: record tau_1 … or q_cmd_1 …"
+                f"{labels[number]}: there is neither a torque channel nor a commanded position: record tau_1 "
+                "… or q_cmd_1 …"
             )
         for rows in pieces_of(recording):
             part = slice_rows(recording, rows)
@@ -156,7 +157,7 @@ def windows_of(
                 pieces.append(piece)
                 parts += made
     if not parts:
-        raise BadInput(f"{labels[0]}: no part of at least {LEAST_S:g} s without a break in which positions are read")
+        raise BadInput(f"{labels[0]}: no part of at least {LEAST_S:g} s has position readings without a break")
     longest = max(len(part["at"]) for part in parts)
     stacked = {name: np.stack([_padded(part[name], longest, name) for part in parts], axis=-1) for name in parts[0]}
     number_of = stacked.pop("recording").astype(np.intp)

@@ -15,9 +15,9 @@ def advice(answer: Diagnosis) -> str:
     if answer.verdict == "unexplained":
         return "Change nothing yet: look at where the gap is, check cabling, payload and model there, and record again."
     if answer.doubts:
-        return "First settle what the recordings hold: each question names the option that answers it."
+        return "First answer the questions about the recordings; each question names the option that answers it."
     if answer.verdict == "ambiguous":
-        return "Record one more motion that separates the candidates; gap plan makes it of the answer in JSON."
+        return "Record one more motion that separates the candidates; gap plan plans it from the JSON answer."
     return "Add these effects to the simulation: with --out-model the diagnosis writes the corrected model."
 
 
@@ -31,16 +31,16 @@ def sentence(answer: Diagnosis) -> str:
         return f"Gap not explained: no effect of the library accounts for {answer.unexplained:.0%} of it"
     if answer.doubts:
         columns = " and ".join(dict.fromkeys(f"{each.channel} of {each.joint}" for each in answer.doubts))
-        return f"Cause ambiguous: it depends on {columns}, which may not hold what they are taken for"
+        return f"Cause ambiguous: it depends on what {columns} really contain, which is in doubt"
     first = answer.causes[0]
     if answer.verdict == "ambiguous" and not first.confounded_with:
         hints = ", ".join(cause.effect for cause in answer.causes if cause.confidence < HINT)
         return f"Cause ambiguous: {first.effect} fits, but part of the explanation is only a hint: {hints}"
     if answer.verdict == "ambiguous":
         rivals = " or ".join(first.confounded_with)
-        return f"Cause ambiguous: {first.effect} fits, and so does {rivals}; to separate them, {first.separate_by}"
+        return f"Cause ambiguous: {first.effect} fits, but {rivals} fits as well; to separate them, {first.separate_by}"
     share = f"{1.0 - answer.unexplained:.0%}"
-    return f"Gap explained: {share} of it on held-out data, most of it by {first.effect}"
+    return f"Gap explained: {share} of the gap on held-out data, most of it by {first.effect}"
 
 
 def parameter_rows(cause: Cause) -> list[list[str]]:

@@ -27,8 +27,8 @@ def motion_sections(found: Identified, causes: Sequence[Cause]) -> list[Section]
     """A section with the motion of every joint, if there is any to show."""
     figure = motion_figure(found, causes)
     text = (
-        "The command, the measured motion, and simulations that run free along the command, on held-out data. "
-        "Click a name to hide or show it; “without” leaves one effect out of the corrected model."
+        "The command, the measured motion, and simulations that run free along the command, on held-out data. Click a "
+        "name to hide or show its curve; “without” leaves one effect out of the corrected model."
     )
     return [] if figure is None else [Section("Motion of every joint", paragraph(text), [figure])]
 

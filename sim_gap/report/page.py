@@ -15,8 +15,11 @@ from sim_gap.report.motion_figure import motion_sections
 from sim_gap.report.time_figures import torque_over_time
 
 PARAMETERS = {
-    "N·m": "Fitted parameters, each as a difference to what the model has.",
-    "rad": "Fitted parameters: of joints and controller as the arm has them, of links, zeros and base the change.",
+    "N·m": "Fitted parameters, each as a difference to the value of the model.",
+    "rad": (
+        "Fitted parameters: for joints and controller the values of the arm, for links, zeros and base the "
+        "change against the model."
+    ),
 }
 """Meaning of the parameters of a diagnosis, by the unit of its gap."""
 
@@ -43,7 +46,8 @@ def _verdict(answer: Diagnosis) -> Section:
             ReportTable(
                 ("effect", "joints", f"RMS before [{answer.unit}]", f"after [{answer.unit}]", "shrink", "confidence"),
                 [_cause_row(cause) for cause in answer.causes],
-                "Causes in order, each added to those above it; RMS on held-out data over the joints of the cause.",
+                "Causes in order; each row adds its cause to the causes above it. RMS on held-out data, "
+                "over the joints of the cause.",
                 texts=2,
             )
         )
@@ -92,8 +96,9 @@ def _gap(answer: Diagnosis) -> Section:
     ]
     header = ("joint", "noise floor", "training data: before", "after", "held-out data: before", "after")
     text = (
-        f"Gap of the simulation, RMS in {answer.unit} per joint, of the nominal model and with the causes added. "
-        f"The held-out data, {answer.heldout_is}, were used neither for the fit nor for the selection of effects."
+        f"RMS gap of the simulation per joint, in {answer.unit}, before and after the causes were added to "
+        f"the nominal model. The held-out data, {answer.heldout_is}, were used neither for the fit nor for "
+        "the selection of effects."
     )
     figures = [] if answer.rollout is None else [rollout_bars(answer.names, answer.rollout)]
     return Section("Gap before and after", paragraph(text), figures, [ReportTable(header, rows)])
@@ -103,10 +108,14 @@ def _over_time(answer: Diagnosis) -> list[Section]:
     """Measured, nominal and corrected torque of every joint."""
     layout, out = answer.internals.heldout.layout, []
     for channel in filter(None, (layout.sensor, layout.motor)):
-        nominal = "by the nominal model" if channel == layout.against_model else "by the torque sensor's readings"
+        nominal = (
+            "the prediction of the nominal model"
+            if channel == layout.against_model
+            else "the prediction from the readings of the torque sensor"
+        )
         text = (
-            f"The {CHANNEL_WORDS[channel]} of every joint along held-out data, as measured, {nominal}, and with the "
-            "causes added. Click a name to hide or show it; “without” leaves one effect out."
+            f"The {CHANNEL_WORDS[channel]} of every joint on held-out data: the measurement, {nominal}, and the "
+            "prediction with the causes added. Click a name to hide or show its curve; “without” leaves one effect out."
         )
         figure = torque_over_time(answer, channel)
         if figure is not None:
@@ -120,8 +129,8 @@ def _causes(answer: Diagnosis) -> list[Section]:
     if not shown:
         return []
     text = (
-        "Each cause on the row where it explains most, on held-out data: grey is the residual less all other causes, "
-        "orange the contribution of this cause. A correct cause follows the centre of the grey points."
+        "Each cause at the joint and channel where it explains most, on held-out data: grey is the residual minus all "
+        "other causes, orange is the contribution of this cause. A correct cause follows the centre of the grey points."
     )
     return [Section("The causes one by one", paragraph(text), shown)]
 
@@ -130,8 +139,9 @@ def _laws(answer: Diagnosis) -> list[Section]:
     if not answer.laws:
         return []
     text = (
-        "What the effects of the library leave of these rows follows one quantity of the joint. The law was fitted to "
-        "the training data; grey are held-out data. It says how the torque varies, and not why."
+        "Here the part of the torque that the effects of the library do not explain follows one quantity of "
+        "the joint. The law was fitted to the training data; grey points are held-out data. The law says "
+        "how the torque varies, not why."
     )
     return [Section("Laws outside the library", paragraph(text), [law_figure(answer, law) for law in answer.laws])]
 
@@ -150,9 +160,12 @@ def _residuals(answer: Diagnosis) -> list[Section]:
         ]
         header = ("joint", "correlates with", "share", "RMS [N·m]", "noise [N·m]")
         words = CHANNEL_WORDS[channel]
-        text = f"The {words} minus {against} on held-out data: grey as measured, orange the sum of the causes."
+        text = (
+            f"The {words} minus the prediction of {against} on held-out data: grey is the measurement, orange is "
+            "the sum of the causes."
+        )
         table = ReportTable(
-            header, rows, "The regime of motion with the largest share of each residual's mean square.", texts=2
+            header, rows, "For each residual, the regime of motion with the largest share of its mean square.", texts=2
         )
         figure = residual_panels(answer, channel)
         out.append(

@@ -263,8 +263,8 @@ def require_length(recordings: Sequence[Recording], labels: Sequence[str], short
     for recording, label, span in zip(recordings, labels, spans, strict=False):
         if len(recording.t) < 4 or sum(spans) < SHORTEST_S or span < shortest:
             raise BadInput(
-                f"{label}: {len(recording.t)} rows over {span:.3g} s: too short for a diagnosis; "
-                f"record at least {SHORTEST_S:.0f} s, in one recording or in several"
+                f"{label}: {len(recording.t)} rows over {span:.3g} s are too short for a diagnosis: record "
+                f"at least {SHORTEST_S:.0f} s, in one recording or in several"
             )
 
 
@@ -281,13 +281,15 @@ def prepare(
     `start` is the time at which the recording that this is a part of began [s]; times count from there.
     """
     if recording.n != arm.n:
-        raise BadInput(f"{label}: has {recording.n} joints, the model {arm.n}: give the model of the recorded arm")
+        raise BadInput(
+            f"{label}: has {recording.n} joints, but the model has {arm.n}: give the model of the recorded arm"
+        )
     raw_step = float(np.median(np.diff(recording.t)))
     span = float(recording.t[-1] - recording.t[0])
     if span > MOST_SAMPLES_PER_ROW * raw_step * recording.t.size:
         raise BadInput(
-            f"{label}: {recording.t.size} rows over {span:.3g} s, mostly {raw_step:.2g} s apart: stamped together? "
-            "Record the times of sampling"
+            f"{label}: {recording.t.size} rows over {span:.3g} s are mostly {raw_step:.2g} s apart: did "
+            "several rows get one time stamp? Record the times of sampling"
         )
     even = np.arange(recording.t[0], recording.t[-1] + 0.5 * raw_step, raw_step)
     stride = max(1, int(1.0 / raw_step / WORK_HZ + 0.1))
@@ -315,7 +317,9 @@ def prepare(
         known[channel] = coverage(recording.t, values, even)[::stride]
         noise[channel] = np.array([band_noise(recording.t, values[:, j], band) for j in range(arm.n)])
     if not reading:
-        raise BadInput(f"{label}: no torque channel holds a number: at least one of tau, tau_motor, tau_cmd is needed")
+        raise BadInput(
+            f"{label}: no torque channel holds a number: at least one of tau, tau_motor and tau_cmd is needed"
+        )
     near = are_near_spikes(recording.t, list(spikes.values()), times)
     known = {channel: there * ~near for channel, there in known.items()}
     clock = times - (times[0] if start is None else start)

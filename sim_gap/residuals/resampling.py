@@ -26,8 +26,8 @@ def interpolate_even(t: Array, values: Array, even: Array, label: str, column: s
         there = np.isfinite(values[:, j])
         if there.sum() < 4 or (column == "q" and there.mean() < 0.2):
             raise BadInput(
-                f"{label}: column {column}_{j + 1} holds {int(there.sum())} numbers in {len(t)} rows: "
-                "expected a reading in most rows; record that channel or leave it out"
+                f"{label}: column {column}_{j + 1} holds only {int(there.sum())} numbers in {len(t)} rows: "
+                "record a reading in most rows, or leave this channel out"
             )
         own = t[there]
         steps, usual = np.diff(own), float(np.median(np.diff(own)))

@@ -67,9 +67,9 @@ def test_defaults_are_those_of_the_contract(tmp_path):
         (("kinematics", "joints", 0, "a"), "long", "key kinematics.joints.0.a: "),
         (("kinematics", "joints", 0, "a"), float("nan"), "key kinematics.joints.0.a: Input should be a finite number"),
         (("kinematics", "gravity"), [0.0, -9.8], "key kinematics.gravity: "),
-        (("kinematics", "model"), "arm.xml", "give either joints"),
-        (("kinematics", "joints", 1, "name"), "joint_1", "'joint_1' stands twice"),
-        (("link", "joints", 1, "node"), 1, "'node 1' stands twice"),
+        (("kinematics", "model"), "arm.xml", "give either `joints`"),
+        (("kinematics", "joints", 1, "name"), "joint_1", "'joint_1' is given twice"),
+        (("link", "joints", 1, "node"), 1, "'node 1' is given twice"),
         (
             ("link", "joints", 1, "node"),
             128,
@@ -82,10 +82,10 @@ def test_defaults_are_those_of_the_contract(tmp_path):
         ),
         (("link", "joints", 0, "max_velocity"), math.inf, "key link.joints.0.max_velocity: Input should be a finite"),
         (("link", "joints", 0, "max_torque_rate"), math.inf, "max_torque_rate: Input should be a finite number"),
-        (("link", "joints", 1, "name"), "wrist", "same names, same order"),
+        (("link", "joints", 1, "name"), "wrist", "give both the same names in the same order"),
         (("link", "rate"), 0, "key link.rate: Input should be greater than 0 (value 0)"),
         (("link", "rate"), 4000, "key link.rate: Input should be less than or equal to 1000"),
-        (("path",), "x", "key path: not a key of the arm file"),
+        (("path",), "x", "`path` is not a key of an arm file"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(tmp_path, keys, value, says):
@@ -101,7 +101,7 @@ def test_what_is_wrong_is_named_in_one_line(tmp_path, keys, value, says):
 
 @pytest.mark.parametrize("text", ["- a\n- b\n", "", "just words"])
 def test_a_file_that_is_no_mapping(tmp_path, text):
-    with pytest.raises(BadInput, match="expected a mapping with keys name, kinematics, link"):
+    with pytest.raises(BadInput, match="an arm file is a mapping with the keys `name`, `kinematics` and `link`"):
         load_arm(written(tmp_path, text))
 
 
@@ -118,7 +118,7 @@ def test_an_arm_that_nobody_has():
 
 def test_what_a_command_needs_and_the_file_has_not(tmp_path):
     arm = load_arm(written(tmp_path, changed(("link",), REMOVE)))
-    with pytest.raises(BadInput, match="key link is missing"):
+    with pytest.raises(BadInput, match="key `link` is missing"):
         arm.require_link()
 
 

@@ -181,8 +181,12 @@ def test_a_xacro_file_is_expanded(tmp_path, monkeypatch):
     assert model.body_mass[model.body("l1").id] == 2.0
     assert model.body_ipos[model.body("l1").id] == pytest.approx([0.2, 0, 0])
     (tmp_path / "two.xacro").write_text(XACRO.replace("0.4", "$(find somewhere)"))
-    with pytest.raises(BadInput, match=r"xacro cannot expand it: .* need ROS: xacro .*two.xacro > "):
+    with pytest.raises(
+        BadInput, match=r"xacro cannot expand it: .* need ROS: on a machine with ROS, run xacro .*two.xacro > "
+    ):
         expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")
     monkeypatch.setitem(sys.modules, "xacro", None)
-    with pytest.raises(BadInput, match=r"is a xacro file: pip install xacro, or expand it yourself"):
+    with pytest.raises(
+        BadInput, match=r"is a xacro file: install xacro \(pip install xacro\), or expand the file yourself"
+    ):
         expanded(tmp_path / "two.xacro", tmp_path / "two.urdf")

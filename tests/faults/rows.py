@@ -67,7 +67,7 @@ ROWS = (
         "boot-up message",
         1,
         f"the node's brake closes; the others: {QUICK_STOP}",
-        "joint_2: its controller has restarted (boot-up message): calibration and mode are lost; find out why, then "
+        "joint_2: its drive has restarted (boot-up message): calibration and mode are lost; find out why, then "
         "start again",
     ),
     Row(
@@ -105,7 +105,8 @@ ROWS = (
         "frames lost by the receive queue",
         1,
         QUICK_STOP,
-        "… frames lost: this host reads too slowly: give it more time or less to do",
+        "… frames were lost because this host reads too slowly: stop other programs on this host, or give "
+        "the job less to do in each cycle",
         vcan="the kernel's own count is in tests/armlink",
     ),
     Row(
@@ -115,7 +116,7 @@ ROWS = (
         "frames a cycle, ten cycles running",
         11,
         QUICK_STOP,
-        "more frames than these joints send, most of them 001h: a node babbles: disconnect it",
+        "the bus carries more frames than these joints send, most of them 001h: a node babbles, disconnect this node",
     ),
     Row(
         "corrupted frames",
@@ -142,7 +143,7 @@ ROWS = (
         "two readings a cycle, three cycles running, more than there were SYNCs",
         4,
         QUICK_STOP,
-        "joint_2: two readings in every cycle: a second node has its id: give every node its own",
+        "joint_2: two readings come in every cycle, so a second node has the same id: give every node an id of its own",
     ),
     Row(
         "EMCY storm",
@@ -169,7 +170,7 @@ ROWS = (
         "time-out",
         None,
         "not powered",
-        "no answer from joint_2 (node 12) on …: is it powered, and its id right?",
+        "no answer from joint_2 (node 12) on …: check power and wiring, and the ids in the arm file",
     ),
     Row(
         "mode refused",
@@ -178,8 +179,9 @@ ROWS = (
         "mode display 6061h",
         26,
         QUICK_STOP,
-        "joint_2: refuses mode 10 (cyclic synchronous torque): its mode display 6061h is 0; look at its error code "
-        "603Fh and at what 6502h says it supports",
+        "joint_2: refuses mode 10 (cyclic synchronous torque): its mode display 6061h is 0; read its error "
+        "code 603Fh and "
+        "its supported modes 6502h",
     ),
     Row(
         "clock jump",

@@ -11,26 +11,26 @@ from bus_attacks import BARE, GUARDED, Scene, link, scene
 
 pytestmark = [pytest.mark.vcan, pytest.mark.long]  # quick: `test_vcan.py`
 
-OWN_WATCHES = "the joints could not be told to stop, which their own watches do"
+OWN_WATCHES = "the joints could not be told to stop, so they stop by their own watch of the bus"
 CLOSED = {
     "killed": "",
-    "command on the wire": "20Bh on the wire, which this guard did not send: another host commands the drives there",
-    "suspended": "it fell behind: frames",
-    "a second guard": "on the wire, which this guard did not send: another host|which only a drive may send|"
+    "command on the wire": "20Bh came on the wire and is not from this guard: another host commands the drives there",
+    "suspended": "it is late: frames",
+    "a second guard": "came on the wire and is not from this guard: another host|which only a drive may send|"
     "which the policy does not name",
-    "wire down and up": f"an interface failed: Network is down; {OWN_WATCHES}|the wire takes no frames",
+    "wire down and up": rf"an interface failed \(Network is down\); {OWN_WATCHES}|the wire takes no frames",
     "killed and started again at once": "",
-    "its terminal is closed": "it was told to end; the joints were told to stop",
-    "flood of SYNCs by a program": "80h: more often than 100 times a second",
-    "SYNC as CAN FD by a program": "80h as CAN FD, which these drives do not speak",
+    "its terminal is closed": "the guard was told to end; the joints were told to stop",
+    "flood of SYNCs by a program": "80h: is sent more often than 100 times a second",
+    "SYNC as CAN FD by a program": "the program sent 80h as CAN FD, which these drives do not understand",
 }
 """Attack → what the guard says of it; empty where a killed one says nothing."""
 SAID = {
-    "flood: readings of a drive": "joint_1: two readings in every cycle: a second node has its id",
+    "flood: readings of a drive": "joint_1: two readings come in every cycle, so a second node has the same id",
     "flood: bus-off": "bus-off: check wiring, termination and bit rate",
     "interface down and up": "Network is down",
     "flood: extended": "",
-    "flood while the host does not read": "the host was .* ms late|frames lost: this host reads too slowly",
+    "flood while the host does not read": "the host was .* ms late|frames were lost because this host reads too slowly",
 }
 """Attack → what the host says of it; empty where it may go on."""
 LATE = r"the host was \d+ ms late"
@@ -78,5 +78,5 @@ def test_an_interface_that_is_removed_during_work_is_one_line(place: Scene) -> N
     found = place.attack(remove, guarded=True)
     assert not found.wrong, found
     assert re.search("No such device|Network is down", found.host), found.host
-    assert "guard: closed: an interface failed: " in found.guard
+    assert "guard: closed, it passes no more frames: an interface failed (" in found.guard
     assert "the joints were told to stop" in found.guard

@@ -82,7 +82,7 @@ def test_a_joint_whose_velocity_reading_stands_still_is_stopped_by_its_positions
     pushed.bus.inject(f"frozen.velocity:{pushed.sim.names[1]}")
     fastest, says = pushed.until_refused()
     assert fastest < 1.5
-    assert "contradict each other" in says or "by its positions" in says
+    assert "contradict each other" in says or "according to its positions" in says
 
 
 @pytest.mark.sample(2)
@@ -102,7 +102,7 @@ def test_torque_control_does_not_start_from_a_torque_that_the_drives_law_does_no
     pushed.bus.inject(f"forged.torque:{pushed.sim.names[1]}:25")
     pushed.link.commander.command(pushed.command)
     _, says = pushed.until_refused()
-    assert "but its gains and its command give" in says or "two readings in every cycle" in says
+    assert "but its gains and its command give" in says or "two readings come in every cycle" in says
 
 
 @pytest.mark.sample(2)
@@ -112,14 +112,14 @@ def test_velocities_that_a_second_node_sends_on_a_slow_channel_are_counted(name,
     """They come in a frame of their own, every fourth cycle, and the true ones come too."""
     pushed = Pushed(name, push=0.0)
     pushed.bus.inject(f"{how}.velocity:{pushed.sim.names[1]}")
-    with pytest.raises(BusFault, match="more readings than it sends"):
+    with pytest.raises(BusFault, match="more readings come than this joint sends"):
         pushed.hold(17)
 
 
 def test_a_second_sender_of_positions_is_noticed_where_drives_send_by_their_own_clock():
     pushed = Pushed("six-odrive", push=0.0)
     pushed.bus.inject(f"forged.position:{pushed.sim.names[1]}:0.7")
-    with pytest.raises((BusFault, Refused), match=r"contradict|by its positions|its reading is false"):
+    with pytest.raises((BusFault, Refused), match=r"contradict|according to its positions|its reading is false"):
         pushed.hold(5)
 
 
@@ -142,14 +142,24 @@ def started(name, **joint):
 @pytest.mark.parametrize(
     ("register", "value", "says"),
     [
-        (22, 2.0, r"shoulder: register 22 \(VMAX\) ends velocity readings at 2 rad/s, and the gate must see 3 rad/s: "),
-        (23, 20.0, r"shoulder: register 23 \(TMAX\) ends torque readings at 20 N·m, and the gate must see 36 N·m: "),
+        (
+            22,
+            2.0,
+            r"shoulder: register 22 \(VMAX\) limits the velocity readings to 2 rad/s, but the gate must "
+            r"be able to read 3 rad/s: ",
+        ),
+        (
+            23,
+            20.0,
+            r"shoulder: register 23 \(TMAX\) limits the torque readings to 20 N·m, but the gate must be "
+            r"able to read 36 N·m: ",
+        ),
     ],
 )
 def test_a_damiao_range_below_the_gates_limits_is_refused(register, value, says):
     link, sim = started("six-damiao")
     sim.drive_at[1].registers[register] = value
-    with pytest.raises(Refused, match=says + r"write it with the maker's tool and store it, or lower max_"):
+    with pytest.raises(Refused, match=says + r"write a larger range with the maker's tool and store it, or lower max_"):
         link.start()
     assert not any(drive.motor.powered for drive in sim.drive_at.values())
 
@@ -158,19 +168,23 @@ def test_a_position_range_that_ends_before_the_gates_window_is_refused():
     link, sim = started("six-damiao")
     window = link.values.limits(1, link.limits[1])
     sim.drive_at[1].registers[21] = max(-window.lower, window.upper) + 0.05
-    with pytest.raises(Refused, match=r"register 21 \(PMAX\) ends position readings at .* correct zero and direction"):
+    with pytest.raises(
+        Refused, match=r"register 21 \(PMAX\) limits the position readings to .* correct zero and direction"
+    ):
         link.start()
 
 
 def test_ranges_that_the_arm_file_states_are_held_to_the_gates_limits_too():
     link, _ = started("six-cubemars", velocity_range=2.5)
-    with pytest.raises(Refused, match=r"shoulder: velocity_range ends velocity readings at 2\.5 rad/s"):
+    with pytest.raises(Refused, match=r"shoulder: velocity_range limits the velocity readings to 2\.5 rad/s"):
         link.start()
 
 
 def test_a_model_that_cannot_show_its_limits_is_refused():
     link, _ = started("six-robstride", max_torque=70.0)
-    with pytest.raises(Refused, match="shoulder: the range of an RS03 ends torque readings at 60 N·m, and the gate"):
+    with pytest.raises(
+        Refused, match="shoulder: the range of an RS03 limits the torque readings to 60 N·m, but the gate"
+    ):
         link.start()
 
 

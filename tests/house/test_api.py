@@ -91,7 +91,7 @@ def test_paths_are_text_or_path(kind, tmp_path):
 def test_an_open_link_takes_no_bus(tmp_path):
     with (
         armlink.open_link(ROOT / "examples" / "planar3.yaml", simulated=True) as link,
-        pytest.raises(armlink.ArmlinkError, match="the link given is open already"),
+        pytest.raises(armlink.ArmlinkError, match="the given link is already open"),
     ):
         armlink.sweep(link, tmp_path / "unloaded", bus="socketcan:can0")
 
@@ -99,11 +99,11 @@ def test_an_open_link_takes_no_bus(tmp_path):
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: armlink.open_link(3), "arm: expected an ArmFile, a path or a bundled arm's name, not int"),
-        (lambda: armlink.open_link("sarcos", "socketcan:vcan0", simulated=True), "leave bus or simulated out"),
+        (lambda: armlink.open_link(3), "arm: expected an ArmFile, a path, or the name of a bundled arm, not int"),
+        (lambda: armlink.open_link("sarcos", "socketcan:vcan0", simulated=True), "leave out `bus` or `simulated`"),
         (lambda: armlink.open_link("sarcos", load=2.0), "only a simulated arm"),
-        (lambda: armlink.calibrate(), "give the data sets of sweep"),
-        (lambda: armlink.calibrate(["a", "b"]), "one argument each, not list"),
+        (lambda: armlink.calibrate(), "give data sets of sweep"),
+        (lambda: armlink.calibrate(["a", "b"]), "each as an argument of its own, not list"),
         (lambda: armlink.identify("nosuch"), "nosuch"),
         (lambda: armlink.diagnose("sarcos", 3), "diagnose: train: expected recordings or their paths, not int"),
         (lambda: armlink.diagnose("sarcos", [None]), "not NoneType"),
@@ -134,6 +134,6 @@ def test_a_user_s_script_passes_mypy_strict(tmp_path):
 
 
 def test_a_sweep_with_a_mass_that_no_drive_holds_is_refused_before_anything_is_opened(tmp_path):
-    with pytest.raises(BadInput, match=r"attach at most 13 kg; is it 5 kg\?"):
+    with pytest.raises(BadInput, match=r"attach at most 13 kg; or do you mean 5 kg\?"):
         armlink.sweep("sarcos", tmp_path / "loaded", simulated=True, reference_mass=5000.0)
     assert not (tmp_path / "loaded").exists()

@@ -85,5 +85,5 @@ def test_every_command_of_the_page_and_the_same_in_python(
     low, high = sensors.ci95("coulomb")[0]
     assert 0 < low < high < 1.0
     assert armlink.verify("my-openarm.yaml", gravity, sensors, simulated=True, poses=3).passed
-    with pytest.raises(armlink.ArmlinkError, match="keep no calibration"):
+    with pytest.raises(armlink.ArmlinkError, match="store no calibration"):
         armlink.verify("my-openarm.yaml", gravity, simulated=True)

@@ -120,7 +120,7 @@ with PlainConsole().status("working") as status:
     time.sleep(0.3)
     results().print("found: one")
     time.sleep(0.3)
-    answer = ask("Which one?")
+    answer = ask("Which arm?")
     time.sleep(0.3)
 results().print(f"verdict: {answer}")
 """
@@ -158,7 +158,7 @@ def read_until(master, words):
 
 
 def test_a_prompt_is_not_overwritten_by_a_spinner():
-    before, waiting, after = on_terminal([sys.executable, "-c", ASKS], "Which one?", "both")
+    before, waiting, after = on_terminal([sys.executable, "-c", ASKS], "Which arm?", "both")
     assert "working" in before
     assert before.count("found: one") == 1
     assert "\x1b" not in waiting, "nothing is drawn while the question waits"
@@ -167,7 +167,7 @@ def test_a_prompt_is_not_overwritten_by_a_spinner():
 
 def test_a_question_leaves_standard_output_alone(tmp_path):
     with (tmp_path / "out").open("w") as out:
-        on_terminal([sys.executable, "-c", ASKS], "Which one?", "both", stdout=out)
+        on_terminal([sys.executable, "-c", ASKS], "Which arm?", "both", stdout=out)
     assert (tmp_path / "out").read_text() == "found: one\nverdict: both\n"
 
 

@@ -27,15 +27,18 @@ URDF = """<robot name="two"><link name="world"/>
 
 
 def test_a_missing_length_an_unknown_effect_and_a_wrong_unit_are_named() -> None:
-    with pytest.raises(BadInput, match=r"sensors\.gain: 2 values, expected 1"):
+    with pytest.raises(BadInput, match=r"sensors\.gain has 2 values, expected 1"):
         sim_section(one_joint(sensors={"gain": [1.0, 1.0]}))
     for entry, message in [
         ({"effect": "friction.columb", "joint": "hinge", "torque": 1.0}, "no effect 'friction.columb'"),
-        ({"effect": "friction.coulomb", "joint": "hinge"}, r"parameter torque is missing; it has torque \[N·m\]"),
+        (
+            {"effect": "friction.coulomb", "joint": "hinge"},
+            r"parameter torque is missing; this effect has torque \[N·m\]",
+        ),
         ({"effect": "friction.coulomb", "joint": "hinge", "torque": 1.0, "speed": 2}, "no parameter 'speed'"),
-        ({"effect": "friction.coulomb", "torque": 1.0}, "key joint is missing"),
+        ({"effect": "friction.coulomb", "torque": 1.0}, "key `joint` is missing"),
         ({"effect": "link.mass_moment", "joint": "hinge", "moment": [1.0]}, "expected 3 numbers"),
-        ({"effect": "base.tilt", "joint": "hinge", "angles": [0.1, 0.2]}, "acts on the whole arm"),
+        ({"effect": "base.tilt", "joint": "hinge", "angles": [0.1, 0.2]}, "belongs to the whole arm"),
     ]:
         with pytest.raises(BadInput, match=message):
             one_joint(effects=[entry])

@@ -49,7 +49,7 @@ def test_the_true_model_is_first_in_windows_and_running_free(models: list[str], 
         assert here["free"] < there["free"]
         low, high = there["windows"]["ci95"]
         assert low < there["windows"]["value"] < high
-    assert "true.xml leaves the least" in " ".join(capsys.readouterr().out.split())
+    assert "true.xml leaves the smallest gap" in " ".join(capsys.readouterr().out.split())
 
 
 def test_known_gains_stand_in_for_actuators(models: list[str], tmp_path: Path) -> None:
@@ -69,11 +69,11 @@ def test_gains_beside_torques_are_refused_and_what_was_corrected_is_told(tmp_pat
     save_recording(replace(made, torque=made.torque * np.array([1.0, -1.0, 1.0])), tmp_path / "run.csv")
     command = ["gap", "compare", f"--sim={path}", f"--sim={path}", f"--heldout={tmp_path / 'run.csv'}"]
     assert run([*command, "--gains=kp=20"]) == 2
-    assert "--gains: the recordings have a torque channel" in capsys.readouterr().err
+    assert "--gains: leave this option out, since the recordings have a torque channel" in capsys.readouterr().err
     assert run([*command, f"--json={tmp_path / 'a.json'}"]) == 0
     checks = json.loads((tmp_path / "a.json").read_text())["checks"]
     assert [(each["model"], each["option"]) for each in checks] == 2 * [(str(path), "--sign tau_2=-1")]
-    assert "has the opposite sign" in " ".join(capsys.readouterr().out.split())
+    assert "the sign is opposite" in " ".join(capsys.readouterr().out.split())
 
 
 def test_models_of_other_joints_are_refused(models: list[str], tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_models_of_other_joints_are_refused(models: list[str], tmp_path: Path) -
     other.write_text(text, encoding="utf-8")
     recording = record(text, 1, 8.0)
     unnamed = replace(recording, names=())
-    with pytest.raises(BadInput, match="its joints are shoulder, elbow, not shoulder, knee"):
+    with pytest.raises(BadInput, match="its joints are shoulder, elbow, but the other models have shoulder, knee"):
         compare_models([str(other), models[0]], [unnamed])
 
 

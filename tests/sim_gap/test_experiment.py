@@ -89,9 +89,9 @@ def test_a_motion_that_does_not_fit_the_arm_is_refused(tmp_path: Path) -> None:
     missing[7, 1] = np.nan
     for name, bad, words in (
         ("beyond", beyond, "joint_3 goes from .* beyond its range"),
-        ("fast", fast, "joint_5 turns at .* beyond its max_velocity"),
-        ("missing", missing, "row 8: no value of q_cmd_2"),
-        ("narrow", rows[:, :5], "no column q_cmd_6, q_cmd_7"),
+        ("fast", fast, "joint_5 turns at .* but its max_velocity"),
+        ("missing", missing, "row 8: q_cmd_2 has no value"),
+        ("narrow", rows[:, :5], "column q_cmd_6, q_cmd_7 is missing"),
     ):
         with pytest.raises(BadInput, match=words):
             load_motion(write(tmp_path / f"{name}.csv", bad), arm)

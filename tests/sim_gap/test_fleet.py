@@ -167,7 +167,7 @@ def test_no_scheduler_at_an_address_is_one_line() -> None:
 def test_a_file_of_something_else_is_not_added_to(tmp_path: Path) -> None:
     other = tmp_path / "notes.json"
     other.write_text('{"mine": 1}\n', encoding="utf-8")
-    with pytest.raises(BadInput, match="line 1 is not a result of a fleet"):
+    with pytest.raises(BadInput, match="line 1 is not a result of diagnose-fleet"):
         Answers(other)
     assert other.read_text(encoding="utf-8") == '{"mine": 1}\n'
 
@@ -188,7 +188,7 @@ def test_a_file_of_something_else_is_not_added_to(tmp_path: Path) -> None:
 def test_a_line_that_is_no_answer_is_refused_before_anything_is_diagnosed(tmp_path: Path, answer: str) -> None:
     path = tmp_path / "answers.jsonl"
     path.write_text(f'{{"case": "a/2026-11-22", "answer": {answer}}}\n', encoding="utf-8")
-    with pytest.raises(BadInput, match="line 1 is not a result of a fleet"):
+    with pytest.raises(BadInput, match="line 1 is not a result of diagnose-fleet"):
         Answers(path)
 
 

@@ -55,7 +55,9 @@ class MulticastPort(DatagramPort):
 
     def _full(self) -> BusFault:
         """No node has a part in it: the datagrams loop back within this machine."""
-        return Stall(f"bus {self._name}: this machine took no datagrams for 50 ms: it has too much else to do")
+        return Stall(
+            f"bus {self._name}: this machine accepted no datagrams for 50 ms: too many other programs run on it"
+        )
 
     def _decode(self, count: int) -> list[Frame]:
         batch, own, decode = self._in, self._own, self._decoder.decode
@@ -93,7 +95,7 @@ def _connect(name: str, family: int, group: tuple[str, int], hop_limit: int) -> 
         sending.connect(group)
     except OSError as error:
         sending.close()
-        raise BusFault(f"bus {name}: no route to the group: {error.strerror}") from None
+        raise BusFault(f"bus {name}: no route to the multicast group: {error.strerror}") from None
     return sending
 
 

@@ -118,7 +118,10 @@ def next_control(state: DriveState, target: DriveState) -> int:
         return int(_TO_DISABLED.get(state, Control.DISABLE_VOLTAGE))
     if target is DriveState.QUICK_STOP:
         return int(Control.QUICK_STOP)
-    raise ValueError(f"no transition to {target.value} is defined: targets are enabled, quick stop, switch on disabled")
+    raise ValueError(
+        f'no transition to "{target.value}" is defined: it must be "operation enabled", "quick stop '
+        'active" or "switch on disabled"'
+    )
 
 
 def set_point_control(status_word: int) -> int:

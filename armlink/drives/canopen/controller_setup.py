@@ -144,8 +144,8 @@ def check_identity(services: NodeServices, joint: LinkJoint) -> None:
 def refused_identity(name: str, node: int, mismatches: list[str]) -> Refused:
     """The refusal of a joint's controller, with what differs and how to fix it."""
     return Refused(
-        f"{name} (node {node}): another controller than the arm file states: {'; '.join(mismatches)}: "
-        "connect the right arm, or correct identity or eds of this joint under link.joints"
+        f"{name} (node {node}): another drive than the arm file states: {'; '.join(mismatches)}: connect the "
+        "right arm, or correct `identity` or `eds` of this joint under link.joints"
     )
 
 
@@ -176,8 +176,8 @@ def offered_modes(services: NodeServices) -> int:
     if services.has(objects.TARGET_VELOCITY) and _enters(services, CYCLIC_VELOCITY, supports(told, CYCLIC_VELOCITY)):
         return offered | 1 << (CYCLIC_VELOCITY - 1)
     raise BusFault(
-        f"{services.joint} (node {services.node}): enters none of the modes 8 and 1 (positions) and 9 (velocity): "
-        f"6502h is {told:#x}"
+        f"{services.joint} (node {services.node}): the drive enters none of the modes 8 and 1 (position) and "
+        f"9 (velocity): 6502h is {told:#x}"
     )
 
 
@@ -306,9 +306,9 @@ def reading_ranges(
         count = int(services.read(entry)) if services.has(entry) else 0
         if 0 < count * fastest < stated * (1 - SPEED_ROUNDING):
             raise Refused(
-                f"{joint.name} ({joint.settings.address}): {entry} is {count}, which is {count * fastest:.4g} rad/s, "
-                f"and max_velocity asks for {stated:.4g}: set it to {math.ceil(stated / fastest)} or more, or lower "
-                "max_velocity"
+                f"{joint.name} ({joint.settings.address}): {entry} is {count}, which is "
+                f"{count * fastest:.4g} rad/s, but max_velocity is {stated:.4g} rad/s: set the object to "
+                f"{math.ceil(stated / fastest)} or more, or lower max_velocity"
             )
     ranges = [ReadingRange("position", 2**31 * unit.position, str(objects.POSITION), COARSER)]
     if profile.has(objects.VELOCITY):

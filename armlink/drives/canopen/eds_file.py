@@ -24,10 +24,10 @@ MOST_SHEET = 4 << 20
 MOST_ENTRIES = 254
 """Largest sub-index of an array (CiA 301: 255 has another use)."""
 OPTIONAL = {
-    object_dictionary.TORQUE_OFFSET: "torque offset: nothing latched to clear",
-    object_dictionary.PROFILE_VELOCITY: "profile velocity: no profile position mode",
-    object_dictionary.TORQUE_SLOPE: "torque slope: no profile torque mode",
-    object_dictionary.STORE_MANUFACTURER: "store: a calibration is lost at power-off",
+    object_dictionary.TORQUE_OFFSET: "torque offset: the device has none that would have to be cleared",
+    object_dictionary.PROFILE_VELOCITY: "profile velocity: the device has no profile position mode",
+    object_dictionary.TORQUE_SLOPE: "torque slope: the device has no profile torque mode",
+    object_dictionary.STORE_MANUFACTURER: "store: the device loses its calibration at power-off",
     object_dictionary.HEARTBEAT_PRODUCER: "",
 }
 """Objects that a controller may lack → the function that is then missing."""
@@ -89,8 +89,8 @@ def read_sheet(path: Path, joint: LinkJoint) -> Any:
         return sheet
     if object_dictionary.TORQUE_READING.index not in sheet:
         raise BadInput(
-            f"{where}: the device has no torque sensor record 2100h: give drive: {{family: canopen, node: "
-            f"{joint.settings.node}, torque: motor}}, which reads the drive's own estimate (docs/drives.md)"
+            f"{where}: the device has no torque sensor record 2100h: write `drive: {{family: canopen, node: "
+            f"{joint.settings.node}, torque: motor}}`, which reads the torque estimate of the drive (docs/drives.md)"
         )
     for entry in used_objects():
         found = sheet.get_variable(entry.index, entry.sub)

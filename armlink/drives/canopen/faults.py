@@ -63,7 +63,7 @@ def state_fault(known: JointStates, now: float, modes: Sequence[int], patience: 
             continue
         state = state_of(status)
         if mode != OFF or state in _FAULTS:
-            told = f"{state.value} (status word {status:#06x}), expected operation enabled"
+            told = f'is in state "{state.value}" (status word {status:#06x}), expected "operation enabled"'
             return BusFault(f"{known.names[joint]}: {told}")
     return None
 
@@ -89,21 +89,21 @@ def node_fault(known: JointStates) -> str | None:
         return f"{known.names[joint]}: emergency {code:04X}h, {emcy.name_of(code)} (error register {register:02X}h)"
     for joint in sorted(known.restarted):
         return (
-            f"{known.names[joint]}: its controller has restarted (boot-up message): calibration and mode are lost; "
+            f"{known.names[joint]}: its drive has restarted (boot-up message): calibration and mode are lost; "
             "find out why, then start again"
         )
     for joint, state in known.node_states.items():
         if state != objects.OPERATIONAL:
             found = objects.NMT_STATES.get(state, str(state))
-            return f"{known.names[joint]}: NMT state is {found}, expected operational"
+            return f"{known.names[joint]}: its NMT state is {found}, expected operational"
     return None
 
 
 def refused_mode(mode: int, display: int) -> str:
     """That a controller does not enter a mode that it was told to."""
     return (
-        f"refuses mode {mode} ({_name_of(mode)}): its mode display 6061h is {display}; "
-        "look at its error code 603Fh and at what 6502h says it supports"
+        f"refuses mode {mode} ({_name_of(mode)}): its mode display 6061h is {display}; read its error code "
+        "603Fh and its supported modes 6502h"
     )
 
 
@@ -118,5 +118,5 @@ def stuck(known: JointStates, joint: int, target: DriveState, mode: int, seconds
         return f"{name}: {refused_mode(mode, known.displays[joint])}"
     for place, code, _ in known.emergencies:
         if place == joint:
-            return f"{name}: {state.value} after emergency {code:04X}h, {emcy.name_of(code)}"
-    return f"{name}: stays in {state.value}, expected {target.value} within {seconds} s"
+            return f'{name}: is in state "{state.value}" after emergency {code:04X}h, {emcy.name_of(code)}'
+    return f'{name}: stays in state "{state.value}" and does not reach "{target.value}" within {seconds} s'

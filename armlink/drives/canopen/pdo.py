@@ -142,11 +142,13 @@ def disable(index: int, write: Write, read: Read) -> None:
     if not held & INVALID:
         write(cob_id, held | INVALID)
         if not read(cob_id) & INVALID:
-            raise MappingRefused(f"{cob_id}: stays valid, so another program could command this joint through it")
+            raise MappingRefused(
+                f"{cob_id}: stays valid, so another program could command this joint through this RPDO"
+            )
 
 
 def _same(entry: Entry, written: int, held: int) -> None:
     if held != written:
         raise MappingRefused(
-            f"{entry}: wrote {written:#x}, the device holds {held:#x}: it does not accept this mapping"
+            f"{entry}: {written:#x} was written, but the device holds {held:#x}: it does not accept this mapping"
         )

@@ -15,23 +15,23 @@ from armlink.drives.orders import Mode
 from armlink.errors import BusFault
 
 LOST: Mapping[Entry, str] = {
-    objects.RPDO_DEADLINE: "no deadline for commands: only its heartbeat shows that the host is gone",
+    objects.RPDO_DEADLINE: "commands have no deadline: only the heartbeat shows the device that its host is gone",
     objects.HEARTBEAT_CONSUMER: "the device does not watch its host",
     objects.HEARTBEAT_PRODUCER: "only missing readings show that the device has left the bus",
-    objects.ABORT_OPTION: "what it does when its host falls silent cannot be set",
-    objects.QUICK_STOP_OPTION: "whether it holds after a quick stop cannot be set",
-    objects.MAX_TORQUE: "the device does not bound torque: the host alone does",
-    objects.POSITION_LOWER: "the device does not bound positions: the host alone does",
+    objects.ABORT_OPTION: "the reaction of the device to a silent host cannot be set",
+    objects.QUICK_STOP_OPTION: "whether the device holds after a quick stop cannot be set",
+    objects.MAX_TORQUE: "the device does not limit torque: only the host does",
+    objects.POSITION_LOWER: "the device does not limit positions: only the host does",
     objects.POSITION_UPPER: "",
-    objects.INTERPOLATION_VALUE: "the device assumes its own period between targets",
+    objects.INTERPOLATION_VALUE: "the device assumes a fixed period between targets, which cannot be set",
     objects.INTERPOLATION_INDEX: "",
     objects.TARGET_TORQUE: "no torque control",
     objects.MOTOR_TORQUE: "no torque reading from the motor's current",
-    objects.VELOCITY: "no velocity reading: no torque control",
-    objects.RATED_TORQUE: "rated torque as the arm file has it",
-    objects.SUPPORTED_MODES: "modes as they are displayed",
-    objects.MODE_DISPLAY: "only the motion shows that a mode is refused",
-    objects.TORQUE_OFFSET: "nothing latched to clear",
+    objects.VELOCITY: "without a velocity reading there is no torque control",
+    objects.RATED_TORQUE: "the rated torque is taken from the arm file",
+    objects.SUPPORTED_MODES: "only the mode display shows which modes the device supports",
+    objects.MODE_DISPLAY: "only the motion of the joint shows that the device refused a mode",
+    objects.TORQUE_OFFSET: "the device has no torque offset that would have to be cleared",
     objects.PROFILE_VELOCITY: "no profile position mode",
     objects.TORQUE_SLOPE: "no profile torque mode",
 }
@@ -90,9 +90,14 @@ class Profile:
         if self.by_velocity:
             told = (
                 *told,
-                "mode 9 alone (cyclic velocity): positions are controlled by the host, and there is no torque",
+                "only mode 9 (cyclic velocity) can be used: the host controls positions, and there is no torque "
+                "control",
             )
-        return told if self.modes_by_pdo else (*told, "6060h cannot be mapped: one mode for the whole session")
+        return (
+            told
+            if self.modes_by_pdo
+            else (*told, "6060h cannot be mapped: the joint keeps one mode for the whole session")
+        )
 
     @property
     def pdos(self) -> tuple[Pdo, ...]:

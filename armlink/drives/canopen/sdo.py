@@ -163,7 +163,7 @@ class NodeServices:
         """Read an object and compare it with `value`, bit for bit; raises BusFault."""
         held = self.read(entry)
         if struct.pack("<" + entry.code, held) != struct.pack("<" + entry.code, value):
-            raise self.fault(entry, f"wrote {value}, the device holds {held}")
+            raise self.fault(entry, f"{value} was written, but the device holds {held}")
 
     def read_text(self, index: int) -> str:
         """A visible string; empty if the device does not have the object."""

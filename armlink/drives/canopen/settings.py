@@ -58,7 +58,9 @@ class CanopenSettings(DriveSettings):
     @model_validator(mode="after")
     def _calibration_has_a_place(self) -> "CanopenSettings":
         if self.calibration == "controller" and self.torque != "record":
-            raise ValueError("calibration: controller needs torque: record (object 2100h); expected host")
+            raise ValueError(
+                "`calibration: controller` needs `torque: record` (object 2100h): write `calibration: host`"
+            )
         return self
 
     @property

@@ -37,7 +37,7 @@ def require_record(services: NodeServices) -> None:
     """Raise BusFault where 2100h is not our record: another maker's device has something else there (the serial number
     of an EPOS4), and nothing is ever written to it. Every object of ours has four bytes, and a gain is a gain."""
     if not GAIN_RANGE[0] <= read_record(services).gain <= GAIN_RANGE[1]:
-        raise services.fault(objects.GAIN, "is no gain: 2100h of this device is not the torque sensor record")
+        raise services.fault(objects.GAIN, "is not a gain, so 2100h of this device is not the torque sensor record")
 
 
 def write_record(services: NodeServices, calibration: Calibration, store: bool = False) -> Calibration:
@@ -47,12 +47,18 @@ def write_record(services: NodeServices, calibration: Calibration, store: bool =
     """
     gain, offset, record_id, date = calibration.gain, calibration.offset, calibration.record_id, calibration.date
     if not GAIN_RANGE[0] <= gain <= GAIN_RANGE[1]:
-        raise BadInput(f"{services.joint}: gain {gain} for the controller: expected {GAIN_RANGE[0]} to {GAIN_RANGE[1]}")
+        raise BadInput(
+            f"{services.joint}: gain {gain} cannot be written to the drive: expected {GAIN_RANGE[0]} to {GAIN_RANGE[1]}"
+        )
     if not abs(offset) < 1e4:
-        raise BadInput(f"{services.joint}: offset {offset} N·m for the controller: expected a finite number")
+        raise BadInput(
+            f"{services.joint}: offset {offset} N·m cannot be written to the drive: expected a finite number"
+        )
     for what, number in (("record id", record_id), ("date", date)):
         if not 0 <= number < 2**32:
-            raise BadInput(f"{services.joint}: {what} {number} for the controller: expected 0 to {2**32 - 1}")
+            raise BadInput(
+                f"{services.joint}: {what} {number} cannot be written to the drive: expected 0 to {2**32 - 1}"
+            )
     require_record(services)
     crc = calibration_crc(gain, offset, record_id, date)
     services.write_checked(objects.STAGED_GAIN, gain)

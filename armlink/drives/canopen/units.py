@@ -50,7 +50,9 @@ def units_from(
     Raises ValueError on a zero.
     """
     if not all((rated_torque_mnm, *encoder, *gear, *feed)):
-        raise ValueError(f"a zero in 6076h {rated_torque_mnm}, 608Fh {encoder}, 6091h {gear} or 6092h {feed}")
+        raise ValueError(
+            f"one of 6076h ({rated_torque_mnm}), 608Fh ({encoder}), 6091h ({gear}) and 6092h ({feed}) contains a zero"
+        )
     increments_a_turn = encoder[0] / encoder[1] * gear[0] / gear[1]
     return Units(
         torque=rated_torque_mnm * 1e-6,
@@ -96,7 +98,7 @@ def read_units(services: NodeServices, joint: LinkJoint) -> Units:
     try:
         return told_units(services, rated_mnm)
     except ValueError as error:
-        raise BusFault(f"{joint.name} (node {settings.node}): no units: {error}") from None
+        raise BusFault(f"{joint.name} (node {settings.node}): the units of the drive cannot be read: {error}") from None
 
 
 def _stock_units(services: NodeServices, joint: LinkJoint, settings: CanopenSettings) -> Units:
@@ -108,8 +110,8 @@ def _stock_units(services: NodeServices, joint: LinkJoint, settings: CanopenSett
     position = settings.position_unit or _position_unit(services)
     if position is None:
         raise BadInput(
-            f"{joint.name} ({settings.address}): 6092h, 608Fh and 60A8h do not give the unit of 6064h: "
-            "give drive.position_unit, radians of one count"
+            f"{joint.name} ({settings.address}): 6092h, 608Fh and 60A8h do not give the unit of 6064h: write "
+            "`position_unit` (radians of one count) in the `drive:` section of this joint"
         )
     velocity = settings.velocity_unit or _velocity_unit(services, position)
     return Units(rated * 1e-3, position, velocity, position)
@@ -122,9 +124,9 @@ def unit_doubt(services: NodeServices, joint: LinkJoint) -> str:
     if not given or not own or math.isclose(given, own, rel_tol=RATED_TORQUE_TOLERANCE):
         return ""
     return (
-        f"{joint.name} ({joint.settings.address}): drive.position_unit is {given / own:.3g} times what 6092h, 60A8h or "
-        f"608Fh of the device tell; if it is wrong, the joint turns {own / given:.3g} times as fast and as far as it "
-        "reads: before anything else, armlink check ARM --scales hand"
+        f"{joint.name} ({joint.settings.address}): drive.position_unit is {given / own:.3g} times the unit that 6092h, "
+        f"60A8h or 608Fh of the device give; if position_unit is wrong, the joint turns {own / given:.3g} times as "
+        "fast and as far as it reads: before anything else, run `armlink check ARM --scales hand`"
     )
 
 
@@ -176,6 +178,6 @@ def _optional(services: NodeServices, entry: Entry) -> int:
 def _require_rated(joint: LinkJoint, found: float, stated: float) -> None:
     if abs(found - stated) > RATED_TORQUE_TOLERANCE * stated:
         raise BadInput(
-            f"{joint.name} ({joint.settings.address}): rated torque 6076h is {found} N·m, the arm file says "
-            f"{stated}: correct link.joints or connect the right arm"
+            f"{joint.name} ({joint.settings.address}): rated torque 6076h is {found} N·m, but the arm file "
+            f"has {stated} N·m: correct link.joints, or connect the right arm"
         )

@@ -65,8 +65,8 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
             other = self._joint_of.get(settings.reply)
             if other is not None:
                 raise BadInput(
-                    f"{arm.path}: {self.names[joint]}: drive.reply {settings.reply:#04x} is the id of "
-                    f"{self.names[other]}'s commands: replies need an id that is no drive's (master id, usually 0)"
+                    f"{arm.path}: {self.names[joint]}: drive.reply {settings.reply:#04x} is also the id of commands to "
+                    f"{self.names[other]}: set a reply id that no drive has (master id, usually 0)"
                 )
         self._replies = {(each.reply, each.id): joint for joint, each in enumerate(self.settings)}
         self._spare_canopen(arm)
@@ -78,7 +78,7 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
             if joint.settings.family == "canopen" and joint.bus in buses:
                 raise BadInput(
                     f"{arm.path}: {joint.name}: a CANopen node takes CubeMars replies on id 0 for NMT commands: put "
-                    "it on another bus, or set another master id in the drives (drive.reply)"
+                    "the CANopen node on another bus, or set another master id in the CubeMars drives (drive.reply)"
                 )
 
     # ---- before the cycle
@@ -117,14 +117,14 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         reply = self._exit(ask, joint)
         if reply is None:
             raise BusFault(
-                f"{name}: no answer from {settings.address} on id {settings.reply:02X}h: is it powered, in MIT mode, "
-                "and are its CAN and master ids right?"
+                f"{name}: no answer from {settings.address} on id {settings.reply:02X}h: check that the "
+                "drive is powered and in MIT mode, and that its CAN id and its master id are right"
             )
         self.memory[joint] = CubeMarsMemory(on=False)
         self.powers[joint], self.faults[joint] = Power.OFF, error_text(reply.error)
-        notes = (_watched(settings), "scales are the arm file's: the drive reports none")
+        notes = (_watched(settings), "the scales are taken from the arm file, since the drive reports none")
         where = ("position_range", "velocity_range", "torque_range")
-        remedy = "if that is the drive's own range, take a drive with more; else correct it or drive.model"
+        remedy = "correct this range or `model` in the `drive:` section, or take a drive with a larger range"
         return self.mit_setup(joint, limits, reply.feedback.position, grid, notes, where, remedy)
 
     # ---- cycle
@@ -191,7 +191,7 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         known = self.memory[joint]
         if known.limits is None or not now - known.lacking > known.limits.deadline:
             return ""
-        return "makes no torque although its commands ask for some: it has left motor mode, or restarted"
+        return "makes no torque although its commands ask for torque: it has left motor mode, or restarted"
 
     @staticmethod
     def _power(known: CubeMarsMemory) -> Power:
@@ -215,7 +215,7 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
     def own_stop(self, joint: int) -> str:
         if not self.memory[joint].stopped:
             return ""
-        return f"{self.where(joint)}: without a command for its deadline: its CAN timeout has let it go"
+        return f"{self.where(joint)}: no command came within its CAN timeout, so it has switched its torque off"
 
     def forget(self, restarts: bool = False) -> None:
         super().forget(restarts)
@@ -225,8 +225,14 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
 
 def _watched(settings: CubeMarsSettings) -> str:
     if not settings.can_timeout:
-        return "no CAN timeout stated (drive.can_timeout): it keeps on after its host died"
-    return f"CAN timeout of {settings.can_timeout} cycles as stated: it cannot be read over CAN"
+        return (
+            "`can_timeout` is not given in the `drive:` section: the drive may keep on with its last "
+            "command after its host died"
+        )
+    return (
+        f"the CAN timeout of {settings.can_timeout} cycles is taken from the arm file: it cannot be read over "
+        "CAN, so check it in the drive"
+    )
 
 
 def find_drives(bus: SearchedBus) -> list[FoundDrive]:

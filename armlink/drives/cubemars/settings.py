@@ -38,8 +38,8 @@ class CubeMarsSettings(DriveSettings):
         given = (self.position_range, self.velocity_range, self.torque_range)
         if self.model.upper() not in MODELS and None in given:
             raise ValueError(
-                f"model {self.model!r} is not known: give one of {', '.join(MODELS)}, or position_range, "
-                "velocity_range and torque_range as its manual has them"
+                f"model {self.model!r} is unknown: give one of {', '.join(MODELS)}, or give position_range, "
+                "velocity_range and torque_range from the manual"
             )
         return self
 
@@ -47,8 +47,8 @@ class CubeMarsSettings(DriveSettings):
     def _replies_differ_from_commands(self) -> "CubeMarsSettings":
         if self.reply == self.id:
             raise ValueError(
-                f"reply {self.reply:#04x} is the drive's own id: replies could not be told from commands of another "
-                "host; set another master id in the drive (set_master_id, over its serial port)"
+                f"reply {self.reply:#04x} is the id of the drive itself, so replies would look like commands "
+                "of another host: set another master id in the drive (set_master_id, over its serial port)"
             )
         return self
 

@@ -124,8 +124,8 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
         found = (self._read(ask, joint, (register,)) or {}).get(register)
         if found != value:
             raise BusFault(
-                f"{self.names[joint]}: register {int(register)} ({register.name}) was set to {value} and reads back "
-                f"{found}: {otherwise}"
+                f"{self.names[joint]}: register {int(register)} ({register.name}) was set to {value}, but "
+                f"reads back {found}: {otherwise}"
             )
 
     def _told_grid(self, joint: int, values: Mapping[int, float]) -> Grid:
@@ -134,7 +134,8 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
             if not 0.0 < values[register] < LARGEST_RANGE:
                 name = DamiaoRegister(register).name
                 raise BusFault(
-                    f"{self.names[joint]}: register {register:d} ({name}) is {values[register]}: no usable scale"
+                    f"{self.names[joint]}: register {register:d} ({name}) is {values[register]}, which is "
+                    "not a usable scale"
                 )
         return grid_of(Ranges(*(values[register] for register in RANGE_FIELDS)))
 
@@ -157,7 +158,7 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
             return self.absent(joint)
         hardware, software, serial, reply = map(int, values.values())
         own = self.settings[joint].reply
-        wrong = "" if reply == own else f"replies on {reply:02X}h, the arm file says {own:02X}h"
+        wrong = "" if reply == own else f"replies on {reply:02X}h, but the arm file has {own:02X}h"
         return self.present(joint, "Damiao DM-J", f"{serial:08X}", f"{software} (hardware {hardware})", wrong)
 
     def positions(self, ask: Ask) -> list[float]:
@@ -180,33 +181,41 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
         ask.send(settings.id, special(Special.DISABLE))
         values = self._read(ask, joint, (*RANGE_FIELDS, DamiaoRegister.REPLY_ID, *NOTED))
         if values is None:
-            raise BusFault(f"{name}: no answer from {settings.address}: is it powered, and its id right?")
+            raise BusFault(
+                f"{name}: no answer from {settings.address}: check that the drive is powered and its id is right"
+            )
         reply_id = values[DamiaoRegister.REPLY_ID]
         if reply_id != settings.reply:
             raise BadInput(
-                f"{name}: its drive replies on id {int(reply_id):02X}h (register 7), "
-                f"the arm file says reply: {settings.reply:#04x}"
+                f"{name}: its drive replies on id {int(reply_id):02X}h (register 7), but the arm file has "
+                f"`reply: {settings.reply:#04x}`"
             )
         grid = self._told_grid(joint, values)
         self.require_window(joint, limits, grid, " (register 21)")
         self._set(ask, joint, DamiaoRegister.CONTROL_MODE, frames.MIT_MODE, "the drive is not in MIT mode")
         deadman = round(limits.deadline / TIMEOUT_UNIT)
-        self._set(ask, joint, DamiaoRegister.TIMEOUT, deadman, "it would keep on after its host died")
+        self._set(
+            ask,
+            joint,
+            DamiaoRegister.TIMEOUT,
+            deadman,
+            "the drive would keep on with its last command after its host died",
+        )
         reply = self._state(ask, joint, grid)
         if reply is None:
-            raise BusFault(f"{name}: {settings.address} answers registers, but sends no feedback")
+            raise BusFault(f"{name}: {settings.address} answers register requests, but sends no feedback")
         if reply.state == DamiaoStatus.ENABLED:
             raise BusFault(f"{name}: {settings.address} stays enabled although it was commanded to disable")
         constant = values[DamiaoRegister.TORQUE_CONSTANT]
         notes = (
             f"torque constant {constant:g} N·m/A"
             if constant
-            else "torque constant register reads 0: its meaning is unknown",
+            else "the torque constant register reads 0, whose meaning is unknown",
             f"gear {values[DamiaoRegister.GEAR_RATIO]:g}",
             f"current limit {values[DamiaoRegister.OVER_CURRENT] * values[DamiaoRegister.LARGEST_CURRENT]:g} A",
         )
         where = ("register 21 (PMAX)", "register 22 (VMAX)", "register 23 (TMAX)")
-        remedy = "write it with the maker's tool and store it"
+        remedy = "write a larger range with the maker's tool and store it"
         self.memory[joint].state = None
         return self.mit_setup(joint, limits, reply.feedback.position, grid, notes, where, remedy)
 

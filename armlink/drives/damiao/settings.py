@@ -30,7 +30,7 @@ class DamiaoSettings(DriveSettings):
     def _is_known(cls, label: str) -> str:
         model = model_on_label(label)
         if label and model is None:
-            raise ValueError(f"no Damiao model {label!r}; there are {', '.join(MODELS)} (or leave it out)")
+            raise ValueError(f"Damiao model {label!r} is unknown; there are {', '.join(MODELS)} (or leave `model` out)")
         return model or ""
 
     @property

@@ -109,7 +109,7 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
         section = arm.require_link()
         bus = section.buses[joints[0].bus] if joints[0].bus else section.bus
         if not bus.fd:
-            raise BadInput(f"{arm.path}: {joints[0].name}: moteus controllers need CAN FD: set fd: true at their bus")
+            raise BadInput(f"{arm.path}: {joints[0].name}: moteus drives need CAN FD: write `fd: true` at their bus")
 
     def routes(self) -> Mapping[int, int]:
         return self._joint_of
@@ -166,23 +166,26 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
         values = self._ask(ask, joint, {MoteusRegister.MODE: frames.MoteusMode.STOPPED}, asked)
         if values is None:
             address = self.settings[joint].address
-            raise BusFault(f"{name}: no answer from {address}: is it powered, its id right, the bus CAN FD?")
+            raise BusFault(
+                f"{name}: no answer from {address}: check that the drive is powered, its id is right, and the "
+                "bus is CAN FD"
+            )
         if values.get(MoteusRegister.HOME_STATE) != HOMED_AT_OUTPUT:
             raise BusFault(
-                f"{name}: its position is not that of the output (home state "
-                f"{values.get(MoteusRegister.HOME_STATE, math.nan):.0f}, expected 2): set it (register 130h) or "
-                "use an encoder at the output"
+                f"{name}: its position is not the position of its output (home state "
+                f"{values.get(MoteusRegister.HOME_STATE, math.nan):.0f}, expected 2): set the output "
+                "position (register 130h), or use an encoder at the output"
             )
         position = values.get(MoteusRegister.POSITION, math.nan) * TURN
         if not math.isfinite(position):
-            raise BusFault(f"{name}: reports no position")
+            raise BusFault(f"{name}: its drive reports no position")
         known.limits, known.mode = limits, None
         return Setup(
             position=position,
             torque=0.0,
             position_step=real32_step(position / TURN) * TURN,
             modes=frozenset((int(Mode.POSITION), int(Mode.TORQUE))),
-            notes=("largest torque and watchdog are part of every command",),
+            notes=("every command carries the largest torque and the time of the watchdog",),
         )
 
     def _ask(self, ask: Ask, joint: int, writes: Mapping[int, float], asked: Sequence[int]) -> dict[int, float] | None:
@@ -225,7 +228,7 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
     def _command(self, joint: int, order: Order) -> dict[int, float]:
         limits = self.limits_of(joint)
         if not all(math.isfinite(value) for value in (order.position, order.velocity, order.torque)):
-            raise ValueError(f"{self.names[joint]}: an order that is not finite: {order}")
+            raise ValueError(f"{self.names[joint]}: the order is not finite: {order}")
         stiff = float(order.mode == Mode.POSITION)
         return {
             MoteusRegister.MODE: frames.MoteusMode.POSITION,

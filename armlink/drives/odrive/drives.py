@@ -167,15 +167,19 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
     def prepare(self, ask: Ask, joint: int, limits: Limits) -> Setup:
         known, name, address = self.memory[joint], self.names[joint], self.settings[joint].address
         if Message.HEARTBEAT not in known.came:
-            raise BusFault(f"{name}: no heartbeat from {address}: is it powered, its node id and bit rate right?")
+            raise BusFault(
+                f"{name}: no heartbeat from {address}: check that the drive is powered and its node id and bit "
+                "rate are right"
+            )
         if Message.ESTIMATES not in known.came or not math.isfinite(known.position):
             raise BusFault(
-                f"{name}: {address} sends no encoder estimates: set axis0.config.can.encoder_msg_rate_ms to the cycle"
+                f"{name}: {address} sends no encoder estimates: set axis0.config.can.encoder_msg_rate_ms to "
+                "the period of the cycle"
             )
         lost: tuple[str, ...] = ()
         modes = {int(Mode.POSITION), int(Mode.TORQUE)}
         if Message.TORQUES not in known.came:
-            lost = ("torques (1Ch) do not come: no torque reading; set axis0.config.can.torques_msg_rate_ms",)
+            lost = ("no torque readings (1Ch) are received: to get them, set axis0.config.can.torques_msg_rate_ms",)
             modes.discard(int(Mode.TORQUE))
         known.limits, known.mode = limits, 0
         return Setup(
@@ -291,7 +295,7 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
         beat = self.memory[joint].heartbeat
         if beat is None or beat.state == AxisState.CLOSED_LOOP or not beat.error & AxisError.WATCHDOG:
             return ""
-        return f"{self.where(joint)}: its watchdog ran out: idle, the torque is off"
+        return f"{self.where(joint)}: its watchdog ran out: it is idle, and the torque is off"
 
     def forget(self, restarts: bool = False) -> None:
         """The next request goes out at once."""
@@ -355,7 +359,7 @@ def _order_of(message: int, data: bytes) -> Order | None:
 
 def _checked(value: float) -> float:
     if not math.isfinite(value):
-        raise ValueError(f"an order of {value}: expected a finite number")
+        raise ValueError(f"the order is {value}: expected a finite number")
     return value
 
 

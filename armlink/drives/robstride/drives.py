@@ -136,13 +136,13 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         found = self.read_parameter(ask, joint, parameter)
         if found is None:
             raise BusFault(
-                f"{name}: its firmware has no parameter {int(parameter):04X}h ({parameter.name}): {otherwise}; "
-                "update it"
+                f"{name}: its firmware has no parameter {int(parameter):04X}h ({parameter.name}): "
+                f"{otherwise}; update the firmware"
             )
         if abs(found - value) > TOLERANCE * abs(value):
             raise BusFault(
-                f"{name}: parameter {int(parameter):04X}h ({parameter.name}) was set to {value:g} and reads back "
-                f"{found:g}: {otherwise}"
+                f"{name}: parameter {int(parameter):04X}h ({parameter.name}) was set to {value:g}, but reads "
+                f"back {found:g}: {otherwise}"
             )
 
     # ---- before the cycle
@@ -169,18 +169,26 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         feedback = self._fed_back(ask, joint, frames.stop_frame(settings.id, settings.host))
         if feedback is None:
             raise BusFault(
-                f"{self.names[joint]}: no answer from {settings.address}: is it powered, its id right, its protocol "
-                "private?"
+                f"{self.names[joint]}: no answer from {settings.address}: check that the drive is powered, "
+                "its id is right, and its protocol is private"
             )
         most = min(limits.max_torque, grid.t)
         self._set(ask, joint, RobStrideParameter.RUN_MODE, MOTION_MODE, "the drive is not in motion mode")
-        self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "its own torque limit is not in force")
+        self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "the torque limit of the drive is not in force")
         deadman = round(limits.deadline / TIMEOUT_UNIT)
-        self._set(ask, joint, RobStrideParameter.TIMEOUT, deadman, "it would keep on after its host died")
+        self._set(
+            ask,
+            joint,
+            RobStrideParameter.TIMEOUT,
+            deadman,
+            "the drive would keep on with its last command after its host died",
+        )
         known.mode, known.was_on = None, False
-        notes = (f"scales of {settings.model} by its manual: the drive has no register for them",)
+        notes = (
+            (f"the scales are taken from the manual of the {settings.model}, since the drive has no register for them"),
+        )
         where = (f"the range of an {settings.model}",) * 3
-        remedy = "the drive has no register for it: correct drive.model, or take a drive with more"
+        remedy = "correct `model` in the `drive:` section, or take a drive with a larger range"
         return self.mit_setup(joint, limits, feedback.motion.position, grid, notes, where, remedy)
 
     # ---- cycle
@@ -248,7 +256,7 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         known = self.memory[joint]
         if not known.was_on or known.mode != RunMode.RESET or known.faults:
             return ""
-        return f"{self.where(joint)}: went to mode reset: its canTimeout ran out, the torque is off"
+        return f"{self.where(joint)}: its canTimeout ran out, so it went to mode reset, and the torque is off"
 
     def forget(self, restarts: bool = False) -> None:
         super().forget(restarts)

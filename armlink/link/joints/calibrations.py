@@ -58,14 +58,14 @@ class Calibrations:
         missing = [self.names[joint] for joint in hosted if found[joint] is None]
         if missing and not simulated:
             log.warning(
-                "%s: no calibration record is in force for %s: torque is as the drives report it",
+                "%s: no calibration record is in force for %s: their torques are used as the drives report them",
                 self.arm.name,
                 ", ".join(missing),
             )
         if len(missing) < len(hosted) and not self.arm.has_serial:
             log.warning(
-                "%s: its serial is %s: the calibration in force may be that of another arm of this name: give each its "
-                "own (serial: …), then calibrate its sweeps again",
+                "%s: its serial is %s, so the calibration in force may belong to another arm of this name: give "
+                "each arm a serial of its own (`serial: …`), then calibrate again from the sweeps of each arm",
                 self.arm.name,
                 self.arm.serial,
             )
@@ -122,8 +122,8 @@ class Calibrations:
             gain, offset = calibration.gain, calibration.offset
             if not (GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and abs(offset) < 1e4):
                 raise BadInput(
-                    f"{self.names[joint]}: gain {gain} and offset {offset} N·m: expected a gain of {GAIN_RANGE[0]} to "
-                    f"{GAIN_RANGE[1]} and a finite offset"
+                    f"{self.names[joint]}: gain {gain} and offset {offset} N·m: the gain must be {GAIN_RANGE[0]} "
+                    f"to {GAIN_RANGE[1]}, and the offset a finite number"
                 )
             self._in_host[joint] = calibration
             self._apply_host()

@@ -36,7 +36,9 @@ def make_groups(arm: ArmFile, bus: CanBus | None = None) -> tuple[Group, ...]:
         other = taken.setdefault((address, tag), joint.name)
         if other != joint.name:
             where = "one bus" if bus is None else bus.channel_info
-            raise BadInput(f"{other} and {joint.name} are both {address} on {where}: ids are unique on a bus")
+            raise BadInput(
+                f"{other} and {joint.name} both have {address} on {where}: give each joint an id of its own on a bus"
+            )
         found.setdefault((joint.settings.family, tag), []).append(place)
     groups = []
     for (name, tag), places in found.items():

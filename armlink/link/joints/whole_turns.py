@@ -55,22 +55,27 @@ class Misplacement:
         """The drive's error, and its remedy."""
         if not self.turns:
             return (
-                "no whole turn of its drive explains it: zero, direction, gear, the stops or the scale of the reading "
-                "are wrong: correct the arm file (check --scales hand judges the scale)"
+                "No number of whole turns of its drive explains this reading, so zero, direction, gear, the "
+                "stops or the scale of the reading are wrong: correct the arm file (`check --scales "
+                "hand` judges the scale)"
             )
-        zeros = [f"zero: {self.zero_after(turns)} ({_in_words(turns)})" for turns in self.turns]
+        zeros = [f"`zero: {self.zero_after(turns)}` ({_in_words(turns)})" for turns in self.turns]
         if len(self.turns) == 1:
-            automatic = "" if self.automatic else ", or turns: auto"
+            automatic = "" if self.automatic else " or `turns: auto`"
             return (
-                f"its drive has lost count of whole turns: set {zeros[0]} in its drive{automatic}, or power it again "
-                "in the turn that it was set up in"
+                f"Its drive has lost count of whole turns: write {zeros[0]}{automatic} in the `drive:` section "
+                "of this joint in the arm file, or turn the joint back to where its drive was set up and switch "
+                "the drive on again"
             )
         listed = " or ".join(zeros)
         if len(zeros) > MOST_NAMED:
-            ends = " to ".join(f"zero: {self.zero_after(turns)}" for turns in (min(self.turns), max(self.turns)))
-            listed = f"{zeros[0]} or another of {ends}, in steps of {TURN:.4f},"
-        chosen = ": turns: auto cannot choose" if self.automatic else ""
-        return f"several whole turns of its drive explain it{chosen}: find out which, and set {listed} in its drive"
+            ends = " to ".join(f"`zero: {self.zero_after(turns)}`" for turns in (min(self.turns), max(self.turns)))
+            listed = f"{zeros[0]} or another value of {ends}, in steps of {TURN:.4f},"
+        chosen = ", so `turns: auto` cannot choose" if self.automatic else ""
+        return (
+            f"Several numbers of whole turns of its drive explain this reading{chosen}: find out which number is "
+            f"right, and write {listed} in the `drive:` section of this joint in the arm file"
+        )
 
     @property
     def what(self) -> str:
@@ -78,7 +83,10 @@ class Misplacement:
         lower, upper = self.stops
         beyond = lower - self.reading if self.reading < lower else self.reading - upper
         stops = f"{lower:.4g} to {upper:.4g} rad"
-        return f"reads {self.reading:+.3f} rad, {beyond:.2f} rad beyond its stops ({stops}), where no joint can stand"
+        return (
+            f"reads {self.reading:+.3f} rad, which is {beyond:.2f} rad beyond its stops ({stops}), where no joint "
+            "can stand"
+        )
 
     def zero_after(self, turns: int) -> str:
         """The zero that differs by so many turns, as one writes it in the arm file."""
@@ -86,7 +94,7 @@ class Misplacement:
 
     def __str__(self) -> str:
         """One line for people."""
-        return f"{self.name}: {self.what}: {self.remedy}"
+        return f"{self.name}: {self.what}. {self.remedy}"
 
 
 class WholeTurns:
@@ -149,7 +157,7 @@ class WholeTurns:
         found = []
         for joint, (row, reading) in enumerate(zip(self._joints, positions, strict=True)):
             if joint in wrong:
-                told = f"{wrong[joint].what}: {wrong[joint].remedy}"
+                told = f"{wrong[joint].what}. {wrong[joint].remedy}"
                 found.append(Result(row.name, "position", "failed", told))
             elif math.isfinite(reading):
                 note = self.note(joint)
@@ -172,7 +180,7 @@ class WholeTurns:
         if stated == used:
             return ""
         turns = round((used - stated) / TURN)
-        return f"zero {used:.4f} is used in place of {stated:g}, {_in_words(turns)} (turns: auto)"
+        return f"zero {used:.4f} is used instead of {stated:g}, {_in_words(turns)} (`turns: auto`)"
 
 
 def _in_words(turns: int) -> str:
@@ -198,7 +206,7 @@ def positions_before_power(commander: "Commander", set_up: Sequence[float], sinc
         commander.stand([Power.STOPPED if each else Power.OFF for each in powered])
     else:
         names = ", ".join(commander.names[joint] for joint in outdated())
-        raise BusFault(f"{names}: no position came in {MOST_CYCLES} cycles: nothing gets power")
+        raise BusFault(f"{names}: no position was received in {MOST_CYCLES} cycles: no joint gets power")
     pairs = zip(loop.seen, loop.latest_position, set_up, strict=True)
     return [latest if seen > since and math.isfinite(latest) else first for seen, latest, first in pairs]
 
@@ -215,7 +223,7 @@ class PlaceWatch:
         try:
             self._turns = WholeTurns(arm, values, joint_ranges(arm))
         except BadInput as error:  # a model without ranges does not keep anybody from listening
-            log.info("%s: stops are not known, so that whole turns are not looked for: %s", arm.name, error)
+            log.info("%s: the stops are not known, so no joint is checked for lost whole turns: %s", arm.name, error)
         self._unseen = np.ones(values.gear.size, bool)
         """Joints that no position came from yet."""
 

@@ -63,8 +63,10 @@ def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path 
         opened.shutdown()
     text = rewired_text(arm, matches, bus_keys(bus, out, drives), out)
     parse_arm(parse_yaml(text, out), out)
-    title = f"{arm.name} with the drives on {channel}, from {model.name}, by the command new."
-    write_whole(out, yaml_comment(f"{title} Nodes, rated torques and identities are the drives' own.") + "\n" + text)
+    title = f"{arm.name} with the drives on {channel}: made from {model.name} by `armlink new`."
+    write_whole(
+        out, yaml_comment(f"{title} Nodes, rated torques and identities were read from the drives.") + "\n" + text
+    )
     told = addresses([match.drive for match in matches])
     return _tell(out, told, "check", arm.name, _matched(matches), findings, json_file)
 
@@ -88,7 +90,7 @@ def copy(model: Path, out: Path, bus: str, new_serial: bool, json_file: Path | N
     finally:
         opened.shutdown()
     write_whole(out, copied.text)
-    told = f"{', '.join(address for _, address, _ in copied.drives)} answer; limits are those of {model}"
+    told = f"{', '.join(address for _, address, _ in copied.drives)} answer; the limits are copied from {model}"
     joints = [{"name": name, "address": address, "serial": serial} for name, address, serial in copied.drives]
     return _tell(out, told, "doctor", arm.name, joints, copied.findings, json_file)
 

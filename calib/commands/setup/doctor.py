@@ -14,12 +14,12 @@ COLOURS = {"error": "red", "warning": "yellow", "hint": "cyan"}
 def doctor(
     arm: Arm,
     bus: OtherBus = None,
-    offline: Annotated[bool, typer.Option("--offline", help="Leave the bus alone.")] = False,
+    offline: Annotated[bool, typer.Option("--offline", help="Do not open the bus.")] = False,
     json_file: JsonFile = None,
 ) -> int:
     """Examine an arm file, its model, the sweeps that it allows, and the drives on its bus, which are only read.
 
-    Findings come in the order in which to deal with them; each names its remedy. Exit status 1 where there is an error.
+    Findings come in the order in which to deal with them; each names its remedy. Exit status 1 if there is an error.
 
     Example: armlink doctor sarcos --json -
     """
@@ -35,7 +35,7 @@ def doctor(
         console.print(str(found).replace(f"{Path.cwd()}/", ""))
     errors = sum(found.level == "error" for found in findings)
     if errors:
-        console.print(f"{errors} {'error' if errors == 1 else 'errors'} to deal with first")
+        console.print(f"{errors} {'error' if errors == 1 else 'errors'} to correct first")
     else:
         console.print("no errors")
         suggest(command_line("check", arm, bus=bus))

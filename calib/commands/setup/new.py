@@ -16,69 +16,75 @@ def new(
     model: Annotated[
         Path | None,
         typer.Argument(
-            help="URDF or MJCF model; with --bus also an arm file, or nothing: the drives alone.",
+            help="URDF or MJCF model of the arm. With --bus: a model, an arm file, or nothing (the drives alone).",
             metavar="MODEL_OR_ARM",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Arm file to write; default: the model's name with .yaml, here; arm.yaml without one."),
+        typer.Option(
+            help="Arm file to write; by default named like the model, in this folder (arm.yaml without a model)."
+        ),
     ] = None,
     base: Annotated[
         str | None,
-        typer.Option(help="Body that carries the arm, such as a torso; default: the world.", rich_help_panel="Model"),
+        typer.Option(help="Body that carries the arm, such as a torso; by default the world.", rich_help_panel="Model"),
     ] = None,
     tip: Annotated[
         str | None,
-        typer.Option(help="Body that the arm ends in; default: the end of the longest chain.", rich_help_panel="Model"),
+        typer.Option(help="Last body of the arm; by default the end of the longest chain.", rich_help_panel="Model"),
     ] = None,
     stops: Annotated[
         list[str] | None,
         typer.Option(
-            help="JOINT:LOWER:UPPER [rad], instead of the model's limits; may be repeated.", rich_help_panel="Model"
+            help="JOINT:LOWER:UPPER [rad], instead of the limits of the model; may be repeated.",
+            rich_help_panel="Model",
         ),
     ] = None,
     rated_torque: Annotated[
         list[str] | None,
         typer.Option(
-            help="JOINT:TORQUE [N·m], instead of the model's effort limit; may be repeated.", rich_help_panel="Model"
+            help="JOINT:TORQUE [N·m], instead of the effort limit of the model; may be repeated.",
+            rich_help_panel="Model",
         ),
     ] = None,
     lock: Annotated[
         list[str] | None,
         typer.Option(
-            help="JOINT:POSITION [rad, m]: held by other means than these drives, such as a lift; default position 0;"
-            " may be repeated.",
+            help="JOINT:POSITION [rad, m]: a joint that these drives do not move, such as a lift; default "
+            "position 0; may be repeated.",
             rich_help_panel="Model",
         ),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the arm; default: the model's.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the arm; by default the name of the model.")] = None,
     bus: Annotated[
         str | None,
         typer.Option(
-            help="INTERFACE:CHANNEL[@BITRATE]: find the drives there, and write them down.",
+            help="INTERFACE:CHANNEL[@BITRATE]: find the drives on this bus and write them to the arm file.",
             rich_help_panel="Drives on a bus",
         ),
     ] = None,
     by_hand: Annotated[
         bool | None,
         typer.Option(
-            help="With --bus: find each joint's drive, direction and gear by turning the joint by hand, without power;"
-            " else the drives are taken in the order of their node ids. Default: ask.",
+            help="With --bus: find each joint's drive, direction and gear by turning the joint by hand, without "
+            "power; with --no-by-hand, take the drives in the order of their node ids. By default the "
+            "command asks.",
             show_default=False,
             rich_help_panel="Drives on a bus",
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     json_file: JsonFile = None,
 ) -> int:
     """Write an arm file that demo, sweep and check take as it is.
 
-    The arm is the longest chain of revolute joints; gripper, mimic and prismatic joints at its end are set aside, as
-    are those that carry --base or that --lock names. Limits and torques are the model's. What the model does not state
-    is asked on a terminal, else assumed; every assumed value says so in a comment. Drives on the bus are only read.
-    Exit status 1 where a joint turns the other way or has another gear than the model. Without a model, the drives on
-    --bus make an arm file of which only the geometry is missing: enough to check, monitor and record.
+    The arm is the longest chain of revolute joints. Gripper, mimic and prismatic joints at its end are not part of it,
+    nor are joints that carry --base or that --lock names. Limits and torques are taken from the model. What the model
+    does not state is asked on a terminal, or else assumed; a comment marks every assumed value. Drives on the bus are
+    only read. Exit status 1 if a joint turns in the other direction or has another gear than the model. Without a
+    model, the arm file is made from the drives on --bus; only its geometry is missing, so it is enough for check,
+    monitor and record.
 
     Example: armlink new arm.urdf --out arm.yaml
     """
@@ -102,15 +108,16 @@ def new(
     console = PlainConsole()
     interactive = sys.stdin is not None and sys.stdin.isatty()
     if bus is None and by_hand:
-        raise BadInput("--by-hand: needs --bus, on which the drives are")
+        raise BadInput("--by-hand needs --bus, the bus of the drives")
     if model is None:
         if bus is None:
             raise BadInput(
-                "new: give a URDF or MJCF model of the arm, or --bus INTERFACE:CHANNEL to begin with its drives"
+                "new: give a URDF or MJCF model of the arm, or `--bus INTERFACE:CHANNEL` to begin with the drives alone"
             )
         if base or tip or stops or rated_torque or lock:
             raise BadInput(
-                "--base, --tip, --stops, --rated-torque and --lock are for a model: give one, or change the arm file"
+                "--base, --tip, --stops, --rated-torque and --lock belong to a model: give a model, or "
+                "change the arm file afterwards"
             )
         out = out or Path("arm.yaml")
         _require_free(out, force, interactive)
@@ -118,10 +125,12 @@ def new(
     bundled = bundled_arms().get(str(model))
     is_arm_file = bundled is not None or model.suffix.lower() in (".yaml", ".yml")
     if is_arm_file and bus is None:
-        raise BadInput(f"{model}: is an arm file already: give --bus to find its drives, or armlink doctor {model}")
+        raise BadInput(
+            f"{model} is an arm file already: give --bus to find its drives, or check it with `armlink doctor {model}`"
+        )
     if is_arm_file and (base or tip or stops or rated_torque or lock or name):
         options = "--base, --tip, --stops, --rated-torque, --lock and --name"
-        raise BadInput(f"{model}: {options} are for a model: change the arm file itself")
+        raise BadInput(f"{model}: {options} belong to a model: change the arm file itself")
     is_xacro = model.suffix.lower() == ".xacro"
     if not is_arm_file and not is_xacro and model.suffix.lower() not in MODEL_SUFFIXES:
         suffixes = ", ".join((*MODEL_SUFFIXES, ".xacro"))
@@ -178,7 +187,7 @@ def _require_free(out: Path, force: bool, interactive: bool) -> None:
     if not out.exists() or force:
         return
     if not interactive:
-        raise BadInput(f"{out}: exists already: choose another --out, or --force to replace it")
+        raise BadInput(f"{out} exists already: choose another `--out`, or give `--force` to replace the file")
     confirm(f"{out} exists. Replace it?")
 
 
@@ -191,18 +200,20 @@ def _show(console: Any, made: "NewArm") -> None:
     ends = "stops [rad]" if draft.servo is None else "range [rad]"
     table = Table("joint", "node", ends, "rated [N·m]", "largest [N·m]", title=f"{draft.name}: {made.out}")
     for joint in draft.joints:
-        stops = "the model's" if joint.stops is None else f"{joint.stops[0]:+.2f} {joint.stops[1]:+.2f}"
+        stops = "from the model" if joint.stops is None else f"{joint.stops[0]:+.2f} {joint.stops[1]:+.2f}"
         table.add_row(joint.name, str(joint.node), stops, f"{joint.rated_torque:g}", f"{joint.max_torque:g}")
     console.print(table)
     for name, why in draft.aside:
-        console.print(f"{name} {why}: set aside")
+        console.print(f"joint {name} {why}, so it is not part of the arm")
     for note in draft.notes:
         console.print(note, style="yellow")
     if draft.servo is not None:
-        console.print(f"resting joints are held by their servos: {draft.servo}", style="yellow")
+        console.print(f"joints at rest are held by their position loops: {draft.servo}", style="yellow")
     for found in made.findings:
         console.print(str(found), style="red" if found.level == "error" else "yellow")
-    console.print(f"{made.out} written; {len(assumed_lines(made.text))} values are assumed, each says so in the file")
+    console.print(
+        f"{made.out} is written; {len(assumed_lines(made.text))} values are assumed, each is marked in the file"
+    )
 
 
 def _answer(made: "NewArm", step: str) -> dict[str, Any]:

@@ -64,12 +64,14 @@ def parse_locks(texts: Sequence[str]) -> dict[str, float]:
 def hand(by_hand: bool | None, interactive: bool) -> "Ask | None":
     """How a person is asked to turn a joint; None where drives are taken in order. Raises BadInput."""
     if by_hand and not interactive:
-        raise BadInput("--by-hand: nobody to ask: run it on a terminal, or leave it out")
+        raise BadInput(
+            "--by-hand: there is no terminal to ask on: run the command on a terminal, or leave `--by-hand` out"
+        )
     if by_hand is None and interactive:
         by_hand = confirm("Find each joint's drive by turning the joint by hand?", abort=False, default=True)
     if not by_hand:
         return None
-    PlainConsole().print("The drives must have no power at the motors: release the brakes, and hold the arm.")
+    PlainConsole().print("The motors must have no power: release the brakes, and hold the arm.")
     return lambda text: ask(f"{text}, then press Enter", default="", show_default=False)
 
 
@@ -80,7 +82,7 @@ class Terminal:
     def which(self, chains: "Sequence[Chain]") -> "Chain":
         for number, chain in enumerate(chains, start=1):
             names = ", ".join(joint.name for joint in chain.joints)
-            self._console.print(f"{number}: ends in {chain.tip}: {names}")
+            self._console.print(f"{number}: the arm that ends in {chain.tip}, with the joints {names}")
         numbered = {str(number): chain for number, chain in enumerate(chains, start=1)}
 
         def chosen(text: str) -> "Chain":
@@ -88,7 +90,7 @@ class Terminal:
                 raise BadParameter(f"{text}: expected a number from 1 to {len(chains)}")
             return numbered[text.strip()]
 
-        answer: Chain = ask("The model has several arms. Which one?", default="1", value_proc=chosen)
+        answer: Chain = ask("The model has several arms. Which arm?", default="1", value_proc=chosen)
         return answer
 
     def stops(self, joint: str) -> tuple[float, float] | None:

@@ -59,7 +59,7 @@ class ActiveRecords:
         waited = self._environment.monotonic() - self._looked if self._looking else 0.0
         if self._store_fault or waited <= RECORDS_SECONDS:
             return self._store_fault
-        return f"record store {self._store.url}: has not answered for {waited:.0f} s"
+        return f"record store {self._store.url} has not answered for {waited:.0f} s"
 
     def tick(self) -> None:
         """Look at the record store when it is time."""
@@ -112,7 +112,7 @@ class ActiveRecords:
     def _store_failed(self, fault: StoreFault) -> None:
         self._looked = self._environment.monotonic() - RECORDS_SECONDS + STORE_SECONDS
         if not self._store_fault:
-            kept = "" if self.observation is None else "; the records in force are kept"
+            kept = "" if self.observation is None else "; the records in force stay in force"
             self._events.say("fault", None, f"{fault}{kept}", {})
         self._store_fault = str(fault)
 
@@ -137,7 +137,7 @@ class ActiveRecords:
         if before is not None:
             evidence = {"calibration": calibration.id, "gravity": gravity.id}
             self._events.say(
-                "configuration", None, "other records are in force now, and the observer uses them", evidence
+                "configuration", None, "other records are now in force, and the observer uses them", evidence
             )
         self._check_controllers()
 
@@ -188,11 +188,11 @@ class ActiveRecords:
 
         def done(outcome: tuple[bool, Held] | ArmlinkError) -> None:
             if isinstance(outcome, ArmlinkError):
-                self._events.say("fault", None, f"the controllers could not be read: {outcome}", {})
+                self._events.say("fault", None, f"the calibration in the drives could not be read: {outcome}", {})
                 return
             undone, self._held = outcome
             if undone:
-                self._events.say("roll-back", None, "an interrupted write to the controllers was undone", {})
+                self._events.say("roll-back", None, "an interrupted write to the drives was undone", {})
             self._compare()
 
         self._jobs.start(work, done)
@@ -207,23 +207,23 @@ class ActiveRecords:
         if not differ:
             return
         if self._configuration.settings.policy != "apply" or self._configuration.listen_only:
-            text = f"{', '.join(differ)}: the controllers hold another calibration than record {record.id}"
+            text = f"{', '.join(differ)}: the drives hold another calibration than record {record.id}"
             write = f"armlink rollback {self._configuration.arm.argument} --to {record.id} --apply"
-            text += f"; readings are converted; it is written by {write}"
+            text += f"; the daemon converts their readings; to write the record: {write}"
             self._events.say("configuration", None, text, {"record": record.id, "joints": differ})
             return
 
         def done(outcome: tuple[str, ...] | ArmlinkError) -> None:
             if isinstance(outcome, ArmlinkError):
                 gate = {"gate": outcome.refusal.name} if isinstance(outcome, GateRefused) else {}
-                text = f"record {record.id} is not written: {outcome}"
+                text = f"record {record.id} was not written: {outcome}"
                 self._events.say("refused", None, text, {"record": record.id, "joints": differ, **gate})
                 return
             feed.controllers_hold(None)
             self._arm_state.calibrated(outcome)
             recalibrations.restored(outcome)
             evidence = {"record": record.id, "joints": differ, "applied": True, "restored": True}
-            text = f"record {record.id} written again to {', '.join(outcome)}"
+            text = f"record {record.id} was written again to {', '.join(outcome)}"
             self._events.say("recalibration", None, text, evidence)
 
         self._jobs.start(recalibrations.restore, done)

@@ -145,14 +145,14 @@ class DailyDiagnosis:
         if self._process.poll() is None:
             if now - self._begun > LONGEST:
                 self.close()
-                self._failed(f"took longer than {LONGEST / 60:.0f} min")
+                self._failed(f"it took longer than {LONGEST / 60:.0f} min")
             return
         process, self._process = self._process, None
         said = process.communicate()[1].strip().splitlines()
         try:
             answer = json.loads((self._directory / FOUND).read_text())
         except (OSError, ValueError):
-            self._failed(said[-1].removeprefix("armlink: ") if said else f"ended with status {process.returncode}")
+            self._failed(said[-1].removeprefix("armlink: ") if said else f"it ended with status {process.returncode}")
             return
         self._tell(answer)
         (self._directory / FOUND).replace(self._directory / TOLD)
@@ -178,7 +178,7 @@ class DailyDiagnosis:
     def _failed(self, why: str) -> None:
         """Say why there is no diagnosis, once for the same reason."""
         if why != self._failure:
-            self._told.append(("diagnosis", None, f"no diagnosis of the day: {why}", {}))
+            self._told.append(("diagnosis", None, f"there is no diagnosis of the day: {why}", {}))
         self._failure = why
 
 

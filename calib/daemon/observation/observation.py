@@ -210,4 +210,4 @@ class ActiveObservation:
             if event.finding is not None:
                 self.recalibrations.found(event.finding)
             elif event.kind == "undecided":
-                self._more_poses("observation alone cannot decide")
+                self._more_poses("the readings so far cannot decide on the cause")

@@ -43,7 +43,7 @@ class PoseTours:
         state = self._state()
         if self._configuration.listen_only or state is not State.OBSERVING:
             reason = "the daemon only listens" if self._configuration.listen_only else f"the daemon is {state}"
-            self._events.say("refused", None, f"no sweep ({why}): {reason}", {})
+            self._events.say("refused", None, f"the sweep ({why}) was not begun: {reason}", {})
             return
         self.progress, self._last = Progress(0, TOUR_POSES), self._environment.monotonic()
         self._events.say("sweep", None, f"sweeping {TOUR_POSES} poses: {why}", {"poses": TOUR_POSES})

@@ -117,7 +117,10 @@ class RecalibrationWorkflow:
             std = dict(zip(("gain_std", "offset_std"), finding.std, strict=True))
             named = {"proposal": record.number, "record": record.id}
             evidence = {**named, "gain": finding.gain, "offset": finding.offset, **std}
-            text = f"{joint}: record {record.id} proposed: gain {outcome.gain:.5f}, offset {outcome.offset:.3f} N·m"
+            text = (
+                f"{joint}: record {record.id} is proposed with gain {outcome.gain:.5f} and offset "
+                f"{outcome.offset:.3f} N·m"
+            )
             self._events.say("proposal", joint, text, evidence)
             if automatic:
                 self._journal.once_kept(lambda: self._write_automatically(added))
@@ -129,23 +132,25 @@ class RecalibrationWorkflow:
         joint, evidence = row.joint, {"proposal": row.number}
         limit = self._limit(joint)
         if limit:
-            self._events.say("undecided", joint, f"{joint}: not written automatically: {limit}", evidence)
+            self._events.say(
+                "undecided", joint, f"{joint}: the proposal was not written automatically: {limit}", evidence
+            )
             return
         try:
             self._write(row, APPLIED_BY)
         except NotPossible as error:
-            self._events.say("refused", joint, f"not recalibrated: {error}", evidence)
+            self._events.say("refused", joint, f"the joint was not recalibrated: {error}", evidence)
 
     def _limit(self, joint: str) -> str:
         """The rate limit that forbids a write now, empty if none does; by the monotonic clock, over restarts too."""
         settings, now = self._configuration.settings, self._monotonic()
         ages = [(name, now - t) for name, t in self._written]
         if any(name == joint and age < settings.rest_between_writes for name, age in ages):
-            return f"at most one recalibration of a joint in {settings.rest_between_writes:g} s"
+            return f"a joint may be recalibrated only once in {settings.rest_between_writes:g} s"
         if sum(age < DAY for _, age in ages) >= settings.writes_per_day:
-            return f"{settings.writes_per_day} recalibrations within a day are the limit"
+            return f"only {settings.writes_per_day} recalibrations are allowed within a day"
         if any(name is None and age < DAY for name, age in ages):
-            return "a damaged journal was set aside within a day: what was written before is not known"
+            return "a damaged journal was set aside less than a day ago, so it is not known what was written before"
         return ""
 
     # ---- what a person decides
@@ -170,7 +175,7 @@ class RecalibrationWorkflow:
             raise NotPossible("another recalibration is under way: try again in a moment")
         current = recalibrator.record.id
         if row.base != current:
-            raise NotPossible(f"proposal {number} follows from record {row.base}, but {current} is in force now")
+            raise NotPossible(f"proposal {number} follows from record {row.base}, but record {current} is in force now")
 
         def approved() -> None:
             self._approved.append((row, by))
@@ -187,7 +192,9 @@ class RecalibrationWorkflow:
         def kept() -> None:
             found = self._journal.proposal(row.id)
             if found is None or found.record != row.record:
-                answer.set_exception(NoSuch(f"no proposal {row.number}: the journal was damaged and begun anew"))
+                answer.set_exception(
+                    NoSuch(f"there is no proposal {row.number} any more: the journal was damaged and begun anew")
+                )
                 return
             then()
             answer.set_result(self._named(row.number).answer())
@@ -240,9 +247,9 @@ class RecalibrationWorkflow:
 
     def _require_pending(self, row: ProposalRow) -> None:
         if row.state != "pending":
-            raise NotPossible(f"proposal {row.number} is {row.state} already")
+            raise NotPossible(f"proposal {row.number} is already {row.state}")
         if row.id in self._journal.deciding:
-            raise NotPossible(f"proposal {row.number} is decided already; the decision waits for the disk")
+            raise NotPossible(f"proposal {row.number} is already decided; the decision waits for the disk")
 
     # ---- after a write
 
@@ -263,7 +270,7 @@ class RecalibrationWorkflow:
         self._checking = (row.joint,)
         joint = record.joints[row.finding.joint]
         gain = "as before" if joint.gain is None else f"{joint.gain:.5f}"
-        text = f"{row.joint}: record {record.id} in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
+        text = f"{row.joint}: record {record.id} is in force: gain {gain}, offset {joint.offset or 0.0:.3f} N·m"
         evidence = {"proposal": row.number, "record": record.id, "replaces": row.base, "by": by, "applied": True}
         self._decided(row, "applied", by)
         self._events.say("recalibration", row.joint, text, evidence)
@@ -311,7 +318,7 @@ class RecalibrationWorkflow:
             return
         joint = self._names[checked.joint]
         why = checked.why.removeprefix(f"{joint}: ")
-        self._events.say("check", joint, f"{joint}: recalibration confirmed: {why}", {"kept": True})
+        self._events.say("check", joint, f"{joint}: the recalibration is confirmed: {why}", {"kept": True})
 
     def _take_back(self, checked: Checked) -> None:
         """Roll the last write back; where store or bus fail, again later."""
@@ -323,7 +330,7 @@ class RecalibrationWorkflow:
                 if not isinstance(outcome, StoreFault | BusFault):
                     self._worse = None
                 if not again or self._worse is None:
-                    self._events.say("refused", joint, f"{joint}: roll-back failed: {outcome}", {})
+                    self._events.say("refused", joint, f"{joint}: the roll-back failed: {outcome}", {})
             else:
                 self._worse = None
                 self._forget(checked.joint)
@@ -364,7 +371,7 @@ class RecalibrationWorkflow:
         joint = self._names[finding.joint]
         kind = "refused" if isinstance(error, Refused) else "fault"
         evidence = {} if number is None else {"proposal": number}
-        self._events.say(kind, joint, f"not recalibrated: {error}", evidence)
+        self._events.say(kind, joint, f"the joint was not recalibrated: {error}", evidence)
 
     def _active(self) -> Recalibrator:
         if self._recalibrator is None:
@@ -375,9 +382,11 @@ class RecalibrationWorkflow:
         """The proposal of that number; raises NoSuch, and NotPossible where it is not the one of that digest."""
         row = self._journal.proposal_numbered(number)
         if row is None:
-            raise NoSuch(f"no proposal {number}: /api/proposals lists the present ones")
+            raise NoSuch(f"there is no proposal {number}: /api/proposals lists the present proposals")
         if digest is not None and digest != row.digest:
-            raise NotPossible(f"proposal {number} is not that of hash {digest[:12]}…: look at it again, then decide")
+            raise NotPossible(
+                f"proposal {number} does not have the hash {digest[:12]}…: look at the proposal again, then decide"
+            )
         return row
 
 

@@ -49,7 +49,7 @@ class ArmState:
         late = self.late if self.connected else 0.0
         ages = [float(age) + late for age in self.batch.age]
         worst = max(range(len(ages)), key=ages.__getitem__)
-        return f"{self._names[worst]}: no reading for {ages[worst]:.1f} s" if ages[worst] > STALE else ""
+        return f"{self._names[worst]}: no reading has come for {ages[worst]:.1f} s" if ages[worst] > STALE else ""
 
     def heard(self, batch: Batch) -> None:
         """Take samples and the emergencies among them."""

@@ -115,16 +115,22 @@ Description = tuple[str, str, dict[str, Any]]
 """(kind, text, evidence)"""
 
 _EFFECTS = {
-    "friction": "friction appears in the sensor's readings",
+    "friction": "the sensor now reads friction as well",
     "spring": "a spring (cable, hose) pulls at the joint",
     "slip": "the position reading has slipped",
     "tilt": "the base has tilted",
     "scale": "all torques changed by one factor: gravity, supply voltage, or a common scale",
-    "temperature": "several sensors' zeros moved together: temperature or supply voltage",
+    "temperature": "the zeros of several sensors moved together: temperature or supply voltage",
 }
 _OF_MOTORS = {
-    "gain": ("drift", "its drive reads {change:+.1%} ± {std:.1%} torque: measure its torque constant by creep sweeps"),
-    "offset": ("drift", "its drive reads {change:+.3f} ± {std:.3f} N·m at no torque: measure it by creep sweeps"),
+    "gain": (
+        "drift",
+        "its drive reads {change:+.1%} ± {std:.1%} more torque: measure its torque constant with creep sweeps",
+    ),
+    "offset": (
+        "drift",
+        "its drive reads {change:+.3f} ± {std:.3f} N·m where there is no torque: measure this offset with creep sweeps",
+    ),
     "friction": ("effect", "its friction has changed by {change:+.0%} ± {std:.0%}"),
 }
 """Cause → kind and text, where torque is a motor current."""
@@ -138,9 +144,13 @@ def describe(event: Event) -> Description:
     if event.kind == "outliers":
         return "alarm", f"{joint}: {evidence.get('rows', 'several')} readings in a row are far from the model", evidence
     if event.kind == "undecided":
-        return "undecided", f"{joint}: nothing changed: {'; '.join(evidence.get('reasons', []))}", evidence
+        return (
+            "undecided",
+            f"{joint}: the calibration was not changed: {'; '.join(evidence.get('reasons', []))}",
+            evidence,
+        )
     if event.kind == "proposal":
-        return "drift", f"{joint}: sensor drift confirmed: {_change(evidence)}", evidence
+        return "drift", f"{joint}: a drift of the sensor is confirmed: {_change(evidence)}", evidence
     return _verdict(joint, evidence)
 
 
@@ -167,30 +177,38 @@ def _verdict(joint: str, evidence: dict[str, Any]) -> Description:
         return kind, f"{joint}: {text.format(change=change, std=2 * std)}; {sure}", evidence
     if cause in DRIFT:
         beside = f", and {evidence['beside']}" if "beside" in evidence else ""
-        return "drift", f"{joint}{beside}: the torque sensor drifts ({cause}); {sure}; not written yet", evidence
+        return (
+            "drift",
+            f"{joint}{beside}: the torque sensor drifts ({cause}); {sure}; nothing was written yet",
+            evidence,
+        )
     if cause == "none":
-        return "clear", "sensors and model agree again: the cause is gone (a collision, a contact, a load)", evidence
+        return "clear", "sensors and model agree again, so the cause is gone (a collision, a contact, a load)", evidence
     if cause in ("payload", "tool"):
         return "payload", f"{_load(cause, evidence)}; {sure}", evidence
     if cause == "ambiguous":
-        return "undecided", f"cause still ambiguous: {', '.join(evidence['rivals'])}; {sure}", evidence
+        return "undecided", f"the cause is still ambiguous: {', '.join(evidence['rivals'])}; {sure}", evidence
     if cause == "unknown":
         return (
             "contact",
-            "contact, or several effects at once: no single cause explains the readings; estimates are held",
+            "contact, or several effects at once: no single cause explains the readings; estimates are paused",
             evidence,
         )
-    return "effect", f"{joint}: {_EFFECTS.get(cause, cause)}; {sure}; estimates are held", evidence
+    return "effect", f"{joint}: {_EFFECTS.get(cause, cause)}; {sure}; estimates are paused", evidence
 
 
 def _load(cause: str, evidence: dict[str, Any]) -> str:
     mass, place = evidence["mass"], ", ".join("?" if x is None else f"{x:.3f}" for x in evidence["com"])
-    held = "estimates are held" if cause == "payload" else "it stays: a tool, part of the model from now on"
+    held = (
+        "estimates are paused"
+        if cause == "payload"
+        else "the load stays, so it counts as a tool and is part of the model from now on"
+    )
     if mass is None:
-        return f"payload of unknown mass, since no lever between the axes shows it; {held}"
+        return f"payload of unknown mass, since the levers between the axes do not show its mass; {held}"
     if mass < 0:
-        return f"{-mass:.3f} kg removed at ({place}) m in the last link's frame"
-    return f"payload of {mass:.3f} kg at ({place}) m in the last link's frame; {held}"
+        return f"{-mass:.3f} kg were removed at ({place}) m in the frame of the last link"
+    return f"payload of {mass:.3f} kg at ({place}) m in the frame of the last link; {held}"
 
 
 def _change(evidence: dict[str, Any]) -> str:

@@ -142,7 +142,7 @@ class Journal:
         if waited > SILENT_SECONDS:
             return f"the journal cannot be written: the disk has not answered for {waited:.0f} s"
         if self._took > SILENT_SECONDS:
-            return f"the journal can hardly be written: the disk took {self._took:.0f} s for the last write"
+            return f"the journal can hardly be written, since the disk took {self._took:.0f} s for the last write"
         return ""
 
     def require_writable(self) -> None:
@@ -203,7 +203,10 @@ class Journal:
             raise sqlite3.DatabaseError(f"malformed: {found}")
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
         if version not in (0, SCHEMA):
-            raise BadInput(f"{path}: journal of schema {version}, this program has {SCHEMA}: use its own version")
+            raise BadInput(
+                f"{path}: the journal has schema {version}, but this program writes schema {SCHEMA}: use the "
+                "version of armlink that wrote the journal"
+            )
         with self._committed():
             for statement in filter(str.strip, _TABLES.split(";")):
                 self._db.execute(statement)
@@ -357,7 +360,7 @@ class Journal:
     def _committed_or_not(self, outcome: tuple[int, sqlite3.Error | None] | Exception) -> None:
         if isinstance(outcome, sqlite3.IntegrityError):
             if self._refused:
-                log.error("journal: %s: not kept: %s", outcome, self._queue.popleft().statements)
+                log.error("journal: %s was not saved: %s", outcome, self._queue.popleft().statements)
             self._refused = not self._refused
             self._write_on()
             return
@@ -438,7 +441,7 @@ class Journal:
         with self.transaction():
             for earlier in self.proposals():
                 if earlier.joint == joint and earlier.state == "pending":
-                    self.decide(earlier.id, time, "superseded", "daemon", "a newer proposal")
+                    self.decide(earlier.id, time, "superseded", "daemon", "replaced by a newer proposal")
             self._write(statement, number, *values, proposal=number)
         return number
 

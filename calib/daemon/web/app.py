@@ -20,7 +20,11 @@ from calib.daemon.web.page import PageFile, page_files
 from calib.daemon.web.routes import ERRORS, api_router
 from calib.daemon.web.stream import Streams
 
-TOKEN = {"type": "http", "scheme": "bearer", "description": "TCP only; the Unix socket's file mode controls access"}
+TOKEN = {
+    "type": "http",
+    "scheme": "bearer",
+    "description": "Needed for TCP only; access to the Unix socket follows from its file mode",
+}
 
 
 class Described(FastAPI):
@@ -48,7 +52,10 @@ def _reference(name: str) -> dict[str, str]:
     return {"$ref": f"#/components/schemas/{name}"}
 
 
-PURPOSE = "Shows the observed state of an arm; decides on proposed recalibrations. Commands neither torque nor motion."
+PURPOSE = (
+    "This API shows the observed state of an arm, and lets a person approve or reject proposed recalibrations. "
+    "It can command neither torque nor motion."
+)
 
 _log = logging.getLogger(__name__)
 
@@ -110,7 +117,7 @@ async def _bad_parameter(_: Request, error: Exception) -> Response:
     if first["type"] == "json_invalid":
         return JSONResponse({"error": "the body is not JSON"}, 422)
     if first["type"] == "extra_forbidden":
-        return JSONResponse({"error": f"{where[:80]}: there is no parameter of that name"}, 422)
+        return JSONResponse({"error": f"{where[:80]}: there is no parameter of this name"}, 422)
     given = "" if first["type"] == "missing" else f" (got {str(first.get('input'))[:80]!r})"
     return JSONResponse({"error": f"{where}: {first['msg'].removeprefix('Value error, ')}{given}"}, 422)
 
@@ -123,4 +130,4 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 async def _unexpected(request: Request, error: Exception) -> Response:
     _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return JSONResponse({"error": "internal error; the daemon's log says why"}, 500)
+    return JSONResponse({"error": "internal error; see the log of the daemon"}, 500)

@@ -124,7 +124,7 @@ class RequestGuard:
         headers = _headers(scope)
         line = len(scope.get("raw_path", b"")) + len(scope["query_string"])
         if line + sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_LIMIT:
-            raise Denied(431, f"request line and headers may have {HEAD_LIMIT} bytes", {"connection": "close"})
+            raise Denied(431, f"request line and headers may have at most {HEAD_LIMIT} bytes", {"connection": "close"})
         if peer.tcp and (wait := self._requests.take(peer.address, self.access.now())):
             raise Denied(429, f"too many requests: wait {math.ceil(wait)} s", {"retry-after": str(math.ceil(wait))})
         host = _host_name(headers.get("host", ""))
@@ -133,7 +133,7 @@ class RequestGuard:
         if scope["method"] not in SAFE_METHODS:
             origin = headers.get("origin")
             if origin is not None and origin.partition("://")[2].lower() != headers.get("host", "").lower():
-                raise Denied(403, f"a page of {origin[:100]!r} may not decide anything here")
+                raise Denied(403, f"a page of {origin[:100]!r} may not decide anything on this daemon")
         if peer.tcp and scope["path"] not in self.access.open_paths:
             self._check_token(headers.get("authorization", ""), peer)
             if peer.connection is not None and not peer.connection.trust():
@@ -157,7 +157,7 @@ class RequestGuard:
         if wait := self._wrong.take(peer.address, self.access.now()):
             retry = {"retry-after": str(math.ceil(wait))}
             raise Denied(429, f"too many wrong tokens from {peer.address}: wait {math.ceil(wait)} s", retry)
-        raise Denied(401, "the token is wrong: it is in the file given as --token-file", challenge)
+        raise Denied(401, "the token is wrong: the right token is in the file given as --token-file", challenge)
 
 
 def names_of_host(host: str) -> frozenset[str]:
@@ -194,7 +194,7 @@ def _has_body(headers: dict[str, str]) -> bool:
 
 async def _read_body(headers: dict[str, str], receive: Receive) -> bytes:
     """The whole body; raises Denied if it is too large or too slow."""
-    too_large = Denied(413, f"a request's body may have {BODY_LIMIT} bytes")
+    too_large = Denied(413, f"the body of a request may have at most {BODY_LIMIT} bytes")
     length = headers.get("content-length", "0")
     if not length.isdigit() or int(length[:20]) > BODY_LIMIT:
         raise too_large
@@ -206,14 +206,14 @@ async def _read_body(headers: dict[str, str], receive: Receive) -> bytes:
             while True:
                 message = await receive()
                 if message["type"] == "http.disconnect":
-                    raise Denied(400, "the connection ended within the body")
+                    raise Denied(400, "the connection ended before the end of the body")
                 body += bytes(message.get("body", b""))
                 if len(body) > BODY_LIMIT:
                     raise too_large
                 if not message.get("more_body", False):
                     return body
     except TimeoutError:
-        raise Denied(408, f"the body did not come within {PATIENCE_SECONDS:.0f} s") from None
+        raise Denied(408, f"the body was not received within {PATIENCE_SECONDS:.0f} s") from None
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:

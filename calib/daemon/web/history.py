@@ -80,7 +80,7 @@ class Histories:
     def _enter(self, owner: str) -> None:
         self._under_way = +self._under_way
         if self._under_way.total() >= MOST_ANSWERS or self._under_way[owner] >= MOST_OF_AN_OWNER:
-            raise TooMany(f"{self._under_way.total()} long answers are under way already: ask again in a moment")
+            raise TooMany(f"{self._under_way.total()} long answers are already under way: ask again in a moment")
         self._under_way[owner] += 1
 
 

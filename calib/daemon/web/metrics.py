@@ -22,18 +22,18 @@ BUS_COUNTERS = (
 )
 JOINT = (
     ("position", "joint_position_radians", "Position sensor."),
-    ("torque", "joint_torque_newton_metres", "Torque sensor as the controller calibrates it."),
+    ("torque", "joint_torque_newton_metres", "Torque sensor reading, as the drive calibrates it."),
     ("model_torque", "joint_model_torque_newton_metres", "Gravity model at this position."),
     ("residual", "joint_residual_newton_metres", "Torque minus model torque; meaningful at rest."),
-    ("temperature", "joint_temperature_celsius", "Of the drive, if it reports one."),
+    ("temperature", "joint_temperature_celsius", "Temperature of the drive, if it reports one."),
     ("sample_age_s", "joint_sample_age_seconds", "Time since position and torque last arrived."),
 )
 ESTIMATE = (
-    ("gain", "sensor_gain_ratio", "Gain against the record in force; 1 is no change."),
+    ("gain", "sensor_gain_ratio", "Gain relative to the record in force; 1 is no change."),
     ("gain_std", "sensor_gain_std_ratio", "Standard deviation of the gain."),
-    ("offset", "sensor_offset_newton_metres", "Offset against the record in force; 0 is no change."),
+    ("offset", "sensor_offset_newton_metres", "Offset relative to the record in force; 0 is no change."),
     ("offset_std", "sensor_offset_std_newton_metres", "Standard deviation of the offset."),
-    ("samples", "sensor_rests", "Rests of the arm used for the estimate."),
+    ("samples", "sensor_rests", "Number of rests of the arm used for the estimate."),
 )
 
 
@@ -50,7 +50,9 @@ class DaemonCollector(Collector):
         yield from _of_joints(ESTIMATE, self._view.estimates())
         yield GaugeMetricFamily(PREFIX + "stream_clients", "Present clients of the stream.", self._streams.clients)
         yield CounterMetricFamily(
-            PREFIX + "stream_cut_off", "Clients of the stream cut off because they did not read.", self._streams.cut_off
+            PREFIX + "stream_cut_off",
+            "Clients of the stream that were cut off because they did not read.",
+            self._streams.cut_off,
         )
 
 
@@ -76,11 +78,15 @@ def _of_status(status: Status) -> Iterable[Metric]:
     for key, name, text in BUS_COUNTERS:
         yield CounterMetricFamily(PREFIX + name, text, getattr(status.bus, key))
     yield GaugeMetricFamily(PREFIX + "estimates_held", "1 while the cause of an alarm is not known.", status.held)
-    yield GaugeMetricFamily(PREFIX + "observed_rests", "Rests of the arm that the observer has used.", status.rows)
+    yield GaugeMetricFamily(
+        PREFIX + "observed_rests", "Number of rests of the arm that the observer has used.", status.rows
+    )
     yield GaugeMetricFamily(PREFIX + "proposals_pending", "Pending proposals.", status.pending_proposals)
     yield GaugeMetricFamily(PREFIX + "record_store_up", "1 while the record store answers.", not status.store_fault)
     yield GaugeMetricFamily(PREFIX + "journal_up", "1 while the journal can be written.", not status.journal_fault)
-    yield CounterMetricFamily(PREFIX + "events", "Number of events: the id of the newest one.", status.last_event)
+    yield CounterMetricFamily(
+        PREFIX + "events", "Number of events, which is the id of the newest event.", status.last_event
+    )
 
 
 def _of_joints(families: Iterable[tuple[str, str, str]], joints: Iterable[Answer]) -> Iterable[Metric]:

@@ -39,7 +39,7 @@ Instant = Annotated[
     Annotated[AwareDatetime, AfterValidator(_in_range)] | None,
     BeforeValidator(_plus_sent_as_space),
     BeforeValidator(_empty_is_none),
-    Field(description="ISO 8601 with zone, for example 2026-05-01T08:00:00Z; empty: open end"),
+    Field(description="ISO 8601 with zone, for example 2026-05-01T08:00:00Z; empty for no limit"),
 ]
 
 
@@ -59,7 +59,7 @@ class EventsQuery(_Query):
 class HistoryQuery(_Query):
     """GET /api/history."""
 
-    joint: Annotated[str, Field(max_length=200, description="joint's name; empty: every joint")] = ""
+    joint: Annotated[str, Field(max_length=200, description="name of a joint; empty for every joint")] = ""
     since: Annotated[Instant, Field(alias="from")] = None
     until: Annotated[Instant, Field(alias="to")] = None
     limit: Annotated[int, Field(ge=2, le=20000)] = 2000
@@ -68,7 +68,7 @@ class HistoryQuery(_Query):
     @model_validator(mode="after")
     def _in_order(self) -> Self:
         if self.since is not None and self.until is not None and self.since > self.until:
-            raise ValueError("from is later than to")
+            raise ValueError("parameter `from` must not be later than parameter `to`")
         return self
 
 

@@ -41,18 +41,21 @@ from calib.daemon.web.stream import StreamResponse, Streams
 from calib.daemon.web.window import add_window
 
 REFUSALS: dict[int | str, dict[str, Any]] = {
-    400: {"model": ApiError, "description": "Not HTTP, or the Host header is not a name of this daemon"},
-    401: {"model": ApiError, "description": "TCP only: the token is missing or wrong"},
-    408: {"model": ApiError, "description": "The body did not arrive in time"},
-    413: {"model": ApiError, "description": "The body is too large"},
+    400: {"model": ApiError, "description": "The request is not HTTP, or its Host header is not a name of this daemon"},
+    401: {"model": ApiError, "description": "For TCP only: the token is missing or wrong"},
+    408: {"model": ApiError, "description": "The body of the request did not arrive in time"},
+    413: {"model": ApiError, "description": "The body of the request is too large"},
     422: {"model": ApiError, "description": "A parameter is not valid"},
-    429: {"model": ApiError, "description": "Too many requests, long answers, or clients on the stream"},
-    503: {"model": ApiError, "description": "The journal cannot be read or written now or yet, or too many clients"},
+    429: {"model": ApiError, "description": "There are too many requests, long answers, or clients on the stream"},
+    503: {
+        "model": ApiError,
+        "description": "The journal cannot be read or written at present, or there are too many clients",
+    },
 }
 NO_SUCH: dict[int | str, dict[str, Any]] = {404: {"model": ApiError, "description": "Not found"}}
 NOT_NOW: dict[int | str, dict[str, Any]] = {
     403: {"model": ApiError, "description": "The request came from a page of another origin"},
-    409: {"model": ApiError, "description": "No decision is possible now"},
+    409: {"model": ApiError, "description": "No decision is possible at present"},
 }
 STREAM: dict[int | str, dict[str, Any]] = {
     200: {
@@ -85,7 +88,7 @@ def api_router(view: DaemonView, streams: Streams, metrics: Callable[[], bytes])
     ) -> Response:
         """Joints at 10 Hz, and events as they happen; a slow client still gets every event, in order."""
         if not streams.make_room(owner):
-            raise TooMany(f"{streams.clients} clients are on the stream already")
+            raise TooMany(f"{streams.clients} clients are already on the stream")
         return StreamResponse(streams, query.after if last_event_id is None else last_event_id)
 
     @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}}, tags=["now"])
@@ -155,7 +158,10 @@ def _add_past(router: APIRouter, view: DaemonView, histories: Histories) -> None
         """The newest report in the state directory, one HTML file."""
         path = view.status().report
         if path is None or not await histories.short(path.is_file):
-            raise NoSuch("no report yet: the newest HTML file in the state directory (calibrate --report writes one)")
+            raise NoSuch(
+                "there is no report yet: this page shows the newest HTML file of the state directory, and "
+                "`calibrate --report` writes one there"
+            )
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_CSP})
 
 
@@ -190,8 +196,8 @@ async def _decided(
             return await asyncio.shield(asyncio.wrap_future(answer))
     except TimeoutError:
         raise NotYet(
-            f"not yet: the decision on proposal {number} waits for the disk, which has not answered for "
-            f"{DISK_SECONDS:.0f} s, and is carried out once it does: do not repeat it, see /api/proposals"
+            f"the decision on proposal {number} waits for the disk, which has not answered for "
+            f"{DISK_SECONDS:.0f} s, and will be carried out when it answers: do not repeat it, look at /api/proposals"
         ) from None
 
 

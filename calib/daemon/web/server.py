@@ -42,7 +42,7 @@ async def serve(view: DaemonView, *, socket: Path | None, tcp: tuple[str, int] |
     if tcp is not None and (token is None or len(token) < SHORTEST_TOKEN):
         raise BadInput(f"--tcp needs --token-file with a token of at least {SHORTEST_TOKEN} characters")
     if socket is None and tcp is None:
-        raise BadInput("neither a Unix socket nor a TCP address to serve on")
+        raise BadInput("give a Unix socket or a TCP address to serve on")
     with contextlib.ExitStack() as opened:
         listening, places = [], []
         if socket is not None:
@@ -95,7 +95,7 @@ def _make_room(path: Path) -> None:
     """Remove the socket file of a killed daemon; raises BadInput if it is in use or not a socket."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise BadInput(f"--socket {path}: there is a file of that name that is no socket")
+            raise BadInput(f"--socket {path}: a file of this name exists and is not a socket")
         with sockets.socket(sockets.AF_UNIX, sockets.SOCK_STREAM) as probe:
             probe.settimeout(1.0)
             probe.connect(str(path))
@@ -106,7 +106,7 @@ def _make_room(path: Path) -> None:
             raise BadInput(f"--socket {path}: {error.strerror or error}") from None
         path.unlink(missing_ok=True)
         return
-    raise BadInput(f"--socket {path}: another daemon listens there; stop it, or give another path")
+    raise BadInput(f"--socket {path}: another daemon listens there; stop that daemon, or give another path")
 
 
 def _allow_files() -> None:

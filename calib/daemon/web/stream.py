@@ -80,7 +80,7 @@ class Streams:
             results = await asyncio.gather(client, gone, return_exceptions=True)
         if isinstance(results[0], TimeoutError):
             self.cut_off += 1
-            _log.warning("stream: %s took nothing for %.0f s and was cut off", peer_of(scope).name, SEND_SECONDS)
+            _log.warning("stream: %s has read nothing for %.0f s and was cut off", peer_of(scope).name, SEND_SECONDS)
             if connection is not None:
                 connection.cut()
             return

@@ -170,7 +170,7 @@ def export_fit(
     if any(actuator.delay > 0.0 for actuator in spec.actuators):
         spec.option.timestep = min(float(spec.option.timestep), LONGEST_STEP_S)
     spec.compile()
-    head = "Left out, MJCF has no field for them (the rest was fitted without them):"
+    head = "These effects are left out, since MJCF has no field for them (the other effects were fitted without them):"
     comment = xml_comment([head, *left]) if left else ""
     return Exported(comment + spec.to_xml(), tuple(left), native)
 

@@ -37,7 +37,7 @@ def write_exported(found: Identified, path: Path) -> tuple[str, ...]:
     import mujoco
 
     if found.export is None:
-        raise BadInput("--out-model: the model did not come from a file: give MJCF, URDF or an arm file with --sim")
+        raise BadInput("--out-model needs a model that came from a file: give MJCF, URDF or an arm file with --sim")
     xml, beside = found.export.xml, {} if path.suffix == URDF else _beside(found, path)
     made = write_files(path, found.sim, xml, lambda: mujoco.MjModel.from_xml_string(xml), found.export.lines, beside)
     return tuple(made)
@@ -49,7 +49,7 @@ def _beside(found: Identified, path: Path) -> dict[Path, str | None]:
     out: dict[Path, str | None] = {batch_path(path): None if other is None else other.xml, model: None, module: None}
     if made is not None:
         told = [f"{effect} {joint}" for effect, joint, _ in made.effects]
-        out[model] = xml_comment([f"To be used with {module.name}, which applies:", *told]) + made.xml
+        out[model] = xml_comment([f"Use this model with {module.name}, which applies:", *told]) + made.xml
         out[module] = module_text(found.sim, made.effects, model.name)
     return out
 
@@ -73,7 +73,7 @@ def module_model(path: Path) -> Path:
     return path.with_name(f"{path.stem}_effects.xml")
 
 
-ABOUT = "Friction of other kinds is taken into Coulomb and viscous friction; that joints creep under it is left out."
+ABOUT = "Coulomb and viscous friction stand for all kinds of friction; slow creep of joints under friction is left out."
 
 
 def write_actuators(found: Identified, path: Path, step: float = 0.005) -> None:

@@ -45,7 +45,7 @@ def other():
 
 
 def test_a_second_program_is_told_who_drives_the_arm(other):
-    says = rf"test:\d+: node 4 is driven by python.*\(process {other.pid}, user {os.getuid()}\): stop it"
+    says = rf"test:\d+: node 4 is driven by python.*\(process {other.pid}, user {os.getuid()}\): stop that program"
     with pytest.raises(BusFault, match=says):
         ArmHold(RealTimeBus(), nodes(5, 4))
     with ArmHold(RealTimeBus(), nodes(5)):  # and what was taken on the way is free again

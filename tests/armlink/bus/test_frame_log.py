@@ -186,7 +186,7 @@ def test_a_time_that_is_infinite_ends_the_log(tmp_path):
     path.write_text("(1.0) can0 080#\n(2.0) can0 081#01\n(1e999) can0 080#\n(3.0) can0 080#\n")
     reader = LogReader(path)
     assert len(list(reader.frames())) == 2
-    assert "a time that is no number" in reader.warning
+    assert "a time is not a number" in reader.warning
 
 
 def printed(message: can.Message, time: str) -> str:
@@ -250,10 +250,10 @@ def test_what_a_log_lacks_of_the_arm_is_named(arm_of, tmp_path, text):
         recording_of_log(load_arm("six-damiao"), tmp_path / "other.log")
     said = str(refused.value)
     if "7FF" in text:
-        assert "none is of base (id 01h), shoulder (id 02h)" in said
-        assert "there are frames 7FFh" in said
+        assert "no frame comes from base (id 01h), shoulder (id 02h)" in said
+        assert "the log has the frames 7FFh" in said
     else:
-        assert "no frame is read" in said
+        assert "no frame could be read" in said
     assert "SYNC" not in said
 
 

@@ -162,7 +162,7 @@ def test_datagrams_that_this_machine_does_not_take_are_no_fault_of_a_node(monkey
     port._name = "udp_multicast:239.0.0.1"
     error = port._full()
     assert isinstance(error, Stall)
-    assert "this machine took no datagrams for 50 ms" in str(error)
+    assert "this machine accepted no datagrams for 50 ms" in str(error)
     assert "node" not in str(error)
 
 

@@ -84,7 +84,7 @@ def test_convert_keeps_the_data_and_says_what_it_left_out(tmp_path, capsys):
 def test_convert_says_in_one_line_what_it_cannot_read_or_write(tmp_path, capsys):
     (tmp_path / "a.csv").write_text("t,q_1,tau_1\n0,1,2\n0,1,2\n")
     assert run(["convert", str(tmp_path / "a.csv"), str(tmp_path / "b.mcap")]) == 2
-    assert "row 2: t 0 does not follow 0: time must increase" in capsys.readouterr().err
+    assert "row 2: t is 0 after 0, but time must increase" in capsys.readouterr().err
     (tmp_path / "a.csv").write_text("t,q_1,tau_1\n0,1,2\n1,1,2\n")
     assert run(["convert", str(tmp_path / "a.csv"), str(tmp_path / "none" / "b.parquet")]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -106,6 +106,6 @@ def test_convert_says_which_names_the_format_drops(tmp_path, capsys):
     )
     save_recording(recording, tmp_path / "run.parquet")
     assert run(["convert", str(tmp_path / "run.parquet"), str(tmp_path / "run.csv")]) == 0
-    assert "left/elbow is joint_1, left/wrist is joint_2 there" in " ".join(capsys.readouterr().out.split())
+    assert "left/elbow is called joint_1, left/wrist is called joint_2" in " ".join(capsys.readouterr().out.split())
     assert run(["convert", str(tmp_path / "run.parquet"), str(tmp_path / "two.parquet")]) == 0
-    assert "keeps no names" not in capsys.readouterr().out
+    assert "stores no joint names" not in capsys.readouterr().out

@@ -9,7 +9,7 @@ from armlink.cli import run
 def test_another_format_is_converted_to_afterwards(name, tmp_path, capsys):
     assert run(["record", "sarcos", str(tmp_path / name), "--bus", "virtual:test-record", "--seconds", "0.01"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "recordings are written as .mcap: record " in line
+    assert "record writes .mcap files: record " in line
     assert not list(tmp_path.iterdir())
 
 
@@ -17,4 +17,4 @@ def test_the_format_of_its_own_is_taken(tmp_path, capsys):
     assert (
         run(["record", "sarcos", str(tmp_path / "run.mcap"), "--bus", "virtual:test-record", "--seconds", "0.01"]) == 3
     )
-    assert "recordings are written as" not in capsys.readouterr().err
+    assert "record writes .mcap files" not in capsys.readouterr().err

@@ -180,7 +180,7 @@ def test_damiao_scales_come_from_the_registers():
     ("spoil", "says"),
     [
         (lambda drive: drive.registers.update({10: 2}) or drive.inject("mode.refused", 0), "not in MIT mode"),
-        (lambda drive: drive.registers.update({21: 0.0}), "no usable scale"),
+        (lambda drive: drive.registers.update({21: 0.0}), "not a usable scale"),
         (lambda drive: drive.registers.update({7: 0}), "replies on id 00h"),
         (lambda drive: setattr(drive, "unplugged", True), "no answer from id 02h"),
     ],
@@ -566,9 +566,9 @@ def test_cubemars_ranges_are_the_models_or_those_of_the_arm_file(tmp_path):
 @pytest.mark.parametrize(
     ("drives", "says"),
     [
-        ([{**AK, "model": "AK1"}], "model 'AK1' is not known: give one of AK10-9"),
-        ([{**AK, "reply": 1}], "reply 0x01 is the drive's own id"),
-        ([AK, {**AK, "id": 2, "reply": 1}], "j1: drive.reply 0x01 is the id of j0's commands"),
+        ([{**AK, "model": "AK1"}], "model 'AK1' is unknown: give one of AK10-9"),
+        ([{**AK, "reply": 1}], "reply 0x01 is the id of the drive itself"),
+        ([AK, {**AK, "id": 2, "reply": 1}], "j1: drive.reply 0x01 is also the id of commands to j0"),
         ([AK, {"family": "canopen", "node": 5}], "j1: a CANopen node takes CubeMars replies on id 0 for NMT commands"),
         ([{**AK, "can_timeout": -1}], "drive.can_timeout: "),
     ],
@@ -594,7 +594,7 @@ def test_a_drive_that_restarted_and_makes_no_torque_is_a_fault():
         bench.cycle([bench.order(j, mode=Mode.TORQUE, torque=2.0 if j == 1 else 0.1) for j in range(6)])
         fault = bench.drives.fault([Mode.TORQUE] * 6, bench.arm.time)
     assert 0.1 < bench.arm.time - began < 0.15
-    assert "shoulder (id 02h): makes no torque although its commands ask for some" in str(fault)
+    assert "shoulder (id 02h): makes no torque although its commands ask for torque" in str(fault)
     bench.drives.forget()
     assert bench.walk()
 

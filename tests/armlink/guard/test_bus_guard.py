@@ -110,7 +110,7 @@ def test_torque_and_position_are_bounded_in_size_and_rate():
             return policy.refusal(0x201, struct.pack("<Hhi", 15, torque, position), now + after)
 
         most, step = round(MAX_TORQUE / RATED * 1000), SPEED / UNIT
-        assert "target torque of joint_1 751, allowed -750 to 750" in refused(751, 0)
+        assert "target torque of joint_1 is 751, allowed are -750 to 750" in refused(751, 0)
         assert "at once" in refused(most, 0)
         assert "target position of joint_1" in refused(50, int(WINDOW) + 2)
         assert "at once" in refused(50, int(0.1 * step))
@@ -174,8 +174,8 @@ def test_a_request_that_is_cut_short_is_refused(length):
 
 def test_a_refused_frame_is_named_with_its_bytes():
     policy = Policy(CONTENT)
-    assert policy.refusal(0x201, b"", 10.0).startswith("201h with no data: ")
-    assert policy.refusal(0x201, b"\x0f\x01", 10.0).startswith("201h with 0f 01: ")
+    assert policy.refusal(0x201, b"", 10.0).startswith("the program sent 201h with no data, ")
+    assert policy.refusal(0x201, b"\x0f\x01", 10.0).startswith("the program sent 201h with 0f 01, ")
 
 
 hostile = st.one_of(
@@ -335,8 +335,10 @@ def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
     guard._to_wire(0x123, b"\x01", False)
     guard._to_wire(0x80, b"", False)
     assert wire.sent == [(0x80, b""), *((0x600 + node, bytes.fromhex("2b40600002000000")) for node in (1, 2))]
-    assert lines == ["guard: closed: identifier 123h, which the policy does not name; the joints were told to stop, "
-                     "start the guard again to open it"]  # fmt: skip
+    assert lines == [
+        "guard: closed, it passes no more frames: the program sent identifier 123h, which the policy does not name; "
+        "the joints were told to stop; start the guard again to open it"
+    ]
     guard._to_program(0x181, bytes(8), False)
     assert program.sent == [(0x181, bytes(8))]
 
@@ -344,9 +346,9 @@ def test_the_first_frame_that_is_not_allowed_closes_it_and_stops_the_joints():
 @pytest.mark.parametrize(
     ("flag", "said"),
     [
-        (bus_guard.REMOTE, "a remote or error frame"),
-        (bus_guard.ERROR, "a remote or error frame"),
-        (bus_guard.EXTENDED, "identifier 80000080h, which the policy does not name"),
+        (bus_guard.REMOTE, "the program sent a remote or error frame"),
+        (bus_guard.ERROR, "the program sent a remote or error frame"),
+        (bus_guard.EXTENDED, "the program sent identifier 80000080h, which the policy does not name"),
     ],
 )
 def test_remote_error_and_extended_frames_do_not_pass(flag, said):
@@ -459,7 +461,7 @@ def test_a_reading_that_is_cut_short_is_none():
 
 def test_one_side_of_a_range_may_be_left_open_by_nobody():
     for bounds in ({"least": 0}, {"most": 0}, {"least": -math.inf, "most": 0}):
-        with pytest.raises(PolicyError, match="needs values, or least and most"):
+        with pytest.raises(PolicyError, match="the field needs `values`, or `least` and `most`"):
             Field({"name": "x", "at": 0, "code": "b", **bounds})
     assert Field({"name": "x", "at": 0, "code": "b", "least": 0, "most": 0}).refusal(b"\0", 0.0) == ""
 
@@ -475,18 +477,27 @@ def broken(change):
     [
         ([], "TypeError"),
         ({}, "KeyError: 'schema'"),
-        ({"schema": "armlink.guard/9", "frames": {}, "stop": []}, "schema 'armlink.guard/9', expected armlink.guard/1"),
+        (
+            {"schema": "armlink.guard/9", "frames": {}, "stop": []},
+            "`schema` is 'armlink.guard/9', expected armlink.guard/1",
+        ),
         (broken(lambda c: c["frames"]["513"].pop("lengths")), "KeyError: 'lengths'"),
         (broken(lambda c: c["frames"]["513"].update(lengths=[4])), "beyond the 4 bytes of its frame"),
-        (broken(lambda c: c["frames"]["513"]["fields"][0].update(code="q9")), "code 'q9', expected one of b, B"),
-        (broken(lambda c: c["frames"]["513"]["fields"][0].pop("most")), "needs values, or least and most"),
-        (broken(lambda c: c["frames"]["513"]["fields"][0].update(least=math.nan)), "least is no number"),
+        (
+            broken(lambda c: c["frames"]["513"]["fields"][0].update(code="q9")),
+            "number code 'q9' is unknown, expected one of b, B",
+        ),
+        (
+            broken(lambda c: c["frames"]["513"]["fields"][0].pop("most")),
+            "the field needs `values`, or `least` and `most`",
+        ),
+        (broken(lambda c: c["frames"]["513"]["fields"][0].update(least=math.nan)), "`least` is not a number"),
         (broken(lambda c: c.update(stop=[[1, "xy"]])), "ValueError"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(at=math.inf)), "OverflowError"),
         (broken(lambda c: c["frames"]["513"]["fields"][0].update(most=10**400)), "OverflowError"),
-        (broken(lambda c: c.update(deadline=math.nan)), "policy: deadline is no number"),
+        (broken(lambda c: c.update(deadline=math.nan)), "policy: `deadline` is not a number"),
         (broken(lambda c: c.update(deadline="soon")), "ValueError"),
-        (broken(lambda c: c["frames"]["128"].update(per_second=math.nan)), "frame: per_second is no number"),
+        (broken(lambda c: c["frames"]["128"].update(per_second=math.nan)), "frame: `per_second` is not a number"),
     ],
 )
 def test_a_wrong_policy_is_refused_in_one_line(content, said):
@@ -508,7 +519,7 @@ def test_it_stands_on_the_standard_library_alone():
     [
         ([], "bus_guard.py POLICY PROGRAM_INTERFACE WIRE_INTERFACE"),
         (["missing.json", "a", "b"], "missing.json: [Errno 2]"),
-        (["policy.json", "no-such-can", "can9"], ": expected a CAN interface that is up"),
+        (["policy.json", "no-such-can", "can9"], ": give a CAN interface that is up"),
     ],
 )
 def test_wrong_arguments_get_one_line(words, said, capfd, tmp_path, monkeypatch):
@@ -577,8 +588,8 @@ def test_main_passes_frames_until_it_is_told_to_end_and_stops_the_joints(wires, 
     assert all_heard(wire) == [(0x80, b"", 0, 16), *STOP]
     assert all_heard(program) == [(0x181, b"12345678", 0, 16)]
     first, second = capfd.readouterr().err.splitlines()
-    assert first == f"guard: arm0 may command can0 by {tmp_path / 'policy.json'}"
-    assert second.startswith("guard: closed: it was told to end; ")
+    assert first == f"guard: arm0 may command can0 as {tmp_path / 'policy.json'} allows"
+    assert second.startswith("guard: closed, it passes no more frames: the guard was told to end; ")
 
 
 def test_main_closes_once(wires, monkeypatch, tmp_path, capfd):
@@ -594,7 +605,7 @@ def test_main_closes_when_an_interface_fails_and_stays(wires, monkeypatch, tmp_p
     assert run_main(wires, monkeypatch, tmp_path, [*failures, None]) == 0
     assert all_heard(wires[1]) == STOP
     _, line = capfd.readouterr().err.splitlines()
-    assert line.startswith("guard: closed: an interface failed: Network is down; ")
+    assert line.startswith("guard: closed, it passes no more frames: an interface failed (Network is down); ")
 
 
 def opened(content=CONTENT):
@@ -612,7 +623,7 @@ def test_a_frame_that_waited_for_longer_than_the_drives_wait_for_their_host_goes
     assert wire.sent == []
     assert not guard.closed
     assert len(lines) == 1
-    assert lines[0].startswith("guard: it fell behind: frames 3.0")
+    assert lines[0].startswith("guard: it is late: frames that are 3.0")
     guard._to_wire(0x80, b"", False, time.monotonic())
     assert wire.sent == [(0x80, b"")]
 
@@ -623,7 +634,7 @@ def test_a_reading_counts_from_when_it_came():
     for can_id, data, then in HEARD:
         guard._to_program(can_id, data, False, now - 10.0 + then - ENABLED_AT)
     guard._to_wire(0x201, COMMAND.pack(0x0F, 50, 0), False, now)
-    assert "with power, where no reading shows the joint" in guard.closed
+    assert "in a frame that gives power, but no reading shows the joint" in guard.closed
 
 
 @pytest.mark.parametrize(
@@ -633,7 +644,7 @@ def test_another_host_on_the_wire_closes_it_and_is_shown_to_the_program_once(can
     guard, program, wire, _ = opened()
     for _ in range(3):
         guard._to_program(can_id, data, False)
-    assert guard.closed.startswith(f"{can_id:X}h on the wire, which this guard did not send")
+    assert guard.closed.startswith(f"{can_id:X}h came on the wire and is not from this guard")
     assert program.sent == [(can_id, data)]
     assert wire.sent == [(0x600 + node, bytes.fromhex("2b40600002000000")) for node in (1, 2)]
 
@@ -683,21 +694,22 @@ def test_two_guards_of_one_wire_pass_no_frame_around_for_ever():
 def test_a_drives_frame_from_the_program_is_named_as_one():
     guard, _, _, _ = opened()
     guard._to_wire(0x181, bytes(8), False)
-    assert (
-        guard.closed == "identifier 181h, which only a drive may send: a second guard, or a program that plays a drive"
+    assert guard.closed == (
+        "the program sent identifier 181h, which only a drive may send: stop a second guard, or a "
+        "program that plays a drive"
     )
 
 
 def test_frames_of_the_other_kind_close_it():
     guard, _, wire, _ = opened()
     guard._to_wire(0x80, b"", True)
-    assert guard.closed == "80h as CAN FD, which these drives do not speak"
+    assert guard.closed == "the program sent 80h as CAN FD, which these drives do not understand"
     assert (0x80, b"") not in wire.sent
     guard, _, wire, _ = opened({**CONTENT, "fd": True})
     guard._to_wire(0x80, b"", True)
     assert not guard.closed
     guard._to_wire(0x80, b"", False)
-    assert guard.closed == "80h as classical CAN, which these drives do not speak"
+    assert guard.closed == "the program sent 80h as classical CAN, which these drives do not understand"
 
 
 def test_a_policy_of_before_says_nothing_of_deadline_and_kind():
@@ -715,7 +727,7 @@ def test_syncs_that_no_cycle_needs_close_it():
     now += 1000 * PERIOD
     answers = [policy.refusal(0x80, b"", now + 1e-4 * number) for number in range(50)]
     assert answers[:5] == [""] * 5
-    assert "80h: more often than 500 times a second" in answers
+    assert "80h: is sent more often than 500 times a second" in answers
 
 
 @pytest.mark.parametrize(("side", "name"), [("wire", "wire"), ("program", "program")])
@@ -725,15 +737,17 @@ def test_lost_frames_close_it(wires, side, name):
     (wire if side == "wire" else program).port.lost = 7
     wire.say(0x181, bytes(8))
     guard.step(1.0)
-    assert guard.closed == f"7 frames of the {name} were lost: a flood, or this guard gets too little time"
+    assert guard.closed == (
+        f"7 frames from the {name} were lost: too many frames were sent, or this guard gets too little processor time"
+    )
 
 
 def test_a_stop_that_did_not_leave_is_not_told_as_one():
     guard, _, wire, lines = opened()
     wire.full = True
-    guard.close("it was told to end")
+    guard.close("the guard was told to end")
     (line,) = lines
-    assert "the joints could not be told to stop, which their own watches do" in line
+    assert "the joints could not be told to stop, so they stop by their own watch of the bus" in line
 
 
 def test_a_program_that_takes_no_frames_keeps_none_to_the_wire_waiting(wires, monkeypatch, tmp_path):
@@ -751,7 +765,8 @@ def test_one_interface_for_both_sides_is_refused(capfd, tmp_path):
     path.write_text(json.dumps(CONTENT))
     assert bus_guard.main([str(path), "can0", "can0"]) == 2
     assert capfd.readouterr().err == (
-        "guard: can0: both interfaces: expected one for programs alone, such as a vcan, and the arm's\n"
+        "guard: can0 is given as both interfaces: give first an interface for programs alone (such as a "
+        "vcan), then the interface of the arm\n"
     )
 
 
@@ -777,5 +792,5 @@ def test_nobody_there_to_read_what_it_says_is_no_error(monkeypatch):
 
     monkeypatch.setattr(bus_guard.sys, "stderr", Gone())
     guard = BusGuard(Policy(CONTENT), Side(), Side())
-    guard.close("it was told to end")
+    guard.close("the guard was told to end")
     assert guard.closed

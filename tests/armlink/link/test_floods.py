@@ -119,7 +119,7 @@ def test_what_a_flood_is_made_of_is_named(kind: str, named: str, count: int) -> 
     if kind == "the drives' own" and count == 200:
         assert "a second node" in said
     else:
-        assert said.startswith("more frames than these joints send, most of them " + named)
+        assert said.startswith("the bus carries more frames than these joints send, most of them " + named)
 
 
 def fault_of(link: Link, cycles: int = 3) -> str:
@@ -158,8 +158,8 @@ def test_readings_that_a_flood_keeps_away_are_put_down_to_it() -> None:
         wire.advance = crowded  # type: ignore[method-assign]
         said = fault_of(link, 60)
     assert "reading for 1" in said
-    assert "others fill the bus meanwhile with " in said
-    assert "most of them 001h: a node babbles: disconnect it" in said
+    assert "meanwhile other nodes fill the bus with " in said
+    assert "most of them 001h: a node babbles, disconnect this node" in said
 
 
 def test_another_host_is_named_and_not_the_drive_that_it_stopped(enabled: Link, bus: Any) -> None:

@@ -187,7 +187,7 @@ def test_no_byte_that_leaves_exceeds_a_limit(steps):
 def test_what_leaves_after_a_command_of_a_wrong_shape_is_a_quick_stop(enabled, bus):
     bus.sent.clear()
     bad = Command(np.full(3, 10, np.int8), np.zeros((3, 1)), np.zeros(3))
-    with pytest.raises(Refused, match=r"gate: torque of a command is an array \(3, 1\)"):
+    with pytest.raises(Refused, match=r"gate: field `torque` of the command is an array of shape \(3, 1\)"):
         enabled.cycle(bad)
     words = [struct.unpack("<Hhi", data)[0] for can_id, data in bus.sent if can_id & 0x780 == 0x200]
     assert set(words) == {0x02}

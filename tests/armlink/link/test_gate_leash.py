@@ -157,8 +157,8 @@ def test_the_last_check_takes_the_bound_itself(window):
 
 
 def test_the_last_check_takes_gains_one_by_one():
-    assert beyond(GAINS, order(), order(position=1.5, kp=40.0), AT) == "gains and targets for 40 N·m"
-    assert beyond(GAINS, order(), order(velocity=1.0, kd=40.0), AT) == "gains and targets for 40 N·m"
+    assert beyond(GAINS, order(), order(position=1.5, kp=40.0), AT) == "40 N·m (by its gains and targets)"
+    assert beyond(GAINS, order(), order(velocity=1.0, kd=40.0), AT) == "40 N·m (by its gains and targets)"
     blind = AT._replace(position=math.nan)
     assert beyond(GAINS, order(), order(kp=1.0), blind)
     assert beyond(GAINS, order(), order(), blind) == ""  # without gains the drive needs no reading of ours

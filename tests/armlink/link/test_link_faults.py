@@ -45,19 +45,22 @@ def test_a_restarted_node_is_named(enabled, bus):
     bus.out.append((0x703, b"\x00"))
     cycle, says = cycles_until_fault(enabled)
     assert cycle == 0
-    assert says.startswith("joint_3: its controller has restarted (boot-up message): calibration and mode are lost")
+    assert says.startswith("joint_3: its drive has restarted (boot-up message): calibration and mode are lost")
     assert statuses(bus)[:2] == [QUICK_STOP] * 2
 
 
 def test_a_node_that_leaves_operational_is_named(enabled, bus):
     bus.out.append((0x701, b"\x7f"))
-    assert cycles_until_fault(enabled)[1] == "joint_1: NMT state is pre-operational, expected operational"
+    assert cycles_until_fault(enabled)[1] == "joint_1: its NMT state is pre-operational, expected operational"
 
 
 def test_a_drive_fault_is_named(enabled, bus):
     bus.nodes[1].status = FAULT
     bus.out.append((0x381, struct.pack("<Hb", FAULT, 8)))
-    assert cycles_until_fault(enabled)[1] == "joint_1: fault (status word 0x0008), expected operation enabled"
+    assert (
+        cycles_until_fault(enabled)[1]
+        == 'joint_1: is in state "fault" (status word 0x0008), expected "operation enabled"'
+    )
 
 
 def test_lost_readings_are_nan_with_their_age_then_a_fault(enabled, bus):

@@ -58,7 +58,9 @@ def test_another_controller_than_the_arm_file_states_is_refused(arm_of, bus, key
             Refused, match=rf"joint_1 \(node 1\): .*1018h:0{sub} .* is {found}, expected 0x1234"
         ) as caught:
             link.start()
-        assert "connect the right arm, or correct identity or eds of this joint under link.joints" in str(caught.value)
+        assert "connect the right arm, or correct `identity` or `eds` of this joint under link.joints" in str(
+            caught.value
+        )
     assert not [data for can_id, data in bus.sent if can_id == 0x601 and data[0] & 0xE0 == 0x20]  # nothing was written
 
 
@@ -76,7 +78,7 @@ def test_scan_shows_another_controller(tmp_path, capsys):
     path.write_text(yaml.safe_dump(content))
     assert run(["scan", str(path), "--bus", "armlink_sim:sarcos"]) == 1
     last = capsys.readouterr().err.splitlines()[-1]
-    assert "joint_3 (node 3): another controller than the arm file states: 1018h:02 product code is 0x41524d4c" in last
+    assert "joint_3 (node 3): another drive than the arm file states: 1018h:02 product code is 0x41524d4c" in last
 
 
 def test_scan_shows_a_node_id_given_twice(capsys, monkeypatch):
@@ -121,7 +123,9 @@ def test_a_joint_that_does_not_display_position_control_is_not_enabled(link, bus
 
 def test_a_mode_that_a_controller_does_not_have_is_refused_before_it_is_sent(enabled, bus):
     bus.sent.clear()
-    with pytest.raises(Refused, match=r"gate: joint_1: mode 4 is not supported: its drive has 8, 10"):
+    with pytest.raises(
+        Refused, match=r"gate: joint_1: mode 4 is not supported: the drive of this joint has the modes 8, 10"
+    ):
         enabled.cycle(command(PROFILE_TORQUE))
     assert not [data for can_id, data in bus.sent if can_id & 0x780 == 0x300]
     assert all_stopped(bus)
@@ -170,7 +174,7 @@ def test_a_restart_is_noticed_in_its_cycle_even_where_a_heartbeat_follows(enable
     bus.sent.clear()
     cycle, says = cycles_until_fault(enabled, command(POSITION))
     assert cycle == 0
-    assert says.startswith("joint_3: its controller has restarted (boot-up message)")
+    assert says.startswith("joint_3: its drive has restarted (boot-up message)")
     words = [struct.unpack("<Hhi", data)[0] for can_id, data in bus.sent if can_id & 0x780 == 0x200]
     assert set(words) == {0x02}  # in the very cycle in which it came: no frame enables a joint any more
 
@@ -178,7 +182,7 @@ def test_a_restart_is_noticed_in_its_cycle_even_where_a_heartbeat_follows(enable
 def test_a_restarted_controller_is_not_enabled_before_it_is_set_up_again(enabled, bus):
     bus.out.append((0x703, b"\x00"))
     cycles_until_fault(enabled, command(POSITION))
-    with pytest.raises(BusFault, match="joint_3: its controller has restarted"):
+    with pytest.raises(BusFault, match="joint_3: its drive has restarted"):
         enabled.enable()
     enabled.start()
     enabled.enable()
@@ -194,7 +198,7 @@ def test_the_simulated_arm_restarting_under_way_is_noticed():
         for _ in range(20):
             link.cycle(given)
         simulated.on_frame(0x000, bytes([0x81, simulated.nodes[2].node_id]))
-        with pytest.raises(BusFault, match=r"joint_3: its controller has restarted"):
+        with pytest.raises(BusFault, match=r"joint_3: its drive has restarted"):
             link.cycle(given)
         stopped = [node.value(0x6041) & 0x6F for node in simulated.nodes]
     assert [word for place, word in enumerate(stopped) if place != 2] == [QUICK_STOP] * 6
@@ -224,7 +228,9 @@ def test_a_second_host_stops_all_in_the_cycle_in_which_it_is_heard(enabled, bus,
     bus.sent.clear()
     cycle, says = cycles_until_fault(enabled, command(POSITION))
     assert cycle == 0
-    assert says == f"another host is on this bus: it sends {what}: stop it, only one program may command an arm"
+    assert says == (
+        f"another host is on this bus: it sends {what}: stop that program, since only one program may command an arm"
+    )
     words = [struct.unpack("<Hhi", data)[0] for can_id, data in bus.sent if can_id & 0x780 == 0x200]
     assert set(words) == {0x02}
 
@@ -283,7 +289,9 @@ def test_a_command_that_ages_between_gate_and_bus_does_not_leave(enabled, bus, a
     given.t = None if age is None else bus.clock.time - age
     drives.frames = slow
     bus.sent.clear()
-    with pytest.raises(HostLate, match=r"the host was \d+ ms late .*; the command grew too old before its frames left"):
+    with pytest.raises(
+        HostLate, match=r"the host was \d+ ms late .*; the command became too old before its frames were sent"
+    ):
         enabled.cycle(given)
     words = [struct.unpack("<Hhi", data)[0] for can_id, data in bus.sent if can_id & 0x780 == 0x200]
     assert set(words) == {0x02}
@@ -300,7 +308,9 @@ def test_a_node_id_given_twice_is_found_after_three_cycles(enabled, bus):
     bus._sync = twin
     cycle, says = cycles_until_fault(enabled, command(POSITION))
     assert cycle == 3
-    assert says == "joint_2: two readings in every cycle: a second node has its id: give every node its own"
+    assert says == (
+        "joint_2: two readings come in every cycle, so a second node has the same id: give every node an id of its own"
+    )
     assert all_stopped(bus)
 
 
@@ -343,7 +353,9 @@ def test_a_node_that_babbles_is_found(enabled, bus):
 
     cycle, says = cycles_until_fault(enabled, command(POSITION), babble)
     assert cycle <= 11
-    assert says == "more frames than these joints send, most of them 555h: a node babbles: disconnect it"
+    assert says == (
+        "the bus carries more frames than these joints send, most of them 555h: a node babbles, disconnect this node"
+    )
     assert all_stopped(bus)
 
 

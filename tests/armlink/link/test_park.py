@@ -69,10 +69,10 @@ def test_a_joint_that_is_blocked_on_the_way_holds(caplog, monkeypatch):
         at = float(sim.plant.position[1])
         sim.plant.model.jnt_range[1] = (at - 0.02, at + 0.02)  # something is in the way
         sim.plant.model.jnt_limited[1] = 1
-        with pytest.raises(Refused, match=r"park: shoulder: .* does not follow .* the joints hold"):
+        with pytest.raises(Refused, match=r"park: shoulder is at .* stopped following its target .* all joints hold"):
             link.park()
         assert link.enabled
-    assert "letting the arm down" in caplog.text
+    assert "the arm is being lowered" in caplog.text
 
 
 def test_without_a_pose_the_arm_is_let_down_and_it_says_so(caplog, monkeypatch):
@@ -81,9 +81,11 @@ def test_without_a_pose_the_arm_is_let_down_and_it_says_so(caplog, monkeypatch):
     with caplog.at_level(logging.INFO, "armlink"), Link(arm, LockStepBus(arm=simulated(arm))) as link:
         link.start()
         link.enable()
-        with pytest.raises(BadInput, match=r"key link\.park is missing"):
+        with pytest.raises(BadInput, match=r"key `link\.park` is missing"):
             link.park()
-    assert "letting the arm down, 3 s at most: the arm file has no link.park" in caplog.text
+    assert (
+        "the arm is being lowered, which takes 3 s at most, since it could not be parked: the arm file has no link.park"
+    ) in caplog.text
 
 
 def test_drives_that_hold_are_left_holding():
@@ -102,7 +104,9 @@ def test_the_pose_must_fit_the_joints():
     with pytest.raises(BadInput, match=r"park\.pose has 2 positions, expected 6"):
         parse_arm(content, path)
     content["link"]["park"] = {"pose": [0.0, 1.0, 0.0, 0.0, 0.0, 0.0]}
-    with pytest.raises(BadInput, match=r"link\.park\.pose: shoulder: 1 rad, expected -2\.9 to 0\.2"):
+    with pytest.raises(
+        BadInput, match=r"link\.park\.pose: shoulder is at 1 rad, which is outside the range -2\.9 to 0\.2"
+    ):
         parse_arm(content, path)
 
 
@@ -114,6 +118,6 @@ def test_a_drive_that_keeps_on_is_not_driven():
     sim = simulated(arm)
     with Link(arm, LockStepBus(arm=sim)) as link:
         link.start()
-        with pytest.raises(Refused, match="base: nothing stops its drive when this host dies"):
+        with pytest.raises(Refused, match="base: if this host dies, its drive keeps on"):
             link.enable()
     assert all(node.value(0x6041) & 0x6F != 0x27 for node in sim.nodes)

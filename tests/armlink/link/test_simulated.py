@@ -99,7 +99,9 @@ def test_a_joint_that_runs_away_under_a_constant_torque_is_stopped(link, simulat
     command = Command.hold(sample.position)
     last = link.n - 1
     command.mode[last], command.torque[last] = 10, 3.0
-    with pytest.raises(Refused, match=r"gate: joint_7: turns at -?[\d.]+ rad/s under torque control, limit [\d.]+ \("):
+    with pytest.raises(
+        Refused, match=r"gate: joint_7: turns at -?[\d.]+ rad/s under torque control, the limit is [\d.]+ \("
+    ):
         run(link, command, 4.0)
     simulated.advance(1.0)
     assert [node.value(0x6041, 0) & 0x6F for node in simulated.nodes] == [0x07] * link.n
@@ -173,6 +175,6 @@ def test_a_joint_under_position_control_that_something_else_moves_is_stopped(lin
 
     pushes = [1]
     loops.advance = driven
-    with pytest.raises(Refused, match=r"gate: joint_7: (turns at|reads) .* something else moves it"):
+    with pytest.raises(Refused, match=r"gate: joint_7: (turns at|reads) .* something else moves the joint"):
         run(link, command, 2.0)
     assert np.abs(link.latest_position - command.position).max() < 1.0

@@ -120,7 +120,7 @@ def test_a_turn_of_a_drive_before_a_gear_is_named_wherever_it_can_be_seen(draws)
         steps = (settings.zero - min(named)) / TURN
         assert min(named) - 1e-3 < settings.zero < max(named) + 1e-3
         assert abs(steps - round(steps)) < 1e-4
-        assert len(named) == 1 or "turns: auto cannot choose" in text
+        assert len(named) == 1 or "`turns: auto` cannot choose" in text
     assert seen > draws / 4
 
 
@@ -134,12 +134,12 @@ def test_turns_auto_corrects_zero_limits_and_readings(name):
         settings, bus = arm.link.joints[joint].settings, bus_of(name)
         with Link(host_of(name, {joint: turns * TURN * settings.gear}, turns="auto"), bus) as link:
             if settings.gear != 1:
-                with pytest.raises(Refused, match="turns: auto cannot choose"):
+                with pytest.raises(Refused, match="`turns: auto` cannot choose"):
                     link.start()
                 continue
             link.start()
             assert link.values.zero_of(joint) == pytest.approx(settings.zero, abs=1e-9)
-            assert "(turns: auto)" in link.turns.note(joint)
+            assert "(`turns: auto`)" in link.turns.note(joint)
             standing = link.enable().position
             for _ in range(50):
                 sample = link.cycle(Command.hold(standing))
@@ -167,7 +167,13 @@ def test_a_joint_that_leans_on_its_stop_by_a_sensor_that_reads_too_much_is_not_r
 def test_a_reading_that_no_turn_explains_is_refused_in_other_words():
     start = [0.0, -1.4, 0.0, 0.0, 0.0, 0.0]
     link = Link(host_of("six-damiao", {1: 2.0}, start), bus_of("six-damiao", start))
-    with link, pytest.raises(Refused, match=r"shoulder: reads .* no whole turn of its drive explains it: zero, dir"):
+    with (
+        link,
+        pytest.raises(
+            Refused,
+            match=r"shoulder: reads .* No number of whole turns of its drive explains this reading, so zero, dir",
+        ),
+    ):
         link.start()
 
 
@@ -186,7 +192,7 @@ def test_a_drive_that_wakes_anew_between_start_and_enable_gets_no_power(name):
         link.start()
         bus.arm.drive_at[2].motor._zero += TURN
         bus.clock.sleep_until(bus.clock.now() + 1.0)
-        with pytest.raises(Refused, match=r"elbow: reads .* set zero: 6\.6832"):
+        with pytest.raises(Refused, match=r"elbow: reads .* write `zero: 6\.6832`"):
             link.enable()
         assert Power.ON not in power_of(link)
 
@@ -197,7 +203,7 @@ def test_a_joint_that_tells_no_position_for_long_gets_no_power():
         link.start()
         bus.arm.drive_at[2].faults["feedback.lost"] = 0.0
         bus.clock.sleep_until(bus.clock.now() + 1.0)
-        with pytest.raises(BusFault, match="elbow: no position came"):
+        with pytest.raises(BusFault, match="elbow: no position was received"):
             link.enable()
 
 
@@ -222,10 +228,10 @@ def test_who_only_listens_is_told_and_goes_on(arm_of, caplog):
         assert told[0]["misplaced"] is None
         assert (told[1]["misplaced"] is not None) == (turns == "refuse")
         if turns == "refuse":
-            assert "set zero: 0.0000" in told[1]["misplaced"]
+            assert "write `zero: 0.0000`" in told[1]["misplaced"]
             assert not caplog.records
         else:
-            assert "zero 0.0000 is used in place of 6.28319" in caplog.text
+            assert "zero 0.0000 is used instead of 6.28319" in caplog.text
 
 
 def test_limits_of_a_guard_are_those_of_the_corrected_zero(arm_of):

@@ -141,7 +141,7 @@ def test_a_signal_to_the_job_s_group_parks_the_arm(pendulum: Pendulum, number: s
     assert pendulum.job is not None
     _, told = pendulum.job.communicate(timeout=60)
     pendulum.require_parked()
-    assert number is signal.SIGKILL or "parking, " in told
+    assert number is signal.SIGKILL or "its parking pose, " in told
 
 
 @pytest.mark.long
@@ -190,7 +190,7 @@ def test_a_start_that_parks_first_for_longer_than_a_hang_is_given_may_be_interru
     pendulum.send(signal.SIGINT)
     assert pendulum.job is not None
     _, told = pendulum.job.communicate(timeout=60)
-    assert "parked, the power is off" in told
+    assert "in its parking pose, and its power is off" in told
     pendulum.require_parked()
 
 
@@ -200,10 +200,10 @@ def test_ctrl_c_again_and_again_while_it_parks_lets_the_arm_go(pendulum: Pendulu
     pendulum.send(signal.SIGINT)
     assert pendulum.job is not None
     assert pendulum.job.stderr is not None
-    told = next(line for line in pendulum.job.stderr if "parking, " in line)
+    told = next(line for line in pendulum.job.stderr if "its parking pose, " in line)
     assert "Ctrl-C" in told
     pendulum.send(signal.SIGINT)
-    assert "Ctrl-C once more within 2 s lets the arm fall" in pendulum.job.stderr.readline()
+    assert "pressing Ctrl-C again within 2 s lets the arm fall" in pendulum.job.stderr.readline()
     assert pendulum.powered
     pendulum.send(signal.SIGINT)
     assert serving.wait_for(lambda: not pendulum.powered, 10.0)

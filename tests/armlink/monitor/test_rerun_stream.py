@@ -91,7 +91,8 @@ def values_in(file: Path) -> dict[str, float]:
 @installed
 def test_no_viewer_is_one_line() -> None:
     port = free_port()
-    with pytest.raises(BadInput, match=f"--rerun {port}: no viewer there .*: start it with rerun --port {port}"):
+    says = f"--rerun {port}: there is no viewer on this port .*: start a viewer with rerun --port {port}"
+    with pytest.raises(BadInput, match=says):
         RerunStream("pair", NAMES, port)
 
 

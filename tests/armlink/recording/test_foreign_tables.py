@@ -61,7 +61,7 @@ def test_dates_are_seconds_from_the_first(tmp_path):
 
 def test_a_table_without_a_header_row_says_so(tmp_path):
     (tmp_path / "r.csv").write_text("0.0,1.0,2.0\n0.1,1.0,2.0\n")
-    with pytest.raises(BadInput, match="its first row holds numbers, expected a header row"):
+    with pytest.raises(BadInput, match="its first row holds numbers instead of the names of the columns"):
         load_recording(tmp_path / "r.csv")
 
 
@@ -118,10 +118,10 @@ def test_a_table_without_a_header_row(tmp_path, separator):
 @pytest.mark.parametrize(
     ("header", "text", "said"),
     [
-        ("t,q_1", "0,1,2\n1,2,3\n", "names 2 columns, its rows have 3"),
-        ("t,q_1,tau_1", "t,q,tau\n0,1,2\n1,2,3\n", "its first row holds no numbers"),
-        ("t,angle", "0,1\n1,2\n", "--columns angle: not a column"),
-        ("t,q_1,q_1", "0,1,2\n1,2,3\n", "--columns q_1: occurs twice"),
+        ("t,q_1", "0,1,2\n1,2,3\n", "names 2 columns, but the rows of the file have 3"),
+        ("t,q_1,tau_1", "t,q,tau\n0,1,2\n1,2,3\n", "its first row holds the names of the columns"),
+        ("t,angle", "0,1\n1,2\n", "--columns angle: a recording has no such column"),
+        ("t,q_1,q_1", "0,1,2\n1,2,3\n", "--columns q_1: this column is named twice"),
     ],
 )
 def test_columns_that_do_not_fit_a_table_are_one_error(tmp_path, header, text, said):

@@ -136,7 +136,7 @@ def test_a_recording_cut_anywhere_loads_up_to_the_cut_and_says_so(tmp_path, rows
         assert found >= last
         last = found
         np.testing.assert_array_equal(loaded.position, recording.position[:found])
-        assert f"loaded {found} rows" in loaded.warning or found == rows
+        assert f"the first {found} rows were loaded" in loaded.warning or found == rows
     assert last == rows
 
 
@@ -152,5 +152,5 @@ def test_a_recorder_that_is_killed_loses_at_most_the_last_second(tmp_path):
 
 def test_a_bag_without_joint_states_is_one_line(tmp_path):
     write_bag(tmp_path / "bag.mcap", [("/motor_states", 1.0, ["a"], [], [], [1.0])])
-    with pytest.raises(BadInput, match="no sensor_msgs/msg/JointState on /joint_states"):
+    with pytest.raises(BadInput, match="no topic has messages of type sensor_msgs/msg/JointState"):
         load_recording(tmp_path / "bag.mcap")

@@ -59,7 +59,7 @@ def test_columns_may_be_in_any_order_and_strangers_are_named(tmp_path):
     loaded = load_recording(csv(tmp_path, "tau_1,t,gripper,q_1\n1,0,9,2\n3,0.1,9,nan\n"))
     np.testing.assert_array_equal(loaded.position, [[2], [np.nan]])
     np.testing.assert_array_equal(loaded.torque, [[1], [3]])
-    assert loaded.warning == "columns ignored because they are no channels: gripper"
+    assert loaded.warning == "columns that are no channels are ignored: gripper"
 
 
 def test_uneven_times_are_fine(tmp_path):
@@ -70,12 +70,12 @@ def test_uneven_times_are_fine(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("q_1,tau_1\n0,0\n0,0\n", "missing column t"),
-        ("t,tau_1\n0,0\n1,0\n", "missing column q_1: channel position"),
-        ("t,q_1,q_3,tau_1,tau_2,tau_3\n0,0,0,0,0,0\n", "missing column q_2"),
-        ("t,q_1,q_2,tau_1\n0,0,0,0\n1,0,0,0\n", "missing column tau_2: channel torque"),
+        ("q_1,tau_1\n0,0\n0,0\n", "column t is missing"),
+        ("t,tau_1\n0,0\n1,0\n", "column q_1 is missing: channel position"),
+        ("t,q_1,q_3,tau_1,tau_2,tau_3\n0,0,0,0,0,0\n", "column q_2 is missing"),
+        ("t,q_1,q_2,tau_1\n0,0,0,0\n1,0,0,0\n", "column tau_2 is missing: channel torque"),
         ("t,q_1,dq_1\n0,0,0\n1,0,0\n", "no torque channel: at least one of tau_1, tau_motor_1, tau_cmd_1"),
-        ("t,q_1,tau_1\n0,0,0\n1,0,0\n1,0,0\n", "row 3: t 1 does not follow 1: time must increase"),
+        ("t,q_1,tau_1\n0,0,0\n1,0,0\n1,0,0\n", "row 3: t is 1 after 1, but time must increase"),
         ("t,q_1,tau_1\n0,0,0\n,0,0\n", "row 2: t is nan"),
         ("t,q_1,tau_1\n0,0,0\n1,inf,0\n", "row 2: q_1 is infinite"),
         ("t,q_1,tau_1\n0,0,0\n1,abc,0\n", "invalid value 'abc'"),
@@ -83,7 +83,7 @@ def test_uneven_times_are_fine(tmp_path):
         ("t,q_1,q_1,tau_1\n0,0,0,0\n", "'q_1' occurs twice"),
         ("t,q_1,tau_1\n0,0,0\n", "1 rows: a recording needs at least two"),
         ("t,q_1,tau_1\n", "0 rows"),
-        ("", "missing column q_1"),
+        ("", "column q_1 is missing"),
     ],
 )
 def test_a_table_that_cannot_be_used_is_one_line(tmp_path, text, says):
@@ -122,7 +122,7 @@ def test_a_table_cut_at_any_byte_loads_up_to_the_cut_and_says_so(recording, tmp_
     np.testing.assert_allclose(loaded.position, recording.position[: loaded.t.size], rtol=1e-12)
     np.testing.assert_allclose(loaded.torque, recording.torque[: loaded.t.size], rtol=1e-12)
     line_is_whole = text.endswith(b"\n") or loaded.t.size == rows + 1
-    assert f"loaded {loaded.t.size} rows" in loaded.warning or (suffix == ".csv" and line_is_whole)
+    assert f"the first {loaded.t.size} rows were loaded" in loaded.warning or (suffix == ".csv" and line_is_whole)
 
 
 def test_a_table_written_without_a_last_line_end_is_whole(tmp_path):

@@ -111,8 +111,8 @@ def test_a_device_that_swaps_disable_and_quick_stop_is_found_and_not_tried_again
     monkeypatch.setattr(supervision, "ABORT_DISABLE", 3)
     results = self_test(simulated)
     assert outcomes(results, "RPDO deadline") == ["failed"] * 2
-    assert "goes to switch on disabled, expected quick stop" in results["hinge_1", "RPDO deadline"].found
-    assert "the other way round" in results["hinge_1", "RPDO deadline"].found
+    assert 'goes to "switch on disabled" instead of "quick stop active"' in results["hinge_1", "RPDO deadline"].found
+    assert "swap the values 2 and 3" in results["hinge_1", "RPDO deadline"].found
     assert outcomes(results, "heartbeat of the host") == ["not run"] * 2
     assert "lost its power" in results["hinge_2", "heartbeat of the host"].found
 
@@ -190,7 +190,10 @@ def test_the_command_answers_for_machines(tmp_path, capsys):
 def test_on_another_bus_it_asks_first(capsys):
     assert run(["check", "sarcos", "--bus", "virtual:nobody"]) == 2
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "armlink: check: nobody to ask: give --yes, or --passive for what needs no power"
+    assert last == (
+        "armlink: check: there is no terminal to ask for confirmation: give `--yes`, or `--passive` for "
+        "the checks without power"
+    )
 
 
 def test_an_arm_that_is_not_there_is_a_bus_fault(capsys):
@@ -239,7 +242,7 @@ def test_a_drive_that_lost_a_turn_fails_without_power(tmp_path, capsys, drive, p
     checks = answer["checks"]
     (failed,) = [each for each in checks if each["outcome"] == "failed"]
     assert (failed["joint"], failed["check"]) == ("hinge_2", "position")
-    assert "set zero: 6.2832 (a whole turn more)" in failed["found"]
+    assert "write `zero: 6.2832` (a whole turn more)" in failed["found"]
     with_power = ("enables and holds", "quick stop", "silence")
     assert {each["outcome"] for each in checks if each["check"] in with_power} == {"not run"}
 

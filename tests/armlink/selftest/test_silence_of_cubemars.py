@@ -76,7 +76,7 @@ def test_a_can_timeout_that_is_stated_and_not_set_is_found():
 def test_a_joint_that_carries_no_load_shows_nothing_and_that_is_said():
     results, _ = checked(content(upright=True))
     assert results["hinge_1", "silence"].outcome == "not run"
-    assert "reports no state, and the joint carries no load here" in results["hinge_1", "silence"].found
+    assert "reports no state, and the joint carries no load in this pose" in results["hinge_1", "silence"].found
     assert results["hinge_2", "silence"].outcome == "passed"
 
 
@@ -86,7 +86,7 @@ def test_without_a_can_timeout_it_is_scanned_and_checked_and_not_driven(tmp_path
     simulated = SimulatedArm(arm, Truth.of(arm), 1)
     with Link(arm, LockStepBus(arm=simulated)) as link:
         link.start()
-        with pytest.raises(Refused, match="hinge_1: nothing stops its drive when this host dies"):
+        with pytest.raises(Refused, match="hinge_1: if this host dies, its drive keeps on"):
             link.enable()
     assert not any(device.motor.powered for device in (simulated.device(0), simulated.device(1)))
     monkeypatch.chdir(tmp_path)
@@ -97,5 +97,8 @@ def test_without_a_can_timeout_it_is_scanned_and_checked_and_not_driven(tmp_path
     checks = {(each["joint"], each["check"]): each for each in json.loads(capsys.readouterr().out)["checks"]}
     assert checks["hinge_1", "answers"]["outcome"] == "passed"
     assert checks["hinge_1", "silence"]["outcome"] == "failed"
-    assert "drive.can_timeout" in checks["hinge_1", "set-up"]["found"]
-    assert "it would keep on after its host died" in checks["hinge_1", "enables and holds"]["found"]
+    assert "`can_timeout` is not given in the `drive:` section" in checks["hinge_1", "set-up"]["found"]
+    assert (
+        "if its host died, its drive would keep on with the last command"
+        in checks["hinge_1", "enables and holds"]["found"]
+    )

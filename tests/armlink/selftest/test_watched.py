@@ -13,8 +13,8 @@ from armlink.selftest.self_test import SelfTest
     ("silence", "says"),
     [
         (("stops", "stops"), ""),
-        (("stops", "keeps on"), "b is not driven: it would keep on after its host died"),
-        (("keeps on", "keeps on"), "a is not driven: it would keep on after its host died"),
+        (("stops", "keeps on"), "b is not driven: if its host died, its drive would keep on with the last command"),
+        (("keeps on", "keeps on"), "a is not driven: if its host died, its drive would keep on with the last command"),
     ],
 )
 def test_no_joint_is_driven_where_one_would_keep_on(silence, says, monkeypatch):

@@ -95,8 +95,8 @@ def test_rollback_with_apply_writes_the_controllers_first(kept, capsys) -> None:
     path, first, second = kept
     assert run(["rollback", "sarcos", "--to", first, "--store", path, "--apply"]) == 0
     said = capsys.readouterr().out
-    assert "written to 7 controllers" in said
-    assert "a roll-back is checked for nothing but its distance" in said
+    assert "written to 7 drives" in said
+    assert "a roll-back is checked only for its distance" in said
     assert RecordStore(path).writes(load_arm("sarcos"))[0].body["gates"].startswith("roll-back: only the distance")
     assert run(["rollback", "sarcos", "--to", second, "--store", path, "--apply", "--bus", "socketcan:no_such_bus"]) > 1
     assert [line.record for line in RecordStore(path).activations(load_arm("sarcos"))] == [first, second, first]
@@ -105,7 +105,7 @@ def test_rollback_with_apply_writes_the_controllers_first(kept, capsys) -> None:
 def test_rollback_knows_the_joints_that_it_is_told_of(kept, capsys) -> None:
     path, first, _ = kept
     assert run(["rollback", "sarcos", "--to", first, "--store", path, "--apply", "--replaced", "joint_9"]) == 2
-    assert "--replaced joint_9: no such joint" in capsys.readouterr().err
+    assert "--replaced joint_9: there is no such joint" in capsys.readouterr().err
 
 
 def with_spread(record: CalibrationRecord, gain_std: float) -> CalibrationRecord:

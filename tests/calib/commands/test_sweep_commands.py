@@ -131,7 +131,7 @@ def test_where_the_model_does_not_hold_nothing_is_written_unless_accepted(
     store, bus = ["--store", str(tmp_path / "records.db")], ["--bus", f"armlink_sim:{arm_path}"]
     assert run(["calibrate", *bent, *store, *bus, "--apply"]) == 1
     error = capsys.readouterr().err
-    assert "j2: the sensor model does not hold: torque linear in position" in error
+    assert "j2: the sensor model does not hold: part of the torque is linear in position" in error
     assert "nothing was written" in error
     assert "--accept j2" in error
     assert run(["calibrate", *bent, *store, *bus, "--apply", "--accept", "j9"]) == 2
@@ -182,7 +182,7 @@ def test_history_says_why_a_record_was_not_made_current(
     (other / "manifest.json").write_text(json.dumps(manifest))
     store = ["--store", str(tmp_path / "records.db")]
     assert run(["calibrate", str(swept), str(other), *store]) == 1
-    assert "is kept, and not made current" in capsys.readouterr().err
+    assert "is stored, but not made current" in capsys.readouterr().err
     assert run(["history", str(arm_path), *store, "--json", "-"]) == 0
     (record,) = json.loads(capsys.readouterr().out)["records"]
     assert record["note"].startswith("not made current: ")

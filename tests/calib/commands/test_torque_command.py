@@ -96,12 +96,12 @@ def test_without_inertials_or_record_there_is_no_answer(tmp_path, poses, capsys)
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("q_1,q_2\n0,0\n", ["missing column q_3"]),
+        ("q_1,q_2\n0,0\n", ["column q_3 is missing"]),
         ("q_1,q_2,q_3\n", ["no pose"]),
         ("q_1,q_2,q_3\n0,0,0\n0,none,0\n", ["row 3", "none"]),
         ("q_1,q_2,q_3\n0,nan,0\n", ["row 2", "nan"]),
         ("q_1,q_2,q_3\n0,0\n", ["row 2", "''"]),
-        ("", ["missing column q_1"]),
+        ("", ["column q_1 is missing"]),
     ],
 )
 def test_bad_poses_are_one_line(urdf, tmp_path, capsys, text, words):

@@ -93,7 +93,7 @@ def test_a_sound_arm_has_no_error(tmp_path):
         (("link", "joints", 0, "rated_torque"), "40 Nm", "error", ["link.joints.0.rated_torque", "without 'Nm'"]),
         (("kinematics", "gravity"), [0, 0, -9.81], "error", ["kinematics.gravity", "gravity loads no joint"]),
         (("kinematics", "gravity"), [0, -1.6, 0], "warning", ["kinematics.gravity", "1.6"]),
-        (("kinematics", "joints", 0, "upper"), -1.95, "error", ["shoulder", "nothing to sweep"]),
+        (("kinematics", "joints", 0, "upper"), -1.95, "error", ["shoulder", "leaves nothing of its range"]),
         (("serial",), "FILL-IN", "warning", ["serial is FILL-IN", "serial: …"]),
         (("link", "joints", 0, "max_torque"), 400.0, "warning", ["shoulder", "three times"]),
         (("link", "joints", 0, "max_torque_rate"), 9000.0, "hint", ["shoulder", "usual"]),
@@ -189,16 +189,18 @@ def test_a_drive_that_lost_a_turn_is_named_with_the_zero_that_puts_it_right(tmp_
     assert named.where == "elbow (node 2)"
     if turns == "auto":
         assert named.level == "hint"
-        assert "zero 6.2832 is used in place of 0, a whole turn more (turns: auto)" in named.remedy
+        assert "zero 6.2832 is used instead of 0, a whole turn more (`turns: auto`)" in named.remedy
     else:
         assert named.level == "error"
-        assert "set zero: 6.2832" in named.remedy
+        assert "write `zero: 6.2832`" in named.remedy
 
 
 def test_joints_of_which_no_reading_shows_a_lost_turn_are_listed(tmp_path):
-    (named,) = [each for each in examine("six-odrive", offline=True) if "wakes a whole turn" in each.what]
+    (named,) = [
+        each for each in examine("six-odrive", offline=True) if "may count one turn too many or too few" in each.what
+    ]
     assert named.level == "hint"
     assert "base (0.524 rad), shoulder (0.524 rad), elbow (0.628 rad)" in named.what
     wide = written(tmp_path, (("kinematics", "joints", 0, "upper"), 4.4))
-    (named,) = [each for each in examine(wide, offline=True) if "wakes a whole turn" in each.what]
+    (named,) = [each for each in examine(wide, offline=True) if "may count one turn too many or too few" in each.what]
     assert named.what.endswith("shoulder (6.28 rad)")

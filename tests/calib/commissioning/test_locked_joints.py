@@ -121,7 +121,7 @@ def test_the_joint_in_the_way_is_named_with_the_way_round_it(model: Path, tmp_pa
     [
         ("lift:0.5", "joint 'lift' cannot be locked at 0.5: its range is 0 to 0.3"),
         ("lift:high", "--lock lift:high: expected JOINT:POSITION in rad or m, such as lift:0.2"),
-        ("left:0.1", "--lock left: no joint in"),
+        ("left:0.1", "--lock left: there is no such joint in"),
     ],
 )
 def test_a_lock_that_cannot_be_is_one_line(model: Path, tmp_path: Path, lock: str, said: str) -> None:
@@ -150,5 +150,5 @@ def test_rows_have_nothing_to_lock(tmp_path: Path) -> None:
     path.write_text(
         "name: a\nkinematics:\n  joints: [{name: j, a: 0.2, alpha: 0, d: 0, lower: -1, upper: 1}]\n  locked: {j: 0.1}\n"
     )
-    with pytest.raises(BadInput, match="locked is for a model"):
+    with pytest.raises(BadInput, match="`locked` belongs to a model"):
         load_arm(str(path))

@@ -93,8 +93,8 @@ def test_an_arm_that_could_be_built_is_believed(seed: int, tmp_path: Path) -> No
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 def test_masses_in_another_unit_are_named(seed: int, factor: float, tmp_path: Path) -> None:
-    """Grams for kilograms, and the other way round: no arm of that size weighs so much, or so little."""
-    with pytest.raises(BadInput, match=r"its moving links weigh .* kg at a reach of .* state masses in kg"):
+    """Grams for kilograms, and swap the values 2 and 3: no arm of that size weighs so much, or so little."""
+    with pytest.raises(BadInput, match=r"the moving links weigh .* kg at a reach of .* write masses in kg"):
         drafted(DrawnModel(seed, mass_factor=factor).write(tmp_path))
 
 
@@ -174,7 +174,7 @@ def test_a_link_without_mass_is_mentioned(tmp_path: Path) -> None:
     model.write_text(text[:begin] + text[end:])
     made = drafted(model)
     warnings = [found.what for found in model_findings(made.parsed()) if found.level == "warning"]
-    assert "the model states no mass for what turns with joint_1" in warnings
+    assert "the model gives no mass to what turns with joint_1" in warnings
 
 
 def test_every_command_refuses_in_the_words_of_doctor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -201,8 +201,8 @@ def scaled_lengths(text: str, factor: float) -> str:
 
 
 DEFECTS: dict[str, tuple[Callable[[DrawnModel], None], Callable[[str], str], str]] = {
-    "grams": (lambda drawn: setattr(drawn, "mass_factor", 1e3), str, "state masses in kg"),
-    "tonnes": (lambda drawn: setattr(drawn, "mass_factor", 1e-3), str, "state masses in kg"),
+    "grams": (lambda drawn: setattr(drawn, "mass_factor", 1e3), str, "write masses in kg"),
+    "tonnes": (lambda drawn: setattr(drawn, "mass_factor", 1e-3), str, "write masses in kg"),
     "massless": (lambda drawn: setattr(drawn, "massless", True), str, "states no masses"),
     "placeholder": (lambda drawn: setattr(drawn, "effort", 100.0), str, "is a placeholder"),
     "far stronger": (lambda drawn: setattr(drawn, "effort_factor", 40.0), str, "more than 10 times the load"),

@@ -140,7 +140,9 @@ def test_a_lift_and_a_waist_before_the_arm(tmp_path, monkeypatch):
         assert ("lift", "is prismatic") in made.draft.aside
     made = new_arm(Path("m.xml"), Path("a.yaml"))
     assert (list(made.parsed().joint_names), made.parsed().kinematics.base) == (["waist", "shoulder"], "column")
-    with pytest.raises(BadInput, match="--base shoulder: no such body carries a joint; there are world, column, torso"):
+    with pytest.raises(
+        BadInput, match="--base shoulder: there is no such body that carries a joint; there are world, column, torso"
+    ):
         new_arm(Path("m.xml"), Path("a.yaml"), base="shoulder")
 
 
@@ -171,7 +173,7 @@ def test_a_small_arm_has_drives_of_its_own_strength(tmp_path, monkeypatch):
     [
         ('name="j2" type="revolute"', 'name="j2" type="prismatic"', "j2 is prismatic and lies between the base"),
         ('<joint name="j1" type="revolute">', '<joint name="" type="revolute">', "joint 1 of the chain"),
-        ('<mass value="2"/>', '<mass value="two"/>', "MuJoCo refuses it"),
+        ('<mass value="2"/>', '<mass value="two"/>', "MuJoCo refuses this file"),
     ],
 )
 def test_a_model_that_cannot_be_used_names_the_joint(old, new, says, tmp_path):
@@ -291,7 +293,7 @@ def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_b
     assert json.loads(capsys.readouterr().out)["next"] == "armlink check arm.yaml"
     assert cli.run(["check", "arm.yaml", "--passive"]) == 0
     assert cli.run(["doctor", "arm.yaml"]) == 1
-    assert "geometry is not known" in capsys.readouterr().out
+    assert "geometry of the arm is not known" in capsys.readouterr().out
     assert cli.run(["new"]) == 2
     assert "--bus" in capsys.readouterr().err
 
@@ -346,7 +348,7 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
         1:
     ] == marks
     assert cli.run(["new", "arm4.urdf", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
-    assert "nobody to ask" in capsys.readouterr().err
+    assert "no terminal to ask" in capsys.readouterr().err
 
 
 def test_drives_that_are_known_by_ids_must_all_answer_and_are_not_found_by_hand(tmp_path, monkeypatch, capsys):

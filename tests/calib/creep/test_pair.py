@@ -81,7 +81,7 @@ def test_in_a_model_of_both_arms_the_other_joints_are_parked_where_the_arm_file_
     with pytest.raises(Collided, match="openarm_left_"):
         check_creeps(pair, Geometry(pair), plan, np.array(plan.scout[0]))
     wrong = pair.model_copy(update={"sweep": SweepSection(beside=(ParkedArm(pose={"openarm_right_joint4": 1.0}),))})
-    with pytest.raises(BadInput, match="'openarm_right_joint4' moves itself"):
+    with pytest.raises(BadInput, match="'openarm_right_joint4' is moved by a drive of this arm"):
         Geometry(wrong)
 
 
@@ -89,5 +89,5 @@ def test_a_joint_that_the_parked_arm_does_not_have_and_an_arm_without_geometry_a
     with pytest.raises(BadInput, match="joint 'elbow' is not in"):
         Geometry(arm(ParkedArm(model=OTHER, pose={"elbow": 1.0})))
     rows = load_arm("sarcos").model_copy(update={"sweep": SweepSection(beside=(ParkedArm(),))})
-    with pytest.raises(BadInput, match=r"sweep\.beside: collisions need geometry"):
+    with pytest.raises(BadInput, match=r"sweep\.beside: checking for collisions needs geometry"):
         plan_creep(rows)

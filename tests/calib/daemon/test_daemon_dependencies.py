@@ -117,7 +117,7 @@ def test_a_store_that_does_not_answer_holds_nobody_up(tmp_path: Path) -> None:
     daemon.run(30)
     assert len(later) == 1
     assert daemon.view.status().state is State.OBSERVING
-    assert "records.db: has not answered for 2" in (daemon.view.status().store_fault or "")
+    assert "records.db has not answered for 2" in (daemon.view.status().store_fault or "")
     assert metric(daemon, "record_store_up") == "0.0"
     daemon.run_aside = lambda work, done: done(work())
     work, done = later.pop()
@@ -226,7 +226,7 @@ def test_a_damaged_journal_is_set_aside_and_that_is_said(tmp_path: Path) -> None
     daemon.run(10)
     (event,) = daemon.of_kind("fault")
     (aside,) = journal.parent.glob("journal.db.damaged-*")
-    assert event.text == f"the journal was damaged: it is kept as {aside.name}, and a new one was begun"
+    assert event.text == f"the journal was damaged: it was moved to {aside.name}, and a new journal was begun"
     assert daemon.view.status().detail == ""
     assert daemon.view.status().state is State.OBSERVING
 
@@ -357,9 +357,9 @@ def test_while_the_store_s_file_is_gone_nothing_is_written(tmp_path: Path) -> No
     daemon, path = drifted(tmp_path), tmp_path / "records.db"
     path.rename(tmp_path / "away.db")
     daemon.run(7)
-    assert "its file is gone" in (daemon.view.status().store_fault or "")
+    assert "the file is gone" in (daemon.view.status().store_fault or "")
     answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
-    assert (answer.state, "its file is gone" in answer.note) == ("failed", True)
+    assert (answer.state, "the file is gone" in answer.note) == ("failed", True)
     assert not any(call.startswith("write") for call in daemon.sdo)
     assert not path.exists()
     (tmp_path / "away.db").rename(path)

@@ -174,7 +174,7 @@ def test_listening_on_a_lock_step_bus_where_nobody_sends_sync_goes_on_for_ever(t
     loop.close()
     assert isinstance(messages[0], Up)
     (silent,) = (message for message in messages if isinstance(message, Down))
-    assert silent.reason == f"no SYNC on {bus.channel_info}: is the arm's controller running?"
+    assert silent.reason == f"no SYNC on {bus.channel_info}: is the program that commands the arm running?"
 
 
 def test_an_arm_in_this_process_keeps_the_machines_pace_and_does_not_catch_up(

@@ -69,7 +69,7 @@ def test_under_propose_nothing_is_written_until_a_person_approves(tmp_path: Path
     assert (approved.state, approved.decided_by) == ("applied", "ann")
     assert abs(daemon.fast.error()[0][2]) < 0.003
     assert daemon.store.activations(daemon.arm)[-1].by == "ann"
-    with pytest.raises(NotPossible, match="applied already"):
+    with pytest.raises(NotPossible, match="already applied"):
         daemon.view.decisions.approve(proposal.id, "ann").result(0)
 
 
@@ -127,10 +127,10 @@ def test_a_wall_clock_that_is_set_grants_no_further_write_and_neither_does_a_res
     daemon.service.tick()
     drift_again(daemon, 1)
     assert daemon.view.proposals()[0].state == "pending"
-    assert "1 recalibrations within a day are the limit" in daemon.of_kind("undecided")[-1].text
+    assert "only 1 recalibrations are allowed within a day" in daemon.of_kind("undecided")[-1].text
     assert len(daemon.of_kind("recalibration")) == 1
     limit = daemon.service.recalibrations._limit("joint_5")
-    assert limit.startswith("1 recalibrations within a day")
+    assert limit.startswith("only 1 recalibrations are allowed within a day")
     for hours, back in ((50, 0.0), (-50, daemon.now())):  # the machine has restarted: its monotonic clock begins anew
         daemon.kill()
         daemon.wall_shift, daemon.clock_shift = timedelta(hours=hours), -back
@@ -161,7 +161,7 @@ def test_a_decision_that_names_another_content_is_refused(tmp_path: Path) -> Non
     daemon = drifted(tmp_path, "propose")
     (proposal,) = daemon.view.proposals()
     for decide in (daemon.view.decisions.approve, daemon.view.decisions.reject):
-        with pytest.raises(NotPossible, match=f"proposal {proposal.id} is not that of hash 000000000000…: look at"):
+        with pytest.raises(NotPossible, match=f"proposal {proposal.id} does not have the hash 000000000000…: look at"):
             decide(proposal.id, "ann", "0" * 64)
     assert not any(call.startswith("write") for call in daemon.sdo)
     daemon.kill()
@@ -175,7 +175,7 @@ def test_after_a_damaged_journal_nothing_is_written_automatically_for_a_day(tmp_
     (tmp_path / "state" / "journal.db").write_bytes(b"damaged" * 1000)
     for _ in range(2):  # by its own finding, then by the event that it kept of it
         daemon.start()
-        assert "a damaged journal was set aside within a day" in daemon.service.recalibrations._limit("joint_1")
+        assert "a damaged journal was set aside less than a day ago" in daemon.service.recalibrations._limit("joint_1")
         daemon.kill()
     daemon.start()
     daemon.clock_shift = 86_400.0
@@ -189,7 +189,7 @@ def test_a_record_that_is_not_current_in_the_store_any_more_is_not_followed(tmp_
     other = daemon.store.put(calibration.model_copy(update={"note": "other"}), daemon.arm, by="ann", reason="sweep")
     answer = daemon.view.decisions.approve(daemon.view.proposals()[0].id, "ann").result(0)
     assert answer.state == "failed"
-    assert f"is not current in {daemon.store.url} any more ({other} is): superseded" in answer.note
+    assert f"is superseded: it is not current in {daemon.store.url} any more ({other} is)" in answer.note
     assert not any(call.startswith("write") for call in daemon.sdo)
 
 
@@ -226,7 +226,7 @@ def test_a_roll_back_that_fails_is_tried_again_and_said_once(tmp_path: Path, mon
         patch.setattr(daemon.store, "get", lambda record: (_ for _ in ()).throw(StoreFault("store failed")))
         daemon.run(60)
     (refused,) = daemon.of_kind("refused")
-    assert refused.text == "joint_3: roll-back failed: store failed"
+    assert refused.text == "joint_3: the roll-back failed: store failed"
     daemon.run(3)
     assert daemon.of_kind("roll-back")[0].joint == "joint_3"
     assert abs(daemon.fast.error()[1][2]) < 0.01
@@ -369,7 +369,7 @@ def test_a_joint_that_falls_silent_is_a_fault(tmp_path: Path) -> None:
     batch = daemon.service.arm_state.batch
     batch.age[3] = 1.7
     assert daemon.view.status().state is State.FAULT
-    assert daemon.view.status().detail == "joint_4: no reading for 1.7 s"
+    assert daemon.view.status().detail == "joint_4: no reading has come for 1.7 s"
     assert daemon.view.joints()[3].sample_age_s == pytest.approx(1.7)
 
 
@@ -388,7 +388,7 @@ def test_a_host_near_the_deadline_is_said_once_and_not_of_few_cycles(tmp_path: P
     for _ in range(3):
         daemon.service.tick()
     (event,) = daemon.of_kind("late")
-    assert "60 ms late in 99.9 % of the cycles, near link.deadline (100 ms)" in event.text
+    assert "60 ms late in 99.9 % of the cycles, which comes near link.deadline (100 ms)" in event.text
     assert event.evidence["late_ms"]["p50"] < 0.2
     assert daemon.view.status().state is State.OBSERVING
 

@@ -282,6 +282,6 @@ def test_a_second_daemon_on_a_state_directory_does_not_start(
     error = capsys.readouterr().err
     assert status == 2
     assert f"--state {tmp_path}: in use by" in error
-    assert f"(process {os.getpid()}): stop that, or choose another" in error.replace("\n", " ")
+    assert f"(process {os.getpid()}): stop that process, or choose another one" in error.replace("\n", " ")
     assert begun == []
     assert not (tmp_path / "journal.db").exists()

@@ -128,7 +128,7 @@ def test_an_approval_waits_for_the_disk_and_no_controller_is_written_before(tmp_
     assert [each for each in daemon.sdo if each.startswith("write")] == []
     assert daemon.view.proposals()[0].state == "pending"
     for decide in (daemon.view.decisions.approve, daemon.view.decisions.reject):
-        with pytest.raises(NotPossible, match="decided already; the decision waits for the disk"):
+        with pytest.raises(NotPossible, match="already decided; the decision waits for the disk"):
             decide(waiting(daemon), "bob")
     daemon.disk.release()
     assert answer.result(0).state in ("approved", "applied")
@@ -218,7 +218,7 @@ def test_recordings_that_the_disk_does_not_take_are_left_out_and_begin_again(
         daemon.run(30)
     assert daemon.service.recordings._waiting == 5
     assert [each.getMessage() for each in caplog.records].count(
-        "recordings: the disk is too slow: samples are left out"
+        "recordings: the disk is too slow, so samples are left out"
     ) == 1
     daemon.disk.release()
     daemon.run(5)
@@ -234,7 +234,7 @@ def test_the_end_does_not_wait_for_ever(tmp_path: Path, caplog: pytest.LogCaptur
     daemon.service.take(Up(daemon.held()))
     with caplog.at_level(logging.ERROR):
         daemon.service.close("end")
-    assert any("entries not in the journal" in each.getMessage() for each in caplog.records)
+    assert any("entries are not in the journal" in each.getMessage() for each in caplog.records)
 
 
 def test_work_is_done_in_its_order_and_its_end_is_waited_for_within_a_bound() -> None:

@@ -37,4 +37,4 @@ def test_a_mass_that_is_forgotten_or_another_is_named(share: float) -> None:
     assert felt is not None
     assert felt.contradicts
     assert felt.felt == pytest.approx(share * mass, rel=0.3, abs=0.1 * mass)
-    assert f"{mass:g} kg were stated" in str(felt)
+    assert f"--reference-mass was {mass:g} kg" in str(felt)

@@ -98,7 +98,7 @@ def test_where_all_axes_nearly_meet_it_says_so_and_a_measured_point_helps() -> N
     assert plan is not None
     assert "gains will be known to" in plan.notes[-1]
     assert set(bare.imprecise) == {"j1", "j2", "j3"}
-    assert "measure where it hangs" in bare.imprecise["j1"]
+    assert "measure where the reference mass hangs" in bare.imprecise["j1"]
     assert np.abs(scores(bare, truth)[0]).max() < 2
     measured = truth.attachment + np.array([4e-4, -4e-4, 3e-4])
     known = with_section(arm, reference_point=tuple(measured), reference_point_std=5e-4)

@@ -52,6 +52,6 @@ def test_a_record_without_anything_to_write_is_kept_and_refused(written: list[tu
 
 
 def test_joints_that_the_arm_has_not_are_named(written: list[tuple]) -> None:
-    with pytest.raises(BadInput, match="--replaced elbow: no such joint"):
+    with pytest.raises(BadInput, match="--replaced elbow: there is no such joint"):
         apply_record(record(0.1), ARM, None, Apply("me", replaced=("elbow",)), None, "sweeps")
     assert written == []

@@ -222,7 +222,7 @@ def test_a_controller_that_answers_with_something_else_than_was_written_gets_its
             return self.held[joint] if joint else super().write_calibration(joint, calibration, store)
 
     controllers = Deaf()
-    with pytest.raises(BusFault, match=r"elbow: its controller holds gain 1\.1 and"):
+    with pytest.raises(BusFault, match=r"elbow: its drive holds gain 1\.1 and"):
         _install(store, controllers)
     assert controllers.held == Controllers().held
     assert store.writes(ARM)[-1].stage == "undone"
@@ -240,8 +240,8 @@ def test_a_roll_back_asks_only_how_far_the_record_is_from_what_is_installed(stor
     """10 % of gain and of rated torque (50 N·m) pass; history and bounds are not asked for."""
     far(store, record(joints=(joint("shoulder", 1.2), joint("elbow", 1.1, 4.5))))
     for new, said in (
-        (joint("elbow", 1.25), r"elbow: gain 1\.2500 is \+13\.6% from what its controller holds"),
-        (joint("elbow", 1.1, 6.0), r"elbow: offset 6\.000 N·m is \+6\.400 N·m from what its controller holds"),
+        (joint("elbow", 1.25), r"elbow: gain 1\.2500 is \+13\.6% away from what its drive holds"),
+        (joint("elbow", 1.1, 6.0), r"elbow: offset 6\.000 N·m is \+6\.400 N·m away from what its drive holds"),
     ):
         with pytest.raises(GateRefused, match=said) as error:
             far(store, record(joints=(joint("shoulder"), new)))

@@ -32,7 +32,11 @@ def write(store: RecordStore, controllers: Controllers, new: CalibrationRecord =
 @pytest.mark.parametrize("serial", ["unknown", "Unknown ", "FILL-IN"])
 def test_nothing_is_written_to_an_arm_without_a_serial_number(store: RecordStore, serial: str) -> None:
     arm, controllers = ARM.model_copy(update={"serial": serial}), Controllers()
-    with pytest.raises(Refused, match=r"bench: its serial is .*: another arm .* give it one in bench.yaml \(serial: …"):
+    with pytest.raises(
+        Refused,
+        match=r"bench: its serial is .*, so the calibration may belong to another arm .* give this arm a "
+        r"serial in bench.yaml \(`serial: …",
+    ):
         write(store, controllers, NEW.model_copy(update={"serial": serial}), arm)
     assert controllers.held == Controllers().held
     assert store.writes(arm) == []
@@ -55,7 +59,11 @@ def test_an_arm_that_shares_name_and_serial_with_one_written_before_is_refused(s
     other = Controllers()
     other.drives = OTHER
     for new in (NEW, record()):
-        with pytest.raises(Refused, match="another arm has this name and serial: give each its own serial"):
+        with pytest.raises(
+            Refused,
+            match="another arm has the same name and serial, and nothing was written: give each arm a serial "
+            "of its own",
+        ):
             write(store, other, new)
     assert other.held == Controllers().held
     write(store, Controllers(), record(note="the arm itself goes on"))
@@ -162,7 +170,7 @@ def test_of_two_arms_of_one_name_on_one_store_none_gets_the_other_s_calibration(
         found.append(len(one.of_kind("recalibration")))
         if not found[-1]:
             assert one.held() == held
-            said = {"unknown": "its serial is unknown", "7": "another arm has this name and serial"}[serial]
+            said = {"unknown": "its serial is unknown", "7": "another arm has the same name and serial"}[serial]
             assert said in one.of_kind("refused")[-1].text
             assert one.view.status().state is State.OBSERVING
     assert found == written
@@ -177,4 +185,4 @@ def test_without_a_serial_number_a_daemon_observes_and_proposes(tmp_path: Path) 
     assert (proposal.state, proposal.joint) == ("pending", "joint_3")
     answer = one.view.decisions.approve(proposal.id, "ann").result(0)
     assert answer.state == "failed"
-    assert "give it one in sarcos.yaml (serial: …)" in answer.note
+    assert "give this arm a serial in sarcos.yaml (`serial: …`)" in answer.note

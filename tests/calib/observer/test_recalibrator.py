@@ -95,14 +95,14 @@ def test_what_the_check_finds_worse_is_undone(store: RecordStore) -> None:
     controllers = Controllers()
     recalibrator = Recalibrator(ARM, controllers, store, "apply")
     recalibrator.handle(finding(1.03, 0.3))
-    outcome = recalibrator.undo(Checked("worse", 1, "elbow: RMS 0.9 N·m, 0.2 with the old pair"))
+    outcome = recalibrator.undo(Checked("worse", 1, "elbow: RMS 0.9 N·m, 0.2 with the old gain"))
     assert outcome.record == recalibrator.record == store.current(CalibrationRecord, ARM) == record()
     assert (controllers.held[1].gain, controllers.held[1].record_id) == (pytest.approx(1.1), record().number)
     assert store.activations(ARM)[-1].reason.startswith("elbow: RMS 0.9")
     assert outcome.undo is not None
     old = TorqueCalibration(1.1 * 1.03, -0.4 + 1.1 * 0.3).compose(outcome.undo.change)
     np.testing.assert_allclose((old.gain, old.offset), (1.1, -0.4), atol=1e-6)
-    with pytest.raises(Refused, match="none before it"):
+    with pytest.raises(Refused, match="no record before"):
         recalibrator.undo(Checked("worse", 1, "again"))
 
 
@@ -217,7 +217,7 @@ def test_bounds_are_against_the_last_sweep_not_the_last_step(store: RecordStore)
 
 
 def test_a_controller_that_holds_something_else_is_refused(store: RecordStore) -> None:
-    with pytest.raises(Refused, match="elbow: the controller holds gain 1, record"):
+    with pytest.raises(Refused, match="elbow: the drive holds gain 1, but record"):
         Recalibrator(ARM, Controllers(gain=1.0), store, "apply").handle(finding())
 
 

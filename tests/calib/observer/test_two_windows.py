@@ -27,4 +27,6 @@ def test_what_all_windows_together_do_not_say_is_not_proposed(sarcos, sarcos_bet
     assert asked
     assert "proposal" not in kinds(events)
     reasons = [event.evidence["reasons"] for event in events if event.kind == "undecided"]
-    assert ["all windows together point to another cause"] in reasons
+    assert [
+        "each window of readings shows a drift of the sensor, but all windows together show another cause"
+    ] in reasons

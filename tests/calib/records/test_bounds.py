@@ -164,14 +164,16 @@ def test_a_record_of_the_future_does_not_become_current_and_one_in_force_stays_w
         if sound:
             require_sound(record, ARM, now)
         else:
-            with pytest.raises(Refused, match=r"created is 2026-11-29 03:00 UTC, but this machine's clock says"):
+            with pytest.raises(
+                Refused, match=r"was created on 2026-11-29 03:00 UTC, but the clock of this machine says"
+            ):
                 require_sound(record, ARM, now)
 
 
 def test_a_record_of_other_joints_is_refused() -> None:
     (first, _) = calibration().joints
     record = calibration().model_copy(update={"joints": (first,), "covariance_of": (), "covariance": ()})
-    with pytest.raises(Refused, match="it has 1 joints, the arm 2"):
+    with pytest.raises(Refused, match="it has 1 joints, but the arm has 2"):
         require_sound(record, arm_file())
 
 

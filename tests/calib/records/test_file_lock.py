@@ -11,7 +11,7 @@ from calib.records.file_lock import lock_file, locked_directory
 
 def test_a_directory_in_use_is_refused_and_named(tmp_path):
     with locked_directory(tmp_path, "--state here"):
-        says = rf"--state here: in use by .*\(process {os.getpid()}\): stop that, or choose another"
+        says = rf"--state here: in use by .*\(process {os.getpid()}\): stop that process, or choose another one"
         with pytest.raises(BadInput, match=says), locked_directory(tmp_path, "--state here"):
             pass
     with locked_directory(tmp_path, "--state here"):

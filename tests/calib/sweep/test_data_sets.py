@@ -41,7 +41,7 @@ def test_the_same_readings_twice_are_refused(tmp_path: Path) -> None:
     first = written(tmp_path / "first")
     shutil.copytree(first, tmp_path / "copy")
     for other in (first, tmp_path / "copy"):
-        with pytest.raises(BadInput, match=rf"{other}: the same readings as {first}, .*give one of them"):
+        with pytest.raises(BadInput, match=rf"{other} has the same readings as {first}, .*give one of the two"):
             data_sets([first, other])
 
 
@@ -51,8 +51,8 @@ def test_a_sweep_that_was_ended_early_says_where(tmp_path: Path, caplog: pytest.
     assert len(data.readings) == 14
     assert data.plan is not None
     last = data.plan.sweeps[0].name
-    assert f"{folder}: ended before the end of sweep {last}: fitted to what is there" in caplog.text
-    assert caplog.text.endswith(f"to go on: armlink sweep {data.manifest.arm_file} --out {folder} --resume\n")
+    assert f"{folder} ended before the end of sweep {last}, so the fit uses what is there" in caplog.text
+    assert caplog.text.endswith(f"to continue: armlink sweep {data.manifest.arm_file} --out {folder} --resume\n")
     caplog.clear()
     data_sets([written(tmp_path / "scout", 2, planned=False)])
     assert "ended before its first sweep" in caplog.text
@@ -70,7 +70,7 @@ def test_the_command_refuses_twins_in_one_line(tmp_path: Path, capsys: pytest.Ca
     folder = str(written(tmp_path / "set"))
     assert run(["calibrate", folder, folder, "--store", str(tmp_path / "records.db")]) == 2
     assert capsys.readouterr().err == (
-        f"armlink: {folder}: the same readings as {folder}, which would count twice: give one of them\n"
+        f"armlink: {folder} has the same readings as {folder}, which would count twice: give one of the two\n"
     )
 
 

@@ -85,25 +85,28 @@ def _set(**values: Any) -> Edit:
 
 
 EDITS: dict[str, tuple[Edit, str]] = {
-    "a step past a stop": (lambda p: p["sweeps"][0]["steps"].__setitem__(-1, 3.0), "last step: elbow at 3 rad"),
-    "a scout pose past a stop": (lambda p: p["scout"][0].__setitem__(0, -2.0), "scout pose 1: shoulder at -2 rad"),
+    "a step past a stop": (lambda p: p["sweeps"][0]["steps"].__setitem__(-1, 3.0), "last step: elbow is at 3 rad"),
+    "a scout pose past a stop": (lambda p: p["scout"][0].__setitem__(0, -2.0), "scout pose 1: shoulder is at -2 rad"),
     "no scout pose": (lambda p: p.update(scout=[]), "no scout pose"),
-    "a resting joint in the middle": (lambda p: p["sweeps"][0]["rest"].__setitem__(0, 0.3), "shoulder at 0.3 rad"),
+    "a resting joint in the middle": (lambda p: p["sweeps"][0]["rest"].__setitem__(0, 0.3), "shoulder is at 0.3 rad"),
     "more than its torque": (lambda p: p["sweeps"][0].update(bias=[300.0, 0.0]), "pressed with 300 N·m"),
     "away from its stop": (
         lambda p: p["sweeps"][0].update(bias=[-x for x in p["sweeps"][0]["bias"]]),
-        "not towards the stop",
+        "away from the stop",
     ),
-    "no bias torque": (_set(bias=None), "bias is missing"),
-    "faster than it may": (_set(acceleration=50.0), "acceleration 50 rad/s²"),
+    "no bias torque": (_set(bias=None), "`bias` is missing"),
+    "faster than it may": (_set(acceleration=50.0), "acceleration is 50 rad/s²"),
     "faster on the way": (lambda p: p.update(travel_acceleration=40.0), "travel_acceleration is 40 rad/s²"),
-    "another joint": (_set(joint=7), "joint 7, expected 0 to 1"),
+    "another joint": (_set(joint=7), "joint is 7, expected 0 to 1"),
     "fewer joints": (_set(rest=[0.0]), "rest has 1 values"),
     "steps that fall": (lambda p: p["sweeps"][0]["steps"].reverse(), "steps do not increase"),
-    "a joint that hangs loose": (_set(stops=[0, 0], servo=[False, False]), "neither on a stop nor in its servo"),
+    "a joint that hangs loose": (
+        _set(stops=[0, 0], servo=[False, False]),
+        "neither on a stop nor by its position loop",
+    ),
     "twice the same sweep": (lambda p: p["sweeps"].append(p["sweeps"][0]), "two sweeps are called"),
     "no accuracy": (lambda p: p.update(standard_error=0.0), "standard_error is 0"),
-    "a creep": (_set(speed=0.2), "creeps"),
+    "a creep": (_set(speed=0.2), "is a creep sweep"),
 }
 
 

@@ -77,7 +77,7 @@ def test_a_loud_sensor_is_named() -> None:
     loud = ARM.model_copy(update={"sim": ARM.sim.model_copy(update={"sensors": sensors})})
     with (
         enabled(SimulatedArm(loud, Truth.of(loud), 1)) as link,
-        pytest.raises(Refused, match="j2: its torque sensor's noise is"),
+        pytest.raises(Refused, match="j2: the noise of its torque sensor is"),
     ):
         listen(link, ARM)
 
@@ -133,7 +133,7 @@ def test_stops_are_found_where_the_arm_file_has_them_and_named_where_not() -> No
         np.testing.assert_allclose(found.stops, reading, atol=0.004)
         assert counted[-1] == (4, 4)
         assert simulated.time - begun == pytest.approx(stops_seconds(ARM), rel=0.25)
-        with pytest.raises(Refused, match=r"j2: blocked at .* its stop should be at"):
+        with pytest.raises(Refused, match=r"j2 was blocked at .* its stop should be at"):
             find_stops(link, wider, listened)
 
 
@@ -142,5 +142,5 @@ def test_a_stuck_encoder_bit_is_named_before_any_stop_is_pressed() -> None:
     stick(simulated, 6)
     with enabled(simulated) as link:
         found = listen(link, ARM)
-        with pytest.raises(EncoderFault, match=r"^j2: its position reading .*bit 6 of its encoder, which is stuck"):
+        with pytest.raises(EncoderFault, match=r"^j2: .*its position reading .*the encoder, since its bit 6 is stuck"):
             find_stops(link, ARM, found)

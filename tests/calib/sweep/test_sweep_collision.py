@@ -30,7 +30,7 @@ def test_a_stop_at_which_the_arm_touches_is_not_leant_on(tmp_path: Path) -> None
 def test_a_body_in_the_middle_of_every_sweep_refuses_the_plan(tmp_path: Path, height: float) -> None:
     """Even where it stands between the steps of a sweep."""
     arm = bench(tmp_path, post(0.3, height))
-    with pytest.raises(Collided, match="in every combination of stops something touches, for example post and upper"):
+    with pytest.raises(Collided, match="in every combination of stops two bodies touch, for example post and upper"):
         plan_sweep(arm)
 
 

@@ -29,7 +29,9 @@ def test_a_hard_case_is_named_or_stays_within_its_intervals(case: str, tmp_path:
 def test_a_stuck_bit_ends_the_sweep_before_anything_is_pressed(bit: int, tmp_path: Path) -> None:
     arm, simulated = hard_arm("sound", 1, 2, steps=5, poses=1, max_samples=30, gain_std=0.5)
     stick(simulated, bit)
-    with pytest.raises(EncoderFault, match=rf"^j2: its position reading .* bit {bit} of its encoder"):
+    with pytest.raises(
+        EncoderFault, match=rf"^j2: .*its position reading .*the encoder, since its bit {bit} is stuck or lost"
+    ):
         sweep_case("encoder", arm, simulated, tmp_path, loaded=False)
     assert not any(reading.joint is not None for reading in load_data(tmp_path / "bare").readings)
 
@@ -46,7 +48,7 @@ def _pressed_again(outcome: Outcome, slips: int) -> None:
 
 
 def _said_not_to_be_felt(outcome: Outcome, _: int) -> None:
-    assert "gravity does not act" in outcome.fit.reasons["j1", "gain"]
+    assert "gravity does not load" in outcome.fit.reasons["j1", "gain"]
     assert np.isfinite(outcome.fit.value("offset")[0])
 
 

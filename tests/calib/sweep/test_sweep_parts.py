@@ -224,7 +224,7 @@ def test_a_full_disk_is_said_in_one_line_and_loses_one_reading(tmp_path: Path) -
         size = (folder / "readings.jsonl").stat().st_size
         resource.setrlimit(resource.RLIMIT_FSIZE, (size + 40, unlimited[1]))
         try:
-            with pytest.raises(BadInput, match=r"readings\.jsonl: .*the last reading is not kept.*--resume"):
+            with pytest.raises(BadInput, match=r"readings\.jsonl: .*the last reading was not saved.*--resume"):
                 writer.append(readings[1])
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
@@ -244,7 +244,7 @@ def test_a_data_set_whose_beginning_was_cut_off_can_be_begun_again(tmp_path: Pat
 
 def test_a_data_set_that_another_process_writes_is_not_resumed(tmp_path: Path) -> None:
     arm = random_arm(1, 3)
-    says = r"set: in use by .*\(process \d+\): stop that, or choose another"
+    says = r"set: in use by .*\(process \d+\): stop that process, or choose another one"
     with DataWriter(tmp_path / "set", Manifest.of(arm, 0.0)), pytest.raises(BadInput, match=says):
         DataWriter(tmp_path / "set", Manifest.of(arm, 0.0), resume=True)
     DataWriter(tmp_path / "set", Manifest.of(arm, 0.0), resume=True).__exit__()
@@ -257,7 +257,7 @@ def test_unsettled_readings_are_told_with_their_sweeps() -> None:
     swung = replace(data.readings[0], settled=False)
     (line,) = unsettled_lines(replace(data, readings=(swung, *data.readings[1:])))
     assert line.startswith(f"1 of {len(data.readings)} readings had not settled")
-    assert "in scout: they count less" in line
+    assert "in scout: these readings count less" in line
 
 
 def test_a_missing_number_stays_missing(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_bad_data_sets_say_where(tmp_path: Path) -> None:
         pass
     with pytest.raises(BadInput, match="not empty"):
         DataWriter(tmp_path / "set", Manifest.of(arm, 0.0))
-    with pytest.raises(Refused, match=r"reference_mass is 0\.0 there, but 2\.0"):
+    with pytest.raises(Refused, match=r"reference_mass was 0\.0, but now it is 2\.0"):
         DataWriter(tmp_path / "set", Manifest.of(arm, 2.0), resume=True)
     (tmp_path / "set" / "readings.jsonl").write_text(json.dumps({"kind": "reading", "sweep": "x"}) + "\n")
     with pytest.raises(BadInput, match="line 1: key"):
@@ -293,7 +293,7 @@ def test_a_reading_of_the_wrong_width_is_refused(tmp_path: Path) -> None:
     reading = synthetic_pass(large, Truth.of(large), plan_sweep(large), 0.0, np.random.default_rng(0)).readings[0]
     with DataWriter(tmp_path / "set", Manifest.of(small, 0.0)) as writer:
         writer.append(reading)
-    with pytest.raises(BadInput, match="not one per joint"):
+    with pytest.raises(BadInput, match="must have one value for each joint"):
         load_data(tmp_path / "set")
 
 
@@ -309,5 +309,5 @@ def test_how_far_a_stop_may_be_from_its_place(side: int) -> None:
         Mover._check_stop(mover, 0, side)  # type: ignore[arg-type]
     furthest = 2 * STOP_TOLERANCE + 0.03 * 2.0
     Mover._check_creep(mover, 0, side, place + side * (furthest - 1e-6))  # type: ignore[arg-type]
-    with pytest.raises(Refused, match=f"no stop found at {place:.3f} rad"):
+    with pytest.raises(Refused, match=f"no stop was found at {place:.3f} rad"):
         Mover._check_creep(mover, 0, side, place + side * (furthest + 1e-6))  # type: ignore[arg-type]

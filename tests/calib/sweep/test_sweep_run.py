@@ -211,7 +211,7 @@ def test_a_stop_that_is_not_where_the_arm_file_has_it_is_named(chain: Chain) -> 
     mover = Mover(chain.link, sweep_section(chain.arm), wrong)
     mover.hold_all()
     mover.travel(np.array([(limits.lower[0] + limits.upper[0]) / 2, wrong.upper[1], 0.0]), 1.0)
-    with pytest.raises(Refused, match=f"j2: no stop found at {wrong.upper[1]:.3f} rad"):
+    with pytest.raises(Refused, match=f"j2: no stop was found at {wrong.upper[1]:.3f} rad"):
         mover.press(np.array([0, 1, 0]), np.array([0.0, 5.0, 0.0]))
     mover.hold_all()
     mover.cycle()

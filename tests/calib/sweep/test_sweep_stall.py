@@ -60,7 +60,7 @@ def test_keep_going_repeats_the_reading_that_a_stall_interrupted(tmp_path: Path,
         assert job.returncode == 130, said
     expected = "the host was" if who == "loop" else "no joint has sent a reading for"
     assert f"{expected} " in said
-    assert "enabling them again and repeating the reading" in said
+    assert "enabling the joints again and repeating the reading" in said
     assert not any(word in said for word in FALSE), said
     data = load_data(tmp_path / "unloaded")
     (stall, *_) = [each for each in data.stalls if (each.late_ms is not None) == (who == "loop")]

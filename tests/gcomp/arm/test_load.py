@@ -151,7 +151,7 @@ def test_prismatic_and_mimic_joints_are_refused_by_name(tmp_path: Path) -> None:
         ("0 0 1", "{} 0 1", "joint elbow"),
         ("0 1 0", "{} 1 0", "joint elbow"),
         ("0.5", "{}", "joint elbow"),
-        ("2", "{}", "body lower|MuJoCo refuses it"),
+        ("2", "{}", "body lower|MuJoCo refuses this file"),
     ],
 )
 def test_numbers_that_are_none_are_refused_by_name(
@@ -177,16 +177,16 @@ def test_branches_unknown_tips_and_files_that_are_no_models_are_refused(tmp_path
         '<mujoco><worldbody><body name="a"><joint name="left"/><geom size="0.1"/></body>'
         '<body name="b"><joint name="right"/><geom size="0.1"/></body></worldbody></mujoco>'
     )
-    with pytest.raises(BadModel, match="joint left branches off the chain: name the body at the chain"):
+    with pytest.raises(BadModel, match="joint left is on a side branch: name the last body of the chain"):
         load_model(path)
     assert load_model(path, tip="a").arm.names == ("left",)
-    with pytest.raises(BadModel, match="no body 'c' for tip; there are a, b"):
+    with pytest.raises(BadModel, match="no body 'c' for the tip; there are a, b"):
         load_model(path, tip="c")
     path.write_text("q_1,q_2\n0,1\n")
     with pytest.raises(BadModel, match="not a URDF or MJCF file"):
         load_model(path)
     path.write_text("<mujoco><worldbody/></mujoco>")
-    with pytest.raises(BadModel, match="no joint: an arm has at least one"):
+    with pytest.raises(BadModel, match="the model has no joint, but an arm has at least one"):
         load_model(path)
     path.write_text(
         '<mujoco><worldbody><body name="a"><freejoint name="float"/><geom size="1"/></body></worldbody></mujoco>'

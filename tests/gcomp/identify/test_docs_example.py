@@ -15,4 +15,4 @@ def test_the_pages_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     said = capsys.readouterr().out
     assert "'gain[elbow]': " in said
     assert "gain[shoulder]" in said
-    assert "gain[shoulder] changes no reading: gravity does not act on it in these poses" in said
+    assert "gain[shoulder] changes no reading, since gravity does not act on it in these poses" in said

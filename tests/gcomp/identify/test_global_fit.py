@@ -197,7 +197,7 @@ def test_wrong_names_and_shapes_are_refused(sarcos, rng) -> None:
     rows = make_readings(sarcos, Parameters.nominal(7), *sweep_rows(sarcos, 1, 3, rng))
     with pytest.raises(BadArray, match=r"unknown is .*'gains'.*, expected some of gain, offset"):
         identify_global(sarcos, rows, unknown=("gains",))
-    with pytest.raises(BadArray, match="loss is 'tukey', expected linear, huber or cauchy"):
+    with pytest.raises(BadArray, match="loss is 'tukey', expected one of linear, huber or cauchy"):
         identify_global(sarcos, rows, unknown=("beta",), loss="tukey")
     with pytest.raises(BadArray, match="readings of 7 joints, but the arm has 3"):
         identify_global(make_random_arm(rng, 3).arm, rows, unknown=("beta",))

@@ -87,8 +87,11 @@ def test_an_unknown_direction_of_gravity_costs_one_more(gravity_unknown: bool, d
 def test_common_scale_is_named_and_offsets_stay() -> None:
     found = fit(make_sarcos(), SENSORS, poses=2)
     assert found.null_space == (
-        "common factor of " + ", ".join(f"gain[joint_{i}]" for i in range(1, 8))
-        + " against all mass moments: readings with a reference mass fix it",
+        ", ".join(f"gain[joint_{i}]" for i in range(1, 8))
+        + (
+                " can change by one common factor together with all mass moments: readings with a reference "
+                "mass fix this factor"
+                ),
     )  # fmt: skip
     assert set(found.not_identifiable) == {name for name in found.names if not name.startswith("offset")}
     assert np.isfinite(found.values.offset).all()

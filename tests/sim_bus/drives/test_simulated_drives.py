@@ -242,7 +242,7 @@ def test_a_fault_that_a_drive_cannot_have(drive, fault):
 
 
 def test_a_drive_without_a_model_on_its_label_is_not_simulated():
-    with pytest.raises(BadInput, match=r"hinge: drive\.model is ''; simulated are DM3507"):
+    with pytest.raises(BadInput, match=r"hinge: drive\.model '' cannot be simulated; the simulated models are DM3507"):
         simulated({**DAMIAO, "model": ""})
 
 

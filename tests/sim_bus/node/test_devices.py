@@ -44,7 +44,7 @@ def test_units_that_nobody_tells_are_asked_for():
     arm = arm_of("epos4")
     with (
         Link(arm, LockStepBus(arm=simulated(arm))) as link,
-        pytest.raises(BadInput, match=r"base \(node 1\): .* give drive\.position_unit"),
+        pytest.raises(BadInput, match=r"base \(node 1\): .* write `position_unit`"),
     ):
         link.start()
 

@@ -52,7 +52,7 @@ def test_a_force_from_outside_is_blamed_on_nothing(force):
     answer = diagnosed(pushed(force))
     assert answer.verdict == "unexplained"
     assert not [cause for cause in answer.causes if cause.confidence > 0.5]
-    assert any(note.startswith("joint_2: ") and "remain (noise" in note for note in answer.notes)
+    assert any(note.startswith("joint_2: ") and "remains (noise" in note for note in answer.notes)
 
 
 @pytest.mark.long

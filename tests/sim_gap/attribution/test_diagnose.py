@@ -169,7 +169,7 @@ def test_where_the_sensors_drown_in_noise_the_command_is_compared_with_the_model
         return replace(clean, torque_command=clean.motor_torque, **shaken)
 
     answer = diagnose(model(), [noisy(1)], [noisy(2)])
-    assert "too noisy" in answer.notes[0]
+    assert "is too large" in answer.notes[0]
     assert (answer.causes[0].effect, answer.causes[0].joints) == ("friction.coulomb", ("joint_2",))
 
 

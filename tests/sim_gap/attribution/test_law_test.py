@@ -62,7 +62,7 @@ def test_what_a_law_says_as_well_is_not_said_with_confidence(withheld, wrong):
     recordings = [record(model(), wrong, seed=seed, seconds=40, rate=50.0) for seed in (1, 2)]
     answer = diagnose(model(), recordings[:1], recordings[1:], withhold=[withheld])
     assert not [cause for cause in answer.causes if cause.confidence > 0.8]
-    assert any("would look the same" in note or "remain (noise" in note for note in answer.notes)
+    assert any("would look the same" in note or "remains (noise" in note for note in answer.notes)
     whole = diagnose(model(), recordings[:1], recordings[1:])
     assert whole.causes[0].effect == withheld
     assert whole.causes[0].confidence > 0.8

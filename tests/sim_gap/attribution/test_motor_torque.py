@@ -64,7 +64,7 @@ def test_friction_and_rotors_are_told_in_true_newton_metres(answer, effect, name
 
 
 def test_what_masses_and_constants_have_in_common_is_said_to_be_unknown(answer):
-    assert any("the scale of all masses and torque constants" in note for note in answer.notes)
+    assert any("the common scale of masses and torque constants" in note for note in answer.notes)
     for each in values(answer, "actuator.gain", "gain"):
         assert each.high - each.low > 2 * 0.015 * each.value
 

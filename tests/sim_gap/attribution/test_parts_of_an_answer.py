@@ -150,7 +150,7 @@ def test_a_written_model_that_runs_away_from_the_fit_is_said() -> None:
     )
     far, near = (Rollout(6.0, np.full(2, np.nan), np.array([0.05, left]), closed_loop=True) for left in (0.2, 0.14))
     (note,) = running_free(found, far, gap=True)
-    assert note.endswith("leaves more than the fit: b 0.2 rad (fit 0.01)")
+    assert note.endswith("leaves a larger gap than the fit: b 0.2 rad (fit 0.01)")
     assert running_free(found, near, gap=True) == []
     assert running_free(found, None, gap=True) == []
 
@@ -169,5 +169,5 @@ def test_a_written_model_that_leaves_more_than_the_nominal_one_is_said() -> None
     assert note.endswith("use the nominal model")
     (note,) = running_free(found, worse, gap=True)
     assert note.startswith(
-        "running free, the corrected model leaves a larger gap (0.0381 rad) than the nominal one (0.03 rad)"
+        "running free, the corrected model leaves a larger gap (0.0381 rad) than the nominal model (0.03 rad)"
     )

@@ -91,12 +91,12 @@ def test_a_urdf_keeps_its_shapes_and_says_that_zeros_moved(tmp_path):
     nominal.qpos0[1] = 0.05
     text, lines = urdf_of(nominal, path)
     assert "package://ur_description/meshes/ur10e/collision/shoulder.stl" in text
-    assert lines == ["zero of shoulder_lift_joint: the arm reads 0.05 rad more than this file"]
+    assert lines == ["zero of shoulder_lift_joint: the arm reads 0.05 rad more than a simulation of this file"]
 
 
 def test_a_ball_joint_is_refused():
     ball = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body><joint type="ball"/><geom size="1"/></body></worldbody></mujoco>'
     )
-    with pytest.raises(BadInput, match="hinges and slides alone"):
+    with pytest.raises(BadInput, match="only hinges and slides"):
         urdf_of(ball, None)

@@ -124,8 +124,8 @@ def test_a_velocity_that_is_not_the_derivative_is_left_out(arm, motor, factor, k
     ("holds", "option"),
     [
         ([1, 2, 0], "--map dq_2=dq_1,dq_3=dq_2,dq_1=dq_3"),
-        ([0, 0, 0], "--units dq_2=rad,dq_3=rad (keep it)"),
-        ([2, 1, 1], "--units dq_1=rad,dq_3=rad (keep it)"),
+        ([0, 0, 0], "--units dq_2=rad,dq_3=rad (to keep the velocity)"),
+        ([2, 1, 1], "--units dq_1=rad,dq_3=rad (to keep the velocity)"),
     ],
 )
 def test_velocities_of_other_joints_are_mapped_where_every_joint_has_one(arm, motor, holds, option):
@@ -186,7 +186,11 @@ def test_a_joint_beyond_its_range_is_refused_unless_the_user_says_that_it_is_the
     assert check(with_range(least - 0.01, most + 0.01), motor)[1] == []
     assert check(with_range(least - 0.01, most - 0.1), motor)[1] == []
     narrow = with_range(least - 0.01, most - 0.3)
-    with pytest.raises(BadInput, match=r"q of joint_2: runs from .* the model's joint from .*--zero q_2=0"):
+    with pytest.raises(
+        BadInput,
+        match=r"q of joint_2: the recorded position goes from .* the joint of the model can only go from "
+        r".*--zero q_2=0",
+    ):
         check(narrow, motor)
     assert check(narrow, motor, parse_corrections(zero=["q_2=0"]))[1] == []
 
@@ -201,7 +205,7 @@ def test_rows_that_are_missing_are_said(arm, motor):
 
 def test_counts_are_doubted_with_the_option(arm, motor):
     counts = replace(motor, position=np.round(motor.position * 4096 / (2.0 * np.pi)), velocity=None)
-    with pytest.raises(BadInput, match=r"q of joint_1: holds whole numbers .*--units q=counts:TURN"):
+    with pytest.raises(BadInput, match=r"q of joint_1: the column holds whole numbers .*--units q=counts:TURN"):
         check(arm, counts)
 
 
@@ -323,7 +327,7 @@ def test_rows_stamped_together_are_put_on_even_times_or_refused(arm, motor):
     corrected, (finding,) = check(arm, replace(motor, t=stamped, velocity=None))
     assert finding.finding == "jitter"
     assert np.diff(corrected.t).min() > 0.009
-    with pytest.raises(BadInput, match="stamped together"):
+    with pytest.raises(BadInput, match="did several rows get one time stamp"):
         check(arm, replace(motor, t=stamped, velocity=None), parse_corrections(clock=["t=0"]))
 
 
@@ -332,7 +336,7 @@ def test_torques_exchanged_midway_are_doubted(arm, motor):
     exchanged[motor.t.size // 2 :] = exchanged[motor.t.size // 2 :][:, [0, 2, 1]]
     doubt(
         check(arm, replace(motor, motor_torque=exchanged, velocity=None)),
-        r"after 50% of the recording: .* --map tau_motor_2=tau_motor_3",
+        r"after 50% of the recording, .* --map tau_motor_2=tau_motor_3",
     )
 
 
@@ -341,7 +345,7 @@ def test_torques_exchanged_in_a_part_of_the_rows_are_doubted_with_their_place(ar
     rows = (motor.t > motor.t[0] + share * np.ptp(motor.t)) == late
     exchanged = motor.motor_torque.copy()
     exchanged[rows] = exchanged[rows][:, [2, 1, 0]]
-    place = rf"{'after' if late else 'before'} {share:.0%} of the recording: .* --map tau_motor_1=tau_motor_3"
+    place = rf"{'after' if late else 'before'} {share:.0%} of the recording, .* --map tau_motor_1=tau_motor_3"
     doubt(check(arm, replace(motor, motor_torque=exchanged, velocity=None)), place)
 
 
@@ -350,7 +354,9 @@ def test_amperes_of_one_joint_are_asked_about(arm, motor, joint, constant):
     torque = motor.motor_torque.copy()
     torque[:, joint] /= constant
     column = f"tau_motor_{joint + 1}"
-    error = doubt(check(arm, replace(motor, motor_torque=torque)), rf"amperes, or another unit.*--units {column}=A:K")
+    error = doubt(
+        check(arm, replace(motor, motor_torque=torque)), rf"amperes, or in another unit.*--units {column}=A:K"
+    )
     assert f"{column}=N·m" in error
     assert check(arm, replace(motor, motor_torque=torque), parse_corrections(units=[f"{column}=N·m"]))[1] == []
     assert check(arm, motor, parse_corrections(units=[f"{column}=N·m"]))[1] == []
@@ -365,7 +371,7 @@ def test_a_load_that_counts_many_times_at_a_slim_wrist_is_no_unit(arm, payload):
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
 def test_times_in_a_smaller_unit_are_asked_about(arm, motor, unit):
     fine = replace(motor, t=motor.t / TIME_UNITS[unit])
-    with pytest.raises(BadInput, match=rf"travel .* --units t={unit}, or t=s if it is right"):
+    with pytest.raises(BadInput, match=rf"travel .* --units t={unit}, or t=s if this is right"):
         check(arm, fine)
     in_seconds = parse_corrections(units=[f"t={unit}"])
     assert check(arm, in_seconds.apply(fine, "r"), in_seconds)[1] == []

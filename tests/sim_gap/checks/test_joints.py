@@ -46,7 +46,7 @@ def test_numbers_match_in_any_notation():
     "names", [("a", "b", "c"), ("elbow", "elbow_2", "shoulder"), ("left_elbow", "right_elbow", "x")]
 )
 def test_unknown_names_are_refused_with_the_option(names):
-    with pytest.raises(BadInput, match=r"r: its joints .* --joints "):
+    with pytest.raises(BadInput, match=r"r: the recording has the joints .* --joints "):
         match_joints(recording(*names), MODEL, AS_IT_IS, "r")
 
 

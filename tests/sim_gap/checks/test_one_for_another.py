@@ -83,7 +83,7 @@ def test_one_joint_in_another_unit_makes_no_motors_of_link_sensors(arms, joint):
     column = f"tau_{joint + 1}"
     doubt(
         check_recording(arm, replace(recording, torque=torque), "r", AS_IT_IS),
-        f"amperes, or another unit.*--units {column}=A:K",
+        f"amperes, or in another unit.*--units {column}=A:K",
     )
     stated = parse_corrections(units=[f"{column}=N·m"])
     assert check_recording(arm, replace(recording, torque=torque), "r", stated)[1] == []

@@ -41,6 +41,6 @@ def test_columns_are_not_judged_by_a_single_stroke():
 
 def test_the_diagnosis_says_what_was_not_checked():
     (note,) = unchecked_note([strokes(1.0)])
-    assert "record motion to and fro" in note
+    assert "record motion in both directions" in note
     assert unchecked_note([strokes(1.0), strokes(3.0)]) == ()
     assert note in diagnose(model(), [strokes(1.0)]).notes

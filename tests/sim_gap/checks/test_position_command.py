@@ -39,7 +39,7 @@ def test_the_option_settles_whose_command_it_is(servo, holds, option):
         assert option in str(refused.value)
     else:
         assert "elbow: q_cmd_2 is followed by q_1" in str(refused.value)
-        assert "--map q_cmd_2=COLUMN, or =q_cmd_2 if it is right" in str(refused.value)
+        assert "--map q_cmd_2=COLUMN; if q_cmd_2 is right, confirm it with --map q_cmd_2=q_cmd_2" in str(refused.value)
     stated = parse_corrections(columns=[option.removeprefix("--map ")])
     assert check(stated.apply(spoiled, "r.csv"), stated)[1] == []
 

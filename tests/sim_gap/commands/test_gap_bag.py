@@ -60,4 +60,4 @@ def test_the_option_that_is_printed_numbers_the_joints_so_too(bag, capsys):
     assert status == 0
     (finding,) = json.loads((bag / "answer.json").read_text())["checks"]
     assert (finding["joint"], finding["option"]) == ("shoulder", "--sign tau_1=-1")
-    assert "tau of shoulder: has the opposite sign" in said.out
+    assert "tau of shoulder: the sign is opposite" in said.out

@@ -37,7 +37,9 @@ def test_a_mass_that_comes_from_an_absent_mesh_is_one_line(tmp_path):
         '<mujoco><asset><mesh name="m" file="link.stl"/></asset><worldbody><body name="link"><joint name="j"/>'
         '<geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
     )
-    with pytest.raises(BadInput, match=r"mesh link.stl is not found, and body 'link' has its mass from it alone"):
+    with pytest.raises(
+        BadInput, match=r"mesh link.stl is not found, and body 'link' has its mass from this mesh alone"
+    ):
         load_model(model)
 
 
@@ -64,7 +66,9 @@ def two_arms(tmp_path) -> Path:
 
 
 def test_which_of_two_arms_is_recorded_is_not_guessed(two_arms):
-    with pytest.raises(BadInput, match=r"2 arms of 3 joints: name the body .* --tip: left_lower, right_lower"):
+    with pytest.raises(
+        BadInput, match=r"2 arms of 3 joints: choose an arm by its last body .* --tip: left_lower, right_lower"
+    ):
         load_model(two_arms, (), 3)
 
 
@@ -83,9 +87,9 @@ def test_an_arm_is_chosen_by_its_ends(two_arms):
 @pytest.mark.parametrize(
     ("base", "tip", "says"),
     [
-        ("chest", None, "--base chest: no such body in the model; there are lift, torso, left_upper"),
-        ("left_upper", "right_lower", "the one does not carry the other"),
-        ("right_lower", None, "no hinge between them"),
+        ("chest", None, "--base chest: the model has no such body; there are lift, torso, left_upper"),
+        ("left_upper", "right_lower", "the base body does not carry the tip body"),
+        ("right_lower", None, "no hinge between these bodies"),
     ],
 )
 def test_ends_that_are_none_are_one_line(two_arms, base, tip, says):

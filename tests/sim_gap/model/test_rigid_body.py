@@ -114,7 +114,7 @@ def test_joint_terms_of_the_model_count_on_the_motor_side_and_springs_beside_it(
 def test_a_model_that_is_not_a_plain_chain_is_refused(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(THREE.replace("</mujoco>", '<option density="50" viscosity="9"/></mujoco>'))
-    with pytest.raises(BadInput, match=r"joint_\d.*expected a plain hinge chain"):
+    with pytest.raises(BadInput, match=r"joint_\d.*expected a plain chain of hinges"):
         load_model(path)
 
 

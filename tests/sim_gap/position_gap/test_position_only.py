@@ -127,8 +127,8 @@ def test_joints_that_swing_with_the_servo_off_in_the_held_out_motion_alone_are_n
     found = SimpleNamespace(sim=SimpleNamespace(arm=arm), search=SimpleNamespace(data=fitted), heldout=other)
     (note,) = _released(found)
     assert (
-        "never in training, so the fit may not hold there: shoulder for 25 % of the time: add such a swing to --train"
-        in note
+        "never in training, so the fit may not hold there: shoulder for 25 % of the time: add such a "
+        "recording, with the servo off, to --train" in note
     )
     assert _released(SimpleNamespace(sim=found.sim, search=found.search, heldout=fitted)) == []
     assert _released(SimpleNamespace(sim=found.sim, search=SimpleNamespace(data=other), heldout=other)) == []
@@ -169,7 +169,7 @@ def test_a_module_is_written_with_its_model_and_removed_with_it(answer, tmp_path
     vars(changed)["beside"] = beside
     write_exported(changed, tmp_path / "closed.xml")
     text = (tmp_path / "closed_effects.xml").read_text()
-    assert text.startswith("<!-- To be used with closed_effects.py, which applies:\n  friction.load shoulder\n-->")
+    assert text.startswith("<!-- Use this model with closed_effects.py, which applies:\n  friction.load shoulder\n-->")
     mujoco.MjModel.from_xml_string(text)
     made: dict = {}
     exec((tmp_path / "closed_effects.py").read_text(), made)
@@ -185,7 +185,7 @@ def test_samples_scatter_about_the_fit(answer, tmp_path: Path) -> None:
     assert len(rows) == 200
     assert gains.std() > 0.0
     assert abs(np.median(gains) - answer.internals.fit.point["kp"][0]) < gains.std()
-    (note,) = [note for note in answer.notes if note.startswith("limits that the training motion does not reach")]
+    (note,) = [note for note in answer.notes if note.startswith("the training motion does not reach these limits")]
     least = float(note.split("torque at least shoulder ")[1].split(",")[0])
     assert 0.8 * least < min(row["shoulder.limit"] for row in rows) < 1.3 * least
     write_samples(answer.internals, 3, tmp_path / "draws.csv")
@@ -273,7 +273,7 @@ def test_report_shows_every_joint(answer, tmp_path: Path) -> None:
         (lambda q, c: c[:, ::-1], "--map"),
         (lambda q, c: np.rad2deg(c), "--units q_cmd_1=deg"),
         (lambda q, c: np.rad2deg(c, out=c) * (1.0 + 0.0 * np.rad2deg(q, out=q)), "--units q=deg,q_cmd=deg"),
-        (lambda q, c: np.full_like(c, np.nan), "neither a torque channel nor a commanded position"),
+        (lambda q, c: np.full_like(c, np.nan), "no torque channel and no commanded position"),
     ],
 )
 def test_commands_that_do_not_belong_are_refused(change, message: str) -> None:
@@ -288,7 +288,7 @@ def test_gains_of_recordings() -> None:
     assert gain_scales(["*kp100*=100", "*kp400*=400"], labels) == [1.0, 4.0]
     with pytest.raises(BadInput, match="none given for a/run_kp400"):
         gain_scales(["*kp100*=100"], labels)
-    with pytest.raises(BadInput, match="no recording of that name"):
+    with pytest.raises(BadInput, match="no recording of this name"):
         gain_scales(["*kp9*=100"], labels)
     with pytest.raises(BadInput, match="expected RECORDING=VALUE"):
         gain_scales(["*kp100*=fast"], labels)

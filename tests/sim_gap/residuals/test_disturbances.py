@@ -57,7 +57,7 @@ def test_the_diagnosis_is_that_of_the_rest_and_says_what_it_left_out():
     assert [cause.effect for cause in answer.causes] == ["friction.coulomb"]
     before, after = (made.causes[0].parameters["joint_2"]["torque"].value for made in (clean, answer))
     assert after == pytest.approx(before, rel=0.03)
-    told = [note for note in answer.notes if "several joints leave the fit at once" in note]
+    told = [note for note in answer.notes if "several joints differ suddenly from the fit" in note]
     assert len(told) == 2
     assert all("at 13." in note or "at 14." in note for note in told)
     assert 0.0 < answer.left_out - clean.left_out < 0.05

@@ -50,7 +50,9 @@ def guard_rules(
         device.check_identity(each, row)
         unit, profile = read_units(each, row), device.examined(each, row.settings)
         if profile.by_velocity:
-            raise BadInput(f"{row.name}: velocity control (mode 9): no frame shows a guard where the motion ends")
+            raise BadInput(
+                f"{row.name}: under velocity control (mode 9) no frame shows the guard where the motion will end"
+            )
         check_fits(row, limit, unit)
         sheet = list(each.remote.object_dictionary)
         node = NodeRules(row.name, row.settings.node, profile, unit, limit, protection, sheet)

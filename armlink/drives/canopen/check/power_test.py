@@ -77,11 +77,16 @@ class PowerTest:
             name for joint, name in enumerate(self.link.names) if self.drives.traits(joint).silence == "keeps on"
         ]
         for name in keeping:
-            found = "watches neither commands (1400h:05) nor heartbeat (1016h) of its host: do not drive it"
+            found = (
+                "the device watches neither the commands (1400h:05) nor the heartbeat (1016h) of its host: do "
+                "not drive this joint"
+            )
             self._checks.add(name, "heartbeat of the host", "failed", found)
         if keeping:
             self._refused = True
-            raise Refused(f"{keeping[0]} is not driven: it would keep on after its host died")
+            raise Refused(
+                f"{keeping[0]} is not driven: if its host died, its drive would keep on with the last command"
+            )
 
     def _has(self, joint: int, entry: Entry, check: str) -> bool:
         """Whether a device has the object that a check is about; if not, the check is told to be absent."""
@@ -103,12 +108,12 @@ class PowerTest:
             raise BusFault(
                 f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
                 if watch.intruder
-                else f"{where}: its controller has restarted"
+                else f"{where}: its drive has restarted"
             )
         moved = np.abs(sample.position - self._standing)
         if (moved > HELD).any():
             joint = int(np.nanargmax(moved))
-            raise BusFault(f"{names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: test ended")
+            raise BusFault(f"{names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: the test was ended")
         if tested is not None:
             for joint, code, _ in self.drives.known.emergencies:
                 if joint != tested:
@@ -164,7 +169,7 @@ class PowerTest:
 
     def _enable(self) -> None:
         link = self.link
-        self._progress("enable, and hold")
+        self._progress("enabling the joints, which should hold")
         start = link.clock.now()
         sample = self.commander.walk(Power.ON)
         self._standing, self._last = sample.position.copy(), sample.t
@@ -201,7 +206,7 @@ class PowerTest:
     def _silence(self, joint: int) -> None:
         """No RPDO1 for one joint, all others commanded as before."""
         link, limit = self.link, self.drives.protection.deadline_ms * 1e-3
-        self._progress(f"{link.names[joint]}: no commands for {limit * 1e3:.0f} ms")
+        self._progress(f"{link.names[joint]}: sending no commands for {limit * 1e3:.0f} ms")
         self.loop.withheld = frozenset([joint])
         state, seconds = self._reaction(joint, [Power.ON] * link.n, PATIENCE * limit)
         self._judge(joint, "RPDO deadline", state, seconds, limit)
@@ -215,7 +220,7 @@ class PowerTest:
         watching = [self._has(joint, objects.HEARTBEAT_CONSUMER, "heartbeat of the host") for joint in range(link.n)]
         if not any(watching):
             return
-        self._progress(f"all joints: no heartbeat of the host for {limit * 1e3:.0f} ms")
+        self._progress(f"all joints: sending no heartbeat for {limit * 1e3:.0f} ms")
         self.drives.beat(self.link.ask)
         self.drives.cycle.beating = False
         start, seconds = self._last, 0.0
@@ -262,8 +267,12 @@ class PowerTest:
             in_time = seconds <= allowed
             self._tell(joint, check, in_time, f"quick stop {'' if in_time else 'too late, '}{timing}", seconds)
         else:
-            hint = ": 6007h has values 2 and 3 the other way round?" if state is DriveState.SWITCH_ON_DISABLED else ""
-            self._tell(joint, check, False, f"goes to {state.value}, expected quick stop, {timing}{hint}", seconds)
+            hint = (
+                "; does this device swap the values 2 and 3 of 6007h?" if state is DriveState.SWITCH_ON_DISABLED else ""
+            )
+            self._tell(
+                joint, check, False, f'goes to "{state.value}" instead of "quick stop active" {timing}{hint}', seconds
+            )
             self._harmed = f"not run: {self.link.names[joint]} lost its power in the check of its {check}"
 
     def _state(self, joint: int) -> DriveState:

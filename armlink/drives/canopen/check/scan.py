@@ -139,7 +139,9 @@ class FoundNodes:
         try:
             units = told_units(services, rated)
         except ValueError as error:
-            raise BusFault(f"node {identity.node}: no units: {error}: set up the drive first") from None
+            raise BusFault(
+                f"node {identity.node}: its units cannot be read ({error}): set up the drive first"
+            ) from None
         most = int(services.read(objects.MAX_TORQUE)) * units.torque
         own = services.has(objects.TORQUE_READING)
         keys = None if own else {"node": identity.node, "torque": "motor", "calibration": "host"}
@@ -152,29 +154,35 @@ def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupF
     link, drives = arm_file.require_link(), FoundNodes(opened)
     by_node, ours = {each.node: each for each in drives.found}, {joint.settings.node for joint in link.joints}
     spare = [each.node for each in drives.found if each.node not in ours]
-    unknown = f"; nodes {', '.join(map(str, spare))} answer and are in no joint" if spare else ""
+    unknown = f"; nodes {', '.join(map(str, spare))} answer but belong to no joint" if spare else ""
     for joint, sheet in zip(link.joints, of_joints(arm_file, link.joints), strict=True):
         node = joint.settings.node
         where, drive = f"{joint.name} (node {node})", by_node.get(node)
         if drive is None:
             find = f"armlink new {arm_file.argument} --bus {bus} --out found.yaml"
-            remedy = f"check its power, wiring and node id{unknown}; the drives are found by {find}"
+            remedy = f"check its power, wiring and node id{unknown}; to find the drives: {find}"
             yield SetupFinding("error", f"no answer on {bus}", where, remedy)
             continue
         for differs in identity_mismatches(expected_identity(joint, sheet), vars(drives.identities[node])):
             remedy = "connect the right arm, or correct identity under link.joints"
-            yield SetupFinding("error", f"another controller: {differs}", where, remedy)
+            yield SetupFinding("error", f"another drive than the arm file states: {differs}", where, remedy)
         if abs(drive.rated_torque - joint.rated_torque) > RATED_TORQUE_TOLERANCE * joint.rated_torque:
-            what = f"its rated torque (6076h) is {drive.rated_torque:g} N·m, the arm file has {joint.rated_torque:g}"
+            what = (
+                f"the rated torque of the drive (6076h) is {drive.rated_torque:g} N·m, but the arm file has "
+                f"{joint.rated_torque:g}"
+            )
             yield SetupFinding(
-                "error", what, where, f"set rated_torque: {drive.rated_torque:g}, or connect its own drive"
+                "error",
+                what,
+                where,
+                f"write `rated_torque: {drive.rated_torque:g}` in the arm file, or connect the right drive",
             )
         if drive.max_torque < joint.max_torque * (1 - RATED_TORQUE_TOLERANCE):
-            what = f"the drive allows {drive.max_torque:g} N·m (6072h), max_torque is {joint.max_torque:g}"
+            what = f"the drive allows {drive.max_torque:g} N·m (6072h), but max_torque is {joint.max_torque:g} N·m"
             yield SetupFinding("warning", what, where, f"lower max_torque to {drive.max_torque:g}, or raise 6072h")
     if spare and len(drives.found) - len(spare) == len(link.joints):
-        what = f"nodes {', '.join(map(str, spare))} answer and belong to no joint"
-        yield SetupFinding("hint", what, bus, "a gripper or another arm: nothing is sent to them")
+        what = f"nodes {', '.join(map(str, spare))} answer but belong to no joint"
+        yield SetupFinding("hint", what, bus, "they may be a gripper or another arm: nothing is sent to them")
 
 
 def scan_report(

@@ -54,7 +54,7 @@ class CanopenSelfTest:
         for services, row in zip(self.services, self.drives.rows, strict=True):
             self.progress(f"{services.joint}: identity, objects, settings")
             if services.joint in missing:
-                self.checks.add(services.joint, "answers", "failed", f"no answer at node {services.node}")
+                self.checks.add(services.joint, "answers", "failed", f"no answer from node {services.node}")
                 continue
             try:
                 self.checks.add(services.joint, "identity", "passed", self._identity(services, row))
@@ -86,16 +86,22 @@ class CanopenSelfTest:
             self.checks.add(services.joint, f"objects: {lost.partition(' ')[0]}", "absent", lost)
         needed = [entry for entry in NEEDED if not services.has(entry)]
         found = ", ".join(f"{entry}: the device lacks it" for entry in needed)
-        self.checks.judge(services.joint, "objects", not needed, found or "what the link needs is there")
+        self.checks.judge(
+            services.joint, "objects", not needed, found or "the device has every object that the link needs"
+        )
         self._modes(services)
         if row.name in self.link.uncalibrated:
-            found = "no calibration record in the host: torque is as the device reports it"
+            found = "the host has no calibration record: the torque is used as the device reports it"
             self.checks.add(services.joint, "calibration", "absent", found)
 
     def _with_power(self, power: bool) -> None:
         failed = self.checks.failed
         if failed or not power:
-            reason = f"not run: {failed[0].joint} failed: {failed[0].check}" if failed else "not run: not asked for"
+            reason = (
+                f"not run: {failed[0].joint} failed the check of its {failed[0].check}"
+                if failed
+                else "not run: the checks with power were not requested"
+            )
             for name, check in self.checks.missing(PowerTest.CHECKS, self.link.names):
                 self.checks.add(name, check, "not run", reason)
             return
@@ -142,7 +148,9 @@ class CanopenSelfTest:
             crc = calibration.calibration_crc(held.gain, held.offset, held.record_id, held.date)
             new = (held.gain, held.offset, held.record_id, held.crc) == (1.0, 0.0, 0, 0)
             if held.crc != crc and not new:
-                raise services.fault(objects.RECORD_CRC, f"is {held.crc:#x}, but what it holds gives {crc:#x}")
+                raise services.fault(
+                    objects.RECORD_CRC, f"is {held.crc:#x}, but the calibration in the device gives {crc:#x}"
+                )
             return f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
 
         self.checks.attempt(services.joint, "calibration", work)
@@ -178,7 +186,7 @@ class CanopenSelfTest:
 
 def _others_off(services: NodeServices) -> str:
     device.disable_other_rpdos(services)
-    return "off: no other program can command the joint through them"
+    return "all are off, so no other program can command the joint through them"
 
 
 def _written(services: NodeServices, entry: Entry, value: int) -> str:

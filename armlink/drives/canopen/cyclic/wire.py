@@ -54,17 +54,23 @@ def check_fits(row: LinkJoint, limits: Limits, unit: Units) -> None:
     if row.settings.torque == "record" and limits.max_torque / TORQUE_PER_MICRO > INT32_MAX:
         most = INT32_MAX * TORQUE_PER_MICRO
         raise BadInput(
-            f"{name}: max_torque {limits.max_torque} N·m: the readings of 2100h end at {most:.4g} N·m: lower it, or "
-            "take a drive whose protocol carries more"
+            f"{name}: max_torque is {limits.max_torque} N·m, but the readings of 2100h end at {most:.4g} "
+            "N·m: lower max_torque, or take a drive with larger torque readings"
         )
     if limits.max_torque / unit.torque > INT16_MAX:
         most = INT16_MAX * unit.torque
-        raise BadInput(f"{name}: max_torque {limits.max_torque} N·m: 6071h carries at most {most:.6g} N·m")
+        raise BadInput(f"{name}: max_torque is {limits.max_torque} N·m, but 6071h carries at most {most:.6g} N·m")
     if limits.max_velocity / unit.velocity > UINT32_MAX:
         fastest = UINT32_MAX * unit.velocity
-        raise BadInput(f"{name}: max_velocity {limits.max_velocity} rad/s: 6081h carries at most {fastest:.6g} rad/s")
+        raise BadInput(
+            f"{name}: max_velocity is {limits.max_velocity} rad/s, but 6081h carries at most {fastest:.6g} rad/s"
+        )
     if limits.torque_rate / unit.torque > UINT32_MAX:
         most = UINT32_MAX * unit.torque
-        raise BadInput(f"{name}: max_torque_rate {limits.torque_rate} N·m/s: 6087h carries at most {most:.6g} N·m/s")
+        raise BadInput(
+            f"{name}: max_torque_rate is {limits.torque_rate} N·m/s, but 6087h carries at most {most:.6g} N·m/s"
+        )
     if max(abs(limits.lower), abs(limits.upper)) / unit.position > INT32_MAX:
-        raise BadInput(f"{name}: 607Ah cannot carry its range at {unit.position:.3g} rad a user unit")
+        raise BadInput(
+            f"{name}: 607Ah cannot carry the range of this joint, since one user unit is only {unit.position:.3g} rad"
+        )

@@ -10,7 +10,7 @@ function askToken(wrong) {
   asking ??= new Promise((resolve) => {
     const dialog = document.getElementById("ask-token");
     const field = document.getElementById("token");
-    document.getElementById("token-error").textContent = wrong ? "That token is wrong." : "";
+    document.getElementById("token-error").textContent = wrong ? "This token is wrong." : "";
     field.value = "";
     dialog.addEventListener("cancel", (event) => event.preventDefault());
     dialog.addEventListener("close", () => {

@@ -42,7 +42,7 @@ function nice(largest) {
 
 export function showJoints(joints, moving = false) {
   by("joints").classList.toggle("moving", moving);
-  put(by("moving"), moving ? "The arm moves: residuals count again at rest." : "");
+  put(by("moving"), moving ? "The arm moves; residuals are meaningful again when it rests." : "");
   const largest = Math.max(...joints.map((joint) => Math.abs(joint.residual ?? 0)), 0.1);
   scale = largest > scale || largest < scale / 4 ? nice(largest) : scale;
   put(by("bar-scale"), `±${scale} N·m`);
@@ -85,8 +85,8 @@ export function showEstimates(estimates) {
     const gain = one.gain_limit === null ? MISSING : number(100 * one.gain_limit, 2);
     put(cells.limit, `${gain}, ${number(one.offset_limit, 3)}`);
     line.classList.toggle("drifting", gainIsOff(one) || offsetIsOff(one));
-    line.title = `${one.samples} rests used`;
+    line.title = `${one.samples} rests of the arm used`;
   }
   const rests = estimates[0]?.limit_rests ?? null;
-  put(by("limit-rests"), rests === null ? "" : ` Changes from the size in “noticed from” are found within ${rests} rests, larger ones sooner.`);
+  put(by("limit-rests"), rests === null ? "" : ` A change as large as in the column “Noticed from” is found within ${rests} rests, a larger change sooner.`);
 }

@@ -27,7 +27,7 @@ function shownState(state) {
 function showState(state, detail) {
   const shown = shownState(state);
   const own = {
-    alarm: "Sensors and model disagree: the cause is being determined, estimates are held.",
+    alarm: "Sensors and model disagree: the cause is being determined, and estimates are paused.",
     decide: `${summary} A new calibration waits for your decision.`,
     observing: summary,
   };
@@ -57,7 +57,7 @@ function showStatus() {
   put(by("serial"), status.serial);
   put(by("version"), `armlink ${status.version}`);
   const { calibration, gravity } = status.records;
-  put(by("records"), calibration ? ` (record ${calibration}, gravity ${gravity ?? "none"})` : ": none yet, sweep and calibrate first");
+  put(by("records"), calibration ? ` (record ${calibration}, gravity ${gravity ?? "none"})` : ", of which there is none yet: sweep and calibrate first");
   showState(status.state, status.detail || status.bus.fault || "");
   showBus(status.bus);
   showLink();
@@ -68,7 +68,7 @@ function showStatus() {
 
 function showLink() {
   if (!status || !connected) return;
-  const listens = status.listen_only ? "listens only" : "drives the bus";
+  const listens = status.listen_only ? "listens only" : "commands the bus";
   put(by("link"), `live · policy ${status.policy} · ${listens} · running for ${duration(status.uptime_s)} · ${whole(status.rows)} rests used`);
 }
 
@@ -93,8 +93,8 @@ const on = {
   },
   lost(why) {
     connected = false;
-    showState("lost", `No connection to the daemon: ${why}. The values below are old. Reconnecting.`);
-    put(by("link"), status ? `last heard ${clock(status.time)}` : "");
+    showState("lost", `No connection to the daemon: ${why}. The values below are old. The page tries to reconnect.`);
+    put(by("link"), status ? `last contact ${clock(status.time)}` : "");
   },
   joints(item) {
     setNow(item.time);

@@ -23,8 +23,8 @@ function pending(one) {
   const card = make("div", { className: "proposal" },
     make("div", {},
       make("p", { className: "what" }, `${one.joint} has drifted: ${change(one)}`),
-      make("p", { className: "quiet" }, `from ${one.rows} rests, confidence ${percent(one.confidence)}; `
-        + `record ${one.record} would replace ${one.base}; found ${clock(one.time)}`)),
+      make("p", { className: "quiet" }, `found at ${clock(one.time)} from ${one.rows} rests of the arm, with confidence ${percent(one.confidence)}; `
+        + `record ${one.record} would replace record ${one.base}`)),
     make("div", { className: "row" }, button("approve", "Approve", "main"), button("reject", "Reject", "")));
   card.dataset.proposal = one.id;
   return card;
@@ -43,10 +43,10 @@ function evidence(one) {
 
 function decide(one, verb) {
   const dialog = by("ask-decision");
-  by("decision-title").textContent = verb === "approve" ? `Write the new calibration to ${one.joint}?` : `Drop the proposal for ${one.joint}?`;
+  by("decision-title").textContent = verb === "approve" ? `Write the new calibration to ${one.joint}?` : `Reject the proposal for ${one.joint}?`;
   by("decision-text").textContent = verb === "approve"
-    ? `Record ${one.record} goes to the controller and is read back: ${change(one)}. The arm does not move. A roll-back undoes it.`
-    : `${change(one)} stays uncorrected; nothing is written.`;
+    ? `Record ${one.record} is written to the drive and read back: ${change(one)}. The arm does not move. A roll-back undoes the change.`
+    : `The change (${change(one)}) is not corrected, and nothing is written.`;
   by("decision-evidence").replaceChildren(...evidence(one));
   by("decision-yes").textContent = verb === "approve" ? "Approve" : "Reject";
   by("decision-error").textContent = "";

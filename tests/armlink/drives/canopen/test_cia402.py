@@ -155,7 +155,7 @@ def test_an_unknown_state_is_commanded_nothing():
 
 
 def test_there_is_no_way_to_other_targets():
-    with pytest.raises(ValueError, match="no transition to fault"):
+    with pytest.raises(ValueError, match='no transition to "fault"'):
         next_control(DriveState.READY, DriveState.FAULT)
 
 

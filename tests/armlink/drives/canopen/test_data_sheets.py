@@ -84,7 +84,7 @@ def test_a_stock_device_passes_the_check_and_what_it_lacks_is_told(written, caps
     (node,) = json.loads(scanned.out)["nodes"]
     assert set(node["lost"]) == absent
     assert node["name"] == ("EPOS4" if device == "epos4" else "armlink joint")
-    assert "hinge lacks 1400h:05 RPDO1 event timer: no deadline for commands" in scanned.err
+    assert "hinge lacks 1400h:05 RPDO1 event timer: commands have no deadline" in scanned.err
 
 
 def test_the_sample_of_cia_passes_without_power_and_is_not_driven(written, capsys):
@@ -98,7 +98,10 @@ def test_the_sample_of_cia_passes_without_power_and_is_not_driven(written, capsy
     status, checked = told(capsys, "check", path)
     assert status == 1
     assert [each["check"] for each in checked["checks"] if each["outcome"] == "failed"] == ["heartbeat of the host"]
-    assert "watches neither commands (1400h:05) nor heartbeat (1016h) of its host: do not drive it" in str(checked)
+    assert (
+        "the device watches neither the commands (1400h:05) nor the heartbeat (1016h) of its host: do "
+        "not drive this joint"
+    ) in str(checked)
 
 
 def test_a_device_with_cyclic_velocity_alone_passes_the_check(written, capsys):

@@ -77,7 +77,9 @@ def test_a_sheet_of_another_product_is_refused_before_anything_is_written(arm_of
     path = sheet(vendor=("VendorNumber=0\n", "VendorNumber=0x11\n"), product=("0x41524D4C", "0x99"))
     with (
         Link(arm_of(joint={"eds": path}), bus) as link,
-        pytest.raises(Refused, match=r"1018h:02 product code is 0x22, expected 0x99: .* identity or eds of this joint"),
+        pytest.raises(
+            Refused, match=r"1018h:02 product code is 0x22, expected 0x99: .* `identity` or `eds` of this joint"
+        ),
     ):
         link.start()
     assert not [data for can_id, data in bus.sent if can_id == 0x601 and data[0] & 0xE0 == 0x20]

@@ -181,11 +181,16 @@ FAST = {(0x6080, 0): 3000, (0x6091, 1): 100, (0x6091, 2): 1}
         (
             {(0x607F, 0): 2000},
             2.1,
-            "607Fh:00 max profile velocity is 2000, which is 2 rad/s, .* 2.1: set it to 2100 or",
+            "607Fh:00 max profile velocity is 2000, which is 2 rad/s, .* 2.1 rad/s: set the object to 2100 or",
         ),
         ({(0x607F, 0): 0}, 2.1, ""),  # 0: no limit of its own
         (FAST, 3.1, ""),
-        (FAST, 3.2, "6080h:00 max motor speed is 3000, which is 3.142 rad/s, .* 3.2: set it to 3056 or more, or lower"),
+        (
+            FAST,
+            3.2,
+            "6080h:00 max motor speed is 3000, which is 3.142 rad/s, .* 3.2 rad/s: set the object to "
+            "3056 or more, or lower",
+        ),
         ({(0x6080, 0): 3000}, 300.0, ""),  # without a gear: 314 rad/s
         ({}, 300.0, ""),
     ],

@@ -76,17 +76,17 @@ def test_a_joint_that_loses_its_power_is_told_with_its_emergency():
     bench.test._judge(1, "heartbeat of the host", DriveState.SWITCH_ON_DISABLED, 0.1, 0.1)
     ((name, _, outcome, says, seconds),) = bench.told
     assert (name, outcome, seconds) == ("b", "failed", 0.1)
-    assert "expected quick stop, after 100 ms (set to 100 ms), emergency 8130h, NMT " in says
+    assert 'instead of "quick stop active" after 100 ms (set to 100 ms), emergency 8130h, NMT ' in says
     assert objects.NMT_STATES[4] in says
-    assert says.endswith(": 6007h has values 2 and 3 the other way round?")
+    assert says.endswith("; does this device swap the values 2 and 3 of 6007h?")
 
 
 @pytest.mark.parametrize(
     ("outcome", "power", "says"),
     [
-        ("failed", True, "not run: a failed: units"),
-        ("failed", False, "not run: a failed: units"),
-        ("passed", False, "not run: not asked for"),
+        ("failed", True, "not run: a failed the check of its units"),
+        ("failed", False, "not run: a failed the check of its units"),
+        ("passed", False, "not run: the checks with power were not requested"),
         ("passed", True, None),
     ],
 )

@@ -56,5 +56,5 @@ def test_a_value_that_the_device_does_not_hold_bit_for_bit_is_a_fault(held: floa
     services.write_checked(objects.STAGED_GAIN, 0.9)
     for place in node.values:
         node.values[place] = struct.pack("<f", held)
-    with pytest.raises(BusFault, match=r"wrote 0\.9, the device holds 0"):
+    with pytest.raises(BusFault, match=r"0\.9 was written, but the device holds 0"):
         services.expect(objects.STAGED_GAIN, 0.9)

@@ -183,9 +183,9 @@ class MadeUpView:
         for place, proposal in enumerate(self.offered):
             if proposal.id == number:
                 if digest not in (None, proposal.hash):
-                    raise NotPossible(f"proposal {number} is not that of hash {digest}")
+                    raise NotPossible(f"proposal {number} does not have the hash {digest}")
                 if proposal.state != "pending":
-                    raise NotPossible(f"proposal {number} is {proposal.state} already")
+                    raise NotPossible(f"proposal {number} is already {proposal.state}")
                 update = {"state": state, "decided_by": by, "decided_at": self.time()}
                 self.offered[place] = proposal.model_copy(update=update)
                 if not self.disk_hangs:

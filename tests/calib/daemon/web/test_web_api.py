@@ -91,7 +91,7 @@ def test_a_proposal_is_decided_once_and_by_somebody(server: Served, view: MadeUp
     rejected = client.post("/api/proposals/2/reject").json()
     assert (rejected["state"], "on the socket" in rejected["decided_by"]) == ("rejected", True)
     again = client.post("/api/proposals/1/reject")
-    assert (again.status_code, again.json()) == (409, {"error": "proposal 1 is approved already"})
+    assert (again.status_code, again.json()) == (409, {"error": "proposal 1 is already approved"})
     assert client.post("/api/proposals/9/approve").status_code == 404
     assert [one["state"] for one in client.get("/api/proposals").json()] == ["rejected", "approved"]
 
@@ -102,7 +102,7 @@ def test_a_decision_may_name_the_content_and_is_then_of_that_alone(server: Serve
     (shown,) = client.get("/api/proposals").json()
     other = client.post("/api/proposals/1/approve", json={"hash": "0" * 64})
     assert other.status_code == 409
-    assert "is not that of hash" in other.json()["error"]
+    assert "does not have the hash" in other.json()["error"]
     assert client.post("/api/proposals/1/approve", json={"hash": "1"}).status_code == 422
     assert client.post("/api/proposals/1/approve", json={"hash": shown["hash"], "by": "ann"}).status_code == 200
 
@@ -115,7 +115,7 @@ def test_a_decision_that_is_not_on_disk_in_time_is_not_yet_and_stands(
     view.disk_hangs = True
     answer = server.client().post("/api/proposals/1/approve")
     assert answer.status_code == 503
-    assert answer.json()["error"].startswith("not yet: the decision on proposal 1 waits for the disk")
+    assert answer.json()["error"].startswith("the decision on proposal 1 waits for the disk")
     assert server.client().post("/api/proposals/1/approve").status_code == 409
 
 
@@ -136,13 +136,18 @@ def test_events_that_the_disk_does_not_give_are_given_up(
     [
         ("GET", "/api/events?after=-1", 422, "after"),
         ("GET", "/api/events?after=9223372036854775808", 422, "after"),
-        ("GET", "/api/events?afer=1", 422, "afer: there is no parameter of that name"),
+        ("GET", "/api/events?afer=1", 422, "afer: there is no parameter of this name"),
         ("GET", "/api/history?joint=elbow", 404, "joint_1, joint_2"),
         ("GET", "/api/history?joint=a%00b", 404, "no joint"),
         ("GET", "/api/history?from=yesterday", 422, "from"),
         ("GET", "/api/history?from=2026-05-01T08:00:00", 422, "timezone"),
         ("GET", "/api/history?from=0001-01-01T00:00:00%2B14:00", 422, "between 1970 and 2999"),
-        ("GET", "/api/history?from=2026-05-02T00:00:00Z&to=2026-05-01T00:00:00Z", 422, "from is later than to"),
+        (
+            "GET",
+            "/api/history?from=2026-05-02T00:00:00Z&to=2026-05-01T00:00:00Z",
+            422,
+            "parameter `from` must not be later than parameter `to`",
+        ),
         ("GET", "/api/proposals/0/approve", 405, "GET is not allowed"),
         ("POST", "/api/proposals/0/approve", 422, "id"),
         ("POST", "/api/proposals/one/approve", 422, "id"),
@@ -192,7 +197,7 @@ def test_a_failure_inside_shows_no_traceback(server: Served, view: MadeUpView, m
     monkeypatch.setattr(view, "estimates", broken)
     answer = server.client().get("/api/estimates")
     assert answer.status_code == 500
-    assert answer.json() == {"error": "internal error; the daemon's log says why"}
+    assert answer.json() == {"error": "internal error; see the log of the daemon"}
 
 
 def test_nothing_commands_torque_or_motion(server: Served, view: MadeUpView) -> None:

@@ -135,7 +135,7 @@ def a_bus_fault_shows(page: Page, daemon: Simulated) -> None:
 
 def test_the_token_is_asked_for_once(browser: Browser, server: Served) -> None:
     page = open_page(browser, server, token="not-the-token")
-    expect(page.locator("#token-error")).to_have_text("That token is wrong.")
+    expect(page.locator("#token-error")).to_have_text("This token is wrong.")
     page.fill("#token", TOKEN)
     page.click("#ask-token button")
     expect(page.locator("#state")).to_have_text("observing")

@@ -62,7 +62,7 @@ def test_a_socket_left_by_a_killed_daemon_is_replaced_and_a_live_one_is_not(tmp_
     assert server.client().get("/api/status").status_code == 200
     file = tmp_path / "notes.txt"
     file.write_text("keep me")
-    with pytest.raises(BadInput, match="no socket"), unix_socket(file):
+    with pytest.raises(BadInput, match="not a socket"), unix_socket(file):
         pass
     assert file.read_text() == "keep me"
     with pytest.raises(BadInput, match="--socket"), unix_socket(tmp_path / "missing" / "api.sock"):
