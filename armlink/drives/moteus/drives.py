@@ -10,8 +10,7 @@ from pydantic import Field
 from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import Ask, BasicDrives, DriveMemory, no_order
-from armlink.drives.discovery import Discovery, SearchedBus
-from armlink.drives.family import Family
+from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.moteus import frames
 from armlink.drives.moteus.frames import (
@@ -36,6 +35,7 @@ from armlink.drives.orders import (
     real32_step,
     real32_within,
 )
+from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault

@@ -11,8 +11,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import ANY, BROADCAST, Ask, no_order
-from armlink.drives.discovery import Discovery, SearchedBus
-from armlink.drives.family import Family
+from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory, Steps, order_of
 from armlink.drives.mit_packing import Grid, MitCommand
@@ -28,6 +27,7 @@ from armlink.drives.robstride.frames import (
     Type,
     fault_names,
 )
+from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
