@@ -350,7 +350,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     ]
     return [
         FoundDrive("moteus", each, f"controller {each}", {"id": each}, answers=replies.count(each))
-        for each in sorted(set(replies))
+        for each in sorted({*replies} & {*range(1, 0x7F)})
     ]
 
 

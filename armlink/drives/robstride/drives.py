@@ -294,7 +294,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     answers = [frames.parameter_answer(*frame) for frame in heard if frame[0] & EXTENDED]
     told = {answer[:2]: answer[2] for answer in answers if answer is not None}
     found = []
-    for motor in sorted(came):
+    for motor in sorted(came.keys() & range(1, 0x80)):
         limit, timeout = (told.get((motor, int(each))) for each in wanted)
         # a host that has set up a drive since its power-on has set the limit, and with it the deadman
         models = [] if timeout != 0 else [name for name, ranges in RANGES.items() if ranges.torque == limit]
