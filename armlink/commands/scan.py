@@ -18,9 +18,7 @@ def scan(
     bus: OtherBus = None,
     json: Json = None,
 ) -> int:
-    """List the drives that answer on a bus; with an arm file also those of its joints that do not (exit status 3).
-
-    Without an arm file every family is looked for whose drives can be asked without harm to what else may be there.
+    """List the drives of all families that answer on a bus, or those of an arm and who does not answer (status 3).
 
     Exit status 1 if a joint has another drive than the arm file states (link.joints, key identity).
 

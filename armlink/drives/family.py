@@ -9,22 +9,33 @@ It is named in the entry-point group `armlink.drives`:
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.can_bus import CanBus
 from armlink.contributed import contributed, named
 from armlink.drives.base import BasicDrives
-from armlink.drives.findings import Result, SetupFinding
+from armlink.drives.findings import FoundDrive, FoundDrives, Result, SetupFinding
 from armlink.drives.orders import power_name
+from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput
 
-if TYPE_CHECKING:
-    from armlink.drives.discovery import Discovery
-
 GROUP = "armlink.drives"
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """How the drives of a family are found."""
+
+    how: str
+    """The question that is asked, or what is listened for."""
+    find: Callable[[SearchedBus], Sequence[FoundDrive] | FoundDrives]
+    """Sends nothing but frames that read."""
+    spares: tuple[str, ...] = ()
+    """Families whose drives its requests or answers could command, or whose frames look alike: it is not looked for
+    beside them."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +52,7 @@ class Family:
     it goes further than the one for all families."""
     search: Callable[..., int] | None = None
     """`search(arm, bus or None, json, write, show)`: `armlink scan` of an arm; None: each drive is asked by its id."""
-    discovery: "Discovery | None" = None
+    discovery: Discovery | None = None
     """How its drives are found without an arm file; None: they are found by their ids alone."""
     examine: Callable[[ArmFile, CanBus, str], Iterator[SetupFinding]] | None = None
     """`examine(arm, bus, name)`: what the drives of an arm with this family alone say against its file, on an open bus

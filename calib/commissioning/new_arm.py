@@ -25,6 +25,8 @@ from calib.commissioning.model_joints import model_joints
 from calib.commissioning.model_judgement import model_errors
 from calib.commissioning.motion_checks import largest_inertias
 
+PLACES = ("node", "id", "reply", "direction", "zero")
+"""Keys of a drive that come with the bus; the others are the arm file's own."""
 RATING_FACTOR = 2.5
 """A drive whose rated torque differs from the model's effort limit by more is doubted; a choice."""
 
@@ -204,9 +206,12 @@ def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | in
     link: Any = edited.content["link"]
     for row, match in zip(link["joints"], matches, strict=True):
         drive = match.drive
-        if drive.family != "canopen":
-            told = {key: value for key, value in (drive.drive or {}).items() if value != "" and key not in ("kp", "kd")}
-            row["drive"].update(told)
+        family = row["drive"]["family"] if "drive" in row else "canopen"
+        if drive.family != family:
+            what = f"{row['name']} has a drive of family {family}, {drive.address} is one of family {drive.family}"
+            raise BadInput(f"{arm.path}: {what}: disconnect the others, or correct link.joints")
+        if family != "canopen":
+            row["drive"].update({key: value for key, value in (drive.drive or {}).items() if key in PLACES})
             continue
         if "drive" in row:
             row["drive"]["node"] = drive.node

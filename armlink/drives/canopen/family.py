@@ -7,8 +7,7 @@ from typing import Any
 from armlink.drives.board import NO_STATUS
 from armlink.drives.canopen.cia402 import state_of
 from armlink.drives.canopen.settings import TRAITS, CanopenSettings
-from armlink.drives.discovery import Discovery
-from armlink.drives.family import Family
+from armlink.drives.family import Discovery, Family
 
 
 def _late(module: str, name: str) -> Callable[..., Any]:

@@ -14,12 +14,12 @@ from armlink.bus.port import Frame
 from armlink.drives.base import Ask
 from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, error_text, unpack_reply
 from armlink.drives.cubemars.settings import CubeMarsSettings
-from armlink.drives.discovery import Discovery, SearchedBus
-from armlink.drives.family import Family
+from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory
 from armlink.drives.mit_packing import Special, grid_of, pack_command, special, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, law_torque
+from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 

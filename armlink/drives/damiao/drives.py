@@ -12,12 +12,12 @@ from armlink.drives.base import Ask
 from armlink.drives.damiao import frames
 from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, DamiaoRegister, DamiaoStatus
 from armlink.drives.damiao.settings import MODELS, DamiaoSettings
-from armlink.drives.discovery import Discovery, SearchedBus
-from armlink.drives.family import Family
+from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory
 from armlink.drives.mit_packing import Grid, Ranges, Special, grid_of, special, unpack_feedback, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
+from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 

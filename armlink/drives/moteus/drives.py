@@ -10,8 +10,7 @@ from pydantic import Field
 from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import Ask, BasicDrives, DriveMemory, no_order
-from armlink.drives.discovery import Discovery, SearchedBus
-from armlink.drives.family import Family
+from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.moteus import frames
 from armlink.drives.moteus.frames import (
@@ -36,6 +35,7 @@ from armlink.drives.orders import (
     real32_step,
     real32_within,
 )
+from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
@@ -353,7 +353,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     ]
     return [
         FoundDrive("moteus", each, f"controller {each}", {"id": each}, answers=replies.count(each))
-        for each in sorted(set(replies))
+        for each in sorted({*replies} & {*range(1, 0x7F)})
     ]
 
 

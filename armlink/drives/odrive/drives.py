@@ -14,8 +14,7 @@ from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.frame_bits import longest_frame_bits
 from armlink.bus.port import REMOTE, Frame
 from armlink.drives.base import Ask, BasicDrives, DriveMemory, no_order
-from armlink.drives.discovery import Discovery, SearchedBus
-from armlink.drives.family import Family
+from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.odrive import frames
 from armlink.drives.odrive.frames import (
@@ -43,6 +42,7 @@ from armlink.drives.orders import (
     real32_step,
     real32_within,
 )
+from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault

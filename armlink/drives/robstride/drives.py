@@ -11,8 +11,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, Frame
 from armlink.drives.base import ANY, BROADCAST, Ask, no_order
-from armlink.drives.discovery import Discovery, SearchedBus
-from armlink.drives.family import Family
+from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory, Steps, order_of
 from armlink.drives.mit_packing import Grid, MitCommand
@@ -28,6 +27,7 @@ from armlink.drives.robstride.frames import (
     Type,
     fault_names,
 )
+from armlink.drives.searched_bus import SearchedBus
 from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BusFault
@@ -302,7 +302,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     answers = [frames.parameter_answer(*frame) for frame in heard if frame[0] & EXTENDED]
     told = {answer[:2]: answer[2] for answer in answers if answer is not None}
     found = []
-    for motor in sorted(came):
+    for motor in sorted(came.keys() & range(1, 0x80)):
         limit, timeout = (told.get((motor, int(each))) for each in wanted)
         # a host that has set up a drive since its power-on has set the limit, and with it the deadman
         models = [] if timeout != 0 else [name for name, ranges in RANGES.items() if ranges.torque == limit]

@@ -289,7 +289,7 @@ def test_a_foreign_table_gets_a_map_to_paste(tmp_path):
         ({"columns": ["q_1"]}, "--map q_1: expected COLUMN=VALUE"),
         ({"columns": ["q_1=nope"]}, "--map q_1=nope: the file has no column nope"),
         ({"joints": "x,y"}, "--joints x: .* has no such joint"),
-        ({"effort": "gear"}, "--effort-is gear: expected motor, link, without-gravity"),
+        ({"effort_is": "gear"}, "--effort-is gear: expected motor, link, without-gravity"),
     ],
 )
 def test_options_that_do_not_fit_are_one_line(tmp_path, options, message):

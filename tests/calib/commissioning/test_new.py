@@ -271,6 +271,17 @@ def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doct
     cli.run(["doctor", "found.yaml", "--offline"])
     assert "damping ratio" not in capsys.readouterr().out
     assert cli.run(["check", "found.yaml", "--passive"]) == 0
+    content["link"]["joints"][0]["drive"] |= {"id": 9, "reply": 0x19, "direction": 1, "zero": 0.0, "kp": 33}
+    (tmp_path / "old.yaml").write_text(yaml.safe_dump(content))
+    assert cli.run(["new", "old.yaml", "--out", "mine.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 0
+    first = load_arm("mine.yaml").require_link().joints[0].settings
+    assert (first.id, first.reply, first.direction, first.kp) == (3, 0x13, -1, 33)
+    assert first.zero == pytest.approx(0.7, abs=2e-3)
+    del content["link"]["joints"][0]["drive"]
+    content["link"]["joints"][0]["node"] = 3
+    (tmp_path / "mixed.yaml").write_text(yaml.safe_dump(content))
+    assert cli.run(["new", "mixed.yaml", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
+    assert "j1 has a drive of family canopen, id 03h is one of family damiao" in capsys.readouterr().err
 
 
 def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_be_missing(

@@ -137,7 +137,7 @@ def test_sweeps_that_disagree_with_one_another_do_not_replace_a_good_record(fit,
         check_held_out(new.model_copy(update={"held_out": proof}), record)
 
     judged(DATA)
-    with pytest.raises(Refused, match=f"{ARM.joint_names[1]}: held-out data is predicted with"):
+    with pytest.raises(Refused, match=f"{ARM.joint_names[1]}: the error on held-out data is"):
         judged(spoilt)
 
 

@@ -24,8 +24,8 @@ from armlink.drives.canopen.object_dictionary import SDO_REQUEST_ID, SDO_RESPONS
 from armlink.drives.canopen.profile import Profile, lacking
 from armlink.drives.canopen.sdo import NodeServices, Pump, PumpedNetwork
 from armlink.drives.canopen.units import RATED_TORQUE_TOLERANCE, told_units
-from armlink.drives.discovery import SEARCH_SECONDS
 from armlink.drives.findings import FoundDrive, SetupFinding
+from armlink.drives.searched_bus import SEARCH_SECONDS
 from armlink.errors import BusFault
 
 _READ_DEVICE_TYPE = b"\x40\x00\x10\x00\x00\x00\x00\x00"
