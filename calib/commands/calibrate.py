@@ -42,7 +42,6 @@ def calibrate(
 
     Example: armlink calibrate unloaded loaded --json calibration.json
     """
-    from dataclasses import replace
     from functools import partial
 
     import numpy as np
@@ -103,12 +102,12 @@ def calibrate(
     if not isinstance(fit, SensorFit):
         with early_end(arm_file, again) as work:
             work.enabled = apply and check
-            by = user if apply else "armlink calibrate"
             agrees = None
             if work.enabled and fit.found_gain.any():
                 gravity = fit.gravity.record(arm_file, record)
                 agrees = partial(creep_complaint, arm=arm_file, gravity=gravity, calibration=record)
-            how = replace(how, by=by, check=work.enabled)
+            if not apply:
+                how = Apply(by="armlink calibrate", replaced=how.replaced, accepted=how.accepted, check=False)
             apply_creep(record, arm_file, records, how, fit.broken, agrees)
         kept = "it corrects readings and commands when the arm is opened next"
     elif apply:
@@ -116,7 +115,7 @@ def calibrate(
             work.enabled = check
             beta = None if np.isnan(fit.value("gain")).all() else fit.fit.complete.beta
             written = apply_record(record, arm_file, records, how, beta, "sweeps", fit.broken)
-        kept = f"written to {len(written)} controllers and read back"
+        kept = f"it was written to {len(written)} drives and read back"
     else:
         records.put(record, arm_file, by="armlink calibrate", reason="sweeps")
     out.print(f"record {record.id} is current; {kept}")
