@@ -135,7 +135,7 @@ def test_where_the_model_does_not_hold_nothing_is_written_unless_accepted(
     assert "nothing was written" in error
     assert "--accept j2" in error
     assert run(["calibrate", *bent, *store, *bus, "--apply", "--accept", "j9"]) == 2
-    assert "--accept j9: no such joint" in capsys.readouterr().err
+    assert "--accept j9: there is no such joint" in capsys.readouterr().err
     assert RecordStore(str(tmp_path / "records.db")).current(CalibrationRecord, load_arm(str(arm_path))) is None
     assert run(["calibrate", *bent, *store, *bus, "--apply", "--accept", "j2", "--json", "-"]) == 0
     answer = json.loads(capsys.readouterr().out)

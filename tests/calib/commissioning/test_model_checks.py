@@ -30,7 +30,7 @@ def test_levers_are_those_of_any_gravity_and_none_is_judged_without() -> None:
 
 def test_a_joint_whose_axis_is_vertical_is_named() -> None:
     dead = [each for gravity in ((0.0, 0.0, -9.81), (0.0, -9.81, 0.0), (-9.81, 0.0, 0.0)) for each in found(*gravity)]
-    assert any("its axis is vertical, and" in each.what and each.where == "joint_1" for each in dead)
+    assert any("its axis is vertical, so" in each.what and each.where == "joint_1" for each in dead)
 
 
 @pytest.mark.parametrize(("size", "said"), [(9.69, True), (9.71, False), (9.89, False), (9.91, True)])
