@@ -417,7 +417,9 @@ class KeptLoop(DriveLoop):
                 self._up(Up(None, listener.uncalibrated))
         elif now - self._synced > SYNC_SECONDS and not self._silent:
             self._silent = True
-            self._channel.put(Down(f"no SYNC on {listener.bus.channel_info}: is the arm's controller running?"))
+            self._channel.put(
+                Down(f"no SYNC on {listener.bus.channel_info}: is the program that commands the arm running?")
+            )
 
     def _keep_pace(self, arm: Link | Listener) -> None:
         """Run an in-process simulated arm in real time: wait for the machine's clock."""

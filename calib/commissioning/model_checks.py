@@ -86,8 +86,8 @@ def _lever_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
             axis = "its axis is vertical" if joint == 0 else "its axis is vertical in every pose"
             yield SetupFinding(
                 "warning",
-                f"gravity does not load this joint, since {axis}, so its torque gain cannot be found (lever "
-                f"of gravity at most {lever[joint]:.2f} m·kg per kg)",
+                f"gravity does not load this joint, since {axis}, so its torque gain cannot be found (Γ/g, "
+                f"the share of gravity that it feels, is {lever[joint]:.2f})",
                 name,
                 "incline the base for the sweeps, or accept that this gain stays unknown",
             )

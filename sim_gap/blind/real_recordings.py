@@ -61,9 +61,7 @@ def read_cases(known: Path) -> list[Json]:
         if isinstance(case, dict) and not case.get("refused"):
             lacking += [key for key in ("first", "has") if key not in case]
         if lacking:
-            raise BadInput(
-                f"{known}: entry {number}: {', '.join(lacking)} is missing: write the entry as in {KNOWN.name}"
-            )
+            raise BadInput(f"{known}: entry {number} lacks {', '.join(lacking)}: write the entry as in {KNOWN.name}")
     return list(cases)
 
 

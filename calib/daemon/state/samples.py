@@ -155,7 +155,7 @@ class Recordings:
         full, self._full = self._full, self._waiting >= MOST_WAITING
         if self._full:
             if not full:
-                log.error("recordings: the disk is too slow: samples are left out")
+                log.error("recordings: the disk is too slow, so samples are left out")
             return
         self._waiting += 1
         self._run(lambda: self._append(batch), self._done)

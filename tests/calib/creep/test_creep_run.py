@@ -92,8 +92,8 @@ def test_a_joint_that_meets_something_is_led_back_and_the_sweep_is_noted(tmp_pat
 
 
 EDITED = {
-    "faster": ({"speed": 5.0}, "speed 5 rad/s"),
-    "past a stop": ({"steps": (0.0, 3.0, 6.0)}, "last step: fore at 6 rad"),
+    "faster": ({"speed": 5.0}, "speed is 5 rad/s"),
+    "past a stop": ({"steps": (0.0, 3.0, 6.0)}, "last step: fore is at 6 rad"),
     "resting past a stop": ({"rest": (9.0, 0.0)}, "at 9 rad"),
     "fewer joints": ({"rest": (0.0,)}, "rest has 1 values"),
 }

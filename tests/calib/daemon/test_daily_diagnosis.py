@@ -150,7 +150,7 @@ def test_why_there_is_none_is_said_once(tmp_path: Path, without_model: None) -> 
         bench.day()
     ((kind, joint, text, _),) = bench.said
     assert (kind, joint) == ("diagnosis", None)
-    assert text.startswith("no diagnosis of the day: no model file ")
+    assert text.startswith("there is no diagnosis of the day: no model file ")
     assert "\n" not in text
 
 

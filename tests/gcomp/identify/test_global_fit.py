@@ -199,7 +199,7 @@ def test_wrong_names_and_shapes_are_refused(sarcos, rng) -> None:
         identify_global(sarcos, rows, unknown=("gains",))
     with pytest.raises(BadArray, match="loss is 'tukey', expected one of linear, huber or cauchy"):
         identify_global(sarcos, rows, unknown=("beta",), loss="tukey")
-    with pytest.raises(BadArray, match="readings of 7 joints, but the arm has 3"):
+    with pytest.raises(BadArray, match="the readings have 7 joints, but the arm has 3"):
         identify_global(make_random_arm(rng, 3).arm, rows, unknown=("beta",))
     with pytest.raises(BadArray, match="std of the prior on gain is -1"):
         identify_global(sarcos, rows, unknown=("beta",), priors={"gain": Prior(1, -1.0)})

@@ -56,7 +56,7 @@ def test_a_channel_that_lacks_it():
     answer = diagnose(model(), made[:2], made[2:], labels=["a", "on", "b"])
     found = [(each.recording, each.joint, each.held) for each in answer.friction_compensation]
     assert found == [("on", "joint_1", False), ("on", "joint_2", False)]
-    assert sum("compensates friction with a torque that tau_cmd lacks" in note for note in answer.notes) == 2
+    assert sum("compensates friction with a torque that tau_cmd does not contain" in note for note in answer.notes) == 2
     assert [each["recording"] for each in answer.to_json()["friction_compensation"]] == ["on", "on"]
 
 

@@ -75,7 +75,7 @@ def test_a_folder_without_recordings_and_a_list_of_another_form_are_refused(tmp_
         run_real(tmp_path, tmp_path / "out")
     other = tmp_path / "other.yaml"
     other.write_text("- {case: x, sim: sim.xml}")
-    with pytest.raises(BadInput, match="entry 1: train, first, has missing"):
+    with pytest.raises(BadInput, match="entry 1 lacks train, first, has"):
         read_cases(other)
 
 

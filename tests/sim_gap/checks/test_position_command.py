@@ -60,7 +60,7 @@ def test_per_cent_of_a_range_is_asked_about_with_the_ranges_and_read(realdata):
     with pytest.raises(BadInput) as error:
         check_position_only(sim.arm, [normalised], ["run"], AS_IT_IS)
     ((units, zero),) = re.findall(r'--units "(q=percent:[^"]*)" --zero (\S*),', str(error.value))
-    assert "--units q=deg,q_cmd=deg, or per cent of the ranges" in str(error.value)
+    assert "--units q=deg,q_cmd=deg, or for per cent of the ranges" in str(error.value)
     stated = parse_corrections(units=[units], zero=[zero])
     (read,), found = check_position_only(sim.arm, [stated.apply(normalised, "run")], ["run"], stated)
     assert found == []

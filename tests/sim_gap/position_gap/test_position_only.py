@@ -286,7 +286,7 @@ def test_commands_that_do_not_belong_are_refused(change, message: str) -> None:
 def test_gains_of_recordings() -> None:
     labels = ["a/run_kp100.csv", "a/run_kp400.csv"]
     assert gain_scales(["*kp100*=100", "*kp400*=400"], labels) == [1.0, 4.0]
-    with pytest.raises(BadInput, match="none given for a/run_kp400"):
+    with pytest.raises(BadInput, match="no gain is given for a/run_kp400"):
         gain_scales(["*kp100*=100"], labels)
     with pytest.raises(BadInput, match="no recording of this name"):
         gain_scales(["*kp9*=100"], labels)

@@ -67,8 +67,8 @@ def test_a_decision_by_keyboard_alone(browser: Browser, server: Served, view: Ma
         "Reject joint_2",
         "Turn the view left",
         "Turn the view right",
-        "See it from higher",
-        "See it from lower",
+        "View the arm from higher up",
+        "View the arm from lower down",
         "1 min",
         "10 min",
     ]
