@@ -9,6 +9,7 @@ import numpy.typing as npt
 from armlink.errors import Refused
 from armlink.link.guard import Crossed, ReadingBounds
 from armlink.link.integral import slowest_time
+from armlink.link.joints.groups import make_groups, traits_of
 from armlink.link.types import Command, Sample, Samples, Setpoints
 from armlink.loop.driver import ArmDriver
 from calib.arm.kinematics import DriveLimits
@@ -110,7 +111,8 @@ class Mover:
         drives = [joint.settings for joint in self.link.arm.require_link().joints]
         gains = [(getattr(each, "kp", 0.0), getattr(each, "kd", 0.0)) for each in drives]
         slowest = max(slowest_time(*each) for each in gains)
-        self.rule = SettleRule.of(self.section, share * self.limits.rated, self.link.period, slowest)
+        every = max(each.torque_cycles for each in traits_of(make_groups(self.link.arm)))
+        self.rule = SettleRule.of(self.section, share * self.limits.rated, self.link.period, slowest, every)
 
     def cycle(self) -> Sample:
         """A cycle of the present command; raises Slipped when a pressed joint has left its stop, EncoderFault."""

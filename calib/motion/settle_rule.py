@@ -11,6 +11,8 @@ DRIFT = 2.5
 """Standard errors by which the means of the window's halves may differ."""
 WINDOW_TIMES = 3.0
 """Time constants of the slowest position loop in a window: what drifts more slowly is what one would call creep."""
+FEWEST_READINGS = 8
+"""Torque readings in a window, at the least."""
 QUIET = 1.0
 """Torque scatter that is this many times the standard error asked for has settled whatever its shape."""
 
@@ -31,7 +33,14 @@ class SettleRule:
     """Asked for [N·m]."""
 
     @classmethod
-    def of(cls, section: SweepSection, standard_error: Array, period: float, slowest: float = 0.0) -> "SettleRule":
+    def of(
+        cls,
+        section: SweepSection,
+        standard_error: Array,
+        period: float,
+        slowest: float = 0.0,
+        torque_cycles: int = 1,
+    ) -> "SettleRule":
         """From the sweep section; standard error (n,) [N·m] of each reading, cycle `period` [s].
 
         `slowest` is the longest time constant of the position loops [s], 0 where the drives close them: the window
@@ -41,7 +50,7 @@ class SettleRule:
         seconds = section.settle_window
         if "settle_window" not in section.model_fields_set:
             seconds = max(seconds, WINDOW_TIMES * slowest)
-        window = max(round(seconds / period), 8)
+        window = max(round(seconds / period), FEWEST_READINGS * torque_cycles)
         return cls(
             window=window,
             timeout=round(section.settle_timeout / period),
@@ -66,7 +75,7 @@ class SettleRule:
         return all(self._is_steady(x[np.isfinite(x)], error) for x, error, counted in joints if counted)
 
     def _is_steady(self, torque: Array, standard_error: float) -> bool:
-        """Whether a joint's torque readings (k,) have settled; drives send them in all cycles, or in one of several."""
+        """Whether a joint's torque readings (k,) have settled."""
         half = len(torque) // 2
         if half < 2:
             return False

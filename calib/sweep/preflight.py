@@ -161,6 +161,6 @@ def find_stops(
 
 
 def _noise(values: Array) -> float:
-    """Standard deviation of one sample from the steps between samples, so that a slow change does not count."""
-    steps = np.diff(values)
-    return float(np.sqrt(np.nanmean(steps**2) / 2)) if np.isfinite(steps).any() else float("nan")
+    """Standard deviation of one reading from the steps between readings, so that a slow change does not count."""
+    steps = np.diff(values[np.isfinite(values)])
+    return float(np.sqrt(np.mean(steps**2) / 2)) if len(steps) else float("nan")

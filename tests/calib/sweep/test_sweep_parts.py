@@ -24,6 +24,7 @@ from calib.motion.settle_rule import SettleRule
 from calib.motion.static_reading import StaticReading
 from calib.motion.trajectory import trajectory
 from calib.plan.sweep_plan import plan_sweep
+from calib.sweep.preflight import _noise
 from gcomp.arrays import Array
 from sim_bus.truth import Truth
 
@@ -81,6 +82,17 @@ def test_a_torque_that_comes_with_every_fourth_cycle_settles_by_the_same_rule(dr
     every[:] = drift * np.linspace(0.0, 1.0, len(every)) + random.normal(0.0, 0.05, len(every))
     assert RULE.settled(np.zeros_like(torque), torque, COUNTS, STEP) == (drift == 0.0)
     assert RULE.exact(torque, COUNTS) == (drift == 0.0)
+
+
+def test_a_window_has_as_many_torque_readings_where_they_come_with_every_fourth_cycle() -> None:
+    slow = SettleRule.of(SweepSection(), np.array([0.05]), 0.02, torque_cycles=4)
+    assert (slow.window, SettleRule.of(SweepSection(), np.array([0.05]), 0.02).window) == (32, 8)
+
+
+def test_the_noise_of_a_torque_that_comes_with_every_fourth_cycle_is_known() -> None:
+    readings = np.full(400, np.nan)
+    readings[::4] = np.random.default_rng(4).normal(0.0, 0.1, 100)
+    assert _noise(readings) == pytest.approx(0.1, rel=0.2)
 
 
 def test_a_drifting_torque_has_not_but_one_that_does_not_count_may() -> None:
