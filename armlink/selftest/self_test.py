@@ -67,8 +67,7 @@ class SelfTest:
         except ArmlinkError as error:
             reason = str(error)
             if self.checks.results and not self.checks.failed:
-                who = next((name for name in link.names if reason.startswith(f"{name}:")), link.names[0])
-                self.checks.add(who, self._under_way, "failed", reason)
+                self.checks.add(self._blamed(reason), self._under_way, "failed", reason)
         finally:
             if link.enabled:
                 link.stop()
@@ -77,6 +76,10 @@ class SelfTest:
         for name, check in self.checks.missing(CHECKS, link.names):
             self.checks.add(name, check, "not run", reason)
         return self.checks.results
+
+    def _blamed(self, reason: str) -> str:
+        """The joint that a reason begins with, else the first: `joint_10` is not `joint_1`."""
+        return max(filter(reason.startswith, self.link.names), key=len, default=self.link.names[0])
 
     def _identified(self) -> bool:
         """Each drive answers and is the one that the arm file states."""
@@ -102,8 +105,7 @@ class SelfTest:
         try:
             link.start()
         except BusFault as error:
-            who = next((name for name in link.names if str(error).startswith(name)), link.names[0])
-            self.checks.add(who, "set-up", "failed", str(error))
+            self.checks.add(self._blamed(str(error)), "set-up", "failed", str(error))
             return False
         except Refused as error:
             if not link.setups or not self._places():
@@ -155,11 +157,9 @@ class SelfTest:
         keeping = [name for name, traits in pairs if traits.silence == "keeps on"]
         for name in keeping:
             self.checks.add(name, "silence", "failed", KEEPS_ON)
-        return (
-            f"{keeping[0]} is not driven: if its host died, its drive would keep on with the last command"
-            if keeping
-            else ""
-        )
+        if not keeping:
+            return ""
+        return f"{keeping[0]} is not driven: if its host died, its drive would keep on with the last command"
 
     def _with_power(self) -> str:
         """Enable, hold, silence of each drive, stow; returns why what is left is not run."""
@@ -168,10 +168,10 @@ class SelfTest:
         start = link.clock.now()
         standing = link.enable().position
         seconds = link.clock.now() - start
-        on, sags = [Power.ON] * link.n, self._sags()
-        sample = self._cycle(on, standing, HELD + sags)
+        on, most = [Power.ON] * link.n, HELD + self._sags()
+        sample = self._cycle(on, standing, most)
         for _ in range(self._cycles(HOLD_SECONDS)):
-            sample = self._cycle(on, standing, HELD + sags)
+            sample = self._cycle(on, standing, most)
         moved = np.abs(sample.position - standing)
         for joint, name in enumerate(link.names):
             found = f"moved by {moved[joint]:.4f} rad in {HOLD_SECONDS} s"
@@ -295,7 +295,7 @@ class SelfTest:
             raise BusFault(fault)
         moved = np.abs(np.array(link.commander.loop.latest_position) - standing)
         if (moved > most).any():
-            joint = int(np.nanargmax(moved))
+            joint = int(np.nanargmax(moved - most))
             raise BusFault(
                 f"{link.names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: the test was ended"
             )
