@@ -184,12 +184,10 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
             "the drive would keep on with its last command after its host died",
         )
         known.mode, known.was_on = None, False
-        notes = (
-            (f"the scales are taken from the manual of the {settings.model}, since the drive has no register for them"),
-        )
+        note = f"the scales are taken from the manual of the {settings.model}, since the drive has no register for them"
         where = (f"the range of an {settings.model}",) * 3
         remedy = "correct `model` in the `drive:` section, or take a drive with a larger range"
-        return self.mit_setup(joint, limits, feedback.motion.position, grid, notes, where, remedy)
+        return self.mit_setup(joint, limits, feedback.motion.position, grid, (note,), where, remedy)
 
     # ---- cycle
 
