@@ -141,12 +141,8 @@ class SelfTest:
                 continue
             held = link.read_calibration(joint)
             if name in link.uncalibrated:
-                self.checks.add(
-                    name,
-                    "calibration",
-                    "absent",
-                    "no calibration record is in force: the torque is used as the drive reports it",
-                )
+                told = "no calibration record is in force: the torque is used as the drive reports it"
+                self.checks.add(name, "calibration", "absent", told)
             else:
                 told = f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
                 self.checks.add(name, "calibration", "passed", told)
@@ -192,16 +188,13 @@ class SelfTest:
         """Stow the arm where drives let go without their host; returns why it is not stowed."""
         link = self.link
         letting_go = falling(link)
-        if link.section.park is None and letting_go:
+        if not letting_go:
+            return "every drive holds when its host is silent"
+        if link.section.park is None:
+            lack = "the arm file has no `link.park`"
             for name in letting_go:
-                self.checks.add(
-                    name,
-                    "park",
-                    "absent",
-                    "the arm file has no `link.park`: the arm is slowly lowered when the work ends",
-                )
-        if link.section.park is None or not letting_go:
-            return "every drive holds when its host is silent" if not letting_go else "the arm file has no `link.park`"
+                self.checks.add(name, "park", "absent", f"{lack}: the arm is slowly lowered when the work ends")
+            return lack
         start = link.clock.now()
         try:
             park(link, self.progress)
