@@ -78,8 +78,9 @@ class SelfTest:
         return self.checks.results
 
     def _blamed(self, reason: str) -> str:
-        """The joint that a reason begins with, else the first: `joint_10` is not `joint_1`."""
-        return max(filter(reason.startswith, self.link.names), key=len, default=self.link.names[0])
+        """The joint that a reason begins with, alone or with its address in brackets; else the first."""
+        names = self.link.names
+        return next((name for name in names if reason.startswith((f"{name}:", f"{name} ("))), names[0])
 
     def _identified(self) -> bool:
         """Each drive answers and is the one that the arm file states."""

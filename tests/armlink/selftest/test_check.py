@@ -217,7 +217,8 @@ def test_every_bundled_arm_passes_in_process(arm, capsys):
 def test_the_joint_that_a_reason_begins_with_is_blamed():
     test = SelfTest(SimpleNamespace(names=("joint_1", "joint_10", "joint_2")), print)
     assert test._blamed("joint_10 (id 0Ah): its power stays off") == "joint_10"
-    assert test._blamed("the bus is down") == "joint_1"
+    assert test._blamed("joint_2: its power stays off") == "joint_2"
+    assert test._blamed("joint_2 and joint_10 are silent") == "joint_1"
 
 
 def test_the_joint_that_moved_is_blamed(capsys, monkeypatch):
