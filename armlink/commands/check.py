@@ -24,7 +24,8 @@ WARNING = (
     "One joint after the other is then quick-stopped, and later gets no commands for {deadline:.0f} ms; at "
     "last no joint gets the heartbeat of this host for {heartbeat:.0f} ms. Nothing is moved on purpose, but "
     "a drive that does not hold after a quick stop may let its joint fall: put the arm where no joint can "
-    "fall, keep clear, and keep a hand on the emergency stop. At the end the joints hold, in quick stop."
+    "fall, keep clear, and keep a hand on the emergency stop. At the end the joints hold, in quick stop; if "
+    "drives cannot hold without this host, the arm is parked or lowered, and its power is switched off."
 )
 
 
@@ -57,8 +58,8 @@ def check(
     """Check identity, objects, PDO mapping, limits, calibration; then, with power, quick stop, deadline and heartbeat.
 
     The command shows that each drive stops by itself when its host falls silent, and how long that takes. It first says
-    what it will do to the joints and asks, except with --yes or on a simulated arm in this process. Exit status 1 if a
-    check fails; the joints are left in quick stop, holding.
+    what it will do to the joints and asks, except with --yes or on a simulated arm in this process. At the end the
+    joints hold, in quick stop, or the arm is parked or lowered. Exit status 1 if a check fails.
 
     With --host nothing is sent: this machine makes cycles at the rate of the arm while a job computes and writes. Exit
     status 1 if the machine is too slow for the deadline or the rate of the arm.
@@ -68,7 +69,7 @@ def check(
     Example: armlink check sarcos --bus socketcan:vcan0 --yes --json -
     """
     from armlink.arm_file import load_arm
-    from armlink.commands.early_end import early_end
+    from armlink.commands.early_end import early_end, joints_left
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, command_line, confirm, results, suggest
     from armlink.errors import BadInput, BusFault, Refused
@@ -115,7 +116,7 @@ def check(
             f"{first.found}"
         )
     passed = sum(each.outcome == "passed" for each in found)
-    out.print(f"all {passed} checks passed; the joints {'were not enabled' if passive else 'hold, in quick stop'}")
+    out.print(f"all {passed} checks passed; {'the joints were not enabled' if passive else joints_left(described)}")
     suggest(command_line("sweep", arm, "--plan", bus=bus))
     return 0
 

@@ -1,4 +1,4 @@
-"""Work on an arm that ends early: how its joints were left, and the command that goes on from there."""
+"""The end of work on an arm: how its joints were left, and where it is early the command that goes on from there."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -32,11 +32,16 @@ def early_end(arm: ArmFile, resume: str | Callable[[], str] | None = None) -> It
         yield work
     except (KeyboardInterrupt, Stall):
         from armlink.commands.plain_console import PlainConsole, suggest
-        from armlink.link.joints.groups import make_groups, traits_of
 
         if work.enabled:
-            holds = all(each.silence == "holds" for each in traits_of(make_groups(arm)))
-            PlainConsole().print(f"{arm.name}: {HOLD if holds else PARKED}")
+            PlainConsole().print(f"{arm.name}: {joints_left(arm)}")
         if resume is not None:
             suggest(resume if isinstance(resume, str) else resume())
         raise
+
+
+def joints_left(arm: ArmFile) -> str:
+    """How the end of work leaves the joints (`armlink.link.ends`)."""
+    from armlink.link.joints.groups import make_groups, traits_of
+
+    return HOLD if all(each.silence == "holds" for each in traits_of(make_groups(arm))) else PARKED

@@ -2,12 +2,11 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from armlink.commands.options import Arm, OtherBus
+from armlink.commands.options import Arm, Json, OtherBus
 
 if TYPE_CHECKING:
     from rich.console import Console, Group
@@ -44,9 +43,7 @@ def monitor(
         int | None,
         typer.Option(min=1, max=65535, metavar="PORT", help="Send readings to a Rerun viewer on this machine."),
     ] = None,
-    json: Annotated[
-        Path | None, typer.Option(help="Write the last state as JSON to this file; for standard output give `-`.")
-    ] = None,
+    json: Json = None,
 ) -> int:
     """Show what an arm's joints send; exit status 3 if no joint is heard.
 

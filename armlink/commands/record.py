@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from armlink.commands.options import Arm, OtherBus
+from armlink.commands.options import Arm, Json, OtherBus
 
 SUFFIX = ".mcap"
 
@@ -21,9 +21,7 @@ def record(
     ] = None,
     bus: OtherBus = None,
     seconds: Annotated[float, typer.Option(min=0.0, help="How long to record [s]; 0: until Ctrl-C or SIGTERM.")] = 0.0,
-    json: Annotated[
-        Path | None, typer.Option(help="Write as JSON to this file what was recorded; for standard output give `-`.")
-    ] = None,
+    json: Json = None,
 ) -> int:
     """Record to MCAP, which opens in Foxglove, PlotJuggler and ROS 2; a kill loses at most the last second.
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from armlink.commands.options import Arm
+from armlink.commands.options import Arm, Json
 
 
 def replay(
@@ -23,9 +23,7 @@ def replay(
     speed: Annotated[
         float, typer.Option(min=0.0, help="Speed relative to the recording; 0: as fast as possible.")
     ] = 1.0,
-    json: Annotated[
-        Path | None, typer.Option(help="Write as JSON to this file what was replayed; for standard output give `-`.")
-    ] = None,
+    json: Json = None,
 ) -> int:
     """Decode a raw log or a recording again; with neither TARGET nor --bus, show it as a live table at --speed.
 

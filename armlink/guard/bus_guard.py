@@ -98,11 +98,9 @@ class Field:
         """Why this frame's number is not allowed, or an empty text. Keeps nothing: see `keep`."""
         value = self.number.unpack_from(data, self.at)[0]
         if self.values is not None:
-            return (
-                ""
-                if value in self.values
-                else f"{self.name} is {value}, which is not among the {len(self.values)} allowed values"
-            )
+            if value in self.values:
+                return ""
+            return f"{self.name} is {value}, which is not among the {len(self.values)} allowed values"
         known = [reading for reading, at in self._readings if now - at <= self.age]
         near = any(abs(value - reading) <= self.within for reading in known)
         began = [self._last] if power and self._last is not None else known
@@ -111,11 +109,9 @@ class Field:
         if not power or self.rate == math.inf or near:
             return ""
         if self._last is None:
-            return (
-                ""
-                if value in self.first
-                else f"{self.name} is {value} in a frame that gives power, but no reading shows the joint near it"
-            )
+            if value in self.first:
+                return ""
+            return f"{self.name} is {value} in a frame that gives power, but no reading shows the joint near it"
         if abs(value - self._last) <= self._room_at(now):
             return ""
         return f"{self.name} goes from {self._last} to {value} at once, but may change by {self._room_at(now):g} only"

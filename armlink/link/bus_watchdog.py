@@ -66,6 +66,11 @@ class BusWatch:
         self.crowding = 0.0
         """Frames a cycle that no drive of ours sends, a mean over CROWDED_CYCLES."""
 
+    @property
+    def intrusion(self) -> str:
+        told = f"another host is on this bus: it sends {self.intruder}"
+        return f"{told}: stop that program, since only one program may command an arm"
+
     def settle(self) -> None:
         """After an interruption: reset the crowding counters; replies that are owed may still arrive."""
         self.flooded, self._crowded_cycles, self.crowding, self.reception = False, 0, 0.0, ""

@@ -117,10 +117,7 @@ def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None
     if watch.reception:
         return watch.reception
     if watch.intruder:
-        return (
-            f"another host is on this bus: it sends {watch.intruder}: stop that program, since only one program may "
-            "command an arm"
-        )
+        return watch.intrusion
     doubled = watch.doubled
     if doubled is not None:
         return (

@@ -1,6 +1,7 @@
 """The process that makes an arm's cycles (`armlink.loop.process`), as whoever has started it sees it."""
 
 import contextlib
+import itertools
 import socket
 import subprocess
 import sys
@@ -9,14 +10,16 @@ from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 from armlink.link.ends import EndCause
-from armlink.link.types import Calibration, Tell
+from armlink.link.types import Tell
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.driver import Controllers
 from armlink.loop.ending import see_out
-from armlink.loop.messages import Open
+from armlink.loop.messages import Call, LoopAnswer, Open
 
 HANG_SECONDS = 10.0
 """A process that takes nothing, or answers nothing, for this time hangs [s]."""
+numbers = itertools.count(1)
+"""Ids of what is asked of a process."""
 R = TypeVar("R")
 P = ParamSpec("P")
 
@@ -63,8 +66,10 @@ class CycleProcess:
 class Remote:
     """Whatever asks the process to call a method of its link."""
 
+    _ask: Callable[[Call], LoopAnswer]
+
     def _call(self, what: str | Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        raise NotImplementedError
+        return self._ask(Call(next(numbers), what, args, kwargs)).result()
 
 
 def remote(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Remote, P], R]:
@@ -82,7 +87,4 @@ class RemoteControllers(Remote):
 
     read_calibration = remote(Controllers.read_calibration)
     drive_serial = remote(Controllers.drive_serial)
-
-    def write_calibration(self, joint: int, calibration: Calibration, store: bool = False) -> Calibration:
-        found: Calibration = self._call("write_calibration", joint, calibration, store)
-        return found
+    write_calibration = remote(Controllers.write_calibration)

@@ -1,6 +1,5 @@
 """An arm that a process keeps open for a daemon: batches of samples, state of the bus, requests from any thread."""
 
-import itertools
 import pickle
 import threading
 from collections.abc import Callable, Sequence
@@ -12,7 +11,7 @@ from armlink.errors import BusFault
 from armlink.link.ends import EndCause
 from armlink.link.types import Controller, Tell
 from armlink.loop.channel import Closed
-from armlink.loop.cycle_process import HANG_SECONDS, CycleProcess, RemoteControllers
+from armlink.loop.cycle_process import HANG_SECONDS, CycleProcess, RemoteControllers, numbers
 from armlink.loop.messages import (
     Batch,
     Call,
@@ -29,7 +28,6 @@ from armlink.loop.messages import (
 
 ENDED = "the bus loop's process has ended"
 KeptMessage = Told | Batch | Up | Down | LoopAnswer | Progress | Stopped
-_numbers = itertools.count(1)
 
 
 class KeptControllers(RemoteControllers):
@@ -37,12 +35,6 @@ class KeptControllers(RemoteControllers):
 
     def __init__(self, ask: Callable[[Call], LoopAnswer]) -> None:
         self._ask = ask
-
-    def _call(self, what: str | Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        answer = self._ask(Call(next(_numbers), what, args, tuple(kwargs.items())))
-        if answer.error is not None:
-            raise answer.error
-        return answer.value
 
 
 class BatchMaker:
@@ -89,7 +81,7 @@ class KeptArm(CycleProcess):
 
     def move(self, controller: Controller) -> None:
         """Run a controller from now on; Stopped says where that is not possible."""
-        self._send(RunController(next(_numbers), pickle.dumps(controller)))
+        self._send(RunController(next(numbers), pickle.dumps(controller)))
 
     def pump(self) -> list[KeptMessage]:
         """All messages waiting; raises EOFError if the process has ended."""

@@ -1,7 +1,7 @@
 """Messages between a job and the process that makes the cycles."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -39,13 +39,13 @@ class Open:
 
 @dataclass(frozen=True)
 class Call:
-    """Call a method of the link, or a function with the link; answered by an Answer."""
+    """Call a method of the link, or a function with the link; answered by a LoopAnswer."""
 
     id: int
     what: str | Callable[..., Any]
     """A function is called with the link, and with what tells the job what is being done."""
     args: tuple[Any, ...] = ()
-    kwargs: tuple[tuple[str, Any], ...] = ()
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,12 @@ class LoopAnswer:
     id: int
     value: Any = None
     error: ArmlinkError | None = None
+
+    def result(self) -> Any:
+        """The value; raises the error."""
+        if self.error is not None:
+            raise self.error
+        return self.value
 
 
 @dataclass(frozen=True)
@@ -155,11 +161,6 @@ class Health:
     temperature: Array | None = None
     """Of the drives (n,) [°C]; NaN for one that does not tell it."""
 
-    @classmethod
-    def of(cls, stats: Stats, emergencies: tuple[DriveEvent, ...], temperature: Array) -> "Health":
-        """Of counters that go on."""
-        return cls(replace(stats), emergencies, temperature)
-
 
 @dataclass(frozen=True)
 class Batch:
@@ -185,8 +186,7 @@ class Batch:
         rows = dict(zip(ROWS, values[:, 3:].reshape(len(packed), len(ROWS), -1).transpose(1, 0, 2), strict=True))
         channels = {name: rows[name].copy() for name in CHANNELS}
         status, age = rows["status"][-1].astype(np.int64), rows["age"][-1].copy()
-        told = health.stats, health.emergencies, health.temperature
-        return cls(values[:, 0] + begun, channels, status, age, *told)
+        return cls(values[:, 0] + begun, channels, status, age, **vars(health))
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,8 @@ class DriveLoop:
     def _handle(self, message: object) -> None:
         match message:
             case Call():
-                self._call(message)
+                self._channel.put(self._answer(message))
+                self._channel.flush()
             case End():
                 self._end = message
             case Play() | RunController() if not self._enabled:
@@ -170,19 +171,17 @@ class DriveLoop:
             case Cut() if self._controller is not None:  # its last torque is right for its last sample alone
                 self._hold_here()
             case Cut():
-                self._chunks.clear()
-                self._source = self._unpickled = None
+                self._cut()
             case Alive():
                 pass
 
     def _begin(self, id: int) -> None:
-        self._chunks.clear()
-        self._source, self._id, self._row, self._rows, self._controller = None, id, -1, 0, None
-        self._unpickled = None
+        self._cut()
+        self._id, self._row, self._rows = id, -1, 0
 
-    def _call(self, call: Call) -> None:
-        self._channel.put(self._answer(call))
-        self._channel.flush()
+    def _cut(self) -> None:
+        self._chunks.clear()
+        self._source = self._controller = self._unpickled = None
 
     def _answer(self, call: Call) -> LoopAnswer:
         """Carry a call out; every failure is in the answer."""
@@ -190,12 +189,11 @@ class DriveLoop:
         if isinstance(link, Link):
             link.tell = tell
         try:
-            kwargs = dict(call.kwargs)
             if callable(call.what):
-                answer = LoopAnswer(call.id, call.what(link, tell, *call.args, **kwargs))
+                answer = LoopAnswer(call.id, call.what(link, tell, *call.args, **call.kwargs))
             else:
                 found = getattr(link, call.what)
-                answer = LoopAnswer(call.id, found(*call.args, **kwargs) if callable(found) else found)
+                answer = LoopAnswer(call.id, found(*call.args, **call.kwargs) if callable(found) else found)
         except ArmlinkError as error:
             answer = LoopAnswer(call.id, error=error)
         except KeyboardInterrupt:
@@ -232,10 +230,10 @@ class DriveLoop:
 
     def _cycle(self) -> None:
         """One cycle: the next row, or the last command once more."""
-        now = time.monotonic()
+        now, link = time.monotonic(), self._link
         due = now - self._talked >= self.talk_every
         busy = not due and self._row + 2 < self._rows and self._controller is None
-        self._busy = self._link.commander.unhurried = busy
+        self._busy = link.commander.unhurried = busy
         try:
             row, sample = self._next()
         except Crossed as crossed:
@@ -244,14 +242,12 @@ class DriveLoop:
         except ArmlinkError as error:
             self._stopped(error)
         else:
-            self._channel.put((self._id, row, pack(sample, *self._link.sent)), True)
+            self._channel.put((self._id, row, pack(sample, *link.sent)), True)
             self._mind_silence(now)
             if not due and not 0 <= row == self._rows - 1:
                 return
             self._talked = now
-        self._busy = False
-        if isinstance(self.arm, Link):
-            self.arm.commander.unhurried = False
+        self._busy = link.commander.unhurried = False
         self._talk()
 
     def _stopped(self, error: ArmlinkError) -> None:
@@ -282,8 +278,7 @@ class DriveLoop:
             self._source = None
 
     def _hold_here(self) -> None:
-        self._chunks.clear()
-        self._source = self._controller = self._unpickled = None
+        self._cut()
         self._last = Command.hold(self._link.latest_position)
 
     def _mind_silence(self, now: float) -> None:
@@ -386,7 +381,7 @@ class KeptLoop(DriveLoop):
             self._channel.put(Told(0, ""))
         else:
             events = tuple(self.arm.emergencies) if isinstance(self.arm, Listener) else ()
-            self._channel.put(Health.of(self.arm.stats, events, self.arm.temperatures), True)
+            self._channel.put(Health(self.arm.stats, events, self.arm.temperatures), True)
         progress: tuple[int, int] | None = getattr(self._controller, "progress", None)
         if progress != self._progress:
             self._progress = progress

@@ -27,8 +27,8 @@ class Realtime:
             return "real-time scheduling, memory locked"
         missing = [name for name, got in (("rtprio", self.scheduled), ("memlock", self.locked)) if not got]
         return (
-            f"ordinary scheduling, since {' and '.join(missing)} are not permitted (run as root, or raise "
-            "the limits in /etc/security/limits.conf)"
+            f"ordinary scheduling, without permission for {' and '.join(missing)} (run as root, or raise the limits in "
+            "/etc/security/limits.conf)"
         )
 
 

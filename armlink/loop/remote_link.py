@@ -1,7 +1,6 @@
 """A link whose cycles are made in a process of its own: the job sends commands ahead and gets the samples back."""
 
 import contextlib
-import itertools
 import pickle
 import sys
 import time
@@ -18,7 +17,7 @@ from armlink.link.ends import EndCause, cause_of
 from armlink.link.park import park
 from armlink.link.types import Command, Controller, Sample, Samples, Setpoints, Stats, Tell
 from armlink.loop.channel import Closed
-from armlink.loop.cycle_process import CycleProcess, RemoteControllers, remote
+from armlink.loop.cycle_process import CycleProcess, RemoteControllers, numbers, remote
 from armlink.loop.driver import ArmDriver
 from armlink.loop.ending import TOLD_EVERY
 from armlink.loop.messages import Alive, Call, Cut, LoopAnswer, Open, Play, RunController, Stopped, Told, unpack
@@ -42,7 +41,6 @@ class RemoteLink(CycleProcess, RemoteControllers):
         section = arm.require_link()
         self.names = tuple(joint.name for joint in section.joints)
         self.n, self.rate, self.period = len(self.names), section.rate, 1.0 / section.rate
-        self._numbers = itertools.count(1)
         self._samples: deque[tuple[int, int, bytes]] = deque()
         self._stopped: Stopped | None = None
         self._answers: dict[int, LoopAnswer] = {}
@@ -53,7 +51,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
         self._tell_on: Tell = lambda text: None
         super().__init__(Open(arm, bus))
         try:
-            self.realtime: Realtime = self._answer(0)
+            self.realtime: Realtime = self._answer(0).result()
             """Real-time permissions of the process that makes the cycles."""
         except BaseException:
             self._end(EndCause.FAILED)
@@ -141,7 +139,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
         """As Link.play: every row is sent at once, and played whatever this process does meanwhile."""
         if not len(setpoints):
             return
-        number = next(self._numbers)
+        number = next(numbers)
         for begin in range(0, len(setpoints), CHUNK):
             self._put(Play(number, setpoints[begin : begin + CHUNK]))
         yield from self._take(number, len(setpoints))
@@ -149,7 +147,7 @@ class RemoteLink(CycleProcess, RemoteControllers):
 
     def run(self, controller: Controller) -> Samples:
         """As Link.run, in the other process."""
-        number = next(self._numbers)
+        number = next(numbers)
         self._put(RunController(number, pickle.dumps(controller)))
         yield from self._take(number, sys.maxsize)
 
@@ -226,22 +224,18 @@ class RemoteLink(CycleProcess, RemoteControllers):
                 case _:
                     self._samples.append(message)
 
-    def _call(self, what: str | Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        number = next(self._numbers)
-        self._put(Call(number, what, args, tuple(kwargs.items())))
-        return self._answer(number)
+    def _ask(self, call: Call) -> LoopAnswer:
+        self._put(call)
+        return self._answer(call.id)
 
-    def _answer(self, number: int) -> Any:
+    def _answer(self, number: int) -> LoopAnswer:
         self._heard = time.monotonic()
         while number not in self._answers:
             if time.monotonic() > self._heard + ANSWER:
                 raise BusFault(f"the process that drives the arm has not answered for {ANSWER:g} s")
             self._channel.wait(TOLD_EVERY)
             self._receive()
-        answer = self._answers.pop(number)
-        if answer.error is not None:
-            raise answer.error
-        return answer.value
+        return self._answers.pop(number)
 
     def _gone(self) -> BusFault:
         ended = f"the process that drives the arm has ended (status {self.exit_status})"

@@ -67,8 +67,7 @@ class SelfTest:
         except ArmlinkError as error:
             reason = str(error)
             if self.checks.results and not self.checks.failed:
-                who = next((name for name in link.names if reason.startswith(f"{name}:")), link.names[0])
-                self.checks.add(who, self._under_way, "failed", reason)
+                self.checks.add(self._blamed(reason), self._under_way, "failed", reason)
         finally:
             if link.enabled:
                 link.stop()
@@ -77,6 +76,11 @@ class SelfTest:
         for name, check in self.checks.missing(CHECKS, link.names):
             self.checks.add(name, check, "not run", reason)
         return self.checks.results
+
+    def _blamed(self, reason: str) -> str:
+        """The joint that a reason begins with, alone or with its address in brackets; else the first."""
+        names = self.link.names
+        return next((name for name in names if reason.startswith((f"{name}:", f"{name} ("))), names[0])
 
     def _identified(self) -> bool:
         """Each drive answers and is the one that the arm file states."""
@@ -102,8 +106,7 @@ class SelfTest:
         try:
             link.start()
         except BusFault as error:
-            who = next((name for name in link.names if str(error).startswith(name)), link.names[0])
-            self.checks.add(who, "set-up", "failed", str(error))
+            self.checks.add(self._blamed(str(error)), "set-up", "failed", str(error))
             return False
         except Refused as error:
             if not link.setups or not self._places():
@@ -139,12 +142,8 @@ class SelfTest:
                 continue
             held = link.read_calibration(joint)
             if name in link.uncalibrated:
-                self.checks.add(
-                    name,
-                    "calibration",
-                    "absent",
-                    "no calibration record is in force: the torque is used as the drive reports it",
-                )
+                told = "no calibration record is in force: the torque is used as the drive reports it"
+                self.checks.add(name, "calibration", "absent", told)
             else:
                 told = f"gain {held.gain:.6g}, offset {held.offset:.4g} N·m, record {held.record_id}"
                 self.checks.add(name, "calibration", "passed", told)
@@ -155,11 +154,9 @@ class SelfTest:
         keeping = [name for name, traits in pairs if traits.silence == "keeps on"]
         for name in keeping:
             self.checks.add(name, "silence", "failed", KEEPS_ON)
-        return (
-            f"{keeping[0]} is not driven: if its host died, its drive would keep on with the last command"
-            if keeping
-            else ""
-        )
+        if not keeping:
+            return ""
+        return f"{keeping[0]} is not driven: if its host died, its drive would keep on with the last command"
 
     def _with_power(self) -> str:
         """Enable, hold, silence of each drive, stow; returns why what is left is not run."""
@@ -168,10 +165,10 @@ class SelfTest:
         start = link.clock.now()
         standing = link.enable().position
         seconds = link.clock.now() - start
-        on, sags = [Power.ON] * link.n, self._sags()
-        sample = self._cycle(on, standing, HELD + sags)
+        on, most = [Power.ON] * link.n, HELD + self._sags()
+        sample = self._cycle(on, standing, most)
         for _ in range(self._cycles(HOLD_SECONDS)):
-            sample = self._cycle(on, standing, HELD + sags)
+            sample = self._cycle(on, standing, most)
         moved = np.abs(sample.position - standing)
         for joint, name in enumerate(link.names):
             found = f"moved by {moved[joint]:.4f} rad in {HOLD_SECONDS} s"
@@ -192,16 +189,13 @@ class SelfTest:
         """Stow the arm where drives let go without their host; returns why it is not stowed."""
         link = self.link
         letting_go = falling(link)
-        if link.section.park is None and letting_go:
+        if not letting_go:
+            return "every drive holds when its host is silent"
+        if link.section.park is None:
+            lack = "the arm file has no `link.park`"
             for name in letting_go:
-                self.checks.add(
-                    name,
-                    "park",
-                    "absent",
-                    "the arm file has no `link.park`: the arm is slowly lowered when the work ends",
-                )
-        if link.section.park is None or not letting_go:
-            return "every drive holds when its host is silent" if not letting_go else "the arm file has no `link.park`"
+                self.checks.add(name, "park", "absent", f"{lack}: the arm is slowly lowered when the work ends")
+            return lack
         start = link.clock.now()
         try:
             park(link, self.progress)
@@ -295,7 +289,7 @@ class SelfTest:
             raise BusFault(fault)
         moved = np.abs(np.array(link.commander.loop.latest_position) - standing)
         if (moved > most).any():
-            joint = int(np.nanargmax(moved))
+            joint = int(np.nanargmax(moved - most))
             raise BusFault(
                 f"{link.names[joint]}: moved by {moved[joint]:.3f} rad while it should hold: the test was ended"
             )

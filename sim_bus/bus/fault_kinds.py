@@ -75,6 +75,6 @@ def parse_fault(text: str, joints: Sequence[str]) -> Fault:
             raise ValueError
     except ValueError:
         raise BadInput(
-            f"fault {text!r}: its value is wrong (expected: {kind.value or 'none'}); expected {FORM}"
+            f"fault {text!r}: its value ({kind.value or 'none'}) or its time is wrong; expected {FORM}"
         ) from None
     return Fault(kind.id, joint, amount, instant)

@@ -93,11 +93,9 @@ class Profile:
                 "only mode 9 (cyclic velocity) can be used: the host controls positions, and there is no torque "
                 "control",
             )
-        return (
-            told
-            if self.modes_by_pdo
-            else (*told, "6060h cannot be mapped: the joint keeps one mode for the whole session")
-        )
+        if self.modes_by_pdo:
+            return told
+        return (*told, "6060h cannot be mapped: the joint keeps one mode for the whole session")
 
     @property
     def pdos(self) -> tuple[Pdo, ...]:

@@ -194,13 +194,8 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
         self.require_window(joint, limits, grid, " (register 21)")
         self._set(ask, joint, DamiaoRegister.CONTROL_MODE, frames.MIT_MODE, "the drive is not in MIT mode")
         deadman = round(limits.deadline / TIMEOUT_UNIT)
-        self._set(
-            ask,
-            joint,
-            DamiaoRegister.TIMEOUT,
-            deadman,
-            "the drive would keep on with its last command after its host died",
-        )
+        otherwise = "the drive would keep on with its last command after its host died"
+        self._set(ask, joint, DamiaoRegister.TIMEOUT, deadman, otherwise)
         reply = self._state(ask, joint, grid)
         if reply is None:
             raise BusFault(f"{name}: {settings.address} answers register requests, but sends no feedback")

@@ -176,20 +176,13 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         self._set(ask, joint, RobStrideParameter.RUN_MODE, MOTION_MODE, "the drive is not in motion mode")
         self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "the torque limit of the drive is not in force")
         deadman = round(limits.deadline / TIMEOUT_UNIT)
-        self._set(
-            ask,
-            joint,
-            RobStrideParameter.TIMEOUT,
-            deadman,
-            "the drive would keep on with its last command after its host died",
-        )
+        otherwise = "the drive would keep on with its last command after its host died"
+        self._set(ask, joint, RobStrideParameter.TIMEOUT, deadman, otherwise)
         known.mode, known.was_on = None, False
-        notes = (
-            (f"the scales are taken from the manual of the {settings.model}, since the drive has no register for them"),
-        )
+        note = f"the scales are taken from the manual of the {settings.model}, since the drive has no register for them"
         where = (f"the range of an {settings.model}",) * 3
         remedy = "correct `model` in the `drive:` section, or take a drive with a larger range"
-        return self.mit_setup(joint, limits, feedback.motion.position, grid, notes, where, remedy)
+        return self.mit_setup(joint, limits, feedback.motion.position, grid, (note,), where, remedy)
 
     # ---- cycle
 

@@ -32,7 +32,7 @@ def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", 
     parse_arm(parse_yaml(made.text, out), out)
     write_whole(out, made.text)
     ids = addresses([match.drive for match in made.matches])
-    told = f"{len(made.matches)} joints, {ids}; the geometry is not known, and says so in the file"
+    told = f"{len(made.matches)} joints, {ids}; the geometry is not known, as the file says"
     return _tell(out, told, "check", name or out.stem, _matched(made.matches), [], json_file)
 
 

@@ -3,6 +3,7 @@
 import json
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from sim_bus.truth import Truth
 
 QUICK_STOP = 0x07
 
-
+HOLDING = ("sarcos", "parallel6", "six-cia402")
 RATING = {"rated_torque": 20.0, "max_torque": 20.0}
 DAMIAO = {"family": "damiao", "id": 2, "reply": 0x12, "model": "DM8009", "kp": 50, "kd": 5.0}
 
@@ -208,7 +209,16 @@ def test_an_arm_that_is_not_there_is_a_bus_fault(capsys):
 def test_every_bundled_arm_passes_in_process(arm, capsys):
     """The OpenArm's wrist sags under its soft gains until the integral term has taken its load over."""
     assert run(["check", arm, "--yes"]) == 0
-    assert "checks passed" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "checks passed" in told
+    assert ("the joints hold where they stand" if arm in HOLDING else "its power was switched off") in told
+
+
+def test_the_joint_that_a_reason_begins_with_is_blamed():
+    test = SelfTest(SimpleNamespace(names=("joint_1", "joint_10", "joint_2")), print)
+    assert test._blamed("joint_10 (id 0Ah): its power stays off") == "joint_10"
+    assert test._blamed("joint_2: its power stays off") == "joint_2"
+    assert test._blamed("joint_2 and joint_10 are silent") == "joint_1"
 
 
 def test_the_joint_that_moved_is_blamed(capsys, monkeypatch):

@@ -105,11 +105,7 @@ class PowerTest:
         names, watch = self.link.names, self.loop.watch
         if watch.intruder or self.drives.known.restarted:
             where = self.drives.known.restarted and names[min(self.drives.known.restarted)]
-            raise BusFault(
-                f"another host is on this bus: it sends {watch.intruder}: stop it, only one program may command an arm"
-                if watch.intruder
-                else f"{where}: its drive has restarted"
-            )
+            raise BusFault(watch.intrusion if watch.intruder else f"{where}: its drive has restarted")
         moved = np.abs(sample.position - self._standing)
         if (moved > HELD).any():
             joint = int(np.nanargmax(moved))
