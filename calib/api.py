@@ -199,7 +199,7 @@ def observe(
         recording: ordinary work with rests, with torque sensor readings as the calibrated controllers send them.
         gravity: what `identify` found, or a gravity record.
         sensors: what `calibrate` found, or a calibration record.
-        config: thresholds of the observer.
+        config: settings of the observer at rest; that of motion (motor currents) has none.
 
     Raises BadInput where the recording is of another arm or has no torque sensor readings.
     """

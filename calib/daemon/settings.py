@@ -11,12 +11,15 @@ from pydantic import Field, FiniteFloat, field_validator
 from armlink.arm_file import ArmFile, Positive, Section
 from armlink.loop.kept_arm import KeptArm
 from calib.daemon.logs import log_to_stderr
-from calib.observer.config import ObserverConfig, ObserverConstants, Policy
+from calib.observer.config import ObserverConfig, Policy
 
 log = logging.getLogger("armlink.daemon")
-FORMER_THRESHOLDS = {"excitation_std", "excitation_rows", "places"} | {
-    name for name in vars(ObserverConstants) if not name.startswith("_")
-}
+FORMER_THRESHOLDS = frozenset({
+    "agreement", "alarm_threshold", "audit_rows", "common_joints", "discrepancy_share", "drift_gain", "drift_offset",
+    "evidence", "excitation_rows", "excitation_std", "gap_time", "initial_gain_std", "initial_offset_std",
+    "lever_share", "longest_window", "misfit", "new_pose", "noise_memory", "noise_rows", "outlier", "outliers_in_a_row",
+    "patience", "place_memory", "place_rows", "place_size", "places", "significance",
+})  # fmt: skip
 """Keys that arm files of earlier versions may have: constants by now."""
 _WHOLE = frozenset(field.name for field in fields(ObserverConfig) if field.type == "int" or field.type is int)
 

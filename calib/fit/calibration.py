@@ -22,6 +22,10 @@ from gcomp.arrays import Array
 
 QUANTILE = 1.96
 """Of a normal distribution, of 95 % intervals."""
+VERY_STRONG_EVIDENCE = 10.0
+"""BIC difference that counts as decided: odds of 150 to 1 (docs/theory.md, 4.3 and 6.4)."""
+SIGNIFICANCE = 5.0
+"""A change or an effect counts only if it is this many standard deviations (docs/theory.md, 6.6)."""
 NOMINAL: dict[Parameter, float] = {"position_gain": 1.0, "position_offset": 0.0}
 """Values of position sensors that were not fitted."""
 

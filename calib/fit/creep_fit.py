@@ -208,8 +208,7 @@ def _fit(
 ) -> CreepFit:
     model, slices = MotorModel(arm, rows.readings), family_slices(arm.n)
     scattered = Scatter.even(rows, 0.01 * rated[rows.swept])
-    coulomb, uneven = 0.02 * rated, np.full(HARMONICS, doubt.uneven)
-    mean, std = doubt.prior(arm, rated, rows.by_temperature, coulomb, uneven)
+    mean, std = doubt.prior(arm, rated, rows.by_temperature, 0.02 * rated)
     x = mean.copy() if start is None else start
     for _ in range(NOISE_ROUNDS):
         found = most_probable(model, scattered.whitened, mean, std, x)

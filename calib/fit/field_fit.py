@@ -15,7 +15,7 @@ from armlink.errors import BadInput, Refused
 from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_joint
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
-from calib.fit.calibration import FittedCalibration
+from calib.fit.calibration import VERY_STRONG_EVIDENCE, FittedCalibration
 from calib.fit.heldout import held_out
 from calib.fit.position_field import PositionField
 from calib.fit.scatter import NOISE_ROUNDS, inflation
@@ -41,8 +41,6 @@ DRIFT = 0.05
 """Standard deviation allowed for the drift of a gain that these rows do not show, as a ratio."""
 LEAST_CORRELATION = 0.05
 """Of neighbouring rows' residuals, up to which they are summed (docs/theory.md, section 4.3)."""
-PAYLOAD_EVIDENCE = 10.0
-"""BIC difference up to which a payload that explains the rows worse than new gains and offsets is not excluded."""
 BLOCK = 24
 """Rows that are held out together, since neighbours are correlated: six seconds of a recording."""
 
@@ -233,7 +231,7 @@ def _refuse_payload(problem: FieldProblem, noise: Array, chi2: float) -> None:
     as_load, mass = loaded.chi2 + 4 * log_rows, float(loaded.x[-4])
     as_new = chi2 + 2 * problem.arm.n * log_rows
     as_installed = problem.solve(base, noise).chi2
-    if as_installed > as_load + PAYLOAD_EVIDENCE and mass > 0 and as_load < as_new + PAYLOAD_EVIDENCE:
+    if as_installed > as_load + VERY_STRONG_EVIDENCE and mass > 0 and as_load < as_new + VERY_STRONG_EVIDENCE:
         raise Refused(
             f"a payload of {mass:.2f} kg explains these readings as well as other gains do: if there is a "
             "payload, take it off and record again; if there is none, sweep with a reference mass"

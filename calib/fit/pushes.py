@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.signal import lombscargle
 
 from calib.dataset import StallLine, SweepData
+from calib.fit.calibration import SIGNIFICANCE
 from calib.fit.findings import OUTLIER, FitFinding
 from calib.fit.sweep_readings import SweepReadings
 from gcomp.arrays import Array
@@ -31,8 +32,6 @@ LEAST_PUSH = 0.02
 """Least torque that counts as a disturbance, as a share of rated torque."""
 SPRING_SHARE = 0.1
 """Standard deviation beforehand of a spring that is looked for, of rated torque per rad."""
-SPRING_EVIDENCE = 5.0
-"""Standard deviations of a spring that is named."""
 LEAST_PULL = 0.03
 """Least pull over the range of the sweeps, as a share of rated torque."""
 LEAST_PERIODS = 2.0
@@ -94,7 +93,7 @@ def springs(
     for joint, name in enumerate(names):
         own, value = rows.readings.position[rows.swept == joint, joint], float(stiffness[joint])
         pull = abs(value) * float(np.ptp(own)) if own.size else 0.0
-        if pull > LEAST_PULL * rated[joint] and abs(value) > SPRING_EVIDENCE * std[joint]:
+        if pull > LEAST_PULL * rated[joint] and abs(value) > SIGNIFICANCE * std[joint]:
             text = (
                 f"{name}: something pulls by {value:+.2f} N·m/rad of its position in all its sweeps: a cable under"
                 " tension or a spring; free it and sweep again"

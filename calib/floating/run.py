@@ -21,7 +21,7 @@ HOLD_SECONDS = 0.5
 """Position control before and after [s]; before, the sensors are averaged and compared with the model."""
 AGREEMENT = 0.1
 """Largest difference between sensor and model, as a share of rated torque; beyond it the model is not that of this arm
-as it is now. A calibration leaves well below a hundredth (`ObserverConfig.initial_gain_std`)."""
+as it is now. A calibration leaves well below a hundredth (`calib.observer.config.INITIAL_GAIN_STD`)."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
-from calib.observer.config import ObserverConfig
+from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, ObserverConfig
 from calib.observer.decision import Agreeing
 from calib.observer.evidence import Verdict
 from calib.observer.investigation import Investigation
@@ -16,7 +16,7 @@ An alarm is open, or the first epoch of the reference."""
 
 def audit(tracking: Tracking, state: Investigation, config: ObserverConfig) -> None:
     """Test the last rows: those free of any effect become reference; an effect opens a silent investigation."""
-    window = state.window[-config.longest_window :]
+    window = state.window[-LONGEST_WINDOW:]
     if not tracking.belief.learnt:
         if len(window) < config.window:
             return
@@ -25,7 +25,7 @@ def audit(tracking: Tracking, state: Investigation, config: ObserverConfig) -> N
     if verdict.cause == "unknown":
         state.doubtful += 1
         # longer than a change takes to fill the window; an alarm would be open if it were a contact
-        patience = DOUBTED if tracking.belief.is_first else config.longest_window // config.audit_rows + 1
+        patience = DOUBTED if tracking.belief.is_first else LONGEST_WINDOW // AUDIT_ROWS + 1
         if state.doubtful >= patience:
             tracking.adapt(window)
             verdict = tracking.cause_test(window).verdict()
@@ -33,7 +33,7 @@ def audit(tracking: Tracking, state: Investigation, config: ObserverConfig) -> N
     if verdict.cause == "none":
         tracking.learn(state.settled(tracking.belief.is_first))
         return
-    del state.window[: -config.longest_window]
+    del state.window[:-LONGEST_WINDOW]
     state.learned = min(state.learned, len(state.window))
     if verdict.cause not in ("unknown", "ambiguous"):  # an alarm follows if those last
         state.start(silent=True)
@@ -44,12 +44,10 @@ def may_adapt(tracking: Tracking, window: list[StaticReading], config: ObserverC
     return not tracking.belief.learnt or len(window) >= DOUBTED * config.window
 
 
-def is_confirmed(
-    tracking: Tracking, state: Investigation, test: CauseTest, verdict: Verdict, config: ObserverConfig
-) -> bool:
+def is_confirmed(tracking: Tracking, state: Investigation, test: CauseTest, verdict: Verdict) -> bool:
     """Whether fresh rows twice find what an audit or a suspicion was about; nothing is told before."""
     if verdict.cause in ("none", "unknown", "ambiguous"):
-        if len(state.window) >= config.longest_window:
+        if len(state.window) >= LONGEST_WINDOW:
             state.resume()
             tracking.resume()
         return False

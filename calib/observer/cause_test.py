@@ -6,7 +6,8 @@ from itertools import combinations, product
 
 import numpy as np
 
-from calib.observer.config import ObserverConfig
+from calib.fit.calibration import VERY_STRONG_EVIDENCE
+from calib.observer.config import LONGEST_WINDOW, ObserverConfig
 from calib.observer.evidence import DRIFT, ChangeFit, ChangeHypothesis, ResidualTest, Verdict
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.arm.arm import Arm
@@ -23,7 +24,8 @@ LEVEL_ROWS = 10
 """Rows that what was expected of the discrepancy's level counts for beside those it was fitted to."""
 MOST_GAIN_LIMIT = 1.0
 """A gain whose limit is above this is not observed: gravity hardly loads the joint."""
-
+MISFIT = 4.0
+"""(χ² − dof)/√(2 dof) above which no entry explains the window (docs/theory.md, section 6)."""
 
 CAUSES = {
     "gain": ("torque.gain",),
@@ -85,15 +87,9 @@ def kin(entry: ChangeHypothesis, winner: ChangeHypothesis) -> bool:
 class CauseTest:
     """The dictionary fitted to one window, with model error marginalised: the belief's covariance and σ²I."""
 
-    def __init__(
-        self,
-        belief: GravityBelief,
-        window: StaticReadings,
-        config: ObserverConfig,
-        temperature: Array | None = None,
-    ) -> None:
+    def __init__(self, belief: GravityBelief, window: StaticReadings, temperature: Array | None = None) -> None:
         """Of K rows with true angles, torques as installed, their standard deviations, temperatures (K, n) if told."""
-        self.belief, self.window, self._config = belief, window, config
+        self.belief, self.window = belief, window
         expected = belief.expected(window.position, window.direction, temperature)
         residual = window.torque - expected.torque - expected.mean
         covariance = expected.covariance.copy()
@@ -107,7 +103,7 @@ class CauseTest:
     def verdict(self) -> Verdict:
         """The winning class, or why none wins."""
         fits = sorted(map(self._fit, range(len(self.found.hypotheses))), key=lambda fit: fit.bic)
-        best, config = fits[0], self._config
+        best = fits[0]
         classes = {"none": self.found.chi2}
         for fit in reversed(fits):
             classes[class_of(fit.hypothesis)] = fit.bic
@@ -123,16 +119,16 @@ class CauseTest:
             joint = fit.hypothesis.joint if fit else None
             return Verdict(cause, joint, float(weights[of] / total), *known, evidence, rivals)
 
-        if self.found.chi2 - best.bic < config.evidence:
+        if self.found.chi2 - best.bic < VERY_STRONG_EVIDENCE:
             misfit = self._misfit(self.found.chi2, 0)
             evidence["misfit"] = misfit
-            return answer("unknown" if misfit > config.misfit else "none", None, "none")
+            return answer("unknown" if misfit > MISFIT else "none", None, "none")
         winner, name = best.hypothesis, class_of(best.hypothesis)
         inexact = self._inexact**2 * (self.found.chi2 - best.chi2)
         evidence["misfit"] = self._misfit(best.chi2 - inexact, winner.columns.shape[1])
-        if evidence["misfit"] > config.misfit or (winner.cause == "payload" and not self._weighs(best)):
+        if evidence["misfit"] > MISFIT or (winner.cause == "payload" and not self._weighs(best)):
             return self._two_drifts() or self._all_zeros() or answer("unknown", None, name)
-        near = [fit.hypothesis for fit in fits[1:] if fit.bic - best.bic < config.evidence]
+        near = [fit.hypothesis for fit in fits[1:] if fit.bic - best.bic < VERY_STRONG_EVIDENCE]
         rivals = tuple(dict.fromkeys(class_of(entry) for entry in near if not kin(entry, winner)))
         sensor_or_load = any(entry.cause in (*DRIFT, "payload") for entry in near)
         if winner.cause in OF_AN_ARM and not sensor_or_load and self._is_small(best):
@@ -173,10 +169,10 @@ class CauseTest:
         fits = {pair: self._fit(*pair) for pair in pairs}
         best = min(fits, key=lambda pair: fits[pair].bic)
         fit = fits[best]
-        if not np.isfinite(fit.bic) or self._misfit(fit.chi2, 4) > self._config.misfit or best[1] in whole:
+        if not np.isfinite(fit.bic) or self._misfit(fit.chi2, 4) > MISFIT or best[1] in whole:
             return None
         above = np.array([other.bic - fit.bic for pair, other in fits.items() if pair != best])
-        if above.min() < self._config.evidence:
+        if above.min() < VERY_STRONG_EVIDENCE:
             return None
         confidence = float(1 / (1 + np.exp(-above / 2).sum()))
         evidence = {"next": round(float(above.min()), 1), "misfit": self._misfit(fit.chi2, 4)}
@@ -193,7 +189,7 @@ class CauseTest:
         zeros = [self.found.index("offset", joint) for joint in range(self.belief.arm.n)]
         fit = self._fit(*zeros)
         misfit = self._misfit(fit.chi2, len(zeros))
-        if not np.isfinite(fit.bic) or misfit > self._config.misfit:
+        if not np.isfinite(fit.bic) or misfit > MISFIT:
             return None
         return Verdict("temperature", None, 1.0, fit.values, fit.covariance, {"misfit": misfit})
 
@@ -214,7 +210,7 @@ class CauseTest:
         """Size of a gain's or offset's change that wins in one case of two: over "none", and over every rival."""
         index, entries = self.found.index(cause, joint), self.found.hypotheses
         rivals = [k for k, entry in enumerate(entries) if not kin(entry, entries[index])]
-        return self.found.noticed(index, rivals, self._config.evidence)
+        return self.found.noticed(index, rivals, VERY_STRONG_EVIDENCE)
 
     def of_model(self, joint: int) -> float:
         """Share of the model's own error in the variance of a joint's residuals."""
@@ -256,7 +252,7 @@ def limits(test: CauseTest, config: ObserverConfig, wait: int) -> DetectionLimit
     it confirm it. `wait` is the number of rests until the first test.
     """
     count, n = test.window.position.shape
-    longer = np.sqrt(config.longest_window / count)
+    longer = np.sqrt(LONGEST_WINDOW / count)
     gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) / longer for cause in ("gain", "offset"))
     gain[~(gain <= MOST_GAIN_LIMIT)] = np.nan
-    return DetectionLimits(gain, offset, wait + config.longest_window + 2 * config.window)
+    return DetectionLimits(gain, offset, wait + LONGEST_WINDOW + 2 * config.window)

@@ -19,8 +19,6 @@ from gcomp.gravity.torque import gravity_torque
 ROWS = 12
 """Rests at other poses after which the check decides. An RMS of so few is known to ± 20 % (1/√(2 · 12)), but both RMS
 are of the same rests."""
-FLOOR = 0.0005
-"""Difference in RMS that does not count, as a share of rated torque: half of the scatter of one rest's average."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +44,12 @@ class AfterWrite:
         """`old` and `new`: calibrations of the joints written, before and after. Raises Refused for another arm."""
         self._arm, self._beta = gcomp_arm(arm), np.array(gravity.require(arm).beta)
         self._record = record
-        self._rests = RestDetector(len(record.joints), ObserverConfig())
+        config = ObserverConfig()
+        self._rests = RestDetector(len(record.joints), config)
         self._joints, self._names = list(old), [record.joints[j].name for j in old]
         self._pairs = [(old[j], new[j]) for j in old]
-        self._floor = FLOOR * arm.require_link().rated_torques[self._joints]
+        self._floor = config.noise_share / 2 * arm.require_link().rated_torques[self._joints]
+        """Difference in RMS that does not count [N·m]: half of the scatter of one rest's average."""
         self._before: list[list[float]] = []
         self._after: list[list[float]] = []
 

@@ -6,12 +6,20 @@ from typing import Any, Self
 import numpy as np
 
 from armlink.torque_calibration import TorqueCalibration
+from calib.fit.calibration import SIGNIFICANCE, VERY_STRONG_EVIDENCE
 from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import ObserverConfig
 from calib.observer.evidence import Verdict
 from gcomp.arrays import Array
+from gcomp.design.sweep_design import MINIMUM_LEVER
 
+AGREEMENT = 13.8
+"""Two disjoint windows agree if the χ² of their difference (gain, offset) is smaller: noise exceeds it, with 2 degrees
+of freedom, once in 1000 (docs/theory.md, section 6)."""
+COMMON_JOINTS = 3
+"""If this many joints drift by the same factor, suspect gravity, payload or supply voltage, and write none
+(likewise)."""
 WIDER = 1.5
 """The variance of a finding is larger by this share where the model's error is all there is: level and shape of the
 discrepancy are estimates. Without it the errors of 30 findings on arms of `sim.realism` had 2.5 times the variance."""
@@ -71,7 +79,7 @@ class Agreeing:
     joints: frozenset[int]
 
 
-def windows_agree(first: CauseTest, second: CauseTest, joint: int, beside: int | None, limit: float) -> bool:
+def windows_agree(first: CauseTest, second: CauseTest, joint: int, beside: int | None) -> bool:
     """Whether two disjoint windows find the same gain and offset change of a joint: χ²₂ of the difference.
 
     If gravity does not load the joint, only the offset is compared. `beside`: a joint that drifts at the same time.
@@ -79,8 +87,8 @@ def windows_agree(first: CauseTest, second: CauseTest, joint: int, beside: int |
     (a, cov_a), (b, cov_b) = (window.drift(joint, "drift", beside) for window in (first, second))
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         (a, cov_a), (b, cov_b) = (window.drift(joint, "offset", beside) for window in (first, second))
-        return bool((a - b)[1] ** 2 < limit * (cov_a + cov_b)[1, 1])
-    return float((a - b) @ np.linalg.solve(cov_a + cov_b, a - b)) < limit
+        return bool((a - b)[1] ** 2 < AGREEMENT * (cov_a + cov_b)[1, 1])
+    return float((a - b) @ np.linalg.solve(cov_a + cov_b, a - b)) < AGREEMENT
 
 
 def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig) -> DriftFinding:
@@ -89,7 +97,7 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     beside = verdict.other(joint)
     wider = 1 + WIDER * test.of_model(joint)
     change, covariance = test.drift(joint, cause, beside)
-    weak_lever = test.lever_share(joint) < config.lever_share
+    weak_lever = test.lever_share(joint) < MINIMUM_LEVER
     of_model = test.belief.level.total[joint]  # no worse than what the arm has anyway
     gain_std = float(np.hypot(config.gain_std, of_model / test.belief.kernel.typical[joint]))
     offset_std = float(np.hypot(config.offset_std, of_model))
@@ -98,7 +106,7 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
             f"the gain is known only to ± {np.sqrt(covariance[0, 0]):.2%}, but ± {gain_std:.2%} is required: "
             "sweep this joint"
         )
-        if test.loss(joint, "offset", cause, beside) < config.evidence:
+        if test.loss(joint, "offset", cause, beside) < VERY_STRONG_EVIDENCE:
             cause = "offset"  # explained as well without the gain, which keeps its value
             change, covariance = test.drift(joint, cause, beside)
         else:
@@ -107,17 +115,17 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
         refused.append(
             f"the offset is known only to ± {np.sqrt(covariance[1, 1]):.3f} N·m, but ± {offset_std:.3g} N·m is required"
         )
-    if _distance(change, covariance) < config.significance:
-        refused.append(f"the change is less than {config.significance:g} standard deviations")
+    if _distance(change, covariance) < SIGNIFICANCE:
+        refused.append(f"the change is less than {SIGNIFICANCE:g} standard deviations")
     if len(set(np.sign(test.window.direction[:, joint])) - {0.0}) < 2:
         refused.append("the joint was approached from one side only, so friction looks like an offset")
-    alike = _joints_alike(test, joint, config.significance)
-    if alike >= config.common_joints:
+    alike = _joints_alike(test, joint)
+    if alike >= COMMON_JOINTS:
         refused.append(
             f"{alike} joints changed by the same factor, so the cause may be gravity, a payload or the supply voltage"
         )
-    moved = _moved_zeros(test, verdict, joint, config.significance)
-    if cause != "gain" and moved >= config.common_joints - 1:
+    moved = _moved_zeros(test, verdict, joint)
+    if cause != "gain" and moved >= COMMON_JOINTS - 1:
         refused.append(f"the zeros of {moved} other joints moved as well, so the cause may be the temperature")
     rows = len(test.window.position)
     return DriftFinding(
@@ -132,10 +140,10 @@ def decide(test: CauseTest, verdict: Verdict, joint: int, config: ObserverConfig
     )
 
 
-def _moved_zeros(test: CauseTest, verdict: Verdict, joint: int, significance: float) -> int:
+def _moved_zeros(test: CauseTest, verdict: Verdict, joint: int) -> int:
     """Number of joints beside those that drift whose offset has changed too."""
     changes = [test.drift(j, "offset", joint) for j in range(test.belief.arm.n) if j not in verdict.joints]
-    return sum(bool(abs(change[1]) >= significance * np.sqrt(covariance[1, 1])) for change, covariance in changes)
+    return sum(bool(abs(change[1]) >= SIGNIFICANCE * np.sqrt(covariance[1, 1])) for change, covariance in changes)
 
 
 def _distance(change: Array, covariance: Array) -> float:
@@ -145,12 +153,12 @@ def _distance(change: Array, covariance: Array) -> float:
     return float(np.sqrt(part @ np.linalg.solve(covariance[np.ix_(estimated, estimated)], part)))
 
 
-def _joints_alike(test: CauseTest, joint: int, significance: float) -> int:
+def _joints_alike(test: CauseTest, joint: int) -> int:
     """Number of joints that, each fitted alone, changed their gain by the same factor as this joint within noise."""
     fits = [test.drift(j, "gain") for j in range(test.belief.arm.n)]
     changes = np.array([change[0] for change, _ in fits])
     stds = np.array([np.sqrt(covariance[0, 0]) for _, covariance in fits])
-    alike = (np.abs(changes) >= significance * stds) & (
+    alike = (np.abs(changes) >= SIGNIFICANCE * stds) & (
         np.abs(changes - changes[joint]) <= 3 * np.hypot(stds, stds[joint])
     )
     return int(alike.sum())

@@ -7,9 +7,10 @@ import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.cause_test import CauseTest
-from calib.observer.config import ObserverConfig
+from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, ObserverConfig
 from calib.observer.decision import Agreeing
 from calib.observer.saved_values import read_rows, save_rows
+from calib.observer.tracking.pose_memory import PLACE_ROWS, PLACE_SIZE
 
 
 class Investigation:
@@ -54,7 +55,7 @@ class Investigation:
         """Take a row; False if the window has enough rows of this pose already."""
         if self.window:
             away = np.abs(np.array([kept.position for kept in self.window]) - row.position).max(axis=1)
-            if (away < self._config.place_size).sum() >= self._config.place_rows:
+            if (away < PLACE_SIZE).sum() >= PLACE_ROWS:
                 return False
         self.window.append(row)
         self.fresh += 1
@@ -62,7 +63,7 @@ class Investigation:
 
     def is_due(self) -> bool:
         """Whether there are rows enough for the next test; if so their count starts again."""
-        due = self.fresh >= (self._config.window if self.held else self._config.audit_rows)
+        due = self.fresh >= (self._config.window if self.held else AUDIT_ROWS)
         if due:
             self.fresh = 0
         return due
@@ -73,8 +74,8 @@ class Investigation:
         While the reference's first epoch is open (`first`) all but the newest; afterwards those that leave the window,
         so that a window is tested against rows of another time.
         """
-        leaving = max(0, len(self.window) - self._config.longest_window)
-        upto = max(leaving, len(self.window) - self._config.audit_rows) if first else leaving
+        leaving = max(0, len(self.window) - LONGEST_WINDOW)
+        upto = max(leaving, len(self.window) - AUDIT_ROWS) if first else leaving
         rows = self.window[self.learned : upto]
         del self.window[:leaving]
         self.learned = max(self.learned, upto) - leaving

@@ -13,7 +13,7 @@ import numpy as np
 from calib.motion.static_reading import StaticReading
 from calib.observer.audit import DOUBTED, audit, is_confirmed, may_adapt
 from calib.observer.cause_test import CauseTest, DetectionLimits
-from calib.observer.config import ObserverConfig
+from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, ObserverConfig
 from calib.observer.decision import Agreeing, DriftFinding, decide, windows_agree
 from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.events import Event, verdict_evidence
@@ -31,6 +31,11 @@ from gcomp.arrays import Array
 
 SCHEMA = 1
 """Version of the saved format."""
+DISCREPANCY_SHARE = 5e-4
+"""Discrepancy of the gravity model expected before the first row, as a share of rated torque; if the calibration says
+how large it is, that counts."""
+PATIENCE = 2 * LONGEST_WINDOW
+"""Repeated poses after an alarm after which the test is given up as undecided: as many as two longest windows have."""
 
 
 class Observer:
@@ -58,7 +63,7 @@ class Observer:
         self._position_offset = np.zeros(arm.n) if position_offset is None else position_offset
         self._rest = RestDetector(arm.n, self.config)
         rated, settings = np.asarray(sigma, dtype=float) / self.config.noise_share, self.config
-        expected = level or DiscrepancyLevel.expected(settings.discrepancy_share * rated)
+        expected = level or DiscrepancyLevel.expected(DISCREPANCY_SHARE * rated)
         wander = settings.zero_wander * rated
         belief = GravityBelief(
             arm, beta, beta_covariance, settings.position_std, expected, settings.baseline_rows, wander
@@ -95,9 +100,7 @@ class Observer:
         config = config or ObserverConfig()
         sigma = config.noise_share * np.asarray(rated_torque, dtype=float)
         position = (calibration.values("position_gain", 1.0), calibration.values("position_offset", 0.0))
-        level = DiscrepancyLevel.of_record(
-            calibration, config.discrepancy_share * np.asarray(rated_torque, dtype=float)
-        )
+        level = DiscrepancyLevel.of_record(calibration, DISCREPANCY_SHARE * np.asarray(rated_torque, dtype=float))
         return cls(arm, np.array(gravity.beta), np.array(gravity.covariance), sigma, config, *position, level)
 
     def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Event]:
@@ -136,12 +139,12 @@ class Observer:
     def limits(self) -> DetectionLimits:
         """The changes of each joint that would be noticed now, at poses like the latest ones."""
         key = (
-            self._tracking.rows // self.config.audit_rows,
+            self._tracking.rows // AUDIT_ROWS,
             self._tracking.belief.learnt,
             self._tracking.belief.level.rows,
         )
         if self._limits is None or self._limits[0] != key:
-            self._limits = (key, self._tracking.limits(self._investigation.window[-self.config.longest_window :]))
+            self._limits = (key, self._tracking.limits(self._investigation.window[-LONGEST_WINDOW:]))
         return self._limits[1]
 
     def model_torque(self, position: Array) -> Array:
@@ -182,9 +185,9 @@ class Observer:
             self._tracking.adapt(state.window)
             test = self._tracking.cause_test(state.window)
         verdict = test.verdict()
-        if verdict.cause == "ambiguous" and len(state.window) < self.config.longest_window:
+        if verdict.cause == "ambiguous" and len(state.window) < LONGEST_WINDOW:
             return []  # more rows may decide
-        if state.silent and not is_confirmed(self._tracking, state, test, verdict, self.config):
+        if state.silent and not is_confirmed(self._tracking, state, test, verdict):
             return []
         found, state.silent = state.silent and verdict.is_drift, False
         window, state.window = state.window, []
@@ -229,11 +232,11 @@ class Observer:
         if first is None or first.joints != agreeing.joints:
             return []
         for joint in verdict.joints:
-            if not windows_agree(first.test, test, joint, verdict.other(joint), self.config.agreement):
+            if not windows_agree(first.test, test, joint, verdict.other(joint)):
                 return self._undecided(
                     t, joint, "two windows of readings disagree, so the sensor may still be drifting"
                 )
-        rows = (first.rows + window)[-self.config.longest_window :]
+        rows = (first.rows + window)[-LONGEST_WINDOW:]
         together = self._tracking.cause_test(rows)
         self._investigation.first = Agreeing(rows, together, first.joints)
         verdict = together.verdict()
@@ -266,7 +269,7 @@ class Observer:
         """A pose that the window has already; too many of them under an alarm make a test impossible."""
         state = self._investigation
         state.repeated += self.held
-        if state.repeated < self.config.patience:
+        if state.repeated < PATIENCE:
             return []
         state.clear()
         return self._undecided(t, None, "the arm stood in too few different poses to find a cause: sweep, or move more")
@@ -301,5 +304,5 @@ def observer_of(
     rated_torque (n,) [N·m]. Records of drives whose torque is a current have their friction.
     """
     if any(joint.motor is not None for joint in calibration.joints):
-        return MovingObserver(arm, calibration, gravity, rated_torque, config)
+        return MovingObserver(arm, calibration, gravity, rated_torque)
     return Observer.of_records(arm, calibration, gravity, rated_torque, config)

@@ -5,9 +5,12 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.config import ObserverConfig
+from calib.observer.config import LONGEST_GAP, ObserverConfig
 from calib.observer.saved_values import known
 from gcomp.arrays import Array, as_array
+
+NEW_POSE = 0.05
+"""A stop counts as another one once some joint has moved this far [rad]: a long rest is one row."""
 
 
 class RestDetector:
@@ -31,7 +34,7 @@ class RestDetector:
         if np.isnan(position).any() or np.isnan(torque).any():
             return None
         moved = not np.abs(position - self._anchor).max() <= config.still_band
-        if moved or t - self._last > config.gap_time:
+        if moved or t - self._last > LONGEST_GAP:
             self._restart(t, position, moved=moved)
         self._last = t
         if self._done or t - self._since < config.settle_time:
@@ -57,7 +60,7 @@ class RestDetector:
         self._anchor, self._since = position.copy(), t
         self._samples.clear()
         away = np.abs(position - self._last_stop).max()
-        self._done = self._done and bool(away < self._config.new_pose)
+        self._done = self._done and bool(away < NEW_POSE)
 
     def _complete(self) -> StaticReading:
         times, positions, torques = (np.array(column) for column in zip(*self._samples, strict=True))

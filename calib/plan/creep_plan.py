@@ -66,10 +66,11 @@ class CreepGround:
         geometry = Geometry(arm_file)
         return cls(arm, section, limits, model_arm(arm_file).beta, geometry if geometry.model.ngeom else None)
 
-    def range(self, joint: int) -> tuple[float, float]:
-        """Ends of a joint's way [rad]; they stay away from the stops by twice the doubt of the zero."""
+    @property
+    def ends(self) -> tuple[Array, Array]:
+        """Lower and upper ends of the joints' ways (n,) [rad]; twice the doubt of the zero away from the stops."""
         margin = self.section.range_margin + 2 * self.section.creep.zero_std
-        return float(self.limits.lower[joint]) + margin, float(self.limits.upper[joint]) - margin
+        return self.limits.lower + margin, self.limits.upper - margin
 
     def free(self, poses: Array) -> bool:
         """Whether nothing touches at any of the poses (K, n) [rad]."""
@@ -85,7 +86,7 @@ class CreepGround:
         if self.section.reference_mass is not None:
             return self.section.reference_mass
         random = np.random.default_rng(0)
-        lower, upper = np.array([self.range(joint) for joint in range(self.arm.n)]).T
+        lower, upper = self.ends
         poses = random.uniform(lower, upper, (400, self.arm.n))
         at_origin, by_point = payload_columns(self.arm)
         each = gravity_regressor(self.arm, poses)
@@ -142,22 +143,21 @@ def refuse_unbearable_creeps(arm_file: ArmFile, mass: float) -> None:
 
 def check_creep_limits(ground: CreepGround, arm_file: ArmFile, plan: SweepPlan) -> None:
     """Raise Refused, naming sweep, joint and value, where a plan of creeps leaves what this one would plan within."""
-    ends = np.array([ground.range(joint) for joint in range(ground.arm.n)]).T
-    bounds = (ends[0], ends[1])
-    require_bounds(arm_file, plan, PoseBounds(bounds, bounds, bounds))
-    refuse_unfit(arm_file, _unfit(ground, plan, ends))
+    require_bounds(arm_file, plan, PoseBounds(ground.ends, ground.ends, ground.ends))
+    refuse_unfit(arm_file, _unfit(ground, plan))
 
 
-def _unfit(ground: CreepGround, plan: SweepPlan, ends: Array) -> Iterator[str]:
-    mass, fastest = ground.mass(), max(ground.section.creep.speeds)
+def _unfit(ground: CreepGround, plan: SweepPlan) -> Iterator[str]:
+    mass, (lowest, highest) = ground.mass(), ground.ends
     most = min(ground.section.acceleration, TRAVEL_ACCELERATION)
     if not 0 < plan.travel_acceleration <= most * (1 + ROUNDING):
         yield f"travel_acceleration is {plan.travel_acceleration:g} rad/s², expected at most {most:g}"
     for sweep in plan.sweeps:
         speed, (lower, upper) = creep_speed(sweep), creep_ends(sweep)
-        if speed > min(fastest, ground.limits.speed[sweep.joint]) * (1 + ROUNDING):
+        fastest = min(max(ground.section.creep.speeds), ground.limits.speed[sweep.joint])
+        if speed > fastest * (1 + ROUNDING):
             yield f"sweep {sweep.name}: speed is {speed:g} rad/s, expected at most {fastest:g} rad/s"
-        low, high = ends[:, sweep.joint]
+        low, high = lowest[sweep.joint], highest[sweep.joint]
         if lower < low - ROUNDING or upper > high + ROUNDING:
             yield (
                 f"sweep {sweep.name} goes from {lower:.4g} to {upper:.4g} rad: it must stay between {low:.4g} "
@@ -220,11 +220,11 @@ def _sweep(ground: CreepGround, one: CreepCandidate, number: int, speed: float) 
 
 def _home(ground: CreepGround, random: np.random.Generator) -> Array:
     """A pose from which creeps are reached: the middle of the ranges, or the first free one drawn."""
-    ends = np.array([ground.range(joint) for joint in range(ground.arm.n)])
-    if ground.free(ends.mean(axis=1)[None]):
-        return np.asarray(ends.mean(axis=1))
+    middle = np.asarray(np.mean(ground.ends, axis=0))
+    if ground.free(middle[None]):
+        return middle
     for _ in range(20 * DRAWS):
-        pose = random.uniform(*ends.T)
+        pose = random.uniform(*ground.ends)
         if ground.free(pose[None]):
             return np.asarray(pose)
     raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
@@ -233,12 +233,12 @@ def _home(ground: CreepGround, random: np.random.Generator) -> Array:
 def _candidates(
     ground: CreepGround, joint: int, home: Array, mass: float, random: np.random.Generator
 ) -> list[CreepCandidate]:
-    ends = np.array([ground.range(each) for each in range(ground.arm.n)])
-    low, high = ends[joint]
+    lowest, highest = ground.ends
+    low, high = float(lowest[joint]), float(highest[joint])
     span, found = min(high - low, ground.section.creep.span), list[CreepCandidate]()
     for _ in range(CANDIDATES * DRAWS):
         lower = random.uniform(low, high - span) if high - low > span else low
-        one = CreepCandidate(joint, random.uniform(*ends.T), lower, lower + span)
+        one = CreepCandidate(joint, random.uniform(lowest, highest), lower, lower + span)
         begin = one.poses(2)[0]
         clear = ground.free(one.poses(POINTS + 1)) and ground.way(home, begin)
         if clear and ground.bearable(one, mass):

@@ -8,6 +8,7 @@ from armlink.arm_file import ArmFile
 from calib.arm.kinematics import model_arm
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
+from gcomp.estimate.posterior import linear_posterior
 from gcomp.gravity.torque import gravity_regressor
 
 GAIN_STD = 0.3
@@ -93,16 +94,10 @@ def guess_gravity(
     spread = np.concatenate([np.full(n, GAIN_STD), 0.3 * rated, np.full(2 * n, largest_moment)])
     expected = np.concatenate([np.ones(n), np.zeros(3 * n)])
     counted = np.isfinite(motor_torque)
-    design = np.concatenate(
-        [
-            (sensor_rows / sensor_sigma[:, None]).reshape(-1, 4 * n),
-            (motor_rows / motor_sigma[:, None])[counted],
-            np.diag(1 / spread),
-        ]
+    columns = np.concatenate(
+        [(sensor_rows / sensor_sigma[:, None]).reshape(-1, 4 * n), (motor_rows / motor_sigma[:, None])[counted]]
     )
-    target = np.concatenate([np.zeros(poses * n), (motor_torque / motor_sigma)[counted], expected / spread])
-    solution = np.linalg.lstsq(design, target, rcond=None)[0]
-    covariance = np.linalg.inv(design.T @ design)
-    residual = design @ solution - target
-    excess = max(float(residual @ residual) / max(len(target) - 4 * n, 1), 1.0)
-    return GravityGuess(kinematics, solution[2 * n :], covariance[2 * n :, 2 * n :] * excess)
+    target = np.concatenate([np.zeros(poses * n), (motor_torque / motor_sigma)[counted]])
+    fit = linear_posterior(columns, target, expected, spread)
+    excess = max(fit.chi2 / len(target), 1.0)
+    return GravityGuess(kinematics, fit.x[2 * n :], fit.covariance[2 * n :, 2 * n :] * excess)

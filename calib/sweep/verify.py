@@ -199,10 +199,10 @@ def verify_poses(limits: DriveLimits, section: SweepSection, count: int, seed: i
 def _creep_poses(ground: CreepGround, count: int, seed: int, begin: Array) -> Array:
     """Random poses (P, n) [rad] about which nothing touches, each reached straight from the one before."""
     random = np.random.default_rng([seed, 6])
-    ends = np.array([ground.range(joint) for joint in range(ground.arm.n)]) + CREEP_WAY / 2 * np.array([1.0, -1.0])
+    lower, upper = ground.ends
     here, found = begin, list[Array]()
     for _ in range(200 * count):
-        pose: Array = random.uniform(ends[:, 0], ends[:, 1])
+        pose: Array = random.uniform(lower + CREEP_WAY / 2, upper - CREEP_WAY / 2)
         if ground.way(pose - CREEP_WAY / 2, pose + CREEP_WAY / 2) and ground.way(here, pose):
             found.append(pose)
             here = pose

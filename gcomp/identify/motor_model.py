@@ -86,7 +86,7 @@ class MotorDoubt:
     ) -> tuple[Array, Array]:
         """(Mean, standard deviation) of the vector.
 
-        `coulomb` (n,) scales the friction over position [N·m], of which `uneven` (HARMONICS,) are the harmonics'
+        `coulomb` (n,) > 0 scales the friction over position [N·m], of which `uneven` (HARMONICS,) are the harmonics'
         shares.
         """
         n, slices = arm.n, family_slices(arm.n)
@@ -108,8 +108,8 @@ class MotorDoubt:
             "zero": self.zero,
             "lag": self.lag,
             "spring": self.spring_share * rated,
-            "uneven": np.outer(np.maximum(coulomb, 1e-3 * rated), np.repeat(shares, 2)).ravel(),
-            "ripple": np.repeat(self.ripple * np.maximum(coulomb, 1e-3 * rated), 2),
+            "uneven": np.outer(coulomb, np.repeat(shares, 2)).ravel(),
+            "ripple": np.repeat(self.ripple * coulomb, 2),
             "beta": np.repeat(3.0 * float(rated.max()) / gravity, 2 * n),
             "rho": self.rho,
         }

@@ -1,6 +1,7 @@
 """Motion of an arm that the daemon drives: tours of poses over the joints' whole range, and ordinary work.
 
-A tour is made by schedule, on request, or if watching cannot decide.
+A tour is made by schedule, on request, or if watching cannot decide; it has as many poses as the observer's longest
+window.
 """
 
 from collections.abc import Callable
@@ -14,10 +15,9 @@ from calib.daemon.settings import Configuration
 from calib.daemon.state.events import EventLog
 from calib.daemon.view import State
 from calib.motion.random_work import RandomMotion
+from calib.observer.config import LONGEST_WINDOW
 from gcomp.arrays import Array
 
-TOUR_POSES = 60
-"""As many as the observer's longest window (`ObserverConfig.longest_window`)."""
 TOUR_INTERVAL = 3600.0
 """Time between two tours that the daemon decides on itself [s]."""
 
@@ -45,9 +45,9 @@ class PoseTours:
             reason = "the daemon only listens" if self._configuration.listen_only else f"the daemon is {state}"
             self._events.say("refused", None, f"the sweep ({why}) was not begun: {reason}", {})
             return
-        self.progress, self._last = Progress(0, TOUR_POSES), self._environment.monotonic()
-        self._events.say("sweep", None, f"sweeping {TOUR_POSES} poses: {why}", {"poses": TOUR_POSES})
-        self._move(TOUR_POSES, int(self._last))
+        self.progress, self._last = Progress(0, LONGEST_WINDOW), self._environment.monotonic()
+        self._events.say("sweep", None, f"sweeping {LONGEST_WINDOW} poses: {why}", {"poses": LONGEST_WINDOW})
+        self._move(LONGEST_WINDOW, int(self._last))
 
     def up(self) -> None:
         """The bus is open."""

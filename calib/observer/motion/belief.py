@@ -11,6 +11,7 @@ from typing import Self
 
 import numpy as np
 
+from calib.observer.config import NOISE_ROWS
 from calib.observer.motion.passages import Passage
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque
 from gcomp.arm.arm import Arm
@@ -23,8 +24,6 @@ ZERO_STD = 2e-3
 """Least standard deviation of a position zero [rad]: links give way."""
 SIGMA_SHARE = 2e-3
 """Standard deviation of a row about the model where the record has none, as a share of rated torque."""
-USUAL_ROWS = 5
-"""Rows that the standard deviation assumed at first counts for; then it is measured."""
 ALIKE = 2.0
 """The variance of rows is multiplied by this to begin with: what the model lacks is alike in neighbouring rows. Then it
 is measured."""
@@ -132,7 +131,7 @@ class MotorBelief:
         for j in range(self.arm.n):
             own = np.flatnonzero(model.joint == j)
             square = residual[own] ** 2
-            variance = (square.sum() + USUAL_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + USUAL_ROWS)
+            variance = (square.sum() + NOISE_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + NOISE_ROWS)
             near = np.abs(np.diff(model.readings.position[own, j])) < NEIGHBOUR_DISTANCE
             common = float((residual[own][1:] * residual[own][:-1])[near].sum() / max(square[1:][near].sum(), 1e-12))
             found[j] = np.sqrt(variance * (1 + 2 * min(max(common, 0.0), 1.0)))

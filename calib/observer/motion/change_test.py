@@ -9,12 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.observer.config import ObserverConfig
+from calib.fit.calibration import VERY_STRONG_EVIDENCE
+from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD, NOISE_ROWS
+from calib.observer.decision import AGREEMENT
 from calib.observer.evidence import ChangeFit, ChangeHypothesis, ResidualTest, Verdict
-from calib.observer.motion.belief import USUAL_ROWS, MotorBelief
+from calib.observer.motion.belief import MotorBelief
 from calib.observer.motion.passages import Passage
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
+from gcomp.estimate.posterior import linear_posterior
 from gcomp.identify.motor_model import family_slices
 
 LEAST_ROWS = 6
@@ -27,13 +30,16 @@ INEXACT = 0.03
 PAYLOAD_ROUNDS = 2
 """Further linearisations of a payload."""
 
+UNSEEN_STD = 10 * np.array([INITIAL_GAIN_STD, INITIAL_OFFSET_STD])
+"""Standard deviations of a joint's gain and offset [N·m] where rows of motion tell nothing; a choice."""
+
 
 class ChangeTest:
     """The candidates fitted to K rows."""
 
-    def __init__(self, belief: MotorBelief, passages: Sequence[Passage], config: ObserverConfig) -> None:
+    def __init__(self, belief: MotorBelief, passages: Sequence[Passage]) -> None:
         """Rows after those that the belief rests on."""
-        self._config, self._belief, self._passages = config, belief, passages
+        self._belief, self._passages = belief, passages
         residual, jacobian, covariance = belief.linearised(passages)
         joint = np.array([each.joint for each in passages])
         self.found = ResidualTest(residual, covariance, _candidates(belief, jacobian, joint))
@@ -41,9 +47,9 @@ class ChangeTest:
     def verdict(self) -> Verdict:
         """The change that explains the rows; cause "none", "unknown" or "ambiguous" where no single one does."""
         fits = sorted(map(self._fit, range(len(self.found.hypotheses))), key=lambda fit: fit.bic)
-        nothing, config = np.empty(0), self._config
+        nothing = np.empty(0)
         none = Verdict("none", None, 1.0, nothing, np.empty((0, 0)), {"misfit": self._misfit(self.found.chi2, 0)})
-        if not fits or self.found.chi2 - fits[0].bic < config.evidence:
+        if not fits or self.found.chi2 - fits[0].bic < VERY_STRONG_EVIDENCE:
             return none if self._misfit(self.found.chi2, 0) <= MISFIT else _with_cause(none, "unknown")
         best, others = fits[0], fits[1:]
         scores = np.array([fit.bic for fit in fits] + [self.found.chi2])
@@ -57,7 +63,7 @@ class ChangeTest:
         found = Verdict(cause, joint, float(1 / weight.sum()), values, covariance, evidence)
         if evidence["misfit"] > MISFIT or (cause == "payload" and values[0] < 0):
             return _with_cause(found, "unknown")
-        rivals = [fit.hypothesis for fit in others if fit.bic - best.bic < config.evidence]
+        rivals = [fit.hypothesis for fit in others if fit.bic - best.bic < VERY_STRONG_EVIDENCE]
         if rivals:
             return _with_cause(found, "ambiguous", tuple(each.cause for each in rivals))
         return found
@@ -71,23 +77,19 @@ class ChangeTest:
         known = np.diag(fit.covariance) > 0
         away = (fit.values - values)[known]
         apart = float(away @ np.linalg.pinv(fit.covariance[np.ix_(known, known)]) @ away)
-        return bool(apart > self._config.agreement + 2 * known.sum())
+        return bool(apart > AGREEMENT + 2 * known.sum())
 
     def sensor(self, joint: int) -> tuple[Array, Array]:
         """Change of a joint's gain and offset (2,) [1, N·m], fitted together, and their covariance (2, 2).
 
         Drawn towards nothing where the rows tell little.
         """
-        config = self._config
-        before = np.diag([config.initial_gain_std**-2 * 1e-2, config.initial_offset_std**-2 * 1e-2])
         places = [self._index(cause, joint) for cause in ("gain", "offset")]
         columns = [self.found.columns[place] for place in places if place is not None]
         if not columns:
-            return np.zeros(2), np.linalg.inv(before)
-        white = np.hstack(columns)
-        covariance = np.asarray(np.linalg.inv(white.T @ white + before), dtype=np.float64)
-        change: Array = covariance @ white.T @ self.found.residual
-        return change, covariance
+            return np.zeros(2), np.diag(UNSEEN_STD**2)
+        fit = linear_posterior(np.hstack(columns), self.found.residual, np.zeros(2), UNSEEN_STD)
+        return fit.x, fit.covariance
 
     def noticed(self, cause: str, joint: int) -> float:
         """Size of a change that is noticed in one case of two by as many rows: over "none", and over every rival."""
@@ -95,7 +97,7 @@ class ChangeTest:
         if own is None:
             return float("nan")
         rivals = [k for k in range(len(self.found.hypotheses)) if k != own]
-        return self.found.noticed(own, rivals, self._config.evidence)
+        return self.found.noticed(own, rivals, VERY_STRONG_EVIDENCE)
 
     def _index(self, cause: str, joint: int | None) -> int | None:
         known = [(each.cause, each.joint) for each in self.found.hypotheses]
@@ -115,7 +117,7 @@ class ChangeTest:
         return fit
 
     def _misfit(self, chi2: float, parameters: int) -> float:
-        known = len(self._belief.learnt) + USUAL_ROWS
+        known = len(self._belief.learnt) + NOISE_ROWS
         return self.found.misfit(chi2, parameters, (len(self._passages) - parameters) / known)
 
 

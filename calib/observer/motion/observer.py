@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from calib.observer.cause_test import DetectionLimits
-from calib.observer.config import ObserverConfig
 from calib.observer.decision import DriftFinding
 from calib.observer.events import Event, verdict_evidence
 from calib.observer.motion.belief import MotorBelief
-from calib.observer.motion.change_test import ChangeTest
+from calib.observer.motion.change_test import UNSEEN_STD, ChangeTest
 from calib.observer.motion.passages import Passage, PassageDetector
 from calib.observer.saved_values import UNREADABLE
 from calib.observer.tracking.sensor_filter import Estimate
@@ -29,7 +28,7 @@ BLOCK = 60
 """Rows of one test: of seven joints that creep in turn, 40 s."""
 REFERENCE = 360
 """Rows without a change that the belief is learned from: four minutes of creeping."""
-LONGEST = 120
+LONGEST = 2 * BLOCK
 """Rows of a test at most: the latest."""
 AGREEING = 2
 """Tests in a row that must say the same until it is an event."""
@@ -56,16 +55,9 @@ class Reported:
 class MovingObserver:
     """`handle(sample)` → events; `estimate()`; see `calib.observer.observer.Observer`."""
 
-    def __init__(
-        self,
-        arm: Arm,
-        calibration: CalibrationRecord,
-        gravity: GravityRecord,
-        rated_torque: Array,
-        config: ObserverConfig | None = None,
-    ) -> None:
+    def __init__(self, arm: Arm, calibration: CalibrationRecord, gravity: GravityRecord, rated_torque: Array) -> None:
         """Against records of creep sweeps; rated_torque (n,) [N·m]."""
-        self.arm, self.config = arm, config or ObserverConfig()
+        self.arm = arm
         self._position_gain = calibration.values("position_gain", 1.0)
         self._position_offset = calibration.values("position_offset", 0.0)
         self._detector = PassageDetector(arm.n)
@@ -105,7 +97,7 @@ class MovingObserver:
             return []
         block, self._block = self._block, []
         self._recent = (self._recent + block)[-LONGEST:]
-        test = ChangeTest(self._belief, self._recent, self.config)
+        test = ChangeTest(self._belief, self._recent)
         verdict = test.verdict()
         if (
             verdict.cause == "none"
@@ -132,7 +124,7 @@ class MovingObserver:
         """Gain and offset of every joint against the records, by the latest rows."""
         test = self._test()
         gain, offset = np.ones(self.arm.n), np.zeros(self.arm.n)
-        std = np.full((2, self.arm.n), 10.0) * [[self.config.initial_gain_std], [self.config.initial_offset_std]]
+        std = np.tile(UNSEEN_STD[:, None], self.arm.n)
         for j in range(self.arm.n if test is not None else 0):
             assert test is not None
             change, covariance = test.sensor(j)
@@ -192,5 +184,5 @@ class MovingObserver:
         if len(rows) < BLOCK // 2:
             return None
         if self._tested is None or self._tested[0] != self.rows:
-            self._tested = (self.rows, ChangeTest(self._belief, rows, self.config))
+            self._tested = (self.rows, ChangeTest(self._belief, rows))
         return self._tested[1]

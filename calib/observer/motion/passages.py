@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.observer.config import LONGEST_GAP
 from calib.observer.saved_values import known
 from gcomp.arrays import Array, as_array
 
@@ -24,8 +25,6 @@ STEADY = 0.15
 """Largest acceleration in a stretch [rad/s²]: 1 kg·m² then takes 0.15 N·m."""
 TURNED = 0.03
 """After a reversal friction has turned round once the joint has moved so far [rad]."""
-LONGEST_GAP = 0.05
-"""A stretch with samples missing for longer starts again [s]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,9 @@ from calib.observer.config import ObserverConfig
 from gcomp.arrays import Array, as_array
 
 CHANNELS = ("gain up", "gain down", "offset up", "offset down")
+ALARM_THRESHOLD = 10.0
+"""Log-likelihood ratio of an alarm (docs/theory.md, section 6): one false alarm in 1.1e4 rows of a seven-joint arm,
+which only starts a test."""
 
 
 class Cusum:
@@ -33,7 +36,7 @@ class Cusum:
         ratio = (change * residual[:, None] - change**2 / 2) / variance[:, None]
         self._sums = np.maximum(0.0, self._sums + ratio)
         self._rising = np.where(self._sums > 0.0, self._rising + 1, 0)
-        return [(int(j), CHANNELS[c]) for j, c in np.argwhere(self._sums > self._config.alarm_threshold)]
+        return [(int(j), CHANNELS[c]) for j, c in np.argwhere(self._sums > ALARM_THRESHOLD)]
 
     def reset(self) -> None:
         self._sums, self._rising = np.zeros_like(self._sums), np.zeros_like(self._rising)

@@ -4,25 +4,31 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.config import ObserverConfig
+from calib.observer.config import LONGEST_WINDOW
 from gcomp.arrays import Array, as_array
+
+PLACE_SIZE = 0.2
+"""Poses within this distance in every joint count as one pose [rad]."""
+PLACE_ROWS = 3
+"""Rows of one pose that the filter and a window take: a repeated pose adds no information."""
+PLACE_MEMORY = 20
+"""Rows that the mean residual of a pose is made of; the mean's error, σ/√20, is small against an alarm."""
 
 
 class PoseMemory:
-    """Mean torque residual at each of the latest poses. Poses closer than `place_size` in every joint count as one.
+    """Mean torque residual at each of the latest poses. Poses closer than `PLACE_SIZE` in every joint count as one.
 
     At a pose visited before, the error of the gravity model is known, so that a change stands out from it; another row
     there adds no information about the rest of the joint range.
     """
 
-    def __init__(self, n: int, config: ObserverConfig) -> None:
-        self._config = config
+    def __init__(self, n: int) -> None:
         self._position: Array = np.empty((0, n))
         self._mean: Array = np.empty((0, n))
         self._count = np.empty(0, dtype=int)
 
     def seen(self, position: Array) -> int:
-        """Number of rows known at this pose (n,), at most `place_memory`."""
+        """Number of rows known at this pose (n,), at most `PLACE_MEMORY`."""
         at = self._find(position)
         return 0 if at is None else int(self._count[at])
 
@@ -39,12 +45,12 @@ class PoseMemory:
 
     def add(self, position: Array, residual: Array) -> None:
         """Take a row without alarm: pose (n,) [rad], reading less model (n,) [N·m]."""
-        at, most = self._find(position), self._config.longest_window
+        at, most = self._find(position), LONGEST_WINDOW
         if at is None:
             self._position = np.vstack([self._position, position])[-most:]
             self._mean = np.vstack([self._mean, residual])[-most:]
             self._count = np.append(self._count, 1)[-most:]
-        elif self._count[at] < self._config.place_memory:  # then frozen, so as not to follow a drift
+        elif self._count[at] < PLACE_MEMORY:  # then frozen, so as not to follow a drift
             self._count[at] += 1
             self._mean[at] += (residual - self._mean[at]) / self._count[at]
 
@@ -68,4 +74,4 @@ class PoseMemory:
             return None
         away = np.abs(self._position - position).max(axis=1)
         nearest = int(away.argmin())
-        return nearest if away[nearest] < self._config.place_size else None
+        return nearest if away[nearest] < PLACE_SIZE else None

@@ -6,8 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.config import ObserverConfig
+from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW, ObserverConfig
 from gcomp.arrays import Array, as_array
+
+GAIN_WALK = 1e-4
+"""Random walk of the gain per accepted row (docs/theory.md, section 6): steady-state √(q σ/τ_rms) is 0.05 % for a joint
+loaded with 10 N·m."""
+OFFSET_WALK = 2e-3
+"""Random walk of the offset per accepted row [N·m] (likewise): steady-state √(q σ) is 0.01 N·m at σ = 0.05 N·m."""
+OUTLIER = 10.8
+"""A row is rejected if its squared innovation over the variance is larger: noise exceeds this χ², with 1 degree of
+freedom, once in 1000."""
 
 
 @dataclass(frozen=True)
@@ -34,31 +43,29 @@ class SensorFilter:
         self._config = config
         self.state: Array = np.tile([1.0, 0.0], (n, 1))
         """Gain and offset [N·m] (n, 2)."""
-        self._initial = np.diag([config.initial_gain_std**2, config.initial_offset_std**2])
+        self._initial = np.diag([INITIAL_GAIN_STD**2, INITIAL_OFFSET_STD**2])
         self.covariance: Array = np.tile(self._initial, (n, 1, 1))
         """Of gain and offset (n, 2, 2)."""
         self.accepted = np.zeros(n, dtype=int)
         """Rows that went into each joint's estimate (n,)."""
         self.rejected = np.zeros(n, dtype=int)
         """Consecutive rows rejected as outliers (n,)."""
-        self._recent: deque[Array] = deque(maxlen=config.longest_window)
+        self._recent: deque[Array] = deque(maxlen=LONGEST_WINDOW)
 
     def handle(self, reading: Array, torque: Array, variance: Array) -> None:
         """Update with one row: reading and model torque (n,) [N·m], variance of their difference (n,) [N²·m²]."""
-        config = self._config
         self._recent.append(torque)
         spread = len(self._recent) * np.var(np.array(self._recent), axis=0)
-        excited = spread * config.gain_std**2 >= variance
+        excited = spread * self._config.gain_std**2 >= variance
         for j in range(len(self.state)):
             self._update(j, reading[j], np.array([torque[j], 1.0]), variance[j], bool(excited[j]))
 
     def _update(self, j: int, reading: float, h: Array, variance: float, excited: bool) -> None:
-        config = self._config
-        walk = np.diag([config.drift_gain**2 if excited else 0.0, config.drift_offset**2])
+        walk = np.diag([GAIN_WALK**2 if excited else 0.0, OFFSET_WALK**2])
         predicted = self.covariance[j] + walk
         of_innovation = h @ predicted @ h + variance
         innovation = reading - h @ self.state[j]
-        if innovation**2 > config.outlier * of_innovation:
+        if innovation**2 > OUTLIER * of_innovation:
             self.rejected[j] += 1
             return
         weight = predicted @ h / of_innovation

@@ -7,20 +7,23 @@ import numpy as np
 
 from calib.motion.static_reading import StaticReading, batch, stack
 from calib.observer.cause_test import CauseTest, DetectionLimits, limits
-from calib.observer.config import ObserverConfig
+from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, NOISE_ROWS, ObserverConfig
 from calib.observer.decision import DriftFinding
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.saved_values import read_rows, restored, save_rows
-from calib.observer.tracking.cusum import Cusum
-from calib.observer.tracking.pose_memory import PoseMemory
-from calib.observer.tracking.sensor_filter import SensorFilter
+from calib.observer.tracking.cusum import ALARM_THRESHOLD, Cusum
+from calib.observer.tracking.pose_memory import PLACE_ROWS, PoseMemory
+from calib.observer.tracking.sensor_filter import GAIN_WALK, OFFSET_WALK, OUTLIER, SensorFilter
 from gcomp.arrays import Array, as_array
 from gcomp.identify.readings import StaticReadings
 
 Alarm = tuple[str, int, dict[str, Any]]
 """Kind (alarm, suspicion or outliers), joint, evidence."""
 
-
+NOISE_MEMORY = 200
+"""Rows that the measured standard deviation is averaged over: known within 5 % by then."""
+OUTLIERS_IN_A_ROW = 3
+"""This many rejected rows in succession are an event, not outliers (docs/theory.md, section 6)."""
 DOUBT = 4.0
 """An alarm is one at once if its log-likelihood ratio is this many times larger than needed, where the model's error is
 all there is beside it; else it is first confirmed."""
@@ -40,7 +43,7 @@ class Tracking:
         """Rows taken."""
         self.filter = SensorFilter(n, config)
         self._cusum = Cusum(n, config)
-        self._poses = PoseMemory(n, config)
+        self._poses = PoseMemory(n)
         self._suspected = 0
         """Rows for which there has been a suspicion: it may yet become an alarm."""
         self._since: deque[tuple[StaticReading, bool]] = deque(maxlen=config.window)
@@ -57,7 +60,7 @@ class Tracking:
         steady = bool((row.torque_error <= STEADY * self.sigma).all())
         self.rows += steady
         error = np.minimum(row.torque_error, CHANCE * self.sigma)
-        weight = 1 / min(self.rows + self._config.noise_rows, self._config.noise_memory)
+        weight = 1 / min(self.rows + NOISE_ROWS, NOISE_MEMORY)
         self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * error**2)
         return steady
 
@@ -68,16 +71,16 @@ class Tracking:
         torque, of_model = expected.torque[0], expected.variance[0]
         residual = row.torque - torque - expected.mean[0]
         here, left = self._poses.expected(q, of_model, noise)
-        self._since.append((row, self._poses.seen(q) >= self._config.place_rows))
+        self._since.append((row, self._poses.seen(q) >= PLACE_ROWS))
         if not self.belief.level.is_known:
             return []
         alarms = self._cusum.handle(residual - here, torque, noise + left)
         if alarms and (told := self._judged(alarms)) is not None:
             return told
-        if self._poses.seen(q) < self._config.place_rows:
+        if self._poses.seen(q) < PLACE_ROWS:
             self.filter.handle(row.torque - expected.mean[0], torque, noise + of_model)
         self._poses.add(q, residual)
-        most = self._config.outliers_in_a_row
+        most = OUTLIERS_IN_A_ROW
         wild = [j for j in np.flatnonzero(self.filter.rejected >= most).tolist() if self._are_outliers(j)]
         return [("outliers", joint, {"rows": most}) for joint in wild]
 
@@ -90,7 +93,7 @@ class Tracking:
         seen = [(kind, joint, {"channel": channel}) for kind, joint, channel in found if kind]
         self._suspected = self._suspected + 1 if seen else 0
         certain = [alarm for alarm in seen if alarm[0] == "alarm"]
-        if certain or self._suspected >= self._config.audit_rows:
+        if certain or self._suspected >= AUDIT_ROWS:
             return certain or seen
         return [] if seen else None
 
@@ -108,9 +111,9 @@ class Tracking:
 
     def _are_outliers(self, joint: int) -> bool:
         """Whether the rejected rows stand out together; the model's own error is alike at poses close to each other."""
-        count = self._config.outliers_in_a_row
+        count = OUTLIERS_IN_A_ROW
         residual, _, covariance = self._recent(joint, count)
-        outliers = bool(residual @ np.linalg.solve(covariance, residual) > count * self._config.outlier)
+        outliers = bool(residual @ np.linalg.solve(covariance, residual) > count * OUTLIER)
         if not outliers:
             self.filter.rejected[joint] = 0
         return outliers
@@ -128,7 +131,7 @@ class Tracking:
         change = torque if channel.startswith("gain") else np.ones_like(torque)
         weight = np.linalg.solve(covariance, change)
         of_model = 1 - self.sigma[joint] ** 2 * len(residual) / float(np.trace(covariance))
-        shown = float((weight @ residual) ** 2 / (weight @ change)) / (2 * self._config.alarm_threshold)
+        shown = float((weight @ residual) ** 2 / (weight @ change)) / (2 * ALARM_THRESHOLD)
         if shown <= 1:
             return ""
         return "alarm" if shown > 1 + DOUBT * of_model else "suspicion"
@@ -136,7 +139,7 @@ class Tracking:
     def cause_test(self, rows: list[StaticReading]) -> CauseTest:
         """The cause test of these rows, by the belief from rows before them."""
         belief = self.belief.before(rows[0].position)
-        return CauseTest(belief, batch(rows, self.sigma), self._config, stack(rows, "temperature"))
+        return CauseTest(belief, batch(rows, self.sigma), stack(rows, "temperature"))
 
     def learn(self, rows: list[StaticReading]) -> None:
         """Take rows that are free of drift as reference."""
@@ -157,7 +160,7 @@ class Tracking:
 
     def install(self, finding: DriftFinding) -> None:
         """The finding was written: its joint is as installed, within the finding's uncertainty."""
-        floor = np.diag([self._config.drift_gain**2, self._config.drift_offset**2])
+        floor = np.diag([GAIN_WALK**2, OFFSET_WALK**2])
         self.filter.restart(finding.joint, covariance=finding.covariance + floor)
         self.belief.close()
         self._poses.forget()
@@ -174,9 +177,9 @@ class Tracking:
         wait = 0 if belief.level.is_known else max(0, config.window - self.rows)
         if len(rows) >= config.window:
             return limits(self.cause_test(rows), config, wait)
-        position = belief.kernel.poses[: config.longest_window]
+        position = belief.kernel.poses[:LONGEST_WINDOW]
         anywhere = StaticReadings.of(position, belief.torque(position), self.sigma)
-        return limits(CauseTest(belief, anywhere, config), config, wait)
+        return limits(CauseTest(belief, anywhere), config, wait)
 
     def save(self) -> dict[str, Any]:
         saved = save_rows([row for row, _ in self._since])

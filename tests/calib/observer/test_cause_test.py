@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drawn_arms import drawn_arm
-from effects_on_readings import CONFIG, SIGMA, payload
+from effects_on_readings import SIGMA, payload
 
 from calib.arm.kinematics import gcomp_arm
 from calib.observer.cause_test import CauseTest, dictionary
@@ -132,7 +132,7 @@ def verdict(arm, beta, effect, rows, random, model_std=None) -> tuple[str, Verdi
     v += SIGMA * random.normal(size=v.shape)
     std = np.zeros(beta.size) if model_std is None else model_std
     belief = GravityBelief(arm, beta + std * random.normal(size=beta.size), np.diag(std**2))
-    return truth, CauseTest(belief, window(q, v, direction), CONFIG).verdict()
+    return truth, CauseTest(belief, window(q, v, direction)).verdict()
 
 
 def answer(truth: str, said: Verdict) -> str:
@@ -218,7 +218,7 @@ def test_the_estimate_holds_the_truth_as_often_as_its_covariance_says(sarcos, sa
         v[:, 2] = 1.03 * v[:, 2] + 0.3
         v += SIGMA * random.normal(size=v.shape)
         belief = GravityBelief(sarcos, sarcos_beta + MODEL_STD * random.normal(size=14), np.diag(MODEL_STD**2))
-        test = CauseTest(belief, window(q, v, np.ones_like(q)), CONFIG)
+        test = CauseTest(belief, window(q, v, np.ones_like(q)))
         change, covariance = test.drift(2, "drift")
         error = change - (0.03, 0.3)
         scores.append(float(error @ np.linalg.solve(covariance, error)))
@@ -253,7 +253,7 @@ def test_one_pose_cannot_blame_a_payload(sarcos, sarcos_beta) -> None:
     q = np.tile(random.uniform(sarcos.lower, sarcos.upper), (20, 1))
     v = gravity_torque(sarcos, sarcos_beta, q)
     payload(0.5)(sarcos, sarcos_beta, q, np.ones_like(q), v, random)
-    test = CauseTest(GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14))), window(q, v, q * 0), CONFIG)
+    test = CauseTest(GravityBelief(sarcos, sarcos_beta, np.zeros((14, 14))), window(q, v, q * 0))
     assert test.verdict().cause != "payload"
 
 
@@ -265,7 +265,7 @@ def test_a_vertical_joint_that_gravity_does_not_load_has_only_an_offset(sarcos, 
     v[:, 0] += 0.2
     v += SIGMA * random.normal(size=v.shape)
     belief = GravityBelief(upright, sarcos_beta, np.zeros((14, 14)))
-    said = CauseTest(belief, window(q, v, random.choice([-1.0, 1.0], q.shape)), CONFIG).verdict()
+    said = CauseTest(belief, window(q, v, random.choice([-1.0, 1.0], q.shape))).verdict()
     assert (said.cause, said.joint) == ("offset", 0)
 
 
@@ -278,9 +278,7 @@ def test_a_payload_whose_mass_no_lever_shows_is_a_payload() -> None:
     at_origin, by_point = payload_columns(arm)
     torque = gravity_torque(arm, beta + 0.8 * (at_origin + by_point @ np.array([0.1, -0.05, 0.02])), q)
     torque += SIGMA * random.normal(size=q.shape)
-    found = CauseTest(
-        GravityBelief(arm, beta, np.zeros((2 * arm.n, 2 * arm.n))), window(q, torque, np.ones_like(q)), CONFIG
-    )
+    found = CauseTest(GravityBelief(arm, beta, np.zeros((2 * arm.n, 2 * arm.n))), window(q, torque, np.ones_like(q)))
     verdict = found.verdict()
     assert verdict.cause == "payload"
     assert verdict.covariance[0, 0] == 0

@@ -7,7 +7,7 @@ import pytest
 from rest_arm import RestArm, harmonics
 
 from calib.observer.cause_test import CauseTest
-from calib.observer.config import ObserverConfig
+from calib.observer.config import LONGEST_WINDOW
 from calib.observer.discrepancy.kernel import Kernel
 from calib.observer.discrepancy.level import DiscrepancyLevel
 from calib.observer.evidence import DRIFT
@@ -105,7 +105,7 @@ def test_a_drift_of_later_rows_is_not_learned(sarcos, sarcos_beta) -> None:
         part = slice(start, start + 40)
         belief.learn(q[part], torque[part], side[part], np.full(7, NOISE))
     window = StaticReadings(q[360:], torque[360:], np.full(7, NOISE), direction=side[360:])
-    change, covariance = CauseTest(belief, window, ObserverConfig()).drift(1, "gain")
+    change, covariance = CauseTest(belief, window).drift(1, "gain")
     assert abs(change[0] - 0.02) < 4 * np.sqrt(covariance[0, 0]) < 0.016
 
 
@@ -120,7 +120,7 @@ def warmed(sarcos, sarcos_beta, warmer: float, *, told: bool) -> CauseTest:
     belief.learn(q[:120], torque[:120], side[:120], np.full(7, NOISE), temperature[:120])
     torque[120:, 2] += 0.35
     window = StaticReadings(q[120:], torque[120:], np.full(7, NOISE), direction=side[120:])
-    return CauseTest(belief, window, ObserverConfig(), temperature[120:] + warmer)
+    return CauseTest(belief, window, temperature[120:] + warmer)
 
 
 def test_a_zero_that_moves_as_its_drive_warms_up_is_no_drift(sarcos, sarcos_beta) -> None:
@@ -168,7 +168,7 @@ def test_the_limit_falls_while_rows_are_learned() -> None:
     arm.work(observer, 120)
     late = observer.limits()
     assert (late.gain < 0.8 * early.gain).sum() >= 5
-    assert late.rests == observer.config.longest_window + 2 * observer.config.window
+    assert late.rests == LONGEST_WINDOW + 2 * observer.config.window
     assert np.isfinite(late.offset).all()
 
 

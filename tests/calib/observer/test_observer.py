@@ -10,6 +10,7 @@ from observed_stops import POSE_SECONDS, SIGMA, Bench, kinds
 from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
 from calib.observer.observer import Observer
+from calib.observer.tracking.pose_memory import PLACE_ROWS
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
 
@@ -150,7 +151,7 @@ def test_a_long_rest_and_a_repeated_pose_do_not_wind_it_up(sarcos, sarcos_beta) 
         q = poses[k % 2]
         reading = gravity_torque(sarcos, sarcos_beta, q) + SIGMA * bench.random.normal(size=7)
         assert bench.observer.handle_row(StaticReading.of(2.0 * k, q, reading, np.ones(7))) == []
-    assert bench.observer.estimate().accepted.max() <= 2 * ObserverConfig().place_rows
+    assert bench.observer.estimate().accepted.max() <= 2 * PLACE_ROWS
     assert bench.observer.estimate().offset_std.min() > 1e-3
 
 

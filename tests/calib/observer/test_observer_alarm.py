@@ -7,7 +7,7 @@ import pytest
 from rest_arm import RestArm
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.config import ObserverConfig
+from calib.observer.config import INITIAL_GAIN_STD, ObserverConfig
 from calib.observer.rest_detector import RestDetector
 from calib.observer.tracking.cusum import Cusum
 from calib.observer.tracking.sensor_filter import SensorFilter
@@ -84,7 +84,7 @@ def test_a_joint_without_excitation_keeps_its_gain(sarcos, sarcos_beta) -> None:
         tracked.handle(torque + 0.05, torque, np.full(7, SIGMA**2))
     np.testing.assert_array_equal(tracked.state[:, 0], 1.0)
     assert (np.abs(tracked.state[:, 1] - 0.05) < 3 * np.sqrt(tracked.covariance[:, 1, 1])).all()
-    np.testing.assert_allclose(tracked.covariance[:, 0, 0], CONFIG.initial_gain_std**2)
+    np.testing.assert_allclose(tracked.covariance[:, 0, 0], INITIAL_GAIN_STD**2)
 
 
 def test_an_outlier_is_not_taken_and_is_counted(sarcos) -> None:

@@ -35,7 +35,7 @@ def cause_of_pickup(arm, beta, mass, random) -> str:
     side = random.choice([-1.0, 1.0], (FRESH, arm.n))
     window = StaticReadings(q[fresh], reading[fresh], np.full(arm.n, SIGMA), direction=side)
     exact = GravityBelief(arm, beta, np.zeros((beta.size, beta.size)))
-    verdict = CauseTest(exact, window, CONFIG).verdict()
+    verdict = CauseTest(exact, window).verdict()
     return "drift" if verdict.is_drift else verdict.cause
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from effects_on_readings import CONFIG, SIGMA, payload
+from effects_on_readings import SIGMA, payload
 
 from calib.observer.cause_test import CauseTest
 from calib.observer.evidence import smallest_noticed_change
@@ -35,6 +35,6 @@ def test_the_misfit_of_readings_without_noise_counts_what_was_fitted_to_them(sar
     payload(0.5)(sarcos, sarcos_beta, q, direction, v, random)
     belief = GravityBelief(sarcos, sarcos_beta, np.zeros((sarcos_beta.size, sarcos_beta.size)))
     readings = StaticReadings(q, v, np.full(sarcos.n, SIGMA), direction=direction)
-    verdict = CauseTest(belief, readings, CONFIG).verdict()
+    verdict = CauseTest(belief, readings).verdict()
     assert verdict.cause == "payload"
     assert verdict.evidence["misfit"] == pytest.approx(-np.sqrt((q.size - 4) / 2), abs=0.006)

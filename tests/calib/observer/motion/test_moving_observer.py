@@ -14,7 +14,6 @@ from judged_creeps import creep_arm
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.state.events import describe
 from calib.fit.creep_fit import fit_rows
-from calib.observer.config import ObserverConfig
 from calib.observer.events import Event
 from calib.observer.evidence import ChangeHypothesis, ResidualTest
 from calib.observer.motion.change_test import ChangeTest
@@ -89,7 +88,7 @@ def test_a_change_that_hardly_explains_the_rows_is_none(size: float, cause: str)
     """Fifty rows of whitened noise, and a gain's column in them."""
     random, test = np.random.default_rng(6), ChangeTest.__new__(ChangeTest)
     gain = ChangeHypothesis("gain", 0, random.standard_normal((50, 1)))
-    test._config, test._belief, test._passages = ObserverConfig(), SimpleNamespace(learnt=range(100)), [None] * 50  # type: ignore[assignment, list-item]
+    test._belief, test._passages = SimpleNamespace(learnt=range(100)), [None] * 50  # type: ignore[assignment, list-item]
     test.found = ResidualTest(random.standard_normal(50) + size * gain.columns[:, 0], np.eye(50), [gain])
     assert test.verdict().cause == cause
 
