@@ -17,6 +17,7 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 
 from armlink.errors import ArmlinkError, BadInput, BusFault
 from armlink.recording.corrections import AS_IT_IS, Corrections
+from sim_gap.model.known_gains import parse_known_gains
 
 CONNECT_SECONDS = 10.0
 """Longest wait for a scheduler to answer [s]."""
@@ -123,6 +124,9 @@ class CaseOptions:
     base: str | None = None
     tip: str | None = None
 
+    def __post_init__(self) -> None:
+        parse_known_gains(self.gains)  # what is wrong with them is no answer of a case
+
     def to_json(self) -> dict[str, Any]:
         """Those that differ from the default."""
         every = {**asdict(self.stated), "gains": self.gains, "base": self.base, "tip": self.tip}
@@ -133,7 +137,6 @@ def diagnose_case(case: Case, options: CaseOptions | None = None) -> dict[str, A
     """The JSON result of one case with what is watched, or `{"error": line}` if it cannot be diagnosed."""
     from armlink.recording.files import load_recording
     from sim_gap.attribution.diagnose import diagnose
-    from sim_gap.model.known_gains import parse_known_gains
     from sim_gap.trends import watched_parameters
 
     options = options or CaseOptions()

@@ -200,9 +200,8 @@ def aside_notes(aside: Sequence[Location]) -> tuple[str, ...]:
         + (
             f"at {at.hz:.3g} Hz, a hum or a resonance above the frequencies that are compared"
             if at.hz
-            else where[at.regime]
+            else f"{where[at.regime]}, more than known friction explains: breakaway, hysteresis or backlash"
         )
-        + ("" if at.hz else ", more than known friction explains: breakaway, hysteresis or backlash")
         for at in aside
         if at.clear
     )
@@ -212,9 +211,7 @@ def law_notes(laws: Sequence[ResidualLaw], names: Sequence[str]) -> tuple[str, .
     return tuple(
         f"{names[law.joint]}: the remaining {law.channel} is a function of the joint's {law.quantity}"
         + (", directed against the motion" if law.directed else "")
-        + (
-            f" (which reduces the gap on held-out data from {law.before:.2g} to {law.after:.2g} N·m); its cause "
-            "is not in the library"
-        )
+        + f" (which reduces the gap on held-out data from {law.before:.2g} to {law.after:.2g} N·m); "
+        "its cause is not in the library"
         for law in laws
     )

@@ -110,9 +110,8 @@ def _held(found: Identified) -> list[str]:
     if not found.held:
         return []
     some = ", ".join(found.held[:MOST_NAMED]) + (", …" if len(found.held) > MOST_NAMED else "")
-    return [
-        (f"these parts of the model do not move and touch nothing, since they are not between --base and --tip: {some}")
-    ]
+    told = "these parts of the model do not move and touch nothing, since they are not between --base and --tip"
+    return [f"{told}: {some}"]
 
 
 def _ranges(found: Identified) -> list[str]:
@@ -123,16 +122,8 @@ def _ranges(found: Identified) -> list[str]:
         for j in widened_joints(found.sim)
         for low, high in [found.sim.arm.range[j]]
     ]
-    return (
-        [
-            (
-                "these joints move beyond the joint range of the model, where a simulation would stop them: "
-                f"{', '.join(out)}"
-            )
-        ]
-        if out
-        else []
-    )
+    told = "these joints move beyond the joint range of the model, where a simulation would stop them"
+    return [f"{told}: {', '.join(out)}"] if out else []
 
 
 def _beyond(found: Identified) -> list[str]:

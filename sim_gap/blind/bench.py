@@ -99,7 +99,8 @@ def run_bench(
     `lengths` are the seconds of training and held-out recordings, by default 120 and 40; `effects` is the number of
     effects in every case such as `5-8`, empty for none, one or two. With `positions`, arms with servos of which `q` and
     `q_cmd` alone are seen, none or one effect each, by default 36 s and 18 s. `progress` gets stage, done, total.
-    `diagnose` must be a module-level function if `workers` exceeds 1. Raises BadInput if `out` holds an earlier check.
+    `diagnose` must be a module-level function if `workers` exceeds 1. Cases that no arm shows are left out, and counted
+    in the score. Raises BadInput if `out` holds an earlier check.
     """
     _require_range(effects)
     if positions and effects:
@@ -124,7 +125,7 @@ def run_bench(
     answers, labels = open_labels(out / "answers", out / "labels", digest)
     result = score_positions(answers, labels) if positions else score(answers, labels)
     seconds = {"making": made - started, "diagnosing": answered - made}
-    return {**result, "seed": seed, "sealed": digest, "seconds": seconds}
+    return {**result, "left_out": cases - len(labels), "seed": seed, "sealed": digest, "seconds": seconds}
 
 
 def _require_range(effects: str) -> None:

@@ -210,8 +210,8 @@ class ServoRig(Rig):
 def make_case(recipe: CaseRecipe, out: Path, labels: Path, train_s: float, heldout_s: float) -> None:
     """Draw, simulate and write a case: `out/case_XXXX/{sim.xml,train.csv,heldout.csv}`, `labels/case_XXXX.json`.
 
-    It is drawn again if its effects do not show in the held-out data or its arm is not steady, and left out if no arm
-    can show them.
+    It is drawn again if its effects do not show in the held-out data or its arm is not steady, and left out after
+    ROUNDS drawings, or if no arm can show them.
     """
     first = 0
     for _ in range(ROUNDS):

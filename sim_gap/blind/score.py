@@ -56,11 +56,8 @@ def score_positions(answers: Answers, labels: Answers) -> dict[str, Any]:
 
 
 def judge_all(answers: Answers, labels: Answers) -> list[Judgement]:
-    """Judgements of the answers whose case counts: some arm shows its effects and stays under control."""
     named = [(*name.partition(WITHHELD)[::2], answer) for name, answer in answers.items()]
-    return [
-        judge(answer, labels[case], withheld) for case, withheld, answer in named if labels[case].get("clear", True)
-    ]
+    return [judge(answer, labels[case], withheld) for case, withheld, answer in named]
 
 
 def _tables(judged: Sequence[Judgement], calibrated: Sequence[Judgement]) -> dict[str, Any]:

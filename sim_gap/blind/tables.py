@@ -35,7 +35,7 @@ ROWS = (
 
 
 def show(result: Mapping[str, Any], console: Console) -> None:
-    table = Table("figure", "value", title=f"blind check, {result['label_withheld']['cases']} cases")
+    table = Table("figure", "value", title=f"blind check, {_counted(result)}")
     for text, *path in ROWS:
         value: Any = result
         for key in path:
@@ -47,12 +47,17 @@ def show(result: Mapping[str, Any], console: Console) -> None:
 
 def show_positions(result: Mapping[str, Any], console: Console) -> None:
     console.print(
-        f"{result['answers']} answers, {result['tellable']} of them on one effect that can be identified: right first "
-        f"or confounded {_percent(result['named_where_tellable'])}, a false cause above 0.8 "
+        f"{_counted(result)}; {result['answers']} answers, {result['tellable']} of them on one effect that can be "
+        f"identified: right first or confounded {_percent(result['named_where_tellable'])}, a false cause above 0.8 "
         f"{_percent(result['false_confident'])}, false alarms without an effect "
         f"{_percent(result['label_withheld']['no_effect']['false_alarms'])}"
     )
     _show_effects(result, console)
+
+
+def _counted(result: Mapping[str, Any]) -> str:
+    left = f", {result['left_out']} left out, since no drawn arm shows them" if result["left_out"] else ""
+    return f"{result['label_withheld']['cases']} cases{left}"
 
 
 def _show_effects(result: Mapping[str, Any], console: Console) -> None:

@@ -1,7 +1,7 @@
 """Entry point of the check: recordings and a model in, corrected recordings and findings out.
 
 Run before anything is fitted. A finding that is certain is corrected; one that is not names the options that settle it,
-and the recording is diagnosed as it is.
+and the recording is diagnosed as it is. Times, counts, jumps and ranges that no arm can have end the diagnosis.
 """
 
 from collections.abc import Collection, Sequence

@@ -132,12 +132,11 @@ def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterato
 def _sources(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
     every, channel = tuple(range(arm.n)), motion.channel
     if not stated.without_gravity and arm.n > 1:
-        what, option = (
+        what = (
             "the torque contains no gravity, so the program that recorded it has probably subtracted the gravity of "
-            "the model",
-            f"--effort-is {WITHOUT_GRAVITY}",
+            "the model"
         )
-        yield Hypothesis("effort_source", (channel,), every, what, option, _weighed(arm))
+        yield Hypothesis("effort_source", (channel,), every, what, f"--effort-is {WITHOUT_GRAVITY}", _weighed(arm))
     if not (motion.rubs or stated.effort) and arm.n > 1:
         what = (
             "the torque contains friction, which a sensor on the link side does not feel, so it is the torque "

@@ -197,7 +197,7 @@ def _progress(console: "Console", status: "Status", stage: str) -> None:
 
 def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
     from sim_gap.better_model.training_files import write_motor_entries
-    from sim_gap.position_gap.training.training_files import write_actuators
+    from sim_gap.position_gap.training.position_files import write_actuators
 
     if answer.unit == "rad":
         write_actuators(answer.internals, path, step)
@@ -207,7 +207,7 @@ def _write_actuators(answer: "Diagnosis", path: Path, step: float) -> None:
 
 def _write_samples(answer: "Diagnosis", count: int, path: Path | None, console: "Console") -> None:
     from sim_gap.better_model.training_files import drawn_parameters, write_rows
-    from sim_gap.position_gap.training.training_files import write_samples
+    from sim_gap.position_gap.training.position_files import write_samples
 
     target = path or Path("samples.csv")
     if answer.unit == "rad":
@@ -224,7 +224,7 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
     kind = "URDF" if path.suffix == ".urdf" else "MJCF"
     if answer.unit == "rad":
         from sim_gap.better_model.export import module_path
-        from sim_gap.position_gap.training.training_files import batch_path, module_model, write_exported
+        from sim_gap.position_gap.training.position_files import batch_path, module_model, write_exported
 
         with_actuators = " with its position actuators" if kind == "MJCF" else ""
         for line in write_exported(answer.internals, path):

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from typing import Any, TypeVar
 
 import numpy as np
@@ -123,8 +124,7 @@ def beside(work: Callable[..., Made], *given: Any, **options: Any) -> Iterator[C
     if len(os.sched_getaffinity(0)) < 2:
         yield whole
         return
-    ignored = signal.SIGINT, signal.SIG_IGN  # Ctrl-C is this process's, which then ends the other
-    with ProcessPoolExecutor(1, get_context("spawn"), initializer=signal.signal, initargs=ignored) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_follow_parent) as pool:
         others = active_children()
         job = pool.submit(whole)
         try:
@@ -133,6 +133,19 @@ def beside(work: Callable[..., Made], *given: Any, **options: Any) -> Iterator[C
             for worker in active_children():
                 if worker not in others:
                     worker.terminate()
+
+
+def _follow_parent() -> None:
+    """Leave Ctrl-C to the parent, which then ends this process, and end with it if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 class Demo:

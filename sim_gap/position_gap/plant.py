@@ -15,12 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcomp.arrays import Array
-from sim_gap.better_model.corrected_model import (
-    body_parameters,
-    closest_possible,
-    mass_centre_inertia,
-    mujoco_quaternion,
-)
+from sim_gap.better_model.corrected_model import body_parameters, set_body
 from sim_gap.better_model.native_drives import resting_command
 from sim_gap.effects.base import tilt_gravity
 from sim_gap.effects.link import point_mass
@@ -279,16 +274,8 @@ class MovedModel:
                 )
                 change += point_mass(mass, np.array(moment))
             if change.any():
-                self._set_body(model, link, change)
-
-    def _set_body(self, model: Any, link: int, change: Array) -> None:
-        body, anchor = int(self.bodies[link]), self.model.jnt_pos[self.joints[link]]
-        mass, centre, about = mass_centre_inertia(body_parameters(self.model, body, anchor, np.eye(3)) + change)
-        values, axes = np.linalg.eigh(about)
-        axes[:, 2] *= np.sign(np.linalg.det(axes))
-        model.body_mass[body], model.body_ipos[body] = mass, anchor + centre
-        model.body_inertia[body] = closest_possible(values)
-        mujoco_quaternion(model.body_iquat[body], axes)
+                body, anchor = int(self.bodies[link]), self.model.jnt_pos[self.joints[link]]
+                set_body(model, body, anchor, body_parameters(self.model, body, anchor, np.eye(3)) + change)
 
     # ---- commands
 

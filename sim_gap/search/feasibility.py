@@ -89,12 +89,18 @@ def _closest(wanted: Array, curvature: Array, matrix: Matrix) -> Array:
         least = 2.0 * LEAST_EIGENVALUE * max(float(np.trace(now)), 0.0)
         return np.asarray((np.linalg.eigvalsh(now) - least) / np.trace(matrix(0.0 * x)))
 
-    start = next(share for share in np.linspace(0.95, 0.0, 20) if _positive(matrix(share * wanted)))
+    start = _farthest(0.0 * wanted, 0.95 * wanted, matrix)
     found = minimize(
         lambda x: 0.5 * (x - aim) @ scaled @ (x - aim),
-        start * aim,
+        size * start,
         jac=lambda x: scaled @ (x - aim),
         constraints={"type": "ineq", "fun": above_least},
         method="SLSQP",
     )
-    return np.asarray(found.x / size)
+    return _farthest(start, found.x / size, matrix)  # SLSQP may end outside
+
+
+def _farthest(inside: Array, end: Array, matrix: Matrix) -> Array:
+    """The point nearest to the end, on the way there from one whose matrix is positive, at which it still is."""
+    ways = (inside + share * (end - inside) for share in np.linspace(1.0, 0.0, 20))
+    return next(x for x in ways if _positive(matrix(x)))

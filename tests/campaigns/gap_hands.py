@@ -13,14 +13,13 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from sound_recordings import inverse, scale_of
+from sound_recordings import Motion, inverse, scale_of
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
 
 MODELS = "ur10e/sim.xml", "panda/sim.xml", "tx40/sim.xml", "lwr4/sim.xml", "ur10/sim.xml", "kinova_gen3/sim.urdf"
 SECONDS, RATE, GOAL, MASS = 40.0, 100.0, 0.95, 0.05
-Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def spec_of(path: Path) -> mujoco.MjSpec:

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from armlink.errors import BadInput
 from armlink.recording.files import load_recording, save_recording
 from sim_gap.commands.gap import app
-from sim_gap.fleet import Answers, Case, cluster, diagnose_case, diagnose_fleet, find_cases, open_to_all
+from sim_gap.fleet import Answers, Case, CaseOptions, cluster, diagnose_case, diagnose_fleet, find_cases, open_to_all
 
 
 def write_case(folder: Path, name: str, wrong: wrong_arms.Wrong) -> None:
@@ -119,6 +119,11 @@ def test_recordings_in_degrees_are_followed_with_the_options_of_a_diagnosis(flee
     other = CliRunner().invoke(app, command, standalone_mode=False)
     assert "1 answer was made with other options" in " ".join(other.stderr.split())
     assert "error" in json.loads(other.stdout)["newest"]["answer"]
+
+
+def test_gains_that_are_not_numbers_are_refused_before_any_case() -> None:
+    with pytest.raises(BadInput, match="--gains kp=stiff: expected"):
+        CaseOptions(gains="kp=stiff")
 
 
 def sleeper(case: Case, _options: object) -> dict[str, object]:

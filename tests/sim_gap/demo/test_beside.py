@@ -1,6 +1,8 @@
 """Work in a process of its own: its answer, its error, its end."""
 
 import os
+import subprocess
+import sys
 import time
 
 import pytest
@@ -45,3 +47,28 @@ def test_a_worker_that_vanishes_is_an_error_and_no_hang(monkeypatch: pytest.Monk
     monkeypatch.setattr(module.os, "sched_getaffinity", lambda _: {0, 1})
     with beside(vanish) as answer, pytest.raises(RuntimeError, match="terminated abruptly"):
         answer()
+
+
+WORK = """
+import os, time
+from sim_gap.demo.run import beside
+
+def work():
+    print(os.getpid(), flush=True)
+    time.sleep(300)
+
+if __name__ == "__main__":
+    with beside(work) as answer:
+        answer()
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs a core for the worker")
+def test_a_worker_ends_with_a_process_that_is_killed(tmp_path) -> None:
+    script = tmp_path / "killed.py"
+    script.write_text(WORK, encoding="utf-8")
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as parent:
+        parent.stdout.readline()
+        parent.kill()
+        parent.communicate(timeout=60.0)  # the worker has the pipe open until it ends

@@ -16,7 +16,7 @@ from sim_gap.position_gap.fit import LoopFit, batch, coordinate, evaluate, jacob
 from sim_gap.position_gap.identify import _frozen
 from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.parameters import PARAMETERS, Scales, step_parameter
-from sim_gap.position_gap.training import export, spread, training_files
+from sim_gap.position_gap.training import export, position_files, spread
 from sim_gap.position_gap.training import replay as replays
 from sim_gap.position_gap.windows import choose_windows, thin_moving
 
@@ -82,8 +82,8 @@ def test_delays_are_told_in_whole_steps(monkeypatch, late: float, steps: float) 
     names = ("kp", "gain", "kv", "viscous", "back_emf", "armature", "coulomb", "limit")
     point = {name: np.ones(1) for name in names}
     found = SimpleNamespace(native=SimpleNamespace(point=point), sim=SimpleNamespace(n=1))
-    monkeypatch.setattr(training_files, "_delays", lambda found, j, drawn: 0.002 * np.array([late, late]))
-    entry = training_files._entry(found, 0, 0.002, [])
+    monkeypatch.setattr(position_files, "_delays", lambda found, j, drawn: 0.002 * np.array([late, late]))
+    entry = position_files._entry(found, 0, 0.002, [])
     assert (entry["least"], entry["most"]) == (steps, steps)
 
 

@@ -19,15 +19,15 @@ from sim_gap.position_gap.identify import gain_scales
 from sim_gap.position_gap.training.bands import band
 from sim_gap.position_gap.training.export import export_with_module
 from sim_gap.position_gap.training.jackknife import gaps_left_out, terms_of
-from sim_gap.position_gap.training.replay import Simulated, replay_rms
-from sim_gap.position_gap.training.spread import known_before
-from sim_gap.position_gap.training.training_files import (
+from sim_gap.position_gap.training.position_files import (
     batch_path,
     export_batched,
     write_actuators,
     write_exported,
     write_samples,
 )
+from sim_gap.position_gap.training.replay import Simulated, replay_rms
+from sim_gap.position_gap.training.spread import known_before
 from sim_gap.report.motion_figure import motion_figure
 from sim_gap.report.page import write_report
 

@@ -16,7 +16,7 @@ from sim_gap.search import gauss_newton, model_selection
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
 from sim_gap.search.estimate_signals import signals_about
-from sim_gap.search.feasibility import _closest, _shapes
+from sim_gap.search.feasibility import _closest, _positive, _shapes
 from sim_gap.search.model_selection import relinearised_in_place, select_model
 from sim_gap.search.term import Term
 
@@ -125,6 +125,17 @@ def test_a_body_that_cannot_exist_gives_way_to_the_closest_that_can() -> None:
     best = _closest(np.array([-2.0, 0.3]), np.eye(2), lambda x: np.diag(1.0 + x))
     np.testing.assert_allclose(best, [-1.0, 0.3], atol=1e-2)
     assert best[0] > -1.0
+
+
+@pytest.mark.parametrize("seed", [22, 24, 32])
+def test_the_closest_body_can_exist_where_slsqp_ends_outside(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    columns, own = random.normal(size=(30, 3)) * [1, 10, 100], random.normal(size=(3, 4, 4))
+
+    def matrix(x: np.ndarray) -> np.ndarray:
+        return np.diag([1e-3, 1e-3, 1e-3, 1.0]) + np.tensordot(x, own + own.swapaxes(1, 2), 1)
+
+    assert _positive(matrix(_closest(random.normal(size=3), columns.T @ columns, matrix)))
 
 
 def test_a_link_is_shaped_by_its_inertia_and_the_last_by_a_payload() -> None:

@@ -1,4 +1,4 @@
-"""Files for training: the corrected model, draws of its parameters, and actuator entries."""
+"""Files of what positions have shown: the corrected model, draws of its parameters, and actuator entries."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
