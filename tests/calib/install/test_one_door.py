@@ -24,7 +24,9 @@ ROOT = Path(__file__).parents[3]
 PACKAGES = ("armlink", "calib", "gcomp", "sim_bus", "sim_gap")
 DOOR, GATES = "calib/install/journaled_write.py", "calib/install/plausibility.py"
 ASKS = "armlink/loop/cycle_process.py"
-"""Where the process that makes the cycles is asked to write."""
+"""Where the process that makes the cycles is asked for anything."""
+FORWARDER = (ASKS, "")
+"""The attribute by which it is asked to write."""
 LINKS = ("armlink/loop/kept_arm.py", "armlink/loop/remote_link.py")
 """That of a daemon, and that of a command."""
 WIRE = "armlink/drives/canopen/torque_sensor_record.py"
@@ -91,29 +93,31 @@ def calls(*names: str) -> Iterator[tuple[str, str, ast.expr | None]]:
 
 
 def test_only_the_door_calls_write_calibration() -> None:
-    """Beside it there are only forwarders: methods of that name."""
+    """Beside it there are only forwarders: methods of that name, and the one through the bus process."""
     callers = users("write_calibration")
     assert {function for path, function in callers if path == DOOR} == {"_write", "_restore"}
-    assert all(function == "write_calibration" for path, function in callers if path != DOOR)
+    others = {(path, function) for path, function in callers if path != DOOR and function != "write_calibration"}
+    assert others == {FORWARDER}
 
 
 def test_only_a_forwarder_asks_the_bus_process_to_write() -> None:
-    """By name, in a `Call`; functions in a `Call` (`RemoteLink.inside`) are subject to the test above."""
-    said = {(path, function) for path, function, kind in uses()["write_calibration"] if kind is ast.Constant}
-    assert said == {(ASKS, "write_calibration")}
+    """By the protocol's own method; functions in a `Call` (`RemoteLink.inside`) are subject to the test above."""
+    asked = [(path, function, ast.unparse(what)) for path, function, what in calls("remote") if what is not None]
+    written = [(path, function) for path, function, what in asked if what.endswith(".write_calibration")]
+    assert written == [FORWARDER]
+    assert not [kind for *_, kind in uses()["write_calibration"] if kind is ast.Constant]  # nor by a name in quotes
 
 
 def test_a_call_of_the_bus_process_spells_its_name_out() -> None:
     """Otherwise a name put together at run time would pass the test above."""
-    made = {(path, function) for path, function, _ in calls("Call")}
-    assert made == {(link, "_call") for link in LINKS}
+    assert {(path, function) for path, function, _ in calls("Call")} == {(ASKS, "_call")}
     requests = [call for call in calls("_call", "_enabled") if call[0] in (ASKS, *LINKS)]
-    assert {what.value for _, _, what in requests if isinstance(what, ast.Constant)} >= {"write_calibration", "enable"}
+    assert {what.value for _, _, what in requests if isinstance(what, ast.Constant)} >= {"start", "enable"}
     passed_on = {(path, function) for path, function, what in requests if not isinstance(what, ast.Constant)}
     assert passed_on == {(LINKS[1], "inside"), (LINKS[1], "_enabled"), (ASKS, "ask")}
-    methods = [what.attr for path, _, what in calls("remote") if isinstance(what, ast.Attribute)]
-    assert len(methods) == len(list(calls("remote")))  # of a protocol, by its name
-    assert "write_calibration" not in methods
+    methods = [what for *_, what in calls("remote")]
+    assert methods
+    assert all(isinstance(what, ast.Attribute) for what in methods)  # of a protocol, by its name
 
 
 NAMED = ("armlink/drives/canopen/check/guard_rules.py", "_record_writes")
