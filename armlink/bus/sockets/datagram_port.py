@@ -1,263 +1,198 @@
-"""Frames as datagrams of a socket, sent and received in batches by sendmmsg and recvmmsg.
+"""Frames as datagrams of a socket, a system call each: a call for many saves nothing that can be measured.
 
 Subclasses define the datagram: SocketCAN's frame or python-can's udp_multicast message.
 """
 
 import contextlib
-import ctypes
 import errno
-import os
+import itertools
 import select
 import socket
 import struct
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Sequence
 
-from armlink.bus.port import ERROR, Frame, InterfaceDown
+from armlink.bus.port import ERROR, Frame, InterfaceDown, Stamped
 from armlink.errors import BusFault
 
-BATCH = 64
-"""Datagrams per system call."""
 FLOOD = 32
 """So many frames that came while none could be sent filled the bus: a wire of 125 kbit/s carries 45 in that time."""
-MOST_BATCHES = 16
-"""Limit of batches read for one frame, so that a flood of other datagrams cannot block a reader."""
+MOST_DATAGRAMS = 4096
+"""Limit of datagrams read in one call, so that a flood cannot block a reader."""
 RECEIVE_BUFFER = 1 << 21
 """Size of the socket's receive queue [bytes]: some thousand frames with the kernel's overhead."""
-CONTROL = 64
-"""Space for the control messages of one datagram [bytes]."""
-NAME = 32
-"""Space for the sender's address of one datagram [bytes]."""
 BUS_OFF = 0x40
 """Error class bit in the identifier of an error frame."""
-NOT_OURS = 1 << 32
-"""Marks a datagram that is no frame for the reader: its own echo, or malformed."""
-NO_FRAME = ERROR | NOT_OURS
-"""Flags of everything but data and remote frames."""
 _RETRY = 0.002  # [s] between tries while the transmit queue is full
 _TRIES = 25
 _FULL = (errno.ENOBUFS, errno.EAGAIN)
-_DONTWAIT = int(socket.MSG_DONTWAIT)
-_SO_RCVBUFFORCE, _SO_RXQ_OVFL = 33, 40
-_STAMP_ALONE = 32  # bytes of control messages if there is only a timestamp
-_CONTROL_HEADER = struct.Struct("@Nii")
-_LENGTH = struct.Struct("@56xI4x")
-
-
-class _Vector(ctypes.Structure):
-    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
-
-
-class _Header(ctypes.Structure):
-    _fields_ = (
-        ("name", ctypes.c_void_p),
-        ("name_length", ctypes.c_uint32),
-        ("vectors", ctypes.c_void_p),
-        ("vector_count", ctypes.c_size_t),
-        ("control", ctypes.c_void_p),
-        ("control_length", ctypes.c_size_t),
-        ("flags", ctypes.c_int),
-    )
-
-
-class _MessageHeader(ctypes.Structure):
-    _fields_ = (("header", _Header), ("length", ctypes.c_uint))
-
-
-class DatagramBatch:
-    """Preallocated datagrams and their headers for sendmmsg and recvmmsg."""
-
-    def __init__(self, size: int, names: bool = False) -> None:
-        """BATCH datagrams of at most `size` bytes; `names`: with space for each sender's address."""
-        self.size = size
-        self.content = bytearray(BATCH * size)
-        self.names = bytearray(BATCH * NAME if names else 0)
-        base, name = _address(self.content), _address(self.names) if names else None
-        vectors, messages = (bytearray(BATCH * ctypes.sizeof(each)) for each in (_Vector, _MessageHeader))
-        self._vectors, self._messages = memoryview(vectors).cast("Q"), memoryview(messages)
-        self.messages = (_MessageHeader * BATCH).from_buffer(messages)
-        self.address = ctypes.addressof(self.messages)
-        first, step = _address(vectors), ctypes.sizeof(_Vector)
-        for i, message in enumerate(self.messages):
-            self._vectors[2 * i], self._vectors[2 * i + 1] = base + i * size, size
-            message.header.vectors, message.header.vector_count = first + i * step, 1
-            if name is not None:
-                message.header.name, message.header.name_length = name + i * NAME, NAME
-
-    def put(self, place: int, datagram: bytes) -> None:
-        size, start = len(datagram), place * self.size
-        self.content[start : start + size] = datagram
-        self._vectors[2 * place + 1] = size
-
-    def lengths(self, count: int) -> Iterator[tuple[int]]:
-        """Length of each of the first `count` datagrams received."""
-        return _LENGTH.iter_unpack(self._messages[: count * _LENGTH.size])
+_SO_RCVBUFFORCE, _SO_TIMESTAMPNS, _SO_MEMINFO = 33, 35, 55
+_DROPS = struct.Struct("=32xI")  # the last of the numbers of SO_MEMINFO: frames that the receive queue had no room for
+_STAMP = struct.Struct("=qq")  # wall clock [s], [ns]
+_CLOCK_TRIES, _CLOCK_SECONDS = 5, 1e-4  # two clocks are read within this time, or this often
 
 
 class DatagramPort(ABC):
-    """Port on sockets; counts error frames and frames lost by the receive queue."""
+    """Port on sockets; counts error frames."""
 
-    def __init__(
-        self,
-        name: str,
-        receiving: socket.socket,
-        sending: socket.socket,
-        out: DatagramBatch,
-        into: DatagramBatch,
-        as_node: bool,
-    ) -> None:
+    def __init__(self, name: str, receiving: socket.socket, sending: socket.socket, as_node: bool) -> None:
         """`name` of the bus for messages; both sockets may be the same; `as_node` as in CanBus.open_port."""
         self.errors = 0
-        self.dropped = 0
-        """Frames lost because they were not read in time (SO_RXQ_OVFL)."""
-        self._as_node, self._name, self._out, self._in = as_node, name, out, into
-        self._number, self._out_number = receiving.fileno(), sending.fileno()
-        self._control = ctypes.create_string_buffer(CONTROL)
-        self._first = into.messages[0].header
-        self._first.control = ctypes.addressof(self._control)
-        self._waiting: list[Frame] = []
-        self._dry = False
-        """The last batch emptied the receive queue: the next look needs no system call."""
-        library = ctypes.CDLL(None, use_errno=True)
-        self._sendmmsg, self._recvmmsg = library.sendmmsg, library.recvmmsg
-        self._sendmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
-        self._recvmmsg.argtypes = (*self._sendmmsg.argtypes, ctypes.c_void_p)
-        self._prepare(receiving)
-
-    def _prepare(self, receiving: socket.socket) -> None:
-        """Give the socket a large receive queue and a count of lost frames."""
+        self._as_node, self._name = as_node, name
+        self._receiving, self._send = receiving, sending.send
+        self._waiting: deque[Frame] = deque()
+        """Frames that came while none could be sent."""
         try:
             receiving.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
         except OSError:  # without CAP_NET_ADMIN limited by net.core.rmem_max
             receiving.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-        receiving.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
     @abstractmethod
-    def _encode(self, frames: Sequence[Frame]) -> None:
-        """Encode at most BATCH frames into the outgoing batch."""
+    def _encode(self, can_id: int, data: bytes) -> bytes:
+        """The datagram of a frame."""
 
     @abstractmethod
-    def _decode(self, count: int) -> list[Frame]:
-        """Decode the first `count` datagrams, one frame each, with flags in identifiers."""
+    def _take(self) -> Frame | None:
+        """The frame of the next datagram, with flags in its identifier; None if it is none for the reader: its own
+        echo, or malformed. Raises OSError."""
+
+    @property
+    def dropped(self) -> int:
+        """Frames lost because they were not read in time."""
+        told = self._receiving.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _DROPS.size)
+        return int(_DROPS.unpack(told)[0])
 
     def fileno(self) -> int:
-        return self._number
+        return self._receiving.fileno()
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame; retries for 50 ms if the transmit queue is full, then raises BusFault."""
-        self.send_all(((can_id, data),))
-
-    def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send the frames in this order, BATCH per system call; raises BusFault as send."""
-        if len(frames) > BATCH:
-            for begin in range(0, len(frames), BATCH):
-                self.send_all(frames[begin : begin + BATCH])
-            return
-        self._encode(frames)
-        sent, tries, total = 0, 0, len(frames)
-        step = ctypes.sizeof(_MessageHeader)
-        while sent < total:
-            count = self._sendmmsg(self._out_number, self._out.address + sent * step, total - sent, _DONTWAIT)
-            if count > 0:
-                sent += count
-                continue
-            number = ctypes.get_errno()
-            if number not in _FULL:
-                raise BusFault(f"bus {self._name}: cannot send: {os.strerror(number)}")
+        datagram, tries = self._encode(can_id, data), 0
+        while True:
+            try:
+                self._send(datagram, socket.MSG_DONTWAIT)
+                return
+            except OSError as error:
+                if error.errno not in _FULL:
+                    raise BusFault(f"bus {self._name}: cannot send: {error.strerror}") from None
             tries += 1
             if tries == _TRIES:
                 raise self._full()
             select.select([], [], [], _RETRY)
 
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Send the frames in this order; raises BusFault as send."""
+        for can_id, data in frames:
+            self.send(can_id, data)
+
     def _full(self) -> BusFault:
         """Nothing could be sent for 50 ms. Where many frames came meanwhile, they had a higher priority."""
         with contextlib.suppress(BusFault):
-            if not self._waiting:
-                self._fill()
+            while len(self._waiting) < FLOOD and (frame := self._next()) is not None:
+                self._waiting.append(frame)
         if len(self._waiting) >= FLOOD:
             return BusFault(f"bus {self._name}: transmit queue stays full: frames of higher priority fill the bus")
         return BusFault(f"bus {self._name}: transmit queue stays full: does any node acknowledge?")
 
     def receive(self, timeout: float) -> Frame | None:
-        waiting = self._waiting
-        if waiting:
-            return waiting.pop()
+        if self._waiting:
+            return self._waiting.popleft()
         if timeout <= 0:
-            if self._dry:
-                self._dry = False
-                return None
-            return self._take_now()
+            return self._next()
         end = time.monotonic() + timeout
-        while True:
-            if not select.select([self._number], [], [], timeout)[0]:
-                return None
-            self._fill()
-            if waiting:
-                return waiting.pop()
+        while timeout > 0 and select.select([self._receiving], [], [], timeout)[0]:
+            if (frame := self._next()) is not None:
+                return frame
             timeout = end - time.monotonic()
-            if timeout <= 0:
-                return None
-
-    def _take_now(self) -> Frame | None:
-        for _ in range(MOST_BATCHES):
-            more = self._fill()
-            if self._waiting:
-                return self._waiting.pop()
-            if not more:
-                break
         return None
 
-    def _fill(self) -> bool:
-        """Read a batch; False if the receive queue is empty now."""
-        self._first.control_length = CONTROL
-        count = self._take_batch()
-        if not count:
-            return False
-        self._dry = count < BATCH
-        frames = self._decode(count)
-        others: list[int] = []
-        for can_id, _ in frames:
-            if can_id & NO_FRAME:
-                others = [each for each, _ in frames if each & NO_FRAME]
-                frames = [frame for frame in frames if not frame[0] & NO_FRAME]
-                break
-        frames.reverse()
-        self._waiting[:] = frames
-        if others:
-            self._take_others(others)  # may raise: the frames beside are kept
-        return not self._dry
+    def _next(self) -> Frame | None:
+        """The next frame that is there; raises BusFault for bus-off, and where nothing can be received."""
+        for _ in range(MOST_DATAGRAMS):
+            try:
+                frame = self._take()
+            except BlockingIOError:
+                return None
+            except OSError as error:
+                raise self._reception_fault(error) from None
+            if frame is not None and self._is_frame(frame[0]):
+                return frame
+        return None
 
-    def _take_batch(self) -> int:
-        """Read datagrams into the batch; returns their number."""
-        count: int = self._recvmmsg(self._number, self._in.address, BATCH, _DONTWAIT, None)
-        if count <= 0:
-            number = ctypes.get_errno()
-            if number == errno.EAGAIN:
-                return 0
-            fault = InterfaceDown if number == errno.ENETDOWN else BusFault
-            raise fault(f"bus {self._name}: cannot receive: {os.strerror(number)}")
-        length = self._first.control_length
-        if length not in (0, _STAMP_ALONE):
-            self._read_drops(length)
-        return count
-
-    def _take_others(self, others: list[int]) -> None:
-        """Count error frames; raises BusFault for bus-off."""
-        errors = [can_id for can_id in others if can_id & ERROR]
-        self.errors += len(errors)
-        if any(can_id & BUS_OFF for can_id in errors) and not self._as_node:
+    def _is_frame(self, can_id: int) -> bool:
+        """Whether it is no error frame; those are counted. Raises BusFault for bus-off."""
+        if not can_id & ERROR:
+            return True
+        self.errors += 1
+        if can_id & BUS_OFF and not self._as_node:
             raise BusFault(f"bus {self._name}: bus-off: check wiring, termination and bit rate")
+        return False
 
-    def _read_drops(self, length: int) -> None:
-        """Read the kernel's count of lost frames (32 bits) from the control messages, each aligned to eight bytes."""
-        control, at = self._control.raw[:length], 0
-        while at + _CONTROL_HEADER.size <= length:
-            size, level, kind = _CONTROL_HEADER.unpack_from(control, at)
-            if level == socket.SOL_SOCKET and kind == _SO_RXQ_OVFL:
-                self.dropped = struct.unpack_from("=I", control, at + _CONTROL_HEADER.size)[0]
-            at += max(size + 7 & ~7, _CONTROL_HEADER.size)
+    def _reception_fault(self, error: OSError) -> BusFault:
+        fault = InterfaceDown if error.errno == errno.ENETDOWN else BusFault
+        return fault(f"bus {self._name}: cannot receive: {error.strerror}")
 
 
-def _address(memory: bytearray) -> int:
-    return ctypes.addressof((ctypes.c_char * len(memory)).from_buffer(memory))
+class StampingPort(DatagramPort):
+    """With the kernel's timestamps, for listeners: read by `wait` and `take_all`, not by `receive`."""
+
+    def __init__(self, name: str, receiving: socket.socket, sending: socket.socket, as_node: bool) -> None:
+        super().__init__(name, receiving, sending, as_node)
+        receiving.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._began = time.monotonic()
+
+    @abstractmethod
+    def _take_stamped(self, control: int) -> tuple[Frame | None, list[tuple[int, int, bytes]]]:
+        """As `_take`, with the control messages of the datagram, which have so many bytes at most."""
+
+    def wait(self, timeout: float) -> None:
+        select.select([self._receiving], [], [], timeout)
+
+    def take_all(self) -> list[Stamped]:
+        """All frames in the receive queue, in order; raises BusFault.
+
+        The kernel's timestamps are in wall-clock time. They are converted by the current difference between both
+        clocks and put in order as by `in_order`, so that setting the clock affects one call only.
+        """
+        earliest = self._began
+        self._began, ahead = _clocks()
+        frames: list[Stamped] = []
+        for _ in range(MOST_DATAGRAMS):
+            try:
+                frame, controls = self._take_stamped(socket.CMSG_SPACE(_STAMP.size))
+            except BlockingIOError:
+                break
+            except OSError as error:
+                raise self._reception_fault(error) from None
+            if frame is not None and self._is_frame(frame[0]):
+                stamps = (_STAMP.unpack(content) for _, kind, content in controls if kind == _SO_TIMESTAMPNS)
+                seconds, nano = next(stamps, (0, 0))
+                frames.append((seconds - ahead + 1e-9 * nano, *frame))
+        return in_order(frames, earliest, time.monotonic())
+
+
+def in_order(frames: list[Stamped], earliest: float, latest: float) -> list[Stamped]:
+    """The frames, no time before `earliest` or after `latest` or that of a later frame.
+
+    The kernel turns its timestamps on some milliseconds after it was asked (Linux, `net_enable_timestamp`); a frame
+    that came before gets the time at which it is read.
+    """
+    inside = frames and earliest <= frames[0][0] and frames[-1][0] <= latest
+    if inside and all(one[0] <= other[0] for one, other in itertools.pairwise(frames)):
+        return frames
+    ordered = []
+    for t, can_id, data in reversed(frames):
+        latest = min(t, latest)
+        ordered.append((max(latest, earliest), can_id, data))
+    return ordered[::-1]
+
+
+def _clocks() -> tuple[float, float]:
+    """Monotonic time [s], and the wall clock's lead over it [s]."""
+    for _ in range(_CLOCK_TRIES):
+        before, wall, now = time.monotonic(), time.time(), time.monotonic()
+        if now - before < _CLOCK_SECONDS:
+            break
+    return now, wall - 0.5 * (before + now)

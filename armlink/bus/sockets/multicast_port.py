@@ -1,4 +1,4 @@
-"""Port for python-can's udp_multicast, without message objects and without its own echoes.
+"""Port for python-can's udp_multicast, without its own echoes.
 
 Multicast datagrams loop back to every socket on this machine, the sender's included, and all members share one port
 number. Frames are therefore received on the python-can bus's socket but sent from a second socket, whose address
@@ -7,17 +7,30 @@ identifies the echoes.
 
 import contextlib
 import socket
-import struct
-from collections.abc import Sequence
+from typing import Any
 
-from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame
-from armlink.bus.sockets.datagram_port import NAME, NOT_OURS, DatagramBatch, DatagramPort
-from armlink.bus.sockets.multicast_frames import LONGEST, Decoder, encode
-from armlink.bus.sockets.stamped_port import Stamping
+import can
+import msgpack
+from can.interfaces.udp_multicast.utils import pack_message
+
+from armlink.bus.message_port import as_frame, as_message
+from armlink.bus.port import Frame
+from armlink.bus.sockets.datagram_port import DatagramPort, StampingPort
 from armlink.errors import BusFault, Stall
 
+LONGEST = 1024
+"""Limit of datagrams [bytes]; python-can's have at most 240 without the name of a channel."""
 _IP_MULTICAST_ALL, _IPV6_MULTICAST_ALL = 49, 29
-_IGNORED: Frame = (NOT_OURS, b"")
+_TYPES: dict[str, tuple[type, ...]] = {
+    "arbitration_id": (int,),
+    "dlc": (int, type(None)),
+    "data": (bytes, type(None)),
+    **dict.fromkeys(
+        ("is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "bitrate_switch", "error_state_indicator"),
+        (bool,),
+    ),
+}
+"""Types that python-can's fields have. It checks their values alone: a number for data would be so many bytes."""
 
 
 class MulticastPort(DatagramPort):
@@ -40,18 +53,15 @@ class MulticastPort(DatagramPort):
         """Datagrams received that were no frames."""
         self._fd, self._takes_fd = fd, fd
         self._sending = sending = _connect(name, receiving.family, group, hop_limit)
-        self._own = _address(sending)
+        self._own = _address(sending.getsockname())
         _hear_one_group(receiving)
-        self._decoder = Decoder()
-        super().__init__(name, receiving, sending, DatagramBatch(256), DatagramBatch(LONGEST, names=True), as_node)
+        super().__init__(name, receiving, sending, as_node)
 
     def close(self) -> None:
         self._sending.close()
 
-    def _encode(self, frames: Sequence[Frame]) -> None:
-        put, fd = self._out.put, self._fd
-        for i, (can_id, data) in enumerate(frames):
-            put(i, encode(can_id & 0xFFFFFFFF, data, fd and not can_id & (ERROR | REMOTE | CLASSICAL)))
+    def _encode(self, can_id: int, data: bytes) -> bytes:
+        return bytes(pack_message(as_message(can_id, data, self._fd)))
 
     def _full(self) -> BusFault:
         """No node has a part in it: the datagrams loop back within this machine."""
@@ -59,29 +69,40 @@ class MulticastPort(DatagramPort):
             f"bus {self._name}: this machine accepted no datagrams for 50 ms: too many other programs run on it"
         )
 
-    def _decode(self, count: int) -> list[Frame]:
-        batch, own, decode = self._in, self._own, self._decoder.decode
-        content, names, size = batch.content, batch.names, len(own)
-        frames = []
-        for i, (length,) in enumerate(batch.lengths(count)):
-            if names[i * NAME : i * NAME + size] == own:
-                frames.append(_IGNORED)
-                continue
-            found = decode(bytes(content[i * LONGEST : i * LONGEST + length])) if length < LONGEST else None
-            if found is None:
-                self.ignored += 1
-                frames.append(_IGNORED)
-            elif found[2] and not self._takes_fd:
-                frames.append(_IGNORED)
-            else:
-                if self._as_node and not found[0] & (ERROR | REMOTE):
-                    self._fd = found[2]
-                frames.append(found[:2])
-        return frames
+    def _take(self) -> Frame | None:
+        return self._decoded(*self._receiving.recvfrom(LONGEST + 1, socket.MSG_DONTWAIT))
+
+    def _decoded(self, datagram: bytes, sender: tuple[Any, ...]) -> Frame | None:
+        if _address(sender) == self._own:
+            return None
+        message = message_in(datagram) if len(datagram) <= LONGEST else None
+        if message is None:
+            self.ignored += 1
+            return None
+        if message.is_fd and not self._takes_fd:
+            return None
+        if self._as_node and not (message.is_error_frame or message.is_remote_frame):
+            self._fd = message.is_fd
+        return as_frame(message)
 
 
-class StampedMulticastPort(Stamping, MulticastPort):
+class StampedMulticastPort(MulticastPort, StampingPort):
     """With the kernel's timestamps, for listeners."""
+
+    def _take_stamped(self, control: int) -> tuple[Frame | None, list[Any]]:
+        datagram, controls, _, sender = self._receiving.recvmsg(LONGEST + 1, control, socket.MSG_DONTWAIT)
+        return self._decoded(datagram, sender), controls
+
+
+def message_in(datagram: bytes) -> can.Message | None:
+    """python-can's message in a datagram; None for anything else."""
+    try:
+        fields = msgpack.unpackb(datagram, raw=False)
+        if all(type(value) in _TYPES.get(name, (type(value),)) for name, value in fields.items()):
+            return can.Message(check=True, **fields)
+    except Exception:  # msgpack and python-can raise many kinds
+        pass
+    return None
 
 
 def _connect(name: str, family: int, group: tuple[str, int], hop_limit: int) -> socket.socket:
@@ -99,12 +120,9 @@ def _connect(name: str, family: int, group: tuple[str, int], hop_limit: int) -> 
     return sending
 
 
-def _address(sending: socket.socket) -> bytes:
-    """Beginning of sockaddr_in or sockaddr_in6 that the kernel reports for datagrams from this socket."""
-    address, port, *_ = sending.getsockname()
-    begin = struct.pack("=H", sending.family) + struct.pack("!H", port)
-    packed = socket.inet_pton(sending.family, address.partition("%")[0])
-    return begin + (packed if sending.family == socket.AF_INET else bytes(4) + packed)
+def _address(name: tuple[Any, ...]) -> tuple[str, int]:
+    """Host, without the interface's name that some of IPv6 have, and port of a socket's name."""
+    return name[0].partition("%")[0], name[1]
 
 
 def _hear_one_group(receiving: socket.socket) -> None:

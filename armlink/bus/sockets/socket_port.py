@@ -2,10 +2,10 @@
 
 import socket
 import struct
-from collections.abc import Sequence
+from typing import Any
 
 from armlink.bus.port import CLASSICAL, ERROR, REMOTE, Frame
-from armlink.bus.sockets.datagram_port import DatagramBatch, DatagramPort
+from armlink.bus.sockets.datagram_port import DatagramPort, StampingPort
 
 _CLASSIC, _FD = struct.Struct("=IBB2x8s"), struct.Struct("=IBB2x64s")
 _NEVER_FD, _ON_WIRE = ERROR | REMOTE | CLASSICAL, 0xFFFFFFFF
@@ -18,25 +18,27 @@ class SocketPort(DatagramPort):
 
         `as_node` as in CanBus.open_port.
         """
-        self._layout = _FD if fd else _CLASSIC
-        size = self._layout.size
-        super().__init__(name, raw, raw, DatagramBatch(size), DatagramBatch(size), as_node)
-        self._received = memoryview(self._in.content)
-        self._fd = fd
+        super().__init__(name, raw, raw, as_node)
+        self._fd, self._receive = fd, raw.recv
 
-    def _encode(self, frames: Sequence[Frame]) -> None:
-        if self._layout is _FD:
-            for i, (can_id, data) in enumerate(frames):
-                layout, flags = (_CLASSIC, 0) if can_id & _NEVER_FD or not self._fd else (_FD, _FD_FLAGS)
-                self._out.put(i, layout.pack(can_id & _ON_WIRE, len(data), flags, data))
-            return
-        content, pack, size = self._out.content, self._layout.pack_into, self._layout.size
-        for i, (can_id, data) in enumerate(frames):
-            pack(content, i * size, can_id & _ON_WIRE, len(data), 0, data)
+    def _encode(self, can_id: int, data: bytes) -> bytes:
+        layout, flags = (_FD, _FD_FLAGS) if self._fd and not can_id & _NEVER_FD else (_CLASSIC, 0)
+        return layout.pack(can_id & _ON_WIRE, len(data), flags, data)
 
-    def _decode(self, count: int) -> list[Frame]:
-        layout = self._layout
-        if self._as_node and layout is _FD:
-            self._fd = self._in.messages[count - 1].length == layout.size
-        frames = layout.iter_unpack(self._received[: count * layout.size])
-        return [(can_id, data[:length]) for can_id, length, _, data in frames]
+    def _take(self) -> Frame | None:
+        return self._decoded(self._receive(_FD.size, socket.MSG_DONTWAIT))
+
+    def _decoded(self, datagram: bytes) -> Frame:
+        layout = _FD if len(datagram) == _FD.size else _CLASSIC
+        if self._as_node:
+            self._fd = layout is _FD
+        can_id, length, _, data = layout.unpack(datagram)
+        return can_id, data[:length]
+
+
+class StampedSocketPort(SocketPort, StampingPort):
+    """SocketCAN with timestamps."""
+
+    def _take_stamped(self, control: int) -> tuple[Frame | None, list[Any]]:
+        datagram, controls, _, _ = self._receiving.recvmsg(_FD.size, control, socket.MSG_DONTWAIT)
+        return self._decoded(datagram), controls

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from armlink.bus.sockets.stamped_port import in_order
+from armlink.bus.sockets.datagram_port import in_order
 
 TIMES = st.lists(st.floats(min_value=-1e6, max_value=1e6, allow_nan=False), max_size=20)
 
