@@ -213,24 +213,7 @@ def configure_pdo(services: NodeServices, each: Pdo, deadline_ms: int, profile: 
     """
     is_command, stock = each.communication == pdo.RPDO1.communication, profile is not OURS
     deadline = deadline_ms if is_command and profile.has(objects.RPDO_DEADLINE) else None if stock else 0
-    try:
-        pdo.configure(each, services.node, services.write, services.read, deadline)
-    except pdo.MappingRefused as error:
-        raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
-
-
-def disable_other_rpdos(services: NodeServices) -> None:
-    """Set every RPDO invalid that is not the link's, as another program could move the joint through it.
-
-    Raises BusFault naming joint and object.
-    """
-    for index in pdo.foreign_rpdos(services.remote.object_dictionary):
-        if not services.has(Entry(index, 1, "I", "RPDO COB-ID")):
-            continue
-        try:
-            pdo.disable(index, services.write, services.read)
-        except pdo.MappingRefused as error:
-            raise BusFault(f"{services.joint} (node {services.node}): {error}") from None
+    pdo.configure(services, each, deadline)
 
 
 def configure(
@@ -247,7 +230,7 @@ def configure(
     All is read back. The torque offset 60B2h, which adds to every target torque and stays latched, is cleared where the
     device has one. `supported` is 6502h. Raises BusFault naming joint and object.
     """
-    disable_other_rpdos(services)
+    pdo.disable_others(services)
     for each in profile.pdos:
         configure_pdo(services, each, protection.deadline_ms, profile)
     if services.has(objects.TORQUE_OFFSET):

@@ -21,7 +21,7 @@ from armlink.drives.canopen.cyclic.wire import Wire, check_fits
 from armlink.drives.canopen.eds_file import of_joints
 from armlink.drives.canopen.pdo import RPDO1, RPDO_BASES, STATUS_DECIMATION, TPDO1, TPDO2, TPDO3
 from armlink.drives.canopen.profile import Profile, profile_of
-from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork, joint_services
+from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork
 from armlink.drives.canopen.settings import TRAITS
 from armlink.drives.canopen.units import assumed_units, read_units, unit_doubt
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
@@ -135,8 +135,11 @@ class CanopenDrives(BasicDrives[DriveMemory]):
     def services(self, ask: Ask) -> tuple[NodeServices, ...]:
         """SDO access to each joint's controller."""
         if self._network is None:
-            self._network = PumpedNetwork(ask.send)
-            self._services = joint_services(self._network, self.arm, self.rows, ask.wait)
+            self._network = network = PumpedNetwork(ask.send)
+            pairs = zip(self.rows, of_joints(self.arm, self.rows), strict=True)
+            self._services = tuple(
+                NodeServices(network, row.name, row.settings.node, each, ask.wait) for row, each in pairs
+            )
         return self._services
 
     def missing(self, ask: Ask) -> list[int]:

@@ -12,7 +12,6 @@ from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.settings import TYPES, CanopenSettings, TorqueObject
 from armlink.drives.canopen.units import TORQUE_PER_MICRO
 from armlink.drives.orders import Mode
-from armlink.errors import BusFault
 
 LOST: Mapping[Entry, str] = {
     objects.RPDO_DEADLINE: "commands have no deadline: only the heartbeat shows the device that its host is gone",
@@ -142,14 +141,5 @@ def examine(services: NodeServices, settings: CanopenSettings) -> Profile:
     absent = lacking(services)
     sheet = services.remote.object_dictionary
     modes = [sheet.get_variable(entry.index, 0) for entry in (objects.MODE, objects.MODE_DISPLAY)]
-    by_pdo = all(each is None or each.pdo_mappable for each in modes) and _takes(services, pdo.RPDO2)
+    by_pdo = all(each is None or each.pdo_mappable for each in modes) and pdo.takes(services, pdo.RPDO2)
     return replace(profile_of(settings), absent=absent, modes_by_pdo=by_pdo)
-
-
-def _takes(services: NodeServices, each: Pdo) -> bool:
-    """Whether a device maps the objects of a PDO, by trying it; the PDO is left invalid."""
-    try:
-        pdo.try_mapping(each, services.node, services.write)
-    except BusFault:
-        return False
-    return True

@@ -4,14 +4,12 @@ import logging
 import queue
 import struct
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import canopen
 from canopen.sdo.exceptions import SdoAbortedError, SdoError
 
-from armlink.arm_file import ArmFile, LinkJoint
-from armlink.drives.canopen import eds_file
 from armlink.drives.canopen.object_dictionary import DEVICE_TYPE, Entry
 from armlink.errors import BusFault
 
@@ -175,14 +173,6 @@ class NodeServices:
     def fault(self, entry: Entry, what: str) -> BusFault:
         """A fault of this node that names joint, node and object."""
         return BusFault(f"{self.joint} (node {self.node}): {entry}: {what}")
-
-
-def joint_services(
-    network: PumpedNetwork, arm: ArmFile, joints: Sequence[LinkJoint], pump: Pump
-) -> tuple[NodeServices, ...]:
-    """SDO access to each joint's controller; raises BadInput for a wrong data sheet."""
-    pairs = zip(joints, eds_file.of_joints(arm, joints), strict=True)
-    return tuple(NodeServices(network, joint.name, joint.settings.node, sheet, pump) for joint, sheet in pairs)
 
 
 def no_answer(error: SdoError) -> str:

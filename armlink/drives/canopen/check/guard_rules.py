@@ -180,16 +180,13 @@ class NodeRules:
         for index in pdo.foreign_rpdos(self._described):
             allowed[Entry(index, 1, "I", "COB-ID of an RPDO that is off")] = {"least": pdo.INVALID, "most": _UINT32}
         for each in self.profile.pdos:
-
-            def write(entry: Entry, value: int) -> None:
-                values = allowed.setdefault(entry, {"values": []})["values"]
-                if value not in values:
-                    values.append(value)
-
             is_command = each.communication == pdo.RPDO1.communication
             watched = is_command and self.profile.has(objects.RPDO_DEADLINE)
             for deadline in {self._protection.deadline_ms if watched else 0, None}:
-                pdo.write_mapping(each, self.node, write, deadline)
+                for entry, value in pdo.mapping_writes(each, self.node, deadline):
+                    values = allowed.setdefault(entry, {"values": []})["values"]
+                    if value not in values:
+                        values.append(value)
         allowed[objects.TORQUE_OFFSET] = {"values": [0]}
         allowed[objects.MODE] = {"values": [int(mode) for mode in Mode]}
         every_mode = _UINT32

@@ -185,7 +185,7 @@ class CanopenSelfTest:
 
 
 def _others_off(services: NodeServices) -> str:
-    device.disable_other_rpdos(services)
+    pdo.disable_others(services)
     return "all are off, so no other program can command the joint through them"
 
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from armlink.arm_file import load_arm
 from armlink.drives.canopen import object_dictionary as objects
-from armlink.drives.canopen.sdo import PumpedNetwork, joint_services
+from armlink.drives.canopen.eds_file import bundled
+from armlink.drives.canopen.sdo import NodeServices, PumpedNetwork
 from armlink.errors import BusFault
 
 
@@ -39,8 +39,7 @@ class SlowNode:
 @pytest.mark.parametrize("behind", [0, 1, 2])
 def test_late_responses_are_not_taken_for_those_of_the_next_request(behind: int) -> None:
     node = SlowNode(behind)
-    arm = load_arm("sarcos")
-    services = joint_services(node.network, arm, arm.require_link().joints, node.pump)[0]
+    services = NodeServices(node.network, "joint_1", 1, bundled(), node.pump)
     for number in range(5):
         gain, record = 0.9 + 0.01 * number, 100 + number
         services.write_checked(objects.STAGED_GAIN, gain)
@@ -51,8 +50,7 @@ def test_late_responses_are_not_taken_for_those_of_the_next_request(behind: int)
 @pytest.mark.parametrize("held", [0.9000001, 0.0])
 def test_a_value_that_the_device_does_not_hold_bit_for_bit_is_a_fault(held: float) -> None:
     node = SlowNode(0)
-    arm = load_arm("sarcos")
-    services = joint_services(node.network, arm, arm.require_link().joints, node.pump)[0]
+    services = NodeServices(node.network, "joint_1", 1, bundled(), node.pump)
     services.write_checked(objects.STAGED_GAIN, 0.9)
     for place in node.values:
         node.values[place] = struct.pack("<f", held)
