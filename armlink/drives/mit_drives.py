@@ -82,12 +82,26 @@ class MitDrives(BasicDrives[K]):
             raise BusFault(f"{self.names[joint]}: a command came before the set-up")
         return grid
 
+    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+        known = self.memory[joint]
+        known.damping = False
+        if self.follows(joint, now) and order.power is not Power.OFF:
+            return (self.command(joint, order) if order.power is ON else self.damp(joint),)
+        known.sent = None
+        return self.switching(joint, order, now)
+
+    def follows(self, joint: int, now: float) -> bool:
+        """Whether a drive has power and follows commands, by what is known of it."""
+        raise NotImplementedError
+
+    def switching(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+        """Frames for a drive that does not follow commands, or is to be off: the next step, or a question."""
+        raise NotImplementedError
+
     def command(self, joint: int, order: Order) -> Frame:
         known, limits, grid = self.memory[joint], self.limits_of(joint), self.grid_of(joint)
         _, _, mode, position, velocity, torque, kp, kd, _ = order
-        asked = MitCommand(position, velocity, kp, kd, torque)
-        if mode != POSITION:
-            asked = MitCommand(position, velocity, 0.0, 0.0, torque)
+        asked = MitCommand(position, velocity, *((kp, kd) if mode == POSITION else (0.0, 0.0)), torque)
         return self._sent(joint, grid, round_within(asked, grid, limits, known.position, known.velocity), ON)
 
     def damp(self, joint: int) -> Frame:
@@ -123,7 +137,7 @@ class MitDrives(BasicDrives[K]):
         return Setup(
             position=position,
             torque=0.0,
-            position_step=ranges.position_quantum,
+            position_step=grid.position.span / grid.position.most,
             modes=frozenset((POSITION, TORQUE)),
             gains=Gains(settings.kp, settings.kd, ranges.kp, ranges.kd),
             notes=tuple(notes),
@@ -166,19 +180,19 @@ def round_within(command: MitCommand, grid: Grid, limits: Limits, position: floa
         command = command._replace(torque=math.copysign(most, command.torque))
     q, dq, kp, kd, t = grid.steps(command)
     if kp and limits.lower <= wanted <= limits.upper:
-        at = q * grid.q_span / grid.q_most - grid.q
+        at = grid.position.value(q)
         q += (at < limits.lower) - (at > limits.upper)
     t = _torque_within(t, grid, most)
     if not math.isfinite(position + velocity):
         return q, dq, kp, kd, t
     pull = _pull(q, dq, kp, kd, grid, position, velocity)
-    total = pull + t * grid.t_span / grid.t_most - grid.t
+    total = pull + grid.torque.value(t)
     if abs(total) <= most:
         return q, dq, kp, kd, t
     beyond = total - math.copysign(most, total)
-    quantum = grid.t_span / grid.t_most
+    quantum = grid.torque.span / grid.torque.most
     t = _torque_within(t - math.ceil(abs(beyond) / quantum) * (1 if beyond > 0 else -1), grid, most)
-    torque = t * grid.t_span / grid.t_most - grid.t
+    torque = grid.torque.value(t)
     for _ in range(SOFTER_STEPS):  # where the torque, limited by itself, cannot keep the sum within the limit
         if abs(pull + torque) <= most:
             return q, dq, kp, kd, t
@@ -196,17 +210,17 @@ def damping(kd: float, position: float, velocity: float, most: float) -> MitComm
 
 def _pull(q: int, dq: int, kp: int, kd: int, grid: Grid, position: float, velocity: float) -> float:
     """Torque of both gains where the drive stands [N·m]."""
-    stiff = kp * grid.kp / grid.kp_most * (q * grid.q_span / grid.q_most - grid.q - position)
-    return stiff + kd * grid.kd / grid.kd_most * (dq * grid.v_span / grid.v_most - grid.v - velocity)
+    stiff = grid.kp.value(kp) * (grid.position.value(q) - position)
+    return stiff + grid.kd.value(kd) * (grid.velocity.value(dq) - velocity)
 
 
 def _torque_within(steps: int, grid: Grid, most: float) -> int:
     """Steps of a torque, moved inwards until it is within ±most [N·m] and the range."""
-    steps = max(0, min(int(grid.t_most), steps))
-    torque = steps * grid.t_span / grid.t_most - grid.t
+    field = grid.torque
+    steps = max(0, min(int(field.most), steps))
+    torque = field.value(steps)
     if abs(torque) <= most:
         return steps
-    bound = math.copysign(most, torque)
-    steps = round((bound + grid.t) / grid.t_span * grid.t_most)
-    beyond = abs(steps * grid.t_span / grid.t_most - grid.t) > most  # the limit lies between two steps
+    steps = field.steps(math.copysign(most, torque))
+    beyond = abs(field.value(steps)) > most  # the limit lies between two steps
     return steps - (1 if torque > 0 else -1) * beyond

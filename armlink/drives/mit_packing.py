@@ -48,11 +48,6 @@ class Ranges(NamedTuple):
     kd: float = 5.0
     """[N·m·s/rad]."""
 
-    @property
-    def position_quantum(self) -> float:
-        """Step of a packed position [rad]."""
-        return 2 * self.position / 0xFFFF
-
 
 class MitCommand(NamedTuple):
     """One MIT command in SI units."""
@@ -72,65 +67,64 @@ class MitFeedback(NamedTuple):
     torque: float
 
 
+class Field:
+    """One packed number: of b bits, 2^b − 1 steps from its lowest to its highest value."""
+
+    __slots__ = ("least", "most", "span")
+
+    def __init__(self, least: float, largest: float, bits: int) -> None:
+        self.least, self.span, self.most = least, largest - least, float((1 << bits) - 1)
+
+    def value(self, steps: int) -> float:
+        return steps * self.span / self.most + self.least
+
+    def steps(self, value: float) -> int:
+        """Nearest steps of a value, beyond the range its end. Raises ValueError for a number that is not finite."""
+        if not math.isfinite(value):
+            raise ValueError(f"{value} cannot be packed: expected a finite number")
+        steps, most = (value - self.least) / self.span * self.most, self.most
+        return round(steps) if 0.0 <= steps <= most else 0 if steps < 0.0 else int(most)
+
+
 class Grid:
-    """The values that packed fields can have, of ranges and bits that do not change; see `grid_of`.
+    """The values that packed fields can have, of ranges and bits that do not change; see `grid_of`."""
 
-    A field with b bits has 2^b − 1 steps from its lowest to its highest value.
-    """
-
-    __slots__ = ("kd", "kd_most", "kp", "kp_most", "q", "q_most", "q_span", "ranges", "t", "t_most", "t_span",
-                 "v", "v_most", "v_span")  # fmt: skip
+    __slots__ = ("kd", "kp", "position", "ranges", "torque", "velocity")
 
     def __init__(self, ranges: Ranges, bits: tuple[int, int, int, int, int]) -> None:
         """`bits` of position, velocity, kp, kd and torque."""
         self.ranges = ranges
-        self.q, self.v, self.t, self.kp, self.kd = ranges
-        self.q_span, self.v_span, self.t_span = 2 * self.q, 2 * self.v, 2 * self.t
-        self.q_most, self.v_most, self.kp_most, self.kd_most, self.t_most = (float((1 << each) - 1) for each in bits)
+        q, v, t, kp, kd = ranges
+        self.position, self.velocity = Field(-q, q, bits[0]), Field(-v, v, bits[1])
+        self.kp, self.kd, self.torque = Field(0.0, kp, bits[2]), Field(0.0, kd, bits[3]), Field(-t, t, bits[4])
 
     def steps(self, command: MitCommand) -> tuple[int, int, int, int, int]:
-        """Nearest steps of a command's values, beyond a range its end. Raises ValueError for numbers not finite."""
-        position, velocity, kp, kd, torque = command
-        if not math.isfinite(position + velocity + kp + kd + torque):
-            raise ValueError(f"{command} cannot be packed: expected finite numbers")
+        """Of a command's values; raises ValueError."""
+        q, dq, kp, kd, torque = command
         return (
-            _nearest((position + self.q) / self.q_span * self.q_most, self.q_most),
-            _nearest((velocity + self.v) / self.v_span * self.v_most, self.v_most),
-            _nearest(kp / self.kp * self.kp_most, self.kp_most),
-            _nearest(kd / self.kd * self.kd_most, self.kd_most),
-            _nearest((torque + self.t) / self.t_span * self.t_most, self.t_most),
+            self.position.steps(q),
+            self.velocity.steps(dq),
+            self.kp.steps(kp),
+            self.kd.steps(kd),
+            self.torque.steps(torque),
         )
 
     def command(self, q: int, dq: int, kp: int, kd: int, torque: int) -> MitCommand:
         return MitCommand(
-            q * self.q_span / self.q_most - self.q,
-            dq * self.v_span / self.v_most - self.v,
-            kp * self.kp / self.kp_most,
-            kd * self.kd / self.kd_most,
-            torque * self.t_span / self.t_most - self.t,
+            self.position.value(q),
+            self.velocity.value(dq),
+            self.kp.value(kp),
+            self.kd.value(kd),
+            self.torque.value(torque),
         )
 
     def feedback_steps(self, feedback: MitFeedback) -> tuple[int, int, int]:
-        """Nearest steps of feedback. Raises ValueError for numbers not finite."""
-        position, velocity, torque = feedback
-        if not math.isfinite(position + velocity + torque):
-            raise ValueError(f"{feedback} cannot be packed: expected finite numbers")
-        return (
-            _nearest((position + self.q) / self.q_span * self.q_most, self.q_most),
-            _nearest((velocity + self.v) / self.v_span * self.v_most, self.v_most),
-            _nearest((torque + self.t) / self.t_span * self.t_most, self.t_most),
-        )
+        """Of a reply's values; raises ValueError."""
+        q, dq, torque = feedback
+        return self.position.steps(q), self.velocity.steps(dq), self.torque.steps(torque)
 
     def feedback(self, q: int, dq: int, torque: int) -> MitFeedback:
-        return MitFeedback(
-            q * self.q_span / self.q_most - self.q,
-            dq * self.v_span / self.v_most - self.v,
-            torque * self.t_span / self.t_most - self.t,
-        )
-
-
-def _nearest(steps: float, most: float) -> int:
-    return round(steps) if 0.0 <= steps <= most else 0 if steps < 0.0 else int(most)
+        return MitFeedback(self.position.value(q), self.velocity.value(dq), self.torque.value(torque))
 
 
 @lru_cache(maxsize=256)

@@ -133,7 +133,7 @@ class RobStrideDrive(SimulatedDrive):
 
     def _follow(self) -> None:
         command = self.command
-        limit = min(self.coding.t, max(self.parameters[RobStrideParameter.LIMIT_TORQUE], 0.0))
+        limit = min(self.coding.ranges.torque, max(self.parameters[RobStrideParameter.LIMIT_TORQUE], 0.0))
         self.motor.impede(command.kp, command.kd, command.position, command.velocity, command.torque, limit)
 
     def _stop(self) -> None:

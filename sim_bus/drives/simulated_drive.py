@@ -171,10 +171,10 @@ class WrappingDrive(SimulatedDrive):
         """Follow the newest command."""
         command, coding, position = self.command, self.coding, self.motor.position
         target = command.position + position - self._wrapped(position)
-        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.t)
+        self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.ranges.torque)
 
     def _wrapped(self, position: float) -> float:
-        largest = self.coding.q
+        largest = self.coding.ranges.position
         return (position - self.zero + largest) % (2 * largest) - largest
 
 

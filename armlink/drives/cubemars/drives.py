@@ -132,15 +132,16 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
     def _quiet(self, joint: int) -> Frame:
         return self.settings[joint].id, pack_command(NO_COMMAND, self.grid_of(joint))
 
-    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
-        known, drive, limits = self.memory[joint], self.settings[joint].id, self.limits_of(joint)
-        if known.on and now - known.commanded > limits.deadline:
+    def follows(self, joint: int, now: float) -> bool:
+        known, deadline = self.memory[joint], self.limits_of(joint).deadline
+        if known.on and now - known.commanded > deadline:
             known.on, known.stopped, self.powers[joint] = None, True, Power.STOPPED
-        known.damping = False
-        if known.on and order.power is not Power.OFF:
-            known.commanded = now
-            return [self.command(joint, order) if order.power is Power.ON else self.damp(joint)]
-        known.sent, known.lacking = None, math.inf
+        known.commanded = now if known.on else known.commanded
+        return bool(known.on)
+
+    def switching(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+        known, drive = self.memory[joint], self.settings[joint].id
+        known.lacking = math.inf
         if order.power is Power.ON and order.walk and known.on is False:
             # motor mode goes on with the command that was in force when it was left
             known.switched, known.skip, known.commanded, known.stopped = Special.ENABLE, True, now, False
@@ -161,7 +162,7 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
             return None
         position, velocity, torque = reply.feedback
         if math.isfinite(known.position):
-            position = unwrap(position, known.position, grid.q_span)
+            position = unwrap(position, known.position, grid.position.span)
         known.position, known.velocity = position, velocity
         if known.switched is not None:
             known.on, known.switched = known.switched is Special.ENABLE, None
@@ -180,7 +181,7 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         if known.sent is None:
             return
         wanted = law_torque(known.sent, known.position, known.velocity)
-        shown = abs(wanted) > LOADED * self.grid_of(joint).t
+        shown = abs(wanted) > LOADED * self.grid_of(joint).ranges.torque
         follows = torque * math.copysign(1.0, wanted) > FOLLOWS * abs(wanted)
         known.lacking = min(known.lacking, now) if shown and not follows else math.inf
         if known.asked:

@@ -216,19 +216,14 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
 
     # ---- cycle
 
-    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+    def follows(self, joint: int, now: float) -> bool:
+        return self.memory[joint].limits is not None and self.memory[joint].state == ENABLED
+
+    def switching(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
         known, drive = self.memory[joint], self.settings[joint].id
-        known.damping = False
         if known.limits is None:
-            known.sent = None
             return (self._refresh(joint),)
-        on = known.state == ENABLED
-        if order.power is Power.ON and on:
-            return (self.command(joint, order),)
-        if order.power is Power.STOPPED and on:
-            return (self.damp(joint),)
-        known.sent = None
-        if order.power is Power.OFF and on:
+        if order.power is Power.OFF and known.state == ENABLED:
             return ((drive, special(Special.DISABLE)),)
         if order.power is Power.ON and order.walk:
             if known.state == DamiaoStatus.DISABLED:
@@ -252,8 +247,8 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
             return None
         position, velocity, torque = unpack_feedback(data[1:6], grid)
         known.state = state = data[0] >> 4
-        if abs(known.position - position) > grid.q:
-            position = unwrap(position, known.position, grid.q_span)
+        if abs(known.position - position) > grid.ranges.position:
+            position = unwrap(position, known.position, grid.position.span)
         known.position, known.velocity = position, velocity
         self.powers[joint] = power = self._power(known)
         self.faults[joint] = fault = _fault_text(state)

@@ -172,7 +172,7 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
                 f"{self.names[joint]}: no answer from {settings.address}: check that the drive is powered, "
                 "its id is right, and its protocol is private"
             )
-        most = min(limits.max_torque, grid.t)
+        most = min(limits.max_torque, grid.ranges.torque)
         self._set(ask, joint, RobStrideParameter.RUN_MODE, MOTION_MODE, "the drive is not in motion mode")
         self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "the torque limit of the drive is not in force")
         deadman = round(limits.deadline / TIMEOUT_UNIT)
@@ -192,16 +192,15 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
     def decoded(self, can_id: int, data: bytes, grid: Grid) -> MitCommand:
         return frames.unpack_motion(can_id, data, grid)
 
-    def joint_frames(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
+    def follows(self, joint: int, now: float) -> bool:
+        return self.memory[joint].mode == RunMode.RUN and not self.memory[joint].faults
+
+    def command(self, joint: int, order: Order) -> Frame:
+        self.memory[joint].was_on = True
+        return super().command(joint, order)
+
+    def switching(self, joint: int, order: Order, now: float) -> Sequence[Frame]:
         known, settings = self.memory[joint], self.settings[joint]
-        known.damping = False
-        on = known.mode == RunMode.RUN and not known.faults
-        if on and order.power is Power.ON:
-            known.was_on = True
-            return (self.command(joint, order),)
-        if on and order.power is Power.STOPPED:
-            return (self.damp(joint),)
-        known.sent = None
         known.was_on = known.was_on and order.power is Power.ON
         if order.power is Power.ON and order.walk and known.mode is not None and not known.faults:
             self.limits_of(joint)
@@ -238,7 +237,7 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         settings, limits = self.settings[joint], self.memory[joint].limits
         if limits is None:
             return []
-        most = min(limits.max_torque, self.grid_of(joint).t)
+        most = min(limits.max_torque, self.grid_of(joint).ranges.torque)
         return [_extended(frames.write_frame(settings.id, settings.host, RobStrideParameter.LIMIT_TORQUE, most))]
 
     def lets_go(self, joint: int) -> bool:

@@ -52,7 +52,7 @@ def test_mit_command_by_hand():
 def test_zero_is_sent_as_the_nearest_step():
     """Truncation sends 7FFh for 0 N·m; 2047.5 lies between two steps, and half a step is as near as it goes."""
     sent = unpack_command(pack_command(MitCommand(0.0, 0.0, 0.0, 0.0, 0.0), DM4340), DM4340)
-    assert abs(sent.torque) <= DM4340.t / 0xFFF * 1.0001  # half a step
+    assert abs(sent.torque) <= DM4340.ranges.torque / 0xFFF * 1.0001  # half a step
     small = pack_command(MitCommand(0.0, 0.0, 0.0, 0.0, -0.0001), DM4340)
     large = pack_command(MitCommand(0.0, 0.0, 0.0, 0.0, 0.0001), DM4340)
     assert (small[-2] & 0xF) << 8 | small[-1] == 0x7FF
