@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -90,28 +91,22 @@ def effect(effect_id: str, apply: Apply, **domains: Domain) -> SimulatedEffect:
     return SimulatedEffect(effect_id, parameters, apply, not entry.whole_arm)
 
 
-def adds(array: Callable[[Imperfections], Array], parameter: str) -> Apply:
-    """An effect that adds its parameter to one entry of an array of the state."""
+def changes(how: Callable[[Any, Any], Any], array: Callable[[Imperfections], Array], parameter: str) -> Apply:
+    """An effect that changes one entry of an array of the state by its parameter."""
 
     def apply(state: Imperfections, joint: int, values: Values) -> None:
-        array(state)[joint] += values[parameter]
+        array(state)[joint] = how(array(state)[joint], values[parameter])
 
     return apply
 
 
-def scales(array: Callable[[Imperfections], Array], parameter: str) -> Apply:
-    """An effect that multiplies one entry of an array of the state by its parameter."""
+adds, scales, limits = partial(changes, np.add), partial(changes, np.multiply), partial(changes, np.minimum)
+
+
+def sets(array: Callable[[Imperfections], Array], *parameters: str) -> Apply:
+    """An effect whose parameters are one row of an array of the state."""
 
     def apply(state: Imperfections, joint: int, values: Values) -> None:
-        array(state)[joint] *= values[parameter]
-
-    return apply
-
-
-def limits(array: Callable[[Imperfections], Array], parameter: str) -> Apply:
-    """An effect that lowers one entry of an array of the state to its parameter."""
-
-    def apply(state: Imperfections, joint: int, values: Values) -> None:
-        array(state)[joint] = np.minimum(array(state)[joint], values[parameter])
+        array(state)[joint] = [values[name] for name in parameters]
 
     return apply

@@ -2,7 +2,18 @@
 
 import numpy as np
 
-from sim_bus.effects.effect import NOT_NEGATIVE, POSITIVE, ZERO_BY_DEFAULT, Domain, Values, adds, effect, limits, scales
+from sim_bus.effects.effect import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    ZERO_BY_DEFAULT,
+    Domain,
+    Values,
+    adds,
+    effect,
+    limits,
+    scales,
+    sets,
+)
 from sim_bus.effects.state import Imperfections
 
 
@@ -28,20 +39,8 @@ def _payload(state: Imperfections, _joint: int, values: Values) -> None:
     state.payload[:] = total, *(moment / total)
 
 
-def _eccentricity(state: Imperfections, joint: int, values: Values) -> None:
-    state.eccentricity[joint] = values["amplitude"], values["phase"]
-
-
 def _crosstalk(state: Imperfections, joint: int, values: Values) -> None:
     state.crosstalk[joint, values["source"]] += values["coefficient"]
-
-
-def _ripple(state: Imperfections, joint: int, values: Values) -> None:
-    state.ripple[joint] = values["amplitude"], values["cycles"], values["phase"]
-
-
-def _spring(state: Imperfections, joint: int, values: Values) -> None:
-    state.spring[joint] = values["stiffness"], values["rest"]
 
 
 def _elasticity(state: Imperfections, joint: int, values: Values) -> None:
@@ -91,7 +90,9 @@ LINK = (
 POSITION = (
     effect("position.offset", adds(lambda state: state.position_offset, "offset")),
     effect("position.gain", scales(lambda state: state.position_gain, "gain"), gain=POSITIVE),
-    effect("position.eccentricity", _eccentricity, phase=ZERO_BY_DEFAULT),
+    effect(
+        "position.eccentricity", sets(lambda state: state.eccentricity, "amplitude", "phase"), phase=ZERO_BY_DEFAULT
+    ),
 )
 """Errors of the position sensor: `θ = gain·φ + offset + amplitude·sin(φ + phase)`, φ the reading, θ the true angle."""
 
@@ -114,8 +115,10 @@ distort the signal; then `v = gain·τ + offset + rate·t` on top of the sensor'
 """
 
 TRANSMISSION = (
-    effect("transmission.ripple", _ripple, phase=ZERO_BY_DEFAULT),
-    effect("transmission.spring", _spring, rest=ZERO_BY_DEFAULT),
+    effect(
+        "transmission.ripple", sets(lambda state: state.ripple, "amplitude", "cycles", "phase"), phase=ZERO_BY_DEFAULT
+    ),
+    effect("transmission.spring", sets(lambda state: state.spring, "stiffness", "rest"), rest=ZERO_BY_DEFAULT),
     effect("transmission.elasticity", _elasticity, stiffness=POSITIVE),
     effect("transmission.backlash", adds(lambda state: state.backlash, "width"), width=NOT_NEGATIVE),
     effect("transmission.coupling", _coupling),

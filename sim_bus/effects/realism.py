@@ -4,62 +4,43 @@
 3 is what bad ones have. Encoder, clock and noise stay as the arm file has them.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
 
-
-@dataclass(frozen=True)
-class TroubleSize:
-    """Size of one trouble at level 1."""
-
-    size: float
-    unit: str
-    source: str
-
-
 LEVELS = {
-    "eccentricity": TroubleSize(
-        3e-4,
-        "rad",
-        "encoder disc of 65 mm off centre by 10 µm: 412.5 e/D arc seconds (Celera Motion, on scale eccentricity)",
-    ),
-    "cubic": TroubleSize(
-        1e-3, "of full scale, at full scale", "0.083 % (arXiv 2603.16040) to 0.5 % of full scale (strain gauges)"
-    ),
-    "hysteresis": TroubleSize(5e-4, "of rated torque", "torque sensors of accuracy class 0.05 (VDI/VDE 2646)"),
-    "crosstalk": TroubleSize(
-        2.5e-3, "1", "0.79 % of a bending moment without cross-roller bearings (SSRN 10.2139/ssrn.4216744), 0.2 % with"
-    ),
-    "warm_up": TroubleSize(
-        1e-3, "of rated torque", "zero of class 0.05 per 10 K (VDI/VDE 2646), a joint that warms by 20 K in an hour"
-    ),
-    "cable": TroubleSize(
-        1e-3,
-        "of rated torque per rad",
-        "Lin et al. 2019, gravity compensation of the dVRK's master arms: cables pull by per cents of gravity there",
-    ),
-    "cable_lag": TroubleSize(
-        5e-4, "of rated torque", "the same: half of a cable's pull depends on where it comes from"
-    ),
-    "sag": TroubleSize(
-        3e-4, "rad at rated torque", "1 mrad of a gear of 3 to 6·10⁴ N·m/rad (Harmonic Drive CSG-25), encoder behind it"
-    ),
-    "axis": TroubleSize(
-        1e-3, "rad", "Nubiola and Bonev 2013: an uncalibrated ABB IRB 1600 is off by 1 mm (mean) to 2.2 mm at the tool"
-    ),
-    "length": TroubleSize(1e-3, "m", "the same"),
-    "tilt": TroubleSize(2e-3, "rad", "a base set up by spirit level, 0.1°"),
-    "friction_position": TroubleSize(
-        0.1, "of Coulomb friction", "Bittencourt and Gunnarsson 2012, static friction in a robot joint: joint angle"
-    ),
-    "friction_load": TroubleSize(5e-3, "1", "the same: load torque"),
-    "friction_warm_up": TroubleSize(0.3, "of Coulomb friction", "the same: 30 to 80 °C"),
+    # encoder disc of 65 mm off centre by 10 µm: 412.5 e/D arc seconds (Celera Motion, on scale eccentricity) [rad]
+    "eccentricity": 3e-4,
+    # 0.083 % (arXiv 2603.16040) to 0.5 % of full scale (strain gauges) [of full scale, at full scale]
+    "cubic": 1e-3,
+    # torque sensors of accuracy class 0.05 (VDI/VDE 2646) [of rated torque]
+    "hysteresis": 5e-4,
+    # 0.79 % of a bending moment without cross-roller bearings (SSRN 10.2139/ssrn.4216744), 0.2 % with
+    "crosstalk": 2.5e-3,
+    # zero of class 0.05 per 10 K (VDI/VDE 2646), a joint that warms by 20 K in an hour [of rated torque]
+    "warm_up": 1e-3,
+    # Lin et al. 2019, gravity compensation of the dVRK's master arms: cables pull by per cents of gravity there [of
+    # rated torque per rad]
+    "cable": 1e-3,
+    # the same: half of a cable's pull depends on where it comes from [of rated torque]
+    "cable_lag": 5e-4,
+    # 1 mrad of a gear of 3 to 6·10⁴ N·m/rad (Harmonic Drive CSG-25), encoder behind it [rad at rated torque]
+    "sag": 3e-4,
+    # Nubiola and Bonev 2013: an uncalibrated ABB IRB 1600 is off by 1 mm (mean) to 2.2 mm at the tool [rad]
+    "axis": 1e-3,
+    # the same [m]
+    "length": 1e-3,
+    # a base set up by spirit level, 0.1° [rad]
+    "tilt": 2e-3,
+    # Bittencourt and Gunnarsson 2012, static friction in a robot joint: joint angle [of Coulomb friction]
+    "friction_position": 0.1,
+    # the same: load torque
+    "friction_load": 5e-3,
+    # the same: 30 to 80 °C [of Coulomb friction]
+    "friction_warm_up": 0.3,
 }
-"""Size of each trouble at level 1, and its source."""
+"""Size of each trouble at level 1, with its source and unit."""
 SMALLEST, LARGEST = 0.5, 1.5
 """Range of a drawn size, as a share of its level."""
 COLD = 1200.0
@@ -75,7 +56,7 @@ def add_realism(state: Imperfections, rated: Array, level: float, seed: int) -> 
     n, random = len(rated), np.random.default_rng([seed, 41])
 
     def drawn(name: str, shape: int | tuple[int, ...] = n) -> Array:
-        size = level * LEVELS[name].size * random.uniform(SMALLEST, LARGEST, shape)
+        size = level * LEVELS[name] * random.uniform(SMALLEST, LARGEST, shape)
         signed: Array = size * random.choice([-1.0, 1.0], shape)
         return signed
 
@@ -98,9 +79,9 @@ def add_realism(state: Imperfections, rated: Array, level: float, seed: int) -> 
         ]
     )
     state.compliance += np.abs(drawn("sag")) / rated
-    state.frame_turn += random.uniform(-1, 1, (n, 3)) * level * LEVELS["axis"].size
-    state.frame_shift += random.uniform(-1, 1, (n, 3)) * level * LEVELS["length"].size
-    state.tilt += random.uniform(-1, 1, 2) * level * LEVELS["tilt"].size
+    state.frame_turn += random.uniform(-1, 1, (n, 3)) * level * LEVELS["axis"]
+    state.frame_shift += random.uniform(-1, 1, (n, 3)) * level * LEVELS["length"]
+    state.tilt += random.uniform(-1, 1, 2) * level * LEVELS["tilt"]
     state.uneven[:] = np.column_stack(
         [
             np.minimum(np.abs(drawn("friction_position")), 0.9),
