@@ -15,8 +15,6 @@ class Clock(Protocol):
 
 
 class MonotonicClock:
-    """The machine's own monotonic clock."""
-
     def now(self) -> float:
         return time.monotonic()
 

@@ -143,4 +143,3 @@ _ENTRIES = (
     ),
 )
 CATALOGUE = {entry.id: entry for entry in _ENTRIES}
-"""All effects by id."""

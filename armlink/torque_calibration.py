@@ -76,7 +76,6 @@ class Calibration(TorqueCalibration[float]):
 
 
 def per_joint(calibrations: Iterable[TorqueCalibration[float]]) -> TorqueCalibration[Array]:
-    """Calibrations of single joints as one of n joints."""
     pairs = [(each.gain, each.offset) for each in calibrations]
     gain, offset = np.array(pairs, dtype=np.float64).reshape(-1, 2).T.copy()
     return TorqueCalibration(gain, offset)

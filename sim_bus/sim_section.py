@@ -69,8 +69,6 @@ class Servo(Section):
 
 
 class Stops(Section):
-    """Mechanical stops."""
-
     time_constant: Positive = 0.004
     """Time constant of the contact's critically damped spring and damper [s]."""
 
@@ -90,7 +88,6 @@ class EffectEntry(BaseModel):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The effect's parameters as in the file."""
         return dict(self.model_extra or {})
 
 

@@ -59,8 +59,6 @@ class BusGroup:
 
 
 class GroupPort:
-    """The ports of several buses as one."""
-
     def __init__(self, members: Sequence[Port]) -> None:
         self.members = tuple(members)
         self._numbers = [port.fileno() for port in self.members if isinstance(port, Selectable)]

@@ -50,8 +50,7 @@ class MessageSource(Protocol):
     def shutdown(self) -> None: ...
 
 
-class MessageBus(CanBus, MessageSource, Protocol):
-    """A bus of python-can."""
+class MessageBus(CanBus, MessageSource, Protocol): ...
 
 
 @runtime_checkable

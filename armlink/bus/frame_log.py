@@ -168,7 +168,6 @@ class LogReader:
             raise BadInput(f"{path}: BLF files are compressed already: unpack this file first (gunzip)")
         self._path, self._timeless = path, 0
         self.count = 0
-        """Frames read."""
         self.ids = set[int]()
         """Identifiers of these frames, with flags; not more than `MOST_IDS`."""
         self.warning = ""

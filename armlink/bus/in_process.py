@@ -13,7 +13,6 @@ class InProcessBus(ABC):
     channel_info: str = "in process"
     clock: Clock | None = None
     errors: int = 0
-    """Error frames received."""
 
     @property
     def dropped(self) -> int:
@@ -34,15 +33,13 @@ class InProcessBus(ABC):
             self.clock.sleep_until(self.clock.now() + seconds)
 
     def open_port(self, as_node: bool = False) -> Port:
-        """A port; the same for a node's end."""
         return InProcessPort(self)
 
     def open_listening_port(self) -> Port:
         return InProcessPort(self)
 
     @abstractmethod
-    def shutdown(self) -> None:
-        """Close the bus."""
+    def shutdown(self) -> None: ...
 
 
 class InProcessPort:

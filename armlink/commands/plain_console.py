@@ -44,13 +44,11 @@ class PlainConsole(Console):
             self.width = PIPE_WIDTH
 
     def set_live(self, live: Live) -> Any:
-        """A spinner or progress bar is shown from now on."""
         shown = super().set_live(live)
         _on_screen.append(live)
         return shown
 
     def clear_live(self) -> None:
-        """The newest one is gone."""
         super().clear_live()
         if _on_screen:
             _on_screen.pop()

@@ -104,7 +104,6 @@ def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
 
 
 def _table(channel: str, nodes: list[dict[str, Any]], more: tuple[str, ...] = ()) -> "Table":
-    """The drives of an answer."""
     from rich.box import SIMPLE
     from rich.table import Column, Table
     from rich.text import Text

@@ -90,7 +90,6 @@ class BasicDrives(Generic[M]):
         self.m = len(self.rows)
         self.memory = [memory() for _ in joints]
         self.powers = [Power.UNKNOWN] * self.m
-        """Newest power states."""
         self.faults = [""] * self.m
         """Newest faults, in words; empty: none."""
         self.temperatures = [math.nan] * self.m

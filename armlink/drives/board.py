@@ -71,7 +71,6 @@ class Board:
         self.position[joint], self.sensor[joint] = position, sensor
 
     def slow(self, joint: int, motor: float, velocity: float) -> None:
-        """Motor torque and velocity."""
         self.motor[joint], self.velocity[joint] = motor, velocity
         self.slow_came = True
         self.on_slow(joint)

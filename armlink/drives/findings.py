@@ -14,7 +14,6 @@ class FoundDrive:
 
     family: str
     node: int
-    """Its id on the bus."""
     address: str
     """The id as people write it, unique on its bus."""
     drive: Mapping[str, Any] | None = None
@@ -47,8 +46,6 @@ class FoundDrive:
 
 
 class FoundDrives(Protocol):
-    """The drives of an open bus."""
-
     @property
     def nodes(self) -> list[dict[str, Any]]:
         """All that answer, as `armlink scan` writes them."""
@@ -82,8 +79,6 @@ Outcome = Literal["passed", "failed", "absent", "not run"]
 
 @dataclass(frozen=True)
 class Result:
-    """One check of one joint."""
-
     joint: str
     check: str
     """`GROUP` or `GROUP: PART`."""

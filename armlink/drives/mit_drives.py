@@ -57,7 +57,6 @@ class MitDrives(BasicDrives[K]):
         return {drive: f"MIT command to {self.names[joint]}" for drive, joint in self._joint_of.items()}
 
     def coded(self, joint: int, steps: Steps) -> Frame:
-        """The command frame of packed steps."""
         return self.settings[joint].id, pack_steps(*steps)
 
     def decoded(self, can_id: int, data: bytes, grid: Grid) -> MitCommand:

@@ -50,8 +50,6 @@ class Ranges(NamedTuple):
 
 
 class MitCommand(NamedTuple):
-    """One MIT command in SI units."""
-
     position: float
     velocity: float
     kp: float

@@ -55,7 +55,6 @@ def power_code(power: Power) -> int:
 
 
 def power_name(code: int) -> str:
-    """A power state in words, from its code."""
     return POWERS[code].value if 0 <= code < len(POWERS) else Power.UNKNOWN.value
 
 

@@ -25,7 +25,6 @@ class SearchedBus:
         self.now, self.port = self.clock.now, bus.open_port()
         self.send = self.port.send
         self.take: Callable[[int, bytes, float], object] = lambda can_id, data, now: None
-        """Called with all frames."""
         self.heard = self.gather([])
         """Frames that came before anything was asked."""
 

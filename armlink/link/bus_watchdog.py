@@ -39,9 +39,7 @@ class BusWatch:
         self.strangers = 0
         """Frames of this cycle that no drive of ours sends."""
         self.syncs = 0
-        """SYNCs sent."""
         self.readings = [0] * joints
-        """Readings received from each joint."""
         self.restarted: set[int] = set()
         """Joints whose controller has sent its boot-up message."""
         self.clear()

@@ -97,7 +97,6 @@ class Loop:
         self.latest_velocity = [math.nan] * self.n
         """Newest velocity of each joint whenever it came [rad/s]; for the gate, never for a sample."""
         self.on_cycle: Callable[[], object] = lambda: None
-        """Called at the end of each cycle."""
         self.slow_seen = [-math.inf] * self.n
         """When the motor torque of each joint last came, by the clock [s]."""
         self.speed_seen = [-math.inf] * self.n

@@ -49,6 +49,5 @@ class Lateness:
         )
 
     def in_ms(self) -> dict[str, float]:
-        """Percentiles and the longest [ms]."""
         shares = {"p50": 0.5, "p99": 0.99, "p99_9": 0.999}
         return {name: self.percentile(share) * 1e3 for name, share in shares.items()} | {"max": self.longest * 1e3}

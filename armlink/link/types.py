@@ -111,7 +111,6 @@ class Sample:
 
     @property
     def all_timely(self) -> bool:
-        """Whether the readings of all joints are timely."""
         return self.timely is None or bool(self.timely.all())
 
 
@@ -120,7 +119,6 @@ class Stats:
     """Counters of the link since its first cycle."""
 
     frames: int = 0
-    """Frames sent and received."""
     cycles: int = 0
     missed: int = 0
     """Readings that did not come in their cycle."""

@@ -52,7 +52,6 @@ class Ending:
 
     @property
     def orphaned(self) -> bool:
-        """Whether the job has gone."""
         return os.getppid() != self._job
 
     def _note(self, number: int, frame: FrameType | None) -> None:

@@ -18,7 +18,6 @@ BATCH_SECONDS = 0.1
 """Time between two batches of samples of a kept arm [s]: the stream's 10 Hz (docs/daemon-api.md)."""
 READINGS, COMMANDS = ("position", "velocity", "torque", "motor_torque"), ("torque_command", "position_command")
 CHANNELS = (*READINGS, *COMMANDS)
-"""Channels of a batch."""
 ROWS = (*READINGS, "status", "age", "timely", *COMMANDS)
 """Values (n,) of a packed sample, in their order, after its time, delay and lateness."""
 
@@ -94,7 +93,6 @@ class LoopAnswer:
     error: ArmlinkError | None = None
 
     def result(self) -> Any:
-        """The value; raises the error."""
         if self.error is not None:
             raise self.error
         return self.value
@@ -176,7 +174,6 @@ class Batch:
     """Time since position and torque last arrived (n,) [s]."""
     stats: Stats
     emergencies: tuple[DriveEvent, ...] = ()
-    """See Health."""
     temperature: Array | None = None
 
     @classmethod

@@ -94,7 +94,6 @@ class DriveLoop:
         self._busy = False
         """Whether rows are being played, and the job need be neither heard nor told."""
         self._controller: Controller | None = None
-        """The controller that is being run."""
         self._end: End | None = None
         """How the job wants the arm to end."""
         self._fault: ArmlinkError = BusFault("the joints are not enabled: call start() and enable() before cycle()")
@@ -251,7 +250,6 @@ class DriveLoop:
         self._talk()
 
     def _stopped(self, error: ArmlinkError) -> None:
-        """The joints were stopped."""
         self._begin(self._id)
         self._fault = error
         self._channel.put(Stopped(error))

@@ -76,7 +76,6 @@ def _length(field: bytes, path: Path) -> int:
 
 
 def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
-    """Fields of the header of a record."""
     found, at = dict[bytes, bytes](), 0
     while at + 4 <= len(header):
         (length,) = struct.unpack_from("<I", header, at)

@@ -195,7 +195,6 @@ def _factors(column: str, text: str) -> tuple[float, ...]:
 
 
 def _channel(column: str) -> str:
-    """Channel prefix of a column or of a channel."""
     place = channel_column(column)
     return place[0] if place else column
 

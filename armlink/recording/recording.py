@@ -141,7 +141,6 @@ def joint_count(columns: list[str], source: str) -> int:
 
 
 def is_channel(column: str) -> bool:
-    """Whether a column belongs to a channel, or is the time."""
     return column == "t" or _joint_index(column) is not None
 
 

@@ -34,8 +34,6 @@ TELL_EVERY = 0.5
 
 @dataclass(frozen=True)
 class JointScales:
-    """The evidence of one joint."""
-
     joint: str
     evidence: tuple[Evidence, ...]
     findings: tuple[ScaleFinding, ...]

@@ -89,8 +89,6 @@ class Evidence:
 
 @dataclass(frozen=True)
 class ScaleFinding:
-    """A scale that is off."""
-
     quantities: tuple[str, ...]
     """The quantity; several if the evidence cannot tell which of them."""
     factor: float

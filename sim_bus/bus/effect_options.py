@@ -21,7 +21,6 @@ class SensorDrift:
 
     joint: str
     gain: float
-    """Factor of the gain."""
     offset: float
     """Added to the offset [N·m]."""
     time: float
@@ -75,7 +74,6 @@ def _value(text: str, item: str) -> float | str:
 
 
 def parse_drift(text: str, joints: Sequence[str]) -> SensorDrift:
-    """Parse one `--drift`. Raises BadInput."""
     change, at, time = text.partition("@")
     parts = change.split(":")
     try:

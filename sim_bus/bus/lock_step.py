@@ -66,7 +66,6 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
         """The arm, or the fault injector or wire in front of it."""
         self.wire: TimedWire | None = None
         self.errors = 0
-        """Error frames received."""
         self._injector: Injector | None = None
         self._lock = RLock()
         self.clock: SimulatedClock = SimulatedClock(self, self._lock)

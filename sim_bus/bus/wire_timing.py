@@ -27,11 +27,9 @@ class TimedArm(Protocol):
 
     outbox: deque[Frame]
 
-    def on_frame(self, can_id: int, data: bytes) -> None:
-        """A frame from the host."""
+    def on_frame(self, can_id: int, data: bytes) -> None: ...
 
-    def advance(self, duration: float) -> None:
-        """Advance simulated time [s]."""
+    def advance(self, duration: float) -> None: ...
 
 
 class TimedWire:

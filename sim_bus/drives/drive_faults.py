@@ -31,7 +31,6 @@ DRIVE_KINDS = {
         FaultKind("watchdog.off", True, "", 0.0, "the watchdog's setting is accepted and does nothing"),
     )
 }
-"""By id."""
 
 
 QUANTITIES = ("position", "velocity", "torque")
@@ -55,7 +54,6 @@ FALSE_READINGS = {
     f"{how}.{quantity}": _kind(how, quantity)
     for how, quantity in product(("frozen", "scaled", *SECOND_SENDER), QUANTITIES)
 }
-"""By id."""
 
 
 class FalseReadings:

@@ -32,7 +32,6 @@ class Readings:
         self._mean = self._plant.take_mean_torque()
 
     def at(self, time: float) -> "Readings":
-        """The readings at `time` [s]."""
         if time != self._time:
             plant, sensors = self._plant, self._sensors
             self._time = time

@@ -22,7 +22,6 @@ class SimulatedDrive:
         self.heard = 0.0
         """When its host last fed the watchdog [s]."""
         self.unplugged = False
-        """Disconnected from the bus."""
         self.flash_writes = 0
         """Commands to write flash that it got."""
         self.faults: dict[str, float] = {}
@@ -38,7 +37,6 @@ class SimulatedDrive:
         return True
 
     def sends(self, can_id: int) -> bool:
-        """Whether it sends frames of this identifier."""
         raise NotImplementedError
 
     def on_frame(self, can_id: int, data: bytes) -> None:
@@ -168,7 +166,6 @@ class WrappingDrive(SimulatedDrive):
         return told._replace(position=self._wrapped(told.position))
 
     def follow(self) -> None:
-        """Follow the newest command."""
         command, coding, position = self.command, self.coding, self.motor.position
         target = command.position + position - self._wrapped(position)
         self.motor.impede(command.kp, command.kd, target, command.velocity, command.torque, coding.ranges.torque)

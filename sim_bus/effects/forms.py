@@ -97,7 +97,6 @@ POSITION = (
 """Errors of the position sensor: `θ = gain·φ + offset + amplitude·sin(φ + phase)`, φ the reading, θ the true angle."""
 
 TIMING = (effect("timing.delay", adds(lambda state: state.torque_delay, "delay"), delay=NOT_NEGATIVE),)
-"""Signals that are delayed."""
 
 TORQUE = (
     effect("torque.offset", adds(lambda state: state.torque_offset, "offset")),

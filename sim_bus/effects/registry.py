@@ -19,7 +19,6 @@ _EFFECTS = {each.id: each for each in sorted(EFFECTS, key=lambda each: each.id)}
 
 
 def effects() -> dict[str, SimulatedEffect]:
-    """All effects by id, sorted."""
     return dict(_EFFECTS)
 
 

@@ -17,8 +17,6 @@ class PowerState(IntEnum):
 
 
 class ControlCommand(IntEnum):
-    """Commands of the control word."""
-
     NONE = 0
     DISABLE_VOLTAGE = 1
     QUICK_STOP = 2

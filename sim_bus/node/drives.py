@@ -39,7 +39,6 @@ class SimulatedDrives:
         self.following_window = np.full(n, np.inf)
         """Following error window (6065h) [rad]."""
         self.refused_modes: list[set[int]] = [set() for _ in range(n)]
-        """Modes that each drive refuses."""
         self.gain, self.offset = np.ones(n), np.zeros(n)
         """Active calibration (2100h)."""
         self.on_state: Callable[[int], None] = lambda joint: None

@@ -31,13 +31,11 @@ class Node:
         """Number of its bus, as identifiers carry it (`armlink.bus.port.BUS_SHIFT`)."""
         self.object_dictionary = data_sheet()
         self.device = Device()
-        """Its lacks and differences."""
         self.identity: dict[Key, int | str] = {}
         """Values that differ from the EDS's defaults, kept when defaults are restored."""
         self.record = TorqueRecord()
         self.nmt = INITIALISING
         self.unplugged = False
-        """Disconnected from the bus."""
         self.errors: list[int] = []
         self.on_write: Callable[[Key], None] = lambda key: None
         self.on_pdo_change: Callable[[], None] = lambda: None

@@ -50,7 +50,6 @@ class Supervision:
                 self.command(node, data[0])
 
     def command(self, node: Node, asked: int) -> None:
-        """Bring one node into the commanded state."""
         if asked in (RESET_NODE, RESET_COMMUNICATION):
             if asked == RESET_NODE:
                 self._drives.enter(node.place, PowerState.SWITCH_ON_DISABLED)

@@ -52,7 +52,6 @@ class Plant:
         self.set_imperfections(imperfections)
 
     def _build(self, state: Imperfections) -> None:
-        """Build a model with the transmissions of `state`."""
         built = build_model(self._arm, state)
         self.model, names = built.model, self._arm.joint_names
         self.data = data = mujoco.MjData(self.model)

@@ -50,8 +50,7 @@ class DatagramPort(ABC):
             receiving.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
 
     @abstractmethod
-    def _encode(self, can_id: int, data: bytes) -> bytes:
-        """The datagram of a frame."""
+    def _encode(self, can_id: int, data: bytes) -> bytes: ...
 
     @abstractmethod
     def _take(self) -> Frame | None:

@@ -37,8 +37,6 @@ class SocketPort(DatagramPort):
 
 
 class StampedSocketPort(SocketPort, StampingPort):
-    """SocketCAN with timestamps."""
-
     def _take_stamped(self, control: int) -> tuple[Frame | None, list[Any]]:
         datagram, controls, _, _ = self._receiving.recvmsg(_FD.size, control, socket.MSG_DONTWAIT)
         return self._decoded(datagram), controls

@@ -228,7 +228,6 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         return device.offered_modes(services)
 
     def send_nmt(self, ask: Ask, command: int, node: int = 0) -> None:
-        """An NMT command (CiA 301) to one node, or to all."""
         ask.send(objects.NMT_ID, bytes([command, node]))
 
     def beat(self, ask: Ask) -> None:
@@ -290,7 +289,6 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         return {"node": self.nodes[joint], "nmt": told}
 
     def reading_ids(self) -> Mapping[int, int]:
-        """TPDO1."""
         return {TPDO1.cob_base + node: joint for joint, node in enumerate(self.nodes)}
 
     def poll(self, first: bool) -> list[Frame]:

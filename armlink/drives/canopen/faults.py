@@ -29,7 +29,6 @@ class JointStates:
         self.statuses = [NO_STATUS] * m
         """Status words (6041h)."""
         self.displays = [NO_MODE] * m
-        """Mode displays (6061h)."""
         self.mode_since = [-math.inf] * m
         """When each joint's mode was commanded, by the clock [s]."""
         self.positions = [math.nan] * m

@@ -95,7 +95,6 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
         return self.present(joint, f"CubeMars {self.settings[joint].model}".strip()) if there else self.absent(joint)
 
     def positions(self, ask: Ask) -> list[float]:
-        """Asked as `identify` does."""
         self.identify(ask)
         return [known.position for known in self.memory]
 

@@ -24,8 +24,6 @@ LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 
 class MoteusRegister(IntEnum):
-    """Registers that armlink uses."""
-
     MODE = 0x000
     POSITION = 0x001
     VELOCITY = 0x002

@@ -90,7 +90,6 @@ class ODriveMemory(DriveMemory):
     requested: int = 0
     """Torques that were asked for, and come besides the cyclic ones."""
     came: set[int] = field(default_factory=set)
-    """Messages that have come."""
     mode: int = 0
     """Control mode that it was last told; 0: none."""
     mode_frames: int = 0

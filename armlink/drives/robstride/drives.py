@@ -48,7 +48,6 @@ class RobStrideSettings(DriveSettings):
 
     family: Literal["robstride"] = "robstride"
     id: Annotated[int, Field(ge=1, le=0x7F)]
-    """Motor id."""
     host: Annotated[int, Field(ge=0, le=0xFF)] = OUR_ID
     """Our id, to which it replies."""
     model: Literal["RS00", "RS01", "RS02", "RS03", "RS04", "RS05", "RS06"]
@@ -229,7 +228,6 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         return self.note(Reading(joint, known.position, known.velocity, torque, math.nan, heat, power, fault))
 
     def alarm(self) -> BusFault | None:
-        """Another host."""
         return BusFault(self._intruder) if self._intruder else None
 
     def state_request(self, joint: int) -> list[Frame]:

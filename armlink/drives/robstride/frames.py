@@ -65,8 +65,6 @@ MOTION_MODE = 0
 
 
 class RunMode(IntEnum):
-    """Mode bits of feedback."""
-
     RESET = 0
     CALIBRATION = 1
     RUN = 2

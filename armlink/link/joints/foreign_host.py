@@ -13,7 +13,6 @@ from armlink.link.joints.values import JointValues
 from armlink.link.types import Sample
 
 Commands = tuple[Frame, ...]
-"""Newest command frames."""
 
 
 class ForeignHost:

@@ -52,7 +52,6 @@ class Misplacement:
 
     @property
     def remedy(self) -> str:
-        """The drive's error, and its remedy."""
         if not self.turns:
             return (
                 "No number of whole turns of its drive explains this reading, so zero, direction, gear, the "
@@ -93,7 +92,6 @@ class Misplacement:
         return f"{self.zero + TURN * turns + 0.0:.4f}".replace("-0.0000", "0.0000")
 
     def __str__(self) -> str:
-        """One line for people."""
         return f"{self.name}: {self.what}. {self.remedy}"
 
 

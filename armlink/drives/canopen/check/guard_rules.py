@@ -82,8 +82,6 @@ def shared_rules(nodes: tuple[int, ...], host: int, period: float) -> dict[str, 
 
 
 class NodeRules:
-    """Rules of one node."""
-
     def __init__(
         self,
         name: str,

@@ -108,7 +108,6 @@ class FoundNodes:
         port, clock = bus.open_port(), bus.clock or MonotonicClock()
         self._channel = bus.channel_info
         self.identities = {each.node: each for each in scan_bus(port, clock, {})}
-        """By node id."""
         network, pump = reading_network(port, clock)
         self._services = {
             node: NodeServices(network, f"node {node}", node, bundled(), pump) for node in self.identities
@@ -129,7 +128,6 @@ class FoundNodes:
         return [self._read(each) for each in self.identities.values()]
 
     def positions(self) -> dict[str, float]:
-        """Position readings (6064h)."""
         services = self._services
         return {each.address: int(services[each.node].read(objects.POSITION)) * each.unit for each in self.found}
 

@@ -140,7 +140,6 @@ class CommandFrames:
         return [self.own_mode(joint, mode) for joint, mode in enumerate(modes)] if self._any_own else modes
 
     def own_mode(self, joint: int, mode: int) -> int:
-        """The device's mode for one of an order."""
         return self._own[joint].get(mode, mode)
 
     def _select(self, joint: int, mode: int, frames: list[Frame], now: float) -> None:
