@@ -10,6 +10,7 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.bus.port import BUS_SHIFT
+from armlink.drives.canopen.cia402 import DriveState
 from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import BadInput
 from sim_bus.drives.fronts import build_fronts
@@ -19,7 +20,6 @@ from sim_bus.effects.effect import EffectSetting
 from sim_bus.effects.realism import add_realism
 from sim_bus.effects.registry import imperfections
 from sim_bus.effects.state import Imperfections
-from sim_bus.node.cia402 import PowerState
 from sim_bus.node.devices import device_of, power_on_values
 from sim_bus.node.drives import APPLIED, SimulatedDrives
 from sim_bus.node.node import Node
@@ -356,7 +356,7 @@ class SimulatedArm:
 
     def _state_changed(self, joint: int) -> None:
         node = self._node_at[joint]
-        if node.errors and self.drives.state[joint] is PowerState.SWITCH_ON_DISABLED:
+        if node.errors and self.drives.state[joint] is DriveState.SWITCH_ON_DISABLED:
             node.emergency(0, 0)
         self._watching = self.drives.needs_watch
 

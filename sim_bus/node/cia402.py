@@ -1,76 +1,52 @@
 """State machine of a CiA 402 drive, as a table."""
 
-from enum import IntEnum
-
-
-class PowerState(IntEnum):
-    """States of the power drive system (CiA 402-2, figure of the state machine)."""
-
-    NOT_READY = 0
-    SWITCH_ON_DISABLED = 1
-    READY = 2
-    SWITCHED_ON = 3
-    ENABLED = 4
-    QUICK_STOP = 5
-    FAULT_REACTION = 6
-    FAULT = 7
-
-
-class ControlCommand(IntEnum):
-    NONE = 0
-    DISABLE_VOLTAGE = 1
-    QUICK_STOP = 2
-    SHUTDOWN = 3
-    SWITCH_ON = 4
-    ENABLE = 5
-    FAULT_RESET = 6
-
+from armlink.drives.canopen.cia402 import Control, DriveState
 
 STATUS = {
-    PowerState.NOT_READY: 0x00,
-    PowerState.SWITCH_ON_DISABLED: 0x40,
-    PowerState.READY: 0x21,
-    PowerState.SWITCHED_ON: 0x23,
-    PowerState.ENABLED: 0x27,
-    PowerState.QUICK_STOP: 0x07,
-    PowerState.FAULT_REACTION: 0x0F,
-    PowerState.FAULT: 0x08,
+    DriveState.NOT_READY: 0x00,
+    DriveState.SWITCH_ON_DISABLED: 0x40,
+    DriveState.READY: 0x21,
+    DriveState.SWITCHED_ON: 0x23,
+    DriveState.ENABLED: 0x27,
+    DriveState.QUICK_STOP: 0x07,
+    DriveState.FAULT_REACTION: 0x0F,
+    DriveState.FAULT: 0x08,
 }
 """State bits of the status word (6041h)."""
 
 TRANSITIONS = {
-    (PowerState.SWITCH_ON_DISABLED, ControlCommand.SHUTDOWN): PowerState.READY,
-    (PowerState.READY, ControlCommand.SWITCH_ON): PowerState.SWITCHED_ON,
-    (PowerState.READY, ControlCommand.ENABLE): PowerState.ENABLED,
-    (PowerState.READY, ControlCommand.DISABLE_VOLTAGE): PowerState.SWITCH_ON_DISABLED,
-    (PowerState.READY, ControlCommand.QUICK_STOP): PowerState.SWITCH_ON_DISABLED,
-    (PowerState.SWITCHED_ON, ControlCommand.ENABLE): PowerState.ENABLED,
-    (PowerState.SWITCHED_ON, ControlCommand.SHUTDOWN): PowerState.READY,
-    (PowerState.SWITCHED_ON, ControlCommand.DISABLE_VOLTAGE): PowerState.SWITCH_ON_DISABLED,
-    (PowerState.SWITCHED_ON, ControlCommand.QUICK_STOP): PowerState.SWITCH_ON_DISABLED,
-    (PowerState.ENABLED, ControlCommand.SWITCH_ON): PowerState.SWITCHED_ON,
-    (PowerState.ENABLED, ControlCommand.SHUTDOWN): PowerState.READY,
-    (PowerState.ENABLED, ControlCommand.DISABLE_VOLTAGE): PowerState.SWITCH_ON_DISABLED,
-    (PowerState.ENABLED, ControlCommand.QUICK_STOP): PowerState.QUICK_STOP,
-    (PowerState.QUICK_STOP, ControlCommand.ENABLE): PowerState.ENABLED,
-    (PowerState.QUICK_STOP, ControlCommand.DISABLE_VOLTAGE): PowerState.SWITCH_ON_DISABLED,
-    (PowerState.FAULT, ControlCommand.FAULT_RESET): PowerState.SWITCH_ON_DISABLED,
+    (DriveState.SWITCH_ON_DISABLED, Control.SHUTDOWN): DriveState.READY,
+    (DriveState.READY, Control.SWITCH_ON): DriveState.SWITCHED_ON,
+    (DriveState.READY, Control.ENABLE): DriveState.ENABLED,
+    (DriveState.READY, Control.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.READY, Control.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.SWITCHED_ON, Control.ENABLE): DriveState.ENABLED,
+    (DriveState.SWITCHED_ON, Control.SHUTDOWN): DriveState.READY,
+    (DriveState.SWITCHED_ON, Control.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.SWITCHED_ON, Control.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.ENABLED, Control.SWITCH_ON): DriveState.SWITCHED_ON,
+    (DriveState.ENABLED, Control.SHUTDOWN): DriveState.READY,
+    (DriveState.ENABLED, Control.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.ENABLED, Control.QUICK_STOP): DriveState.QUICK_STOP,
+    (DriveState.QUICK_STOP, Control.ENABLE): DriveState.ENABLED,
+    (DriveState.QUICK_STOP, Control.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,
+    (DriveState.FAULT, Control.FAULT_RESET): DriveState.SWITCH_ON_DISABLED,
 }
 """Transitions 2 to 12, 15 and 16; READY to ENABLED combines 3 and 4. Other commands have no effect."""
 
 
-def command(word: int, previous: int) -> ControlCommand:
-    """Command of a control word (6040h), given the previous one: fault reset is a rising edge of bit 7."""
+def command(word: int, previous: int) -> Control | None:
+    """Command of a control word (6040h), given the previous one: fault reset is a rising edge of bit 7; None: none."""
     if word & 0x80:
-        return ControlCommand.NONE if previous & 0x80 else ControlCommand.FAULT_RESET
+        return None if previous & 0x80 else Control.FAULT_RESET
     if not word & 0x02:
-        return ControlCommand.DISABLE_VOLTAGE
+        return Control.DISABLE_VOLTAGE
     if not word & 0x04:
-        return ControlCommand.QUICK_STOP
+        return Control.QUICK_STOP
     if not word & 0x01:
-        return ControlCommand.SHUTDOWN
-    return ControlCommand.ENABLE if word & 0x08 else ControlCommand.SWITCH_ON
+        return Control.SHUTDOWN
+    return Control.ENABLE if word & 0x08 else Control.SWITCH_ON
 
 
-def next_state(state: PowerState, asked: ControlCommand) -> PowerState:
-    return TRANSITIONS.get((state, asked), state)
+def next_state(state: DriveState, asked: Control | None) -> DriveState:
+    return state if asked is None else TRANSITIONS.get((state, asked), state)

@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from armlink.arm_file import ArmFile
+from armlink.drives.canopen.cia402 import DriveState
 from armlink.drives.canopen.settings import TorqueObject
-from sim_bus.node.cia402 import STATUS, PowerState, command, next_state
+from sim_bus.node.cia402 import STATUS, command, next_state
 from sim_bus.node.devices import Device
 from sim_bus.node.node import Node
 from sim_bus.node.object_arrays import INPUT, ObjectArrays
@@ -34,7 +35,7 @@ class SimulatedDrives:
         self.loops = Loops(arm, plant, sensors, signals)
         self.rated = self.loops.rated
         self._per_mille = 1000 / self.rated
-        self.state = [PowerState.SWITCH_ON_DISABLED] * n
+        self.state = [DriveState.SWITCH_ON_DISABLED] * n
         self.quick_stop_option = [6] * n
         self.following_window = np.full(n, np.inf)
         """Following error window (6065h) [rad]."""
@@ -44,7 +45,7 @@ class SimulatedDrives:
         self.on_state: Callable[[int], None] = lambda joint: None
         self.on_fault: Callable[[int, int], None] = lambda joint, code: None
         self._words = [0] * n
-        self._status = np.full(n, STATUS[PowerState.SWITCH_ON_DISABLED] | REMOTE, np.uint16)
+        self._status = np.full(n, STATUS[DriveState.SWITCH_ON_DISABLED] | REMOTE, np.uint16)
         self._counts, self._velocity = sensors.position_counts(plant.motor_position), np.zeros(n)
         self._position_out, self._velocity_out = signals[0x6064, 0], signals[0x606C, 0]
         self._reading_out, self._motor_out = signals[0x2100, 1], signals[0x6077, 0]
@@ -136,20 +137,20 @@ class SimulatedDrives:
         asked = command(word, self._words[joint])
         self._words[joint] = word
         state = next_state(self.state[joint], asked)
-        if self.state[joint] is PowerState.ENABLED and state is PowerState.QUICK_STOP:
+        if self.state[joint] is DriveState.ENABLED and state is DriveState.QUICK_STOP:
             self.quick_stop(joint)
         elif state is not self.state[joint]:
             self.enter(joint, state)
 
-    def enter(self, joint: int, state: PowerState) -> None:
+    def enter(self, joint: int, state: DriveState) -> None:
         """Enter `state`, with power stage and status word."""
         self.state[joint] = state
         mode = int(self.loops.mode[joint])
-        if state is PowerState.ENABLED:
+        if state is DriveState.ENABLED:
             self.loops.start(joint, KINDS.get(mode, POSITION), mode)
-        elif state is not PowerState.QUICK_STOP:
+        elif state is not DriveState.QUICK_STOP:
             self.loops.start(joint, OFF, mode)
-        if state is PowerState.SWITCH_ON_DISABLED:
+        if state is DriveState.SWITCH_ON_DISABLED:
             self.error_code[joint] = 0
         self._update_status(joint)
         self.on_state(joint)
@@ -157,14 +158,14 @@ class SimulatedDrives:
     def quick_stop(self, joint: int) -> None:
         """Quick stop an enabled drive by 605Ah: 0 disables; 1, 2 stop, then disable; 5 to 8 stop and hold."""
         if self.quick_stop_option[joint] == 0:
-            self.enter(joint, PowerState.SWITCH_ON_DISABLED)
+            self.enter(joint, DriveState.SWITCH_ON_DISABLED)
             return
         self.loops.stop(joint)
-        self.enter(joint, PowerState.QUICK_STOP)
+        self.enter(joint, DriveState.QUICK_STOP)
 
     def fault(self, joint: int, code: int) -> None:
         """Enter fault with error code `code` (603Fh): torque off, brake closed."""
-        self.enter(joint, PowerState.FAULT)
+        self.enter(joint, DriveState.FAULT)
         self.error_code[joint] = code
         self.on_fault(joint, code)
 
@@ -172,11 +173,11 @@ class SimulatedDrives:
         """Monitor following errors (6065h) and the end of a quick stop."""
         error = self.loops.following_error
         for joint in np.flatnonzero(np.abs(error) > self.following_window):
-            if self.state[joint] is PowerState.ENABLED:
+            if self.state[joint] is DriveState.ENABLED:
                 self.fault(int(joint), FOLLOWING_ERROR)
         for joint in np.flatnonzero(self.loops.stopping):
             if self.quick_stop_option[joint] < 5 and self.loops.stopped(int(joint)):
-                self.enter(int(joint), PowerState.SWITCH_ON_DISABLED)
+                self.enter(int(joint), DriveState.SWITCH_ON_DISABLED)
 
     @property
     def needs_watch(self) -> bool:
@@ -188,13 +189,13 @@ class SimulatedDrives:
         mode = asked if asked in KINDS and asked not in self.refused_modes[joint] else 0
         self._mode_out[joint] = mode
         self.loops.mode[joint] = mode
-        if self.state[joint] is PowerState.ENABLED:
+        if self.state[joint] is DriveState.ENABLED:
             self.loops.start(joint, KINDS.get(mode, POSITION), mode)
         self._update_status(joint)
 
     def _update_status(self, joint: int) -> None:
         word = STATUS[self.state[joint]] | REMOTE
-        if self.state[joint] is PowerState.ENABLED and self.loops.mode[joint]:
+        if self.state[joint] is DriveState.ENABLED and self.loops.mode[joint]:
             word |= FOLLOWS
         self._status[joint] = word
         self._status_out[joint] = word

@@ -7,7 +7,7 @@ import math
 import struct
 from collections.abc import Callable
 
-from sim_bus.node.cia402 import PowerState
+from armlink.drives.canopen.cia402 import DriveState
 from sim_bus.node.drives import SimulatedDrives
 from sim_bus.node.node import OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
 
@@ -52,7 +52,7 @@ class Supervision:
     def command(self, node: Node, asked: int) -> None:
         if asked in (RESET_NODE, RESET_COMMUNICATION):
             if asked == RESET_NODE:
-                self._drives.enter(node.place, PowerState.SWITCH_ON_DISABLED)
+                self._drives.enter(node.place, DriveState.SWITCH_ON_DISABLED)
             node.reset(communication_only=asked == RESET_COMMUNICATION)
             self._apply(node)
             self._drives.take_commands()
@@ -141,13 +141,13 @@ class Supervision:
 
     def _abort_connection(self, node: Node, code: int = 0) -> None:
         """Act by the abort connection option (6007h): 0 nothing, 1 fault, 2 disable voltage, 3 quick stop."""
-        if self._drives.state[node.place] is not PowerState.ENABLED:
+        if self._drives.state[node.place] is not DriveState.ENABLED:
             return
         option = node.value(0x6007)
         if option == ABORT_FAULT:
-            self._drives.enter(node.place, PowerState.FAULT)
+            self._drives.enter(node.place, DriveState.FAULT)
         elif option == ABORT_DISABLE:
-            self._drives.enter(node.place, PowerState.SWITCH_ON_DISABLED)
+            self._drives.enter(node.place, DriveState.SWITCH_ON_DISABLED)
         elif option == ABORT_QUICK_STOP:
             self._drives.quick_stop(node.place)
         self._drives.error_code[node.place] = code

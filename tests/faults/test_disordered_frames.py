@@ -8,9 +8,9 @@ import pytest
 from rows import ARM
 from test_lock_step import Bench
 
+from armlink.drives.canopen.cia402 import DriveState
 from armlink.drives.canopen.object_dictionary import SYNC_ID
 from armlink.errors import ArmlinkError, BusFault
-from sim_bus.node.cia402 import PowerState
 
 FASTEST = ARM["link"]["joints"][0]["max_velocity"]
 
@@ -60,7 +60,7 @@ def test_frames_a_few_cycles_late_in_any_order_cost_no_joint_its_hold(most: int,
     cycles, error = worked(bench, 200)
     assert (cycles, error) == (200, None) or isinstance(error, BusFault)
     if error is None:
-        assert all(state is PowerState.ENABLED for state in bench.states)
+        assert all(state is DriveState.ENABLED for state in bench.states)
         bench.bus.inject("node.silent:joint_2")  # a node that is cut off is noticed all the same
         assert isinstance(bench.cycles_until_fault()[1], BusFault)
     assert bench.safe()
@@ -86,4 +86,4 @@ def test_a_bus_that_others_fill_by_frames_of_low_priority_costs_no_cycle() -> No
         wire.on_frame = more  # type: ignore[method-assign]
         assert worked(bench, 200) == (200, None)
         assert (wire._busy - busy) / (wire._cycling - cycling) > 0.99
-        assert all(state is PowerState.ENABLED for state in bench.states)
+        assert all(state is DriveState.ENABLED for state in bench.states)

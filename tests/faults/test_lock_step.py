@@ -10,17 +10,17 @@ import pytest
 from rows import ARM, QUICK_STOP, ROWS, Row, table
 
 from armlink.arm_file import parse_arm
+from armlink.drives.canopen.cia402 import DriveState
 from armlink.errors import ArmlinkError, BadInput, BusFault
 from armlink.link.link import Link
 from armlink.link.types import Command
 from sim_bus.bus.fault_kinds import KINDS, parse_fault
 from sim_bus.bus.lock_step import LockStepBus
-from sim_bus.node.cia402 import PowerState
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
 BIAS = 2.0
-SAFE = (PowerState.QUICK_STOP, PowerState.SWITCH_ON_DISABLED, PowerState.FAULT)
+SAFE = (DriveState.QUICK_STOP, DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 DEADLINE = 0.1
 """link.deadline [s]."""
 BY_KEY = {row.key: row for row in ROWS}
@@ -55,7 +55,7 @@ class Bench:
         raise AssertionError(f"no fault in {most} cycles")
 
     @property
-    def states(self) -> list[PowerState]:
+    def states(self) -> list[DriveState]:
         return self.bus.arm.drives.state
 
     def safe(self) -> bool:
@@ -98,7 +98,7 @@ def test_a_fault_is_seen_in_time_leaves_the_joints_safe_and_says_what_it_is(row:
     assert all(state in SAFE for state in bench.states)
     assert bench.safe()
     if row.joints == QUICK_STOP:
-        assert bench.states == [PowerState.QUICK_STOP] * 3
+        assert bench.states == [DriveState.QUICK_STOP] * 3
 
 
 @pytest.mark.parametrize("key", ["bus-off", "link down", "nobody acknowledges", "node silent", "clock jump"])
@@ -111,7 +111,7 @@ def test_after_a_passing_fault_the_same_link_starts_and_enables_again(key: str, 
     bench.enable()
     for _ in range(50):
         bench.link.cycle(bench.command)
-    assert bench.states == [PowerState.ENABLED] * 3
+    assert bench.states == [DriveState.ENABLED] * 3
 
 
 @pytest.mark.parametrize("key", ["SDO abort", "SDO time-out"])
@@ -119,7 +119,7 @@ def test_a_node_without_sdo_is_named_and_nothing_is_powered(key: str, bench: Ben
     bench.bus.inject(BY_KEY[key].inject)
     with pytest.raises(BusFault, match=pattern(BY_KEY[key].reads)):
         bench.link.start()
-    assert bench.states == [PowerState.SWITCH_ON_DISABLED] * 3
+    assert bench.states == [DriveState.SWITCH_ON_DISABLED] * 3
 
 
 @pytest.mark.parametrize("fault", ["sdo.abort:joint_2", "sdo.timeout:joint_2"])
@@ -128,7 +128,7 @@ def test_a_node_that_loses_its_sdo_while_enabled_holds_on(fault: str, bench: Ben
     bench.bus.inject(fault)
     with pytest.raises(BusFault, match=r"joint_2 \(node 12\)"):
         bench.link.read_calibration(1)
-    assert bench.states == [PowerState.ENABLED] * 3
+    assert bench.states == [DriveState.ENABLED] * 3
     bench.link.cycle(bench.command)
 
 
@@ -137,7 +137,7 @@ def test_a_wall_clock_that_is_set_back_changes_nothing(bench: Bench, monkeypatch
     monkeypatch.setattr(time, "time", lambda: 0.0)
     for _ in range(50):
         bench.link.cycle(bench.command)
-    assert bench.states == [PowerState.ENABLED] * 3
+    assert bench.states == [DriveState.ENABLED] * 3
 
 
 @pytest.mark.parametrize("pause", [0.2, 5.0])
@@ -145,9 +145,9 @@ def test_a_host_that_stops_is_noticed_by_the_joints_and_told_when_it_goes_on(pau
     bench.enable()
     arm = bench.bus.arm
     arm.advance(DEADLINE - 0.01)
-    assert bench.states == [PowerState.ENABLED] * 3
+    assert bench.states == [DriveState.ENABLED] * 3
     arm.advance(0.01 + arm.period)
-    assert bench.states == [PowerState.QUICK_STOP] * 3
+    assert bench.states == [DriveState.QUICK_STOP] * 3
     arm.advance(pause)
     assert bench.safe()
     cycles, error = bench.cycles_until_fault()
@@ -160,7 +160,7 @@ def test_a_corrupted_bus_counts_its_error_frames(bench: Bench) -> None:
     for _ in range(100):
         bench.link.cycle(bench.command)
     assert bench.bus.errors > 10
-    assert bench.states == [PowerState.ENABLED] * 3
+    assert bench.states == [DriveState.ENABLED] * 3
 
 
 def test_emergencies_without_end_are_not_kept_without_end(bench: Bench) -> None:

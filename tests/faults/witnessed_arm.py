@@ -21,8 +21,8 @@ import numpy as np
 
 from armlink.arm_file import load_arm
 from armlink.bus.open import open_link_bus
+from armlink.drives.canopen.cia402 import DriveState
 from sim_bus.bus.server import ArmServer
-from sim_bus.node.cia402 import PowerState
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -78,7 +78,7 @@ def witnessed(arm: Path, bus: str, report: Path) -> Iterator[Witness]:
 def powered(arm: SimulatedArm) -> bool:
     """Whether some joint is under power."""
     states = [arm.drives.state[node.place] for node in arm.nodes]
-    return PowerState.ENABLED in states or any(drive.motor.powered for drive in arm.drive_at.values())
+    return DriveState.ENABLED in states or any(drive.motor.powered for drive in arm.drive_at.values())
 
 
 def main(path: str, bus: str, report: str) -> int:

@@ -81,23 +81,13 @@ _BY_4F = {
 }
 _BY_6F = {0x21: DriveState.READY, 0x23: DriveState.SWITCHED_ON, 0x27: DriveState.ENABLED, 0x07: DriveState.QUICK_STOP}
 
-# One step towards ENABLED, DISABLED (switch on disabled) or QUICK_STOP from each state; None if there is nothing to
-# command: the state is reached or the drive moves on by itself. Quick stop to enabled is transition 16: power stays on.
+# One step towards ENABLED from each state. Quick stop to enabled is transition 16: power stays on.
 _TO_ENABLED = {
     DriveState.SWITCH_ON_DISABLED: Control.SHUTDOWN,
     DriveState.READY: Control.SWITCH_ON,
     DriveState.SWITCHED_ON: Control.ENABLE,
     DriveState.ENABLED: Control.ENABLE,
     DriveState.QUICK_STOP: Control.ENABLE,
-    DriveState.FAULT: Control.FAULT_RESET,
-}
-_TO_DISABLED = {
-    DriveState.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE,
-    DriveState.READY: Control.DISABLE_VOLTAGE,
-    DriveState.SWITCHED_ON: Control.DISABLE_VOLTAGE,
-    DriveState.ENABLED: Control.DISABLE_VOLTAGE,
-    DriveState.QUICK_STOP: Control.DISABLE_VOLTAGE,
-    DriveState.FAULT: Control.FAULT_RESET,
 }
 
 
@@ -112,16 +102,12 @@ def next_control(state: DriveState, target: DriveState) -> int:
     If the drive moves on by itself (not ready, fault reaction) or the state is unknown, the word is disable voltage,
     which is also the low level that the rising edge of fault reset needs.
     """
-    if target is DriveState.ENABLED:
-        return int(_TO_ENABLED.get(state, Control.DISABLE_VOLTAGE))
-    if target is DriveState.SWITCH_ON_DISABLED:
-        return int(_TO_DISABLED.get(state, Control.DISABLE_VOLTAGE))
     if target is DriveState.QUICK_STOP:
         return int(Control.QUICK_STOP)
-    raise ValueError(
-        f'no transition to "{target.value}" is defined: it must be "operation enabled", "quick stop '
-        'active" or "switch on disabled"'
-    )
+    if state is DriveState.FAULT:
+        return int(Control.FAULT_RESET)
+    step = _TO_ENABLED.get(state) if target is DriveState.ENABLED else None
+    return int(step or Control.DISABLE_VOLTAGE)
 
 
 def set_point_control(status_word: int) -> int:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from sweep_arms import at_rate, random_arm, with_section
 
+from armlink.drives.canopen.cia402 import DriveState
 from armlink.errors import BusFault
 from armlink.link.link import Link
 from calib.dataset import load_data
 from calib.sweep.run import run_sweep
 from sim_bus.bus.lock_step import LockStepBus
-from sim_bus.node.cia402 import PowerState
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -25,7 +25,7 @@ ARM = with_section(
     travel_speed=0.95,
 )
 TORQUE_MODE, PRESSED_CYCLES = 10, 160
-SAFE = (PowerState.QUICK_STOP, PowerState.SWITCH_ON_DISABLED, PowerState.FAULT)
+SAFE = (DriveState.QUICK_STOP, DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 
 
 class Resetting(LockStepBus):
@@ -35,7 +35,7 @@ class Resetting(LockStepBus):
 
     def put(self, can_id: int, data: bytes) -> None:
         drives = self.arm.drives
-        enabled = np.array([state is PowerState.ENABLED for state in drives.state])
+        enabled = np.array([state is DriveState.ENABLED for state in drives.state])
         pressing = np.flatnonzero(enabled & (np.asarray(drives.loops.mode) == TORQUE_MODE))
         self.pressed += bool(pressing.size)
         if pressing.size == 1 and self.pressed > PRESSED_CYCLES and not self.reset:

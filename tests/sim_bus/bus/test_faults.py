@@ -6,8 +6,8 @@ import can
 import pytest
 from rig import Rig
 
+from armlink.drives.canopen.cia402 import DriveState
 from sim_bus.bus.lock_step import LockStepBus
-from sim_bus.node.cia402 import PowerState
 
 CSP = 8
 
@@ -40,10 +40,10 @@ def test_a_reboot_loses_mode_and_unsaved_calibration(rig: Rig) -> None:
     rig.write(3, 0x2100, 4, struct.pack("<f", 1.5))
     rig.bus.inject("node.reboot:joint_3")
     assert (0x703, b"\0") in rig.drain()
-    assert rig.arm.drives.state[2] is PowerState.SWITCH_ON_DISABLED
+    assert rig.arm.drives.state[2] is DriveState.SWITCH_ON_DISABLED
     assert struct.unpack("<f", rig.read(3, 0x2100, 4))[0] == 1.0
     assert rig.read(3, 0x6061) == b"\0"
-    assert rig.arm.drives.state[1] is PowerState.ENABLED
+    assert rig.arm.drives.state[1] is DriveState.ENABLED
 
 
 def test_a_fault_waits_for_its_time(rig: Rig) -> None:

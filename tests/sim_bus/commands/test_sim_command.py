@@ -13,11 +13,11 @@ from rig import Hand, one_joint
 
 from armlink.bus.adapters import as_bus
 from armlink.cli import run
+from armlink.drives.canopen.cia402 import DriveState
 from armlink.errors import BadInput
 from sim_bus.bus.control_pipe import ControlPipe
 from sim_bus.bus.effect_options import SensorDrift
 from sim_bus.bus.server import ArmServer
-from sim_bus.node.cia402 import PowerState
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
@@ -120,14 +120,14 @@ def test_in_lock_step_a_host_that_died_is_noticed(ends: tuple[can.BusABC, can.Bu
         send(0x205, struct.pack("<Hhi", word, 0, 0))
         send(0x77E, b"\5")
         send(0x80, b"")
-    assert arm.drives.state == [PowerState.ENABLED]
+    assert arm.drives.state == [DriveState.ENABLED]
     hand.time += 0.5  # a host that thinks: time rests
     server.turn()
-    assert arm.drives.state == [PowerState.ENABLED]
+    assert arm.drives.state == [DriveState.ENABLED]
     for _ in range(10):
         hand.time += 0.2
         server.turn()
-    assert arm.drives.state == [PowerState.QUICK_STOP]
+    assert arm.drives.state == [DriveState.QUICK_STOP]
 
 
 def test_orders_through_a_pipe_change_the_running_arm(ends: tuple[can.BusABC, can.BusABC], tmp_path: Path) -> None:

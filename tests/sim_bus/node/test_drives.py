@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from rig import UNIT, Rig, one_joint
 
-from sim_bus.node.cia402 import STATUS, TRANSITIONS, ControlCommand, PowerState, command, next_state
+from armlink.drives.canopen.cia402 import Control, DriveState
+from sim_bus.node.cia402 import STATUS, TRANSITIONS, command, next_state
 from sim_bus.truth import Truth
 
 CSP, CST = 8, 10
@@ -20,44 +21,44 @@ def coulomb(torque: float) -> list[dict[str, object]]:
 @pytest.mark.parametrize(
     ("word", "asked"),
     [
-        (0x00, ControlCommand.DISABLE_VOLTAGE),
-        (0x02, ControlCommand.QUICK_STOP),
-        (0x06, ControlCommand.SHUTDOWN),
-        (0x07, ControlCommand.SWITCH_ON),
-        (0x0F, ControlCommand.ENABLE),
-        (0x80, ControlCommand.FAULT_RESET),
+        (0x00, Control.DISABLE_VOLTAGE),
+        (0x02, Control.QUICK_STOP),
+        (0x06, Control.SHUTDOWN),
+        (0x07, Control.SWITCH_ON),
+        (0x0F, Control.ENABLE),
+        (0x80, Control.FAULT_RESET),
     ],
 )
-def test_control_words_of_the_standard(word: int, asked: ControlCommand) -> None:
+def test_control_words_of_the_standard(word: int, asked: Control) -> None:
     assert command(word, 0) is asked
 
 
 def test_fault_reset_is_an_edge() -> None:
-    assert command(0x80, 0x80) is ControlCommand.NONE
+    assert command(0x80, 0x80) is None
 
 
 def test_no_command_leads_out_of_a_fault_but_its_reset() -> None:
-    for state, asked in itertools.product(PowerState, ControlCommand):
+    for state, asked in itertools.product(DriveState, Control):
         if (state, asked) not in TRANSITIONS:
             assert next_state(state, asked) is state
-    left = [asked for asked in ControlCommand if next_state(PowerState.FAULT, asked) is not PowerState.FAULT]
-    assert left == [ControlCommand.FAULT_RESET]
+    left = [asked for asked in Control if next_state(DriveState.FAULT, asked) is not DriveState.FAULT]
+    assert left == [Control.FAULT_RESET]
 
 
 def test_walk_through_the_states_and_back() -> None:
     rig = Rig(one_joint())
     rig.start(CSP)
     walk = [
-        (0x06, PowerState.READY),
-        (0x07, PowerState.SWITCHED_ON),
-        (0x0F, PowerState.ENABLED),
-        (0x02, PowerState.QUICK_STOP),
+        (0x06, DriveState.READY),
+        (0x07, DriveState.SWITCHED_ON),
+        (0x0F, DriveState.ENABLED),
+        (0x02, DriveState.QUICK_STOP),
     ]
-    walk += [(0x00, PowerState.SWITCH_ON_DISABLED), (0x0F, PowerState.SWITCH_ON_DISABLED)]
+    walk += [(0x00, DriveState.SWITCH_ON_DISABLED), (0x0F, DriveState.SWITCH_ON_DISABLED)]
     for word, state in walk:
         rig.word = word
         rig.cycle()
-        mask = 0x4F if state in (PowerState.SWITCH_ON_DISABLED, PowerState.FAULT) else 0x6F
+        mask = 0x4F if state in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT) else 0x6F
         assert rig.status(5) & mask == STATUS[state]
 
 
