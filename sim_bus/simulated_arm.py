@@ -24,7 +24,7 @@ from sim_bus.node.devices import device_of, power_on_values
 from sim_bus.node.drives import APPLIED, SimulatedDrives
 from sim_bus.node.node import Node
 from sim_bus.node.object_arrays import Key, ObjectArrays
-from sim_bus.node.pdo import Frame, PdoGroup, PdoTable
+from sim_bus.node.pdo import Frame, Pdo, PdoTable
 from sim_bus.node.supervision import RESET_NODE, Supervision
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import JointSensors
@@ -76,7 +76,7 @@ class SimulatedArm:
         self._address()
         self.supervision = Supervision(self.nodes, self.drives, self._apply)
         self._operational = self.supervision.operational
-        self._pdos = PdoTable(self._signals, self._operational, self._send)
+        self._pdos = PdoTable(self._operational, self._send)
         for node in self.nodes:
             joint = link.joints[node.place]
             node.device = device_of(joint, section.device)
@@ -114,9 +114,9 @@ class SimulatedArm:
 
     def on_frame(self, can_id: int, data: bytes) -> None:
         """Process a frame: SYNC samples and applies targets; PDO, SDO, NMT and heartbeat by CiA 301."""
-        slot = self._pdos.receive.get(can_id)
-        if slot is not None:
-            self._receive_pdo(slot, data)
+        pdo = self._pdos.receive.get(can_id)
+        if pdo is not None:
+            self._receive_pdo(pdo, data)
         elif can_id in self._sdo:
             if self.time > self._sampled:
                 self._sample()
@@ -141,8 +141,8 @@ class SimulatedArm:
 
     def waits_for_sync(self, can_id: int) -> bool:
         """Whether a frame takes effect at the next SYNC only: a synchronous RPDO."""
-        slot = self._pdos.receive.get(can_id)
-        return slot is not None and slot[0].kind <= 240
+        pdo = self._pdos.receive.get(can_id)
+        return pdo is not None and pdo.kind <= 240
 
     def advance(self, duration: float) -> None:
         """Advance simulated time [s], in equal steps of about a SYNC period, or less.
@@ -319,20 +319,18 @@ class SimulatedArm:
             raise BadInput(f"there is no joint {joint!r}; there are {', '.join(self.names)}")
         return self.names.index(joint)
 
-    def _receive_pdo(self, slot: tuple[PdoGroup, int], data: bytes) -> None:
-        group, place = slot
-        joint, size = group.nodes[place], group.size
-        if not self._operational[joint]:
+    def _receive_pdo(self, pdo: Pdo, data: bytes) -> None:
+        size = pdo.packed.itemsize
+        if not self._operational[pdo.node]:
             return
         if len(data) < size:
-            self._node_at[joint].emergency(0x8210, 0x10, struct.pack("<BB", len(data), size))
+            self._node_at[pdo.node].emergency(0x8210, 0x10, struct.pack("<BB", len(data), size))
             return
-        group.buffer[place * size : (place + 1) * size] = data[:size]
-        group.fresh[place] = 1
+        pdo.content = data[:size]
         if self.supervision.watches_rpdos:
-            self.supervision.rpdo(joint, group.number, self.time)
-        if group.kind > 240:
-            self._take(group)
+            self.supervision.rpdo(pdo.node, pdo.number, self.time)
+        if pdo.kind > 240:
+            self._take((pdo,))
             self._pdos.send_events()
 
     def _sync(self) -> None:
@@ -341,17 +339,17 @@ class SimulatedArm:
             return
         self._sample()
         self._pdos.send_sync()
-        for group in self._pdos.sync_receive:
-            self._take(group)
+        self._take(self._pdos.sync_receive)
         self._pdos.send_events()
         self._synchronous = True
         self.supervision.sync(self.time)
 
-    def _take(self, group: PdoGroup) -> None:
-        rows = group.take()
-        if rows is not None:
+    def _take(self, pdos: Sequence[Pdo]) -> None:
+        taken = [pdo for pdo in pdos if pdo.take()]
+        if taken:
             self.drives.take_commands()
-            for index, _ in TARGETS & group.keys:
+        for index, sub in TARGETS:
+            if rows := [pdo.node for pdo in taken if (index, sub) in pdo.keys]:
                 self.drives.loops.fresh(index, rows)
 
     def _state_changed(self, joint: int) -> None:
@@ -369,7 +367,7 @@ class SimulatedArm:
 
     def _written(self, node: Node, key: Key) -> None:
         if key in TARGETS:
-            self.drives.loops.fresh(key[0], node.place)
+            self.drives.loops.fresh(key[0], [node.place])
         elif key[0] < 0x6000 or key[0] in APPLIED:
             self._apply(node)
 

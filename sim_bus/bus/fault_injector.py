@@ -13,7 +13,7 @@ from sim_bus.bus.fault_kinds import CANOPEN_FAULTS, Fault
 from sim_bus.drives.drive_faults import DRIVE_KINDS, FALSE_READINGS, QUANTITIES, FalseReadings
 from sim_bus.drives.simulated_drive import SimulatedDrive
 from sim_bus.node.node import Node
-from sim_bus.node.pdo import Frame, layout
+from sim_bus.node.pdo import Frame
 from sim_bus.simulated_arm import SERVICE, SimulatedArm
 
 PROTOCOL_ERROR, BUS_OFF, RESTARTED = 0x08, 0x40, 0x100
@@ -202,16 +202,14 @@ class Injector:
         """A node's frame with what falsehoods make of it, and a second node's where there is one."""
         device = self.arm.device(place)
         assert isinstance(device, Node)
-        mapped = [each for each in device.pdos(receive=False) if each.cob_id == can_id and each.mapping]
-        if not mapped or len(data) != layout(mapped[0].mapping).itemsize:
+        pdo = next((each for each in device.pdos(receive=False) if each.cob_id == can_id), None)
+        if pdo is None or len(data) != pdo.packed.itemsize:
             return ((can_id, data),)
-        fields, packed = layout(mapped[0].mapping).names or (), layout(mapped[0].mapping)
-        units, carried, found = self.arm.drives.units(place), {}, []
-        for name, entry in zip(fields, mapped[0].mapping, strict=True):
-            if (index := entry >> 16) in OBJECTS:
-                carried[OBJECTS[index]] = name
+        pairs = zip(pdo.packed.names or (), pdo.keys, strict=True)
+        carried = {OBJECTS[index]: name for name, (index, _) in pairs if index in OBJECTS}
+        units, found = self.arm.drives.units(place), []
         for second in (False, True) if false.repeated(tuple(carried)) else (False,):
-            values = np.frombuffer(data, packed).copy()
+            values = np.frombuffer(data, pdo.packed).copy()
             for quantity, name in carried.items():
                 unit = units[QUANTITIES.index(quantity)]
                 told = false.told(quantity, float(values[name][0]) * unit, second) / unit

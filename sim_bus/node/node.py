@@ -12,7 +12,7 @@ from canopen.sdo.exceptions import SdoAbortedError
 from armlink.drives.canopen.pdo import INVALID
 from sim_bus.node.devices import Device
 from sim_bus.node.object_arrays import DTYPES, Key, ObjectArrays, data_sheet, variable
-from sim_bus.node.pdo import Frame, PdoParameters, layout
+from sim_bus.node.pdo import Frame, Pdo, layout
 from sim_bus.node.torque_sensor_record import WRONG_VALUE, TorqueRecord
 
 INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
@@ -155,16 +155,19 @@ class Node:
 
     # ---- PDO objects
 
-    def pdos(self, receive: bool) -> list[PdoParameters]:
-        """The node's RPDOs or TPDOs by its objects."""
-        parameters = []
+    def pdos(self, receive: bool) -> list[Pdo]:
+        """The node's valid RPDOs or TPDOs by its objects."""
+        found = []
         for number in range(4):
-            communication, mapping = (0x1400, 0x1600) if receive else (0x1800, 0x1A00)
-            count = self.value(mapping + number)
-            entries = tuple(self.value(mapping + number, sub) for sub in range(1, count + 1))
-            cob_id, kind = self.value(communication + number, 1), self.value(communication + number, 2)
-            parameters.append(PdoParameters(self.place, number, self.tag | cob_id & ~0x40000000, kind, entries))
-        return parameters
+            communication, mapping = (
+                (0x1400 + number, 0x1600 + number) if receive else (0x1800 + number, 0x1A00 + number)
+            )
+            entries = tuple(self.value(mapping, sub) for sub in range(1, self.value(mapping) + 1))
+            cob_id, kind = self.value(communication, 1), self.value(communication, 2)
+            if entries and not cob_id & INVALID:
+                cob_id = self.tag | cob_id & ~0x40000000
+                found.append(Pdo(self.place, number, cob_id, kind, entries, self._signals))
+        return found
 
     def _check_pdo(self, key: Key, data: bytes) -> None:
         """Mapping changes only while the PDO is invalid, entries only while their number is 0 (CiA 301, 7.5.2.36)."""

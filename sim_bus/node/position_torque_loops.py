@@ -90,7 +90,7 @@ class Loops:
         self._longest = float(self.interpolation.max())
         self._locking[joint] = 1.0 / LOCKING if seconds > 0.0 else 1.0
 
-    def fresh(self, index: int, rows: NDArray[np.intp] | int) -> None:
+    def fresh(self, index: int, rows: list[int]) -> None:
         """Mark targets in object `index` as received for the joints `rows`."""
         waiting = self._fresh[index]
         if np.count_nonzero(waiting) < self.n and not waiting[rows].all():

@@ -1,40 +1,22 @@
-"""PDOs of several nodes in one packed array: what came, and from which nodes."""
+"""PDOs of nodes: what came is taken once, and of its own node alone."""
 
 import numpy as np
 
-from sim_bus.node.pdo import PdoGroup, PdoParameters
+from sim_bus.node.pdo import Pdo
 
 TARGET_POSITION = 0x607A0020
 KEY = (0x607A, 0)
 
 
-def group(*nodes: int) -> tuple[PdoGroup, np.ndarray]:
-    signal = np.zeros(3, np.int32)
-    members = [PdoParameters(node, 1, 0x301 + node, 1, (TARGET_POSITION,)) for node in nodes]
-    return PdoGroup(members, {KEY: signal}), signal
-
-
-def receive(found: PdoGroup, member: int, value: int) -> None:
-    found.buffer[4 * member : 4 * member + 4] = value.to_bytes(4, "little")
-    found.fresh[member] = 1
-
-
 def test_only_what_was_received_is_taken():
-    found, signal = group(0, 1, 2)
-    receive(found, 1, 7)
+    signal = np.zeros(3, np.int32)
+    pdos = [Pdo(node, 1, 0x301 + node, 1, (TARGET_POSITION,), {KEY: signal}) for node in range(3)]
+    pdos[1].content = (7).to_bytes(4, "little")
     signal[2] = 5  # written otherwise
-    assert list(found.take()) == [1]
+    assert [pdo.take() for pdo in pdos] == [False, True, False]
     assert list(signal) == [0, 7, 5]
-    assert found.take() is None
-    for member in range(3):
-        receive(found, member, member)
-    assert list(found.take()) == [0, 1, 2]
+    assert not any(pdo.take() for pdo in pdos)
+    for node, pdo in enumerate(pdos):
+        pdo.content = node.to_bytes(4, "little")
+    assert all(pdo.take() for pdo in pdos)
     assert list(signal) == [0, 1, 2]
-
-
-def test_a_group_of_some_of_the_nodes_leaves_the_others():
-    found, signal = group(0, 2)
-    receive(found, 0, 3)
-    receive(found, 1, 4)
-    assert list(found.take()) == [0, 2]
-    assert list(signal) == [3, 0, 4]
