@@ -7,10 +7,13 @@ from typing import Generic, TypeVar, overload
 import numpy as np
 
 from armlink.arrays import Array
+from armlink.errors import BadInput
 
 V = TypeVar("V", float, Array)
 GAIN_RANGE = (0.5, 2.0)
 """Gains beyond these are no gains of a sensor; none is ever put into force."""
+MOST_OFFSET = 1e4
+"""Offsets beyond this are none of a sensor [N·m]; likewise."""
 REAL32_STEP = 1e-6
 """Relative difference that REAL32 in a controller may make to a value, the rounding of decimal output included."""
 
@@ -73,6 +76,14 @@ class Calibration(TorqueCalibration[float]):
     def is_blank(self) -> bool:
         """Whether no calibration was ever written: gain 1, offset 0, record 0."""
         return (self.gain, self.offset, self.record_id) == (1.0, 0.0, 0)
+
+    def require_usable(self, joint: str) -> None:
+        """Raise BadInput for values that no sensor of this joint has."""
+        if not (GAIN_RANGE[0] <= self.gain <= GAIN_RANGE[1] and abs(self.offset) < MOST_OFFSET):
+            raise BadInput(
+                f"{joint}: gain {self.gain} and offset {self.offset} N·m: the gain must be {GAIN_RANGE[0]} to "
+                f"{GAIN_RANGE[1]}, and the offset a finite number"
+            )
 
 
 def per_joint(calibrations: Iterable[TorqueCalibration[float]]) -> TorqueCalibration[Array]:

@@ -13,11 +13,9 @@ from armlink.link.ends import EndCause
 from armlink.link.types import Tell
 from armlink.loop.channel import Channel, Closed
 from armlink.loop.driver import Controllers
-from armlink.loop.ending import see_out
+from armlink.loop.ending import HANG_SECONDS, see_out
 from armlink.loop.messages import Call, LoopAnswer, Open
 
-HANG_SECONDS = 10.0
-"""A process that takes nothing, or answers nothing, for this time hangs [s]."""
 numbers = itertools.count(1)
 """Ids of what is asked of a process."""
 R = TypeVar("R")

@@ -14,8 +14,8 @@ from armlink.termination import Dropped
 
 GRACE = 2.0
 """After SIGTERM the job has this long to end this process [s]."""
-SILENT_END = 10.0
-"""A process that says nothing for this long while it brings its arm to the end hangs [s]."""
+HANG_SECONDS = 10.0
+"""A process that takes nothing, answers nothing, or says nothing at the end of its arm, for this time hangs [s]."""
 TOLD_EVERY = 0.2
 """Job and loop hear from each other at least so often [s]."""
 OF_A_SERVICE = (signal.SIGTERM, signal.SIGABRT)
@@ -84,12 +84,12 @@ def see_out(channel: Channel, runs: Callable[[], bool], cause: EndCause, tell: C
     """Have the process at the other end bring its arm to the end, and wait until it has ended; whether it has.
 
     `tell` is told what it does, and may raise Dropped: the arm is then let go. `runs` tells whether the process runs.
-    One that says nothing for SILENT_END hangs. Closes the channel.
+    One that says nothing for HANG_SECONDS hangs. Closes the channel.
     """
     heard, dropped = time.monotonic(), False
     try:
         channel.put(End(cause))
-        while runs() and time.monotonic() - heard < SILENT_END:
+        while runs() and time.monotonic() - heard < HANG_SECONDS:
             channel.flush()
             channel.wait(TOLD_EVERY)
             try:
@@ -105,6 +105,6 @@ def see_out(channel: Channel, runs: Callable[[], bool], cause: EndCause, tell: C
     except Closed:
         pass
     channel.close()
-    while runs() and time.monotonic() - heard < SILENT_END:
+    while runs() and time.monotonic() - heard < HANG_SECONDS:
         time.sleep(TOLD_EVERY / 10)
     return not runs()

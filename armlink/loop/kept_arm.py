@@ -11,7 +11,8 @@ from armlink.errors import BusFault
 from armlink.link.ends import EndCause
 from armlink.link.types import Controller, Tell
 from armlink.loop.channel import Closed
-from armlink.loop.cycle_process import HANG_SECONDS, CycleProcess, RemoteControllers, numbers
+from armlink.loop.cycle_process import CycleProcess, RemoteControllers, numbers
+from armlink.loop.ending import HANG_SECONDS
 from armlink.loop.messages import (
     Batch,
     Call,

@@ -14,7 +14,7 @@ from armlink.link.joints.groups import by_joint
 from armlink.link.joints.values import JointValues
 from armlink.link.link import Link
 from armlink.link.listener import Listener
-from armlink.link.park import speeds, straight
+from armlink.link.park import TELL_SECONDS, speeds, straight
 from armlink.link.types import Command, Sample, Setpoints, Tell
 from armlink.selftest.scales import Evidence, ScaleFinding, ScaleTrack, gather, judge
 
@@ -28,8 +28,6 @@ REST_SECONDS = 0.6
 """Rest at both ends of the motion [s]."""
 ASKED = 3
 """Currents that are asked for at each end."""
-TELL_EVERY = 0.5
-"""[s]."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ def by_hand(link: Link, tell: Tell, seconds: float) -> list[JointScales]:
             raise BusFault(fault)
         tracks.add(sample, [None] * link.n)
         low, high = np.fmin(low, sample.position), np.fmax(high, sample.position)
-        if now - told >= TELL_EVERY:
+        if now - told >= TELL_SECONDS:
             told = now
             seen = ", ".join(f"{name} {way:.1f} rad" for name, way in zip(link.names, high - low, strict=True))
             tell(f"turn every joint from stop to stop, {end - now:.0f} s left: {seen}")
@@ -129,7 +127,7 @@ def by_listening(listener: Listener, tell: Tell, seconds: float) -> list[JointSc
         if sample is not None:
             tracks.add(sample, listener.orders_sent)
             heard += 1
-        if now - told >= TELL_EVERY:
+        if now - told >= TELL_SECONDS:
             told = now
             tell(f"{heard} cycles heard, {max(end - now, 0):.0f} s left")
     if not heard:

@@ -7,6 +7,7 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.damiao.frames import (
     INTEGER_REGISTERS,
     MIT_MODE,
+    OTHER_MODES,
     READ,
     REFRESH,
     REGISTERS_ID,
@@ -30,8 +31,6 @@ LEAST_RANGE = 1e-3
 """A range register of 0 counts as this."""
 STORE = 0xAA
 STAGE = int(STAGE_TEMPERATURE)
-OTHER_MODES = 0x100, 0x200, 0x300
-"""Offsets of the command ids of the position, velocity and force modes."""
 WRITABLE = frozenset((0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35))
 
 

@@ -7,9 +7,12 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import EXTENDED, REMOTE
 from armlink.drives.mit_packing import Grid, grid_of
 from armlink.drives.robstride.frames import (
+    FAULTS,
+    IDENTITY_TARGET,
     MOTION_BITS,
     MOTION_MODE,
     NEVER_READ,
+    OUR_ID,
     RANGES,
     TIMEOUT_UNIT,
     Feedback,
@@ -28,12 +31,9 @@ from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import BUS_VOLTAGE, MOTOR_TEMPERATURE, NO_COMMAND, SimulatedDrive
 from sim_bus.sim_section import serial_of
 
-HOST = 0xFD
-"""Host id to which feedback goes before a host has shown its own."""
-ENCODER_FAULT = 1 << 3
+ENCODER_FAULT = 1 << FAULTS.index("encoder")
 REPORT_PERIOD = 0.01
 """Period of active reports (type 24) [s]."""
-IDENTITY_TARGET = 0xFE
 READ_ONLY = frozenset(
     (
         RobStrideParameter.POSITION,
@@ -71,7 +71,7 @@ class RobStrideDrive(SimulatedDrive):
         self.parameters = dict(self._stored)
         self.mode, self.fault_bits = RunMode.RESET, 0
         self.command = NO_COMMAND
-        self._host, self._reports_at = HOST, math.inf
+        self._host, self._reports_at = OUR_ID, math.inf
 
     @property
     def coding(self) -> Grid:
@@ -186,7 +186,7 @@ class RobStrideDrive(SimulatedDrive):
 
     def reboot(self) -> None:
         self.parameters = dict(self._stored)
-        self.fault_bits, self._reports_at, self._host = 0, math.inf, HOST
+        self.fault_bits, self._reports_at, self._host = 0, math.inf, OUR_ID
         self._stop()
 
     def inject(self, fault: str, value: float) -> None:

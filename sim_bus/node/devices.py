@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.canopen.eds_file import expected_identity, of_joints
 from armlink.drives.canopen.settings import TorqueObject
+from armlink.drives.canopen.units import USER_UNITS
 from sim_bus.node.object_arrays import INPUT, Key
-from sim_bus.node.position_torque_loops import CSP, CST, CSV, FEED, PROFILE_POSITION, PROFILE_TORQUE, UNIT
+from sim_bus.node.position_torque_loops import CSP, CST, CSV, PROFILE_POSITION, PROFILE_TORQUE, UNIT
 from sim_bus.sim_section import serial_of, sim_section
 
 SUPPORTED_MODES = sum(1 << (mode - 1) for mode in (PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST))
@@ -102,7 +103,7 @@ def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int, device: Dev
         (0x6085, 0): deceleration,
         (0x6087, 0): round(joint.max_torque_rate * 1000 / joint.rated_torque),
         (0x608F, 1): increments,
-        (0x6092, 1): FEED,
+        (0x6092, 1): USER_UNITS,
         (0x60C2, 1): min(max(round(1000 / link.rate), 1), 255),
         (0x6502, 0): _modes_shown(device),
         **device.values,

@@ -7,11 +7,12 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.drives.canopen.cia402 import DriveState
 from armlink.drives.canopen.settings import TorqueObject
+from armlink.drives.canopen.units import USER_UNITS
 from sim_bus.node.cia402 import STATUS, command, next_state
 from sim_bus.node.devices import Device
 from sim_bus.node.node import Node
 from sim_bus.node.object_arrays import INPUT, ObjectArrays
-from sim_bus.node.position_torque_loops import FEED, KINDS, OFF, POSITION, UNIT, Loops
+from sim_bus.node.position_torque_loops import KINDS, OFF, POSITION, UNIT, Loops
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import JointSensors
 
@@ -54,7 +55,7 @@ class SimulatedDrives:
         self._word_in, self._mode_in, self._limit_in = signals[0x6040, 0], signals[0x6060, 0], signals[0x6072, 0]
         self._seen_words, self._seen_modes = self._word_in.copy(), self._mode_in.copy()
         self._seen_limit = self._limit_in.copy()
-        self._user_per_count = FEED / sensors.increments
+        self._user_per_count = USER_UNITS / sensors.increments
         self._velocity_per_count = self._user_per_count.copy()
         self._input_out, self._input_scale = signals[INPUT, 1], np.full(n, np.inf)
         self._input_zero = np.zeros(n)

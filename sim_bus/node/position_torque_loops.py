@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
+from armlink.drives.canopen.units import USER_UNITS
 from sim_bus.node.object_arrays import ObjectArrays
 from sim_bus.physics.plant import Plant
 from sim_bus.physics.sensors import JointSensors
 from sim_bus.sim_section import sim_section
 
-FEED = 1 << 20
-"""User units per joint revolution (6092h)."""
-UNIT = 2 * np.pi / FEED
+UNIT = 2 * np.pi / USER_UNITS
 OFF, TORQUE, POSITION, IMPEDANCE = 0, 1, 2, 3
 PROFILE_POSITION, PROFILE_TORQUE, CSP, CSV, CST = 1, 4, 8, 9, 10
 KINDS = {PROFILE_POSITION: POSITION, PROFILE_TORQUE: TORQUE, CSP: POSITION, CSV: POSITION, CST: TORQUE}

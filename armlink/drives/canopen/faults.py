@@ -16,8 +16,6 @@ ENABLED_BITS = 0x27
 WATCHDOGS = frozenset({0x8130, 0x8250, 0x8700})
 """Emergencies of a node that does not hear its host: heartbeat, RPDO deadline, SYNC (CiA 301)."""
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
-NO_MODE = 0
-"""Stands for the mode display of a joint that has sent none: no mode is active."""
 
 
 class JointStates:
@@ -28,7 +26,7 @@ class JointStates:
         self.names = names
         self.statuses = [NO_STATUS] * m
         """Status words (6041h)."""
-        self.displays = [NO_MODE] * m
+        self.displays = [OFF] * m
         self.mode_since = [-math.inf] * m
         """When each joint's mode was commanded, by the clock [s]."""
         self.positions = [math.nan] * m

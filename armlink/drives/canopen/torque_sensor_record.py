@@ -46,14 +46,7 @@ def write_record(services: NodeServices, calibration: Calibration, store: bool =
     Raises BadInput for values that no sensor has, BusFault if the controller holds something else than was written.
     """
     gain, offset, record_id, date = calibration.gain, calibration.offset, calibration.record_id, calibration.date
-    if not GAIN_RANGE[0] <= gain <= GAIN_RANGE[1]:
-        raise BadInput(
-            f"{services.joint}: gain {gain} cannot be written to the drive: expected {GAIN_RANGE[0]} to {GAIN_RANGE[1]}"
-        )
-    if not abs(offset) < 1e4:
-        raise BadInput(
-            f"{services.joint}: offset {offset} N·m cannot be written to the drive: expected a finite number"
-        )
+    calibration.require_usable(services.joint)
     for what, number in (("record id", record_id), ("date", date)):
         if not 0 <= number < 2**32:
             raise BadInput(

@@ -20,7 +20,7 @@ bits 24 to 31 of both."""
 SECOND, MINUTE = 0x03, 0x47
 
 USER_UNITS = 1 << 20
-"""User units per joint revolution, assumed if 6092h is not read from the controllers."""
+"""User units per joint revolution (6092h) of our controllers, assumed where it is not read from them."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from armlink.errors import BadInput, BusFault
 
 TRAITS = Traits(torque="current", calibration="host", silence="keeps on", bounds=(), cadence="reply", frame="11")
 """Of a drive with the default keys; with a CAN timeout it lets go."""
-NMT_ID = 0
 LISTEN = 0.1
 """A drive that answers another host is heard within this time [s]."""
 LOADED = 0.02
@@ -73,7 +72,7 @@ class CubeMarsDrives(MitDrives[CubeMarsMemory]):
 
     def _spare_canopen(self, arm: ArmFile) -> None:
         """Raise BadInput where CANopen nodes share the bus and would take replies for NMT commands."""
-        buses = {row.bus for row in self.rows if row.settings.reply == NMT_ID}
+        buses = {row.bus for row in self.rows if row.settings.reply == 0}
         for joint in arm.require_link().joints:
             if joint.settings.family == "canopen" and joint.bus in buses:
                 raise BadInput(

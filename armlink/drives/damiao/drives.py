@@ -10,7 +10,7 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.base import Ask
 from armlink.drives.damiao import frames
-from armlink.drives.damiao.frames import READ, TIMEOUT_UNIT, WRITE, DamiaoRegister, DamiaoStatus
+from armlink.drives.damiao.frames import OTHER_MODES, READ, TIMEOUT_UNIT, WRITE, DamiaoRegister, DamiaoStatus
 from armlink.drives.damiao.settings import MODELS, DamiaoSettings
 from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
@@ -22,8 +22,6 @@ from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="11")
-OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
-"""Offsets of the command ids of the modes that armlink does not use."""
 IDENTITY = (
     DamiaoRegister.HARDWARE_VERSION,
     DamiaoRegister.SOFTWARE_VERSION,

@@ -12,6 +12,8 @@ from armlink.drives.mit_packing import Grid, MitFeedback, pack_feedback, unpack_
 REGISTERS_ID = 0x7FF
 """Identifier of register requests to any drive."""
 READ, WRITE, REFRESH = 0x33, 0x55, 0xCC
+OTHER_MODES = {0x100: "position", 0x200: "velocity", 0x300: "force"}
+"""Offsets of the command ids of the modes that armlink does not use."""
 
 
 class DamiaoRegister(IntEnum):

@@ -16,7 +16,6 @@ WRITE, READ, REPLY = 0x00, 0x10, 0x20
 WRITE_ERROR, READ_ERROR, NOP = 0x30, 0x31, 0x50
 INT8, INT16, INT32, FLOAT = 0, 1, 2, 3
 LAYOUTS = (struct.Struct("<b"), struct.Struct("<h"), struct.Struct("<i"), struct.Struct("<f"))
-SIZES = (1, 2, 4, 4)
 REPLY_WANTED = 0x80
 _NOPS = bytes([NOP])
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -194,10 +193,10 @@ def unpack(data: bytes) -> Iterator[Subframe]:
             if kind == READ:
                 yield Subframe(READ, register, math.nan, resolution)
                 continue
-            if place + SIZES[resolution] > len(data):
+            if place + LAYOUTS[resolution].size > len(data):
                 return
             yield Subframe(kind, register, unpack_value(register, data, place, resolution), resolution)
-            place += SIZES[resolution]
+            place += LAYOUTS[resolution].size
 
 
 def pack_value(register: int, value: float, resolution: int) -> bytes:

@@ -19,7 +19,9 @@ from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, 
 from armlink.drives.robstride import frames
 from armlink.drives.robstride.frames import (
     GRIDS,
+    IDENTITY_TARGET,
     MOTION_MODE,
+    OUR_ID,
     RANGES,
     TIMEOUT_UNIT,
     RobStrideParameter,
@@ -35,8 +37,6 @@ from armlink.errors import BusFault
 TRAITS = Traits(torque="current", calibration="host", silence="falls", bounds=(), cadence="reply", frame="29")
 HOST_TYPES = frozenset((Type.MOTION, Type.ENABLE, Type.STOP, Type.SET_ZERO, Type.SET_ID, Type.WRITE, Type.SAVE))
 """Frames that change something, which one host alone may send."""
-OUR_ID, IDENTITY_TARGET = 0xFD, 0xFE
-"""Id that asks, and that all answers to type 0 go to."""
 MOST_TORQUE = max(RANGES, key=lambda model: RANGES[model].torque)
 """Model with the largest torque range."""
 TOLERANCE = 1e-3

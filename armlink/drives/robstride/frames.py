@@ -25,6 +25,8 @@ MOTION_BITS = (16, 16, 16, 16, 16)
 MOTION = struct.Struct(">4H")
 GRIDS = {model: grid_of(ranges, MOTION_BITS) for model, ranges in RANGES.items()}
 """Steps that the frames of each model can carry."""
+OUR_ID, IDENTITY_TARGET = 0xFD, 0xFE
+"""Id that asks, and that all answers to type 0 go to."""
 NEVER_READ = 0x01
 """Bits 16 to 23 of the identifier that answers the reading of an unknown parameter."""
 

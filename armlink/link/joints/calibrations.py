@@ -12,12 +12,11 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.contributed import contributed
-from armlink.errors import BadInput
 from armlink.link.joints.ask import LinkAsk
 from armlink.link.joints.groups import Group, by_joint, traits_of
 from armlink.link.joints.values import JointValues
 from armlink.link.types import DriveSerial
-from armlink.torque_calibration import GAIN_RANGE, Calibration, per_joint
+from armlink.torque_calibration import Calibration, per_joint
 
 BLANK = Calibration(1.0, 0.0)
 """Of a drive that was never calibrated."""
@@ -119,12 +118,7 @@ class Calibrations:
         calls this.
         """
         if joint in self._in_host:
-            gain, offset = calibration.gain, calibration.offset
-            if not (GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and abs(offset) < 1e4):
-                raise BadInput(
-                    f"{self.names[joint]}: gain {gain} and offset {offset} N·m: the gain must be {GAIN_RANGE[0]} "
-                    f"to {GAIN_RANGE[1]}, and the offset a finite number"
-                )
+            calibration.require_usable(self.names[joint])
             self._in_host[joint] = calibration
             self._apply_host()
             self.calibration_changed(joint)

@@ -8,7 +8,7 @@ from armlink.arm_file import LinkJoint
 from armlink.drives.canopen import controller_setup as device
 from armlink.drives.canopen import object_dictionary as objects
 from armlink.drives.canopen import pdo
-from armlink.drives.canopen.cyclic.wire import check_fits
+from armlink.drives.canopen.cyclic.wire import UINT32_MAX, check_fits
 from armlink.drives.canopen.object_dictionary import Entry
 from armlink.drives.canopen.pdo import Pdo
 from armlink.drives.canopen.profile import Profile
@@ -16,7 +16,7 @@ from armlink.drives.canopen.sdo import NodeServices
 from armlink.drives.canopen.units import Units, read_units
 from armlink.drives.orders import Limits, Mode
 from armlink.errors import BadInput
-from armlink.torque_calibration import GAIN_RANGE
+from armlink.torque_calibration import GAIN_RANGE, MOST_OFFSET
 
 BURST = 5
 """Cycles whose change may come at once, after the host was late."""
@@ -24,9 +24,6 @@ SYNCS_A_CYCLE = 2
 """Every drive acts on a SYNC at once; a cycle may follow another early, when the host was late."""
 READING_AGE = 5.0
 """A reading stands for where a joint is for this long [s]; its set-up takes some seconds before the first cycle."""
-MOST_OFFSET = 1e4
-"""[N·m]."""
-_UINT32 = (1 << 32) - 1
 _NMT_COMMANDS = (1, 2, 128, 129, 130)
 _ACKNOWLEDGED = 0x60
 _UPLOADED = {1: 0x4F, 2: 0x4B, 4: 0x43}
@@ -176,7 +173,7 @@ class NodeRules:
         """Objects that may be written, with the values that the set-up gives them."""
         allowed: dict[Entry, dict[str, Any]] = {}
         for index in pdo.foreign_rpdos(self._described):
-            allowed[Entry(index, 1, "I", "COB-ID of an RPDO that is off")] = {"least": pdo.INVALID, "most": _UINT32}
+            allowed[Entry(index, 1, "I", "COB-ID of an RPDO that is off")] = {"least": pdo.INVALID, "most": UINT32_MAX}
         for each in self.profile.pdos:
             is_command = each.communication == pdo.RPDO1.communication
             watched = is_command and self.profile.has(objects.RPDO_DEADLINE)
@@ -187,7 +184,7 @@ class NodeRules:
                         values.append(value)
         allowed[objects.TORQUE_OFFSET] = {"values": [0]}
         allowed[objects.MODE] = {"values": [int(mode) for mode in Mode]}
-        every_mode = _UINT32
+        every_mode = UINT32_MAX
         for entry, value in device.settings(self.unit, self.limits, self._protection, every_mode, self.profile):
             allowed[entry] = {"values": [value]}
         if self.profile.reading == objects.TORQUE_READING:
@@ -203,7 +200,7 @@ class NodeRules:
 
 def _record_writes() -> dict[Entry, dict[str, Any]]:
     """The torque sensor record: its values bounded, since a wrong gain would change every torque that is read."""
-    free = {"least": 0, "most": _UINT32}
+    free = {"least": 0, "most": UINT32_MAX}
     return {
         objects.STAGED_GAIN: {"least": GAIN_RANGE[0], "most": GAIN_RANGE[1]},
         objects.STAGED_OFFSET: {"least": -MOST_OFFSET, "most": MOST_OFFSET},
