@@ -156,6 +156,12 @@ class BasicDrives(Generic[M]):
         address = self.settings[joint].address
         return DriveIdentity(joint, address, True, name, serial, firmware, self.power(joint), mismatch)
 
+    def silent(self, joint: int, hint: str) -> BusFault:
+        """The fault of a drive that does not answer its set-up; `hint` is what else to check."""
+        return BusFault(
+            f"{self.names[joint]}: no answer from {self.settings[joint].address}: check that the drive is powered{hint}"
+        )
+
     def missing(self, ask: Ask) -> list[int]:
         """Drives that do not answer. Sets nothing."""
         return [each.joint for each in self.identify(ask) if not each.present]

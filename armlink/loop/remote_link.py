@@ -66,7 +66,6 @@ class RemoteLink(CycleProcess, RemoteControllers):
 
     @property
     def position_step(self) -> Array:
-        """Smallest change that each position reading can show (n,) [rad]; inf before start()."""
         return self._step
 
     @property
@@ -81,7 +80,6 @@ class RemoteLink(CycleProcess, RemoteControllers):
 
     @property
     def stats(self) -> Stats:
-        """Counters since the first cycle."""
         found: Stats = self._call("stats")
         return found
 
@@ -117,7 +115,6 @@ class RemoteLink(CycleProcess, RemoteControllers):
         self.inside(park, lambda text: None)
 
     def inside(self, function: Callable[..., Any], tell: Tell, *args: Any, **kw: Any) -> Any:
-        """Call `function(link, tell, ...)` in the process that makes the cycles."""
         self._tell_on = tell
         try:
             return self._call(function, *args, **kw)

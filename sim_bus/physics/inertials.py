@@ -10,8 +10,8 @@ from sim_bus.effects.state import Imperfections
 from sim_bus.physics.mjcf import TINY_INERTIA
 
 
-class ModelInertials:
-    """Keeps the nominal values of a compiled model and writes changed ones into it."""
+class ModelBodies:
+    """Keeps the nominal frames and inertials of a compiled model and writes changed ones into it."""
 
     def __init__(self, model: Any, bodies: list[int], payload_body: int) -> None:
         """`bodies` carry the links, base to tip; `payload_body` the attached mass."""
@@ -19,9 +19,21 @@ class ModelInertials:
         self._mass: Array = model.body_mass.copy()
         self._com: Array = model.body_ipos.copy()
         self._inertia = _full_inertia(model)
+        self._place: Array = model.body_pos[bodies].copy()
+        self._turn: Array = model.body_quat[bodies].copy()
 
-    def apply(self, state: Imperfections, attached: Array) -> None:
-        """Set the nominal values plus effects plus `attached` (mass [kg], point in the last bar frame [m])."""
+    def turn_frames(self, state: Imperfections) -> None:
+        """Set the nominal frames, changed by `frame_turn` and `frame_shift`; `weigh` comes after it."""
+        shift, turn = np.empty(3), np.empty(4)
+        for row, body in enumerate(self._bodies):
+            mujoco.mju_rotVecQuat(shift, state.frame_shift[row], self._turn[row])
+            self._model.body_pos[body] = self._place[row] + shift
+            angle = float(np.linalg.norm(state.frame_turn[row]))
+            mujoco.mju_axisAngle2Quat(turn, state.frame_turn[row] / angle if angle else np.array([0, 0, 1.0]), angle)
+            mujoco.mju_mulQuat(self._model.body_quat[body], self._turn[row], turn)
+
+    def weigh(self, state: Imperfections, attached: Array) -> None:
+        """Set the nominal inertials plus effects plus `attached` (mass [kg], point in the last bar frame [m])."""
         model, bodies = self._model, self._bodies
         mass, com, inertia = self._mass.copy(), self._com.copy(), self._inertia.copy()
         com[bodies] += state.mass_moment / mass[bodies, None]
@@ -64,23 +76,3 @@ def _principal(inertia: Array) -> tuple[Array, Array]:
 def _point_inertia(arm: Array) -> Array:
     x, y, z = arm
     return np.array([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
-
-
-class ModelFrames:
-    """Keeps the nominal frames of a compiled model and writes changed ones into it."""
-
-    def __init__(self, model: Any, bodies: list[int]) -> None:
-        """`bodies` carry the links, base to tip."""
-        self._model, self._bodies = model, bodies
-        self._place: Array = model.body_pos[bodies].copy()
-        self._turn: Array = model.body_quat[bodies].copy()
-
-    def apply(self, state: Imperfections) -> None:
-        """Set the nominal frames, changed by `frame_turn` and `frame_shift`; mj_setConst is the caller's."""
-        shift, turn = np.empty(3), np.empty(4)
-        for row, body in enumerate(self._bodies):
-            mujoco.mju_rotVecQuat(shift, state.frame_shift[row], self._turn[row])
-            self._model.body_pos[body] = self._place[row] + shift
-            angle = float(np.linalg.norm(state.frame_turn[row]))
-            mujoco.mju_axisAngle2Quat(turn, state.frame_turn[row] / angle if angle else np.array([0, 0, 1.0]), angle)
-            mujoco.mju_mulQuat(self._model.body_quat[body], self._turn[row], turn)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from sim_bus.effects.state import Imperfections
-from sim_bus.physics.inertials import ModelFrames, ModelInertials
+from sim_bus.physics.inertials import ModelBodies
 from sim_bus.physics.joint_torques import Cables, LateMotors, dry_friction, unevenness
 from sim_bus.physics.mjcf import build_model
 from sim_bus.physics.transmission import HARD_GEAR_STEP, Transmissions, rotor_inertia
@@ -66,8 +66,7 @@ class Plant:
         if (self._dof == np.arange(self.n)).all():
             self._dof = slice(0, self.n)
         self.lower, self.upper = self.model.jnt_range[joints].T.copy()
-        self._inertials = ModelInertials(self.model, list(built.bodies), built.payload_body)
-        self._frames = ModelFrames(self.model, list(built.bodies))
+        self._bodies = ModelBodies(self.model, list(built.bodies), built.payload_body)
         self._gravity: Array = self.model.opt.gravity.copy()
         self._armature = self.model.dof_armature[self._dof].copy()
         self._damping = self.model.dof_damping[self._dof].copy()
@@ -120,8 +119,8 @@ class Plant:
         self.model.opt.gravity[:] = _tilted(imperfections.tilt).T @ self._gravity
         self.model.jnt_stiffness[self._joints] = imperfections.spring[:, 0]
         self.model.qpos_spring[self._dof] = imperfections.spring[:, 1]
-        self._frames.apply(imperfections)
-        self._inertials.apply(self._imperfections, self._attached)
+        self._bodies.turn_frames(imperfections)
+        self._bodies.weigh(self._imperfections, self._attached)
         self._cables = None
         if imperfections.cable.any():
             self._cables = Cables(imperfections, (self.lower + self.upper) / 2, self.position)
@@ -143,7 +142,7 @@ class Plant:
     def attach_mass(self, mass: float, point: Array) -> None:
         """Attach a point mass [kg] at `point` of the last link's bar frame [m], in place of an earlier one."""
         self._attached = np.array([mass, *np.asarray(point, float)])
-        self._inertials.apply(self._imperfections, self._attached)
+        self._bodies.weigh(self._imperfections, self._attached)
         mujoco.mj_forward(self.model, self.data)
 
     def detach_mass(self) -> None:

@@ -179,9 +179,7 @@ class DamiaoDrives(MitDrives[DamiaoMemory]):
         ask.send(settings.id, special(Special.DISABLE))
         values = self._read(ask, joint, (*RANGE_FIELDS, DamiaoRegister.REPLY_ID, *NOTED))
         if values is None:
-            raise BusFault(
-                f"{name}: no answer from {settings.address}: check that the drive is powered and its id is right"
-            )
+            raise self.silent(joint, " and its id is right")
         reply_id = values[DamiaoRegister.REPLY_ID]
         if reply_id != settings.reply:
             raise BadInput(

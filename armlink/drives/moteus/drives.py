@@ -165,11 +165,7 @@ class MoteusDrives(BasicDrives[MoteusMemory]):
         known, name, asked = self.memory[joint], self.names[joint], (*QUERY, MoteusRegister.HOME_STATE)
         values = self._ask(ask, joint, {MoteusRegister.MODE: frames.MoteusMode.STOPPED}, asked)
         if values is None:
-            address = self.settings[joint].address
-            raise BusFault(
-                f"{name}: no answer from {address}: check that the drive is powered, its id is right, and the "
-                "bus is CAN FD"
-            )
+            raise self.silent(joint, ", its id is right, and the bus is CAN FD")
         if values.get(MoteusRegister.HOME_STATE) != HOMED_AT_OUTPUT:
             raise BusFault(
                 f"{name}: its position is not the position of its output (home state "

@@ -167,10 +167,7 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
         self.require_window(joint, limits, grid)
         feedback = self._fed_back(ask, joint, frames.stop_frame(settings.id, settings.host))
         if feedback is None:
-            raise BusFault(
-                f"{self.names[joint]}: no answer from {settings.address}: check that the drive is powered, "
-                "its id is right, and its protocol is private"
-            )
+            raise self.silent(joint, ", its id is right, and its protocol is private")
         most = min(limits.max_torque, grid.ranges.torque)
         self._set(ask, joint, RobStrideParameter.RUN_MODE, MOTION_MODE, "the drive is not in motion mode")
         self._set(ask, joint, RobStrideParameter.LIMIT_TORQUE, most, "the torque limit of the drive is not in force")

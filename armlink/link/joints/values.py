@@ -133,17 +133,12 @@ class JointValues:
         """The order for a drive from that for its joint; the calibration corrects torque and gains of a motor."""
         gear, sign = self._gears[joint], self._signs[joint]
         gain, offset = self._corrections[joint] if order.power is Power.ON else (1.0, 0.0)
-        power, walk, mode, position, velocity, torque, kp, kd, refused = order
-        return Order(
-            power,
-            walk,
-            mode,
-            sign * gear * position + self._zeros[joint],
-            sign * gear * velocity,
-            sign * (gain * torque + offset) / gear,
-            gain * kp / gear**2,
-            gain * kd / gear**2,
-            refused,
+        return order._replace(
+            position=sign * gear * order.position + self._zeros[joint],
+            velocity=sign * gear * order.velocity,
+            torque=sign * (gain * order.torque + offset) / gear,
+            kp=gain * order.kp / gear**2,
+            kd=gain * order.kd / gear**2,
         )
 
     def ordered(self, joint: int, sent: Order) -> Order:
@@ -151,17 +146,12 @@ class JointValues:
         if self._direct:
             return sent
         gear, sign = self._gears[joint], self._signs[joint]
-        power, walk, mode, position, velocity, torque, kp, kd, refused = sent
-        return Order(
-            power,
-            walk,
-            mode,
-            sign * (position - self._zeros[joint]) / gear,
-            sign * velocity / gear,
-            sign * torque * gear,
-            kp * gear**2,
-            kd * gear**2,
-            refused,
+        return sent._replace(
+            position=sign * (sent.position - self._zeros[joint]) / gear,
+            velocity=sign * sent.velocity / gear,
+            torque=sign * sent.torque * gear,
+            kp=sent.kp * gear**2,
+            kd=sent.kd * gear**2,
         )
 
     def _drive_position(self, joint: int, position: float) -> float:

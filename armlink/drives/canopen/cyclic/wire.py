@@ -57,19 +57,13 @@ def check_fits(row: LinkJoint, limits: Limits, unit: Units) -> None:
             f"{name}: max_torque is {limits.max_torque} N·m, but the readings of 2100h end at {most:.4g} "
             "N·m: lower max_torque, or take a drive with larger torque readings"
         )
-    if limits.max_torque / unit.torque > INT16_MAX:
-        most = INT16_MAX * unit.torque
-        raise BadInput(f"{name}: max_torque is {limits.max_torque} N·m, but 6071h carries at most {most:.6g} N·m")
-    if limits.max_velocity / unit.velocity > UINT32_MAX:
-        fastest = UINT32_MAX * unit.velocity
-        raise BadInput(
-            f"{name}: max_velocity is {limits.max_velocity} rad/s, but 6081h carries at most {fastest:.6g} rad/s"
-        )
-    if limits.torque_rate / unit.torque > UINT32_MAX:
-        most = UINT32_MAX * unit.torque
-        raise BadInput(
-            f"{name}: max_torque_rate is {limits.torque_rate} N·m/s, but 6087h carries at most {most:.6g} N·m/s"
-        )
+    for key, value, of, scale, most, place in (
+        ("max_torque", limits.max_torque, "N·m", unit.torque, INT16_MAX, "6071h"),
+        ("max_velocity", limits.max_velocity, "rad/s", unit.velocity, UINT32_MAX, "6081h"),
+        ("max_torque_rate", limits.torque_rate, "N·m/s", unit.torque, UINT32_MAX, "6087h"),
+    ):
+        if value / scale > most:
+            raise BadInput(f"{name}: {key} is {value} {of}, but {place} carries at most {most * scale:.6g} {of}")
     if max(abs(limits.lower), abs(limits.upper)) / unit.position > INT32_MAX:
         raise BadInput(
             f"{name}: 607Ah cannot carry the range of this joint, since one user unit is only {unit.position:.3g} rad"
