@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.cubemars.frames import CubeMarsReply, pack_reply
-from armlink.drives.cubemars.settings import CubeMarsSettings
 from armlink.drives.mit_packing import Grid, Special, grid_of, special_of, unpack_command
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.simulated_drive import MOTOR_TEMPERATURE, NO_COMMAND, WrappingDrive
@@ -22,9 +21,10 @@ class CubeMarsDrive(WrappingDrive):
 
     def __init__(self, arm: ArmFile, joint: LinkJoint, motor: Motor, send: Callable[[int, bytes], None]) -> None:
         super().__init__(motor, send)
-        settings: CubeMarsSettings = joint.settings
-        self.address, self.reply = settings.id, settings.reply
-        self.can_timeout = settings.can_timeout
+        settings = joint.settings
+        self.address: int = settings.id
+        self.reply: int = settings.reply
+        self.can_timeout: int = settings.can_timeout
         self._ranges = settings.ranges
         self.motor_mode, self.error = False, 0
         self._deaf_until = -math.inf

@@ -7,6 +7,7 @@ from armlink.arm_file import ArmFile, LinkJoint
 from armlink.drives.damiao.frames import (
     INTEGER_REGISTERS,
     MIT_MODE,
+    MODELS,
     OTHER_MODES,
     READ,
     REFRESH,
@@ -20,7 +21,6 @@ from armlink.drives.damiao.frames import (
     pack_value,
     unpack_value,
 )
-from armlink.drives.damiao.settings import MODELS
 from armlink.drives.mit_packing import Grid, Ranges, Special, grid_of, special_of, unpack_command
 from armlink.errors import BadInput
 from sim_bus.drives.motor import Motor

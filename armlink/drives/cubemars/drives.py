@@ -8,18 +8,21 @@ CAN timeout, whether it was or not: the timeout is set over the serial port, and
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
-from armlink.arm_file import ArmFile, LinkJoint
+from pydantic import Field, FiniteFloat, model_validator
+
+from armlink.arm_file import ArmFile, LinkJoint, Positive
 from armlink.bus.port import Frame
 from armlink.drives.base import Ask
-from armlink.drives.cubemars.frames import NO_COMMAND, CubeMarsReply, error_text, unpack_reply
-from armlink.drives.cubemars.settings import CubeMarsSettings
+from armlink.drives.cubemars.frames import MODELS, NO_COMMAND, CubeMarsReply, error_text, unpack_reply
 from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory
-from armlink.drives.mit_packing import Special, grid_of, pack_command, special, unwrap
+from armlink.drives.mit_packing import Ranges, Special, grid_of, pack_command, special, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup, law_torque
 from armlink.drives.searched_bus import SearchedBus
+from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 
@@ -31,6 +34,60 @@ LOADED = 0.02
 """Commands that ask for more than this share of the torque range show whether the drive follows them."""
 FOLLOWS = 0.5
 """A drive that makes less than this share of the torque that is asked for does not follow."""
+
+
+class CubeMarsSettings(DriveSettings):
+    """A CubeMars AK drive in MIT mode."""
+
+    family: Literal["cubemars"] = "cubemars"
+    id: Annotated[int, Field(ge=1, le=0x7F)]
+    """CAN id: that of its commands."""
+    reply: Annotated[int, Field(ge=0, le=0x7F)] = 0
+    """Master id: that of its replies, which tell its own id in their first byte."""
+    model: str = ""
+    """Model as on its label, for example AK80-9: its ranges, where the keys below do not give them."""
+    position_range: Positive | None = None
+    """End of the packed positions [rad]; None: the model's."""
+    velocity_range: Positive | None = None
+    """[rad/s]."""
+    torque_range: Positive | None = None
+    """[N·m]."""
+    can_timeout: Annotated[int, Field(ge=0, le=100_000)] = 0
+    """CAN timeout as set in the drive over its serial port [cycles of its own loop]; 0: none, the drive keeps on."""
+    kp: Annotated[FiniteFloat, Field(ge=0, le=500)]
+    """Stiffness under position control, at the drive's output [N·m/rad]."""
+    kd: Annotated[FiniteFloat, Field(ge=0, le=5)]
+    """Damping under position control [N·m·s/rad]."""
+
+    @model_validator(mode="after")
+    def _ranges_are_known(self) -> "CubeMarsSettings":
+        given = (self.position_range, self.velocity_range, self.torque_range)
+        if self.model.upper() not in MODELS and None in given:
+            raise ValueError(
+                f"model {self.model!r} is unknown: give one of {', '.join(MODELS)}, or give position_range, "
+                "velocity_range and torque_range from the manual"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _replies_differ_from_commands(self) -> "CubeMarsSettings":
+        if self.reply == self.id:
+            raise ValueError(
+                f"reply {self.reply:#04x} is the id of the drive itself, so replies would look like commands "
+                "of another host: set another master id in the drive (set_master_id, over its serial port)"
+            )
+        return self
+
+    @property
+    def ranges(self) -> Ranges:
+        """By which its frames are coded."""
+        of_model = MODELS.get(self.model.upper(), (0.0, 0.0, 0.0))
+        given = (self.position_range, self.velocity_range, self.torque_range)
+        return Ranges(*(own or usual for own, usual in zip(given, of_model, strict=True)))
+
+    @property
+    def address(self) -> str:
+        return f"id {self.id:02X}h"
 
 
 @dataclass

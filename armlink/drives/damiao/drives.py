@@ -1,23 +1,26 @@
 """Damiao DM-J drives on one bus, in MIT mode: set-up by registers, one command and one reply a cycle."""
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, FiniteFloat, field_validator
 
 from armlink.arm_file import ArmFile, LinkJoint
 from armlink.bus.port import Frame
 from armlink.drives.base import Ask
 from armlink.drives.damiao import frames
-from armlink.drives.damiao.frames import OTHER_MODES, READ, TIMEOUT_UNIT, WRITE, DamiaoRegister, DamiaoStatus
-from armlink.drives.damiao.settings import MODELS, DamiaoSettings
+from armlink.drives.damiao.frames import MODELS, OTHER_MODES, READ, TIMEOUT_UNIT, WRITE, DamiaoRegister, DamiaoStatus
 from armlink.drives.family import Discovery, Family
 from armlink.drives.findings import FoundDrive
 from armlink.drives.mit_drives import MitDrives, MitMemory
 from armlink.drives.mit_packing import Grid, Ranges, Special, grid_of, special, unpack_feedback, unwrap
 from armlink.drives.orders import DriveIdentity, Limits, Order, Power, Reading, Setup
 from armlink.drives.searched_bus import SearchedBus
+from armlink.drives.settings import DriveSettings
 from armlink.drives.traits import Traits
 from armlink.errors import BadInput, BusFault
 
@@ -57,6 +60,51 @@ FAULTS = {
     DamiaoStatus.ROTOR_HOT: "motor too hot",
     DamiaoStatus.OVERLOAD: "overload",
 }
+
+
+LABEL = re.compile(r"DM-?(?P<kind>[JHG]?)(?P<size>\d{4,5})(?P<variant>[A-Z]?)(-?2EC)?([ _-]?(24|48)V)?([ _-]?V[\d.]+)?")
+"""A label, such as DM-J4340P-2EC V1.1."""
+
+
+def model_on_label(label: str) -> str | None:
+    """Key of `MODELS` for a label, in whatever case; None for one that is not known.
+
+    Ranges differ by size; a variant that has none of its own has those of its size.
+    """
+    found = LABEL.fullmatch(label.strip().upper())
+    if found is None:
+        return None
+    size = f"DM{found['kind'].replace('J', '')}{found['size']}"
+    return next((model for model in (size + found["variant"], size) if model in MODELS), None)
+
+
+class DamiaoSettings(DriveSettings):
+    """A Damiao DM-J drive in MIT mode."""
+
+    family: Literal["damiao"] = "damiao"
+    id: Annotated[int, Field(ge=1, le=0xFF)]
+    """Command id (ESC_ID, register 8)."""
+    reply: Annotated[int, Field(ge=0, le=0x7FE)]
+    """Reply id (MST_ID, register 7)."""
+    model: str = ""
+    """Model as on its label, for example DM8009 or DM-J8009P-2EC, kept in its short form; a host that only listens
+    takes the scales of its frames from it, until it has heard the drive's own."""
+    kp: Annotated[FiniteFloat, Field(ge=0, le=500)]
+    """Stiffness under position control, at the drive's output [N·m/rad]."""
+    kd: Annotated[FiniteFloat, Field(ge=0, le=5)]
+    """Damping under position control [N·m·s/rad]; 0 with kp makes the motor oscillate."""
+
+    @field_validator("model")
+    @classmethod
+    def _is_known(cls, label: str) -> str:
+        model = model_on_label(label)
+        if label and model is None:
+            raise ValueError(f"Damiao model {label!r} is unknown; there are {', '.join(MODELS)} (or leave `model` out)")
+        return model or ""
+
+    @property
+    def address(self) -> str:
+        return f"id {self.id:02X}h"
 
 
 @dataclass

@@ -7,7 +7,7 @@ import struct
 from enum import IntEnum
 from typing import NamedTuple
 
-from armlink.drives.mit_packing import Grid, MitFeedback, pack_feedback, unpack_feedback
+from armlink.drives.mit_packing import Grid, MitFeedback, Ranges, pack_feedback, unpack_feedback
 
 REGISTERS_ID = 0x7FF
 """Identifier of register requests to any drive."""
@@ -44,6 +44,27 @@ TIMEOUT_UNIT = 50e-6
 """Unit of register 9 [s]; 0 switches the deadman off."""
 MIT_MODE = 1
 """Value of register 10 in which MIT frames are understood."""
+MODELS: dict[str, Ranges] = {
+    "DM3507": Ranges(12.566, 50.0, 5.0),
+    "DM4310": Ranges(12.5, 30.0, 10.0),
+    "DM4310P": Ranges(12.5, 50.0, 10.0),
+    "DM4340": Ranges(12.5, 10.0, 28.0),
+    "DM4340P": Ranges(12.5, 10.0, 28.0),
+    "DM6006": Ranges(12.5, 45.0, 20.0),
+    "DM8006": Ranges(12.5, 45.0, 40.0),
+    "DM8009": Ranges(12.5, 45.0, 54.0),
+    "DM10010": Ranges(12.5, 20.0, 200.0),
+    "DM10010L": Ranges(12.5, 25.0, 200.0),
+    "DMH3510": Ranges(12.5, 280.0, 1.0),
+    "DMH6215": Ranges(12.5, 45.0, 10.0),
+    "DMG6220": Ranges(12.5, 45.0, 10.0),
+    "DM6248P": Ranges(12.566, 20.0, 120.0),
+}
+"""Ranges as delivered, by the name on the label: PMAX [rad], VMAX [rad/s], TMAX [N·m] (registers 21 to 23).
+
+They are taken only where the drive cannot be asked: to listen beside another host, until its registers are heard. A
+start always reads the registers. Source: the maker's register defaults as in python-damiao-driver 1.0.6 and DM_CAN.py.
+"""
 VALUES = struct.Struct("<I"), struct.Struct("<f")
 
 

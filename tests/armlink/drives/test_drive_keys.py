@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from armlink.arm_file import bundled_arms, load_arm
 from armlink.cli import run
-from armlink.drives.damiao.settings import DamiaoSettings
+from armlink.drives.damiao.drives import DamiaoSettings
 from armlink.errors import BadInput
 
 
