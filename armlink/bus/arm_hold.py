@@ -37,7 +37,8 @@ class ArmHold:
             return
         try:
             for name, address in addresses:
-                self._take(_bus_of(bus, name), address)
+                on = bus.member(name) if isinstance(bus, BusGroup) else bus
+                self._take(on.channel_info, address)
         except BaseException:
             self.release()
             raise
@@ -79,10 +80,6 @@ class ArmHold:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.release()
-
-
-def _bus_of(bus: CanBus, name: str) -> str:
-    return bus.member(name).channel_info if isinstance(bus, BusGroup) else bus.channel_info
 
 
 def _holder(name: str) -> str:

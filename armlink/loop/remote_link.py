@@ -140,7 +140,8 @@ class RemoteLink(CycleProcess, RemoteControllers):
         for begin in range(0, len(setpoints), CHUNK):
             self._put(Play(number, setpoints[begin : begin + CHUNK]))
         yield from self._take(number, len(setpoints))
-        self._in_force = _copy(setpoints.command(len(setpoints) - 1))
+        last = setpoints.command(len(setpoints) - 1)
+        self._in_force = Command(last.mode.copy(), last.torque.copy(), last.position.copy(), guard=last.guard)
 
     def run(self, controller: Controller) -> Samples:
         """As Link.run, in the other process."""
@@ -241,10 +242,6 @@ class RemoteLink(CycleProcess, RemoteControllers):
     def _end(self, cause: EndCause) -> None:
         with Presses() as presses:
             self.end(cause, said(self.arm.name, presses))
-
-
-def _copy(command: Command) -> Command:
-    return Command(command.mode.copy(), command.torque.copy(), command.position.copy(), guard=command.guard)
 
 
 def _same(one: Command, other: Command) -> bool:

@@ -42,10 +42,6 @@ class CsvLayout:
     first: tuple[str, ...] = ()
     """Cells of the first row of values."""
 
-    def first_value(self, column: int) -> str:
-        """Cell of the first row of values in a column; empty where there is none."""
-        return self.first[column] if column < len(self.first) else ""
-
 
 def layout_of(content: bytes | bytearray, source: str, header: tuple[str, ...] = ()) -> CsvLayout:
     """Layout of a file's content, of which the first lines are looked at. Raises BadInput where it has no header row.
@@ -138,18 +134,14 @@ def read_numbers(
 
     A time `t` may be dates, which become seconds from the first. Raises BadInput that names row and column.
     """
-    dates = "t" in columns and _holds_dates(layout, columns["t"])
+    first = [cell.replace(layout.decimal, ".") for cell in layout.first[columns["t"] :][:1]] if "t" in columns else []
+    dates = any(cell not in NO_VALUE and not is_number(cell) for cell in first)
     if layout.first and content.count(b"\n") > layout.lines and not dates:
         try:
             return _read_at_once(content, layout, columns)
         except ValueError:
             pass  # an empty cell, or one that is to be named
     return _read_cell_by_cell(content, layout, columns, source, dates)
-
-
-def _holds_dates(layout: CsvLayout, place: int) -> bool:
-    first = layout.first_value(place).replace(layout.decimal, ".")
-    return first not in NO_VALUE and not is_number(first)
 
 
 def _read_at_once(content: bytes | bytearray, layout: CsvLayout, columns: Mapping[str, int]) -> dict[str, Array]:

@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import IO
 
 from armlink.arrays import Array
 from armlink.content.atomic_file import open_whole
@@ -57,11 +56,8 @@ def load_csv(path: Path, columns: Mapping[str, str] = MappingProxyType({}), stat
 
 def names_of_columns(columns: Mapping[str, str], header: Sequence[str]) -> tuple[str, ...]:
     """Joint names that the file's own names of its position columns hold; empty where they hold none."""
-    return joint_names([columns.get(f"q_{i}", "") for i in range(1, 1 + sum(_is_position(c) for c in header))])
-
-
-def _is_position(column: str) -> bool:
-    return (channel_column(column) or ("", 0))[0] == "q"
+    positions = sum((channel_column(column) or ("", 0))[0] == "q" for column in header)
+    return joint_names([columns.get(f"q_{i}", "") for i in range(1, 1 + positions)])
 
 
 def renamed_header(header: list[str], columns: Mapping[str, str], path: Path) -> list[str]:
@@ -90,12 +86,8 @@ def renamed_header(header: list[str], columns: Mapping[str, str], path: Path) ->
 def save_csv(recording: Recording, path: Path) -> None:
     """Write `.csv` or `.csv.gz` with all digits; NaN becomes an empty cell."""
     packed = path.name.lower().endswith(".gz")
-    with open_whole(path) as file, _gzipped(file) if packed else nullcontext(file) as stream:
+    with open_whole(path) as file, gzip.GzipFile("", "wb", 6, file) if packed else nullcontext(file) as stream:
         write_numbers(stream, columns_of(recording))
-
-
-def _gzipped(stream: IO[bytes]) -> gzip.GzipFile:
-    return gzip.GzipFile("", "wb", compresslevel=6, fileobj=stream)
 
 
 def recording_of_columns(

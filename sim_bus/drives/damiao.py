@@ -157,10 +157,8 @@ class DamiaoDrive(WrappingDrive):
         self.registers = dict(self._stored)
         self._stop(DamiaoStatus.DISABLED)
 
-    def inject(self, fault: str, value: float) -> None:
-        super().inject(fault, value)
-        if fault == "drive.mode":
-            self.registers[DamiaoRegister.CONTROL_MODE] = int(value)
+    def change_mode(self, mode: int) -> None:
+        self.registers[DamiaoRegister.CONTROL_MODE] = mode
 
     def lose_feedback(self) -> None:
         """Replies stop; the drive itself goes on."""

@@ -228,11 +228,9 @@ class MoteusDrive(SimulatedDrive):
         self.mode, self.fault_code, self.command = MoteusMode.STOPPED, 0, dict(COMMANDS)
         self.motor.free()
 
-    def inject(self, fault: str, value: float) -> None:
-        super().inject(fault, value)
-        if fault == "drive.mode":
-            self.mode = MoteusMode.BRAKE
-            self._damp()
+    def change_mode(self, mode: int) -> None:
+        self.mode = MoteusMode.BRAKE
+        self._damp()
 
     def lose_feedback(self) -> None:
         """Encoder fault: free."""

@@ -186,10 +186,8 @@ class ODriveAxis(SimulatedDrive):
         self.control_mode = frames.POSITION_CONTROL
         self.motor.free()
 
-    def inject(self, fault: str, value: float) -> None:
-        super().inject(fault, value)
-        if fault == "drive.mode":
-            self.control_mode = int(value)
+    def change_mode(self, mode: int) -> None:
+        self.control_mode = mode
 
     def lose_feedback(self) -> None:
         self._disarm(AxisError.MISSING_ESTIMATE)

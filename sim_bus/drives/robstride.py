@@ -189,10 +189,8 @@ class RobStrideDrive(SimulatedDrive):
         self.fault_bits, self._reports_at, self._host = 0, math.inf, OUR_ID
         self._stop()
 
-    def inject(self, fault: str, value: float) -> None:
-        super().inject(fault, value)
-        if fault == "drive.mode":
-            self.parameters[RobStrideParameter.RUN_MODE] = int(value)
+    def change_mode(self, mode: int) -> None:
+        self.parameters[RobStrideParameter.RUN_MODE] = mode
 
     def lose_feedback(self) -> None:
         """Encoder fault: free, with the bit set."""

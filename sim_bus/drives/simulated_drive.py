@@ -118,9 +118,14 @@ class SimulatedDrive:
             self.trip()
         elif fault == "feedback.lost":
             self.lose_feedback()
+        elif fault == "drive.mode":
+            self.change_mode(int(value))
 
     def lose_feedback(self) -> None:
         self.motor.free()
+
+    def change_mode(self, mode: int) -> None:
+        """It finds itself in another mode of control."""
 
     def end_faults(self) -> None:
         """All injected faults end; what they did stays until it is cleared by the host."""

@@ -92,6 +92,7 @@ def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int, device: Dev
     """Objects of one joint that differ from the EDS's defaults; `increments` of the encoder per joint revolution."""
     link, servo = arm.require_link(), sim_section(arm).servo
     stated = expected_identity(joint, of_joints(arm, [joint])[0]).model_dump(exclude_none=True)
+    modes = SUPPORTED_MODES if device.modes is None else sum(1 << (mode - 1) for mode in device.modes)
     deceleration = round(servo.quick_stop_deceleration / UNIT)
     return {
         (0x1018, 4): serial_of(arm, joint),
@@ -105,12 +106,7 @@ def power_on_values(arm: ArmFile, joint: LinkJoint, increments: int, device: Dev
         (0x608F, 1): increments,
         (0x6092, 1): USER_UNITS,
         (0x60C2, 1): min(max(round(1000 / link.rate), 1), 255),
-        (0x6502, 0): _modes_shown(device),
+        (0x6502, 0): modes & ~device.hidden_modes,
         **device.values,
         **{(0x1018, sub): stated[key] for sub, key in enumerate(IDENTITY, start=1) if key in stated},
     }
-
-
-def _modes_shown(device: Device) -> int:
-    has = SUPPORTED_MODES if device.modes is None else sum(1 << (mode - 1) for mode in device.modes)
-    return has & ~device.hidden_modes

@@ -65,18 +65,13 @@ def state_fault(known: JointStates, now: float, modes: Sequence[int], patience: 
     return None
 
 
-def is_own_watchdog(known: JointStates, joint: int) -> bool:
-    """Whether a joint stopped by itself, as it must when it does not hear its host."""
-    codes = {code for place, code, _ in known.emergencies if place == joint}
-    return bool(codes & WATCHDOGS) or (not codes and state_of(known.statuses[joint]) is DriveState.QUICK_STOP)
-
-
 def stopped_itself(known: JointStates, joint: int) -> str:
-    """That a joint's own watch of the host has stopped it, in words; empty if it has not."""
-    if not is_own_watchdog(known, joint):
+    """That a joint's own watch of the host has stopped it, as it must, in words; empty if it has not."""
+    codes = [code for place, code, _ in known.emergencies if place == joint]
+    watched = [code for code in codes if code in WATCHDOGS]
+    if not watched and (codes or state_of(known.statuses[joint]) is not DriveState.QUICK_STOP):
         return ""
-    codes = [code for place, code, _ in known.emergencies if place == joint and code in WATCHDOGS]
-    why = f" (emergency {codes[0]:04X}h, {emcy.name_of(codes[0])})" if codes else ""
+    why = f" (emergency {watched[0]:04X}h, {emcy.name_of(watched[0])})" if watched else ""
     return f"{known.names[joint]} stopped itself{why}"
 
 
@@ -98,14 +93,11 @@ def node_fault(known: JointStates) -> str | None:
 
 def refused_mode(mode: int, display: int) -> str:
     """That a controller does not enter a mode that it was told to."""
+    name = "cyclic synchronous velocity" if mode == CYCLIC_VELOCITY else MODE_NAMES[Mode(mode)]
     return (
-        f"refuses mode {mode} ({_name_of(mode)}): its mode display 6061h is {display}; read its error code "
+        f"refuses mode {mode} ({name}): its mode display 6061h is {display}; read its error code "
         "603Fh and its supported modes 6502h"
     )
-
-
-def _name_of(mode: int) -> str:
-    return "cyclic synchronous velocity" if mode == CYCLIC_VELOCITY else MODE_NAMES[Mode(mode)]
 
 
 def stuck(known: JointStates, joint: int, target: DriveState, mode: int, seconds: float) -> str:

@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from armlink.drives.canopen.object_dictionary import (
     CONTROL_WORD,
@@ -42,10 +42,6 @@ class Pdo:
     """Index of the mapping record (1600h or 1A00h + n)."""
     entries: tuple[Entry, ...]
     transmission: int
-
-    def with_entries(self, entries: tuple[Entry, ...]) -> "Pdo":
-        """The same PDO with other objects in it."""
-        return self if entries == self.entries else replace(self, entries=entries)
 
     @property
     def layout(self) -> struct.Struct:

@@ -108,7 +108,7 @@ class Profile:
             if not self.modes_by_pdo:
                 held = tuple(entry for entry in held if entry not in (objects.MODE, objects.MODE_DISPLAY))
             if held:
-                found.append(each.with_entries(held))
+                found.append(replace(each, entries=held))
         return tuple(found)
 
 

@@ -159,7 +159,12 @@ class CanopenSelfTest:
         """Configure as start() does, but go on where something is refused."""
         row, profile, limits = self.drives.rows[joint], self.profiles[joint], self.limits[joint]
         attempt = self.checks.attempt
-        attempt(services.joint, "settings: other RPDOs", partial(_others_off, services))
+
+        def others_off() -> str:
+            pdo.disable_others(services)
+            return "all are off, so no other program can command the joint through them"
+
+        attempt(services.joint, "settings: other RPDOs", others_off)
         for each in profile.pdos:
             attempt(services.joint, f"PDO mapping: {each.name}", partial(self._mapping, services, each, profile))
         try:
@@ -182,11 +187,6 @@ class CanopenSelfTest:
         is_command = each.name == pdo.RPDO1.name and profile.has(objects.RPDO_DEADLINE)
         deadline = f", deadline {milliseconds} ms" if is_command else ""
         return f"{len(each.entries)} objects, read back{deadline}"
-
-
-def _others_off(services: NodeServices) -> str:
-    pdo.disable_others(services)
-    return "all are off, so no other program can command the joint through them"
 
 
 def _written(services: NodeServices, entry: Entry, value: int) -> str:
