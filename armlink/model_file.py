@@ -50,13 +50,10 @@ class Beside:
     turned: tuple[float, float, float]
     """Rotation about that frame's x, then y, then z axis [rad]."""
     prefix: str
-    """Prefix of the names of its bodies and joints."""
 
 
 @dataclass(frozen=True)
 class ModelFile:
-    """A model file, parsed."""
-
     spec: Any
     """`mujoco.MjSpec`, without the shapes whose meshes are absent."""
     unused_meshes: tuple[tuple[str, str], ...]

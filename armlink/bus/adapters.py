@@ -36,7 +36,6 @@ class PythonCanBus:
 
     @property
     def fd(self) -> bool:
-        """Whether the bus takes CAN FD frames."""
         return str(self.bus.protocol).startswith("CanProtocol.CAN_FD")
 
     def open_port(self, as_node: bool = False) -> Port:

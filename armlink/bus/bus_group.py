@@ -19,8 +19,6 @@ _ID = (1 << BUS_SHIFT) - 1
 
 
 class BusGroup:
-    """Several buses as one CanBus."""
-
     clock: Clock | None = None
 
     def __init__(self, members: Sequence[MessageBus], names: Sequence[str]) -> None:

@@ -105,7 +105,6 @@ class FrameLog:
         self._writer.stop()
 
     def write(self, message: can.Message, stamp: int) -> None:
-        """Add a message received at `stamp` [µs]."""
         message.timestamp = stamp / 1e6
         self._writer.on_message_received(message)
         if stamp - self._flushed > FLUSH_MICROSECONDS:

@@ -55,7 +55,6 @@ def as_message(can_id: int, data: bytes, fd: bool) -> can.Message:
 
 
 def as_frame(message: can.Message) -> Frame:
-    """Identifier with flags, and data."""
     flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | ERROR * message.is_error_frame
     return message.arbitration_id | flags, bytes(message.dlc) if message.is_remote_frame else bytes(message.data)
 

@@ -55,8 +55,6 @@ class Port(Protocol):
 
 @runtime_checkable
 class Selectable(Protocol):
-    """A port that `select` can wait for."""
-
     def fileno(self) -> int: ...
 
 

@@ -15,8 +15,6 @@ PARKED = (
 
 @dataclass
 class ArmWork:
-    """Work that may end early."""
-
     enabled: bool = False
     """Whether the joints may have been enabled: set it just before."""
 

@@ -47,7 +47,6 @@ def scan(
 
 
 def _look_for_all(bus: str, json: Path | None) -> int:
-    """The drives on a bus, of whatever family."""
     from armlink.arm_file import Bus
     from armlink.bus.open import open_bus
     from armlink.commands.output import write_json
@@ -73,7 +72,6 @@ def _look_for_all(bus: str, json: Path | None) -> int:
 
 
 def _ask_all(arm: "ArmFile", bus: str | None, json: Path | None) -> int:
-    """The drives of an arm, each asked for its identity."""
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import results
     from armlink.errors import BusFault, Refused

@@ -72,7 +72,6 @@ class EditedYaml:
         """Mappings and lists of the text, to be changed in place."""
 
     def in_line(self, values: Mapping[str, Any]) -> Any:
-        """A mapping that is written on one line."""
         made = CommentedMap(values)
         made.fa.set_flow_style()
         return made

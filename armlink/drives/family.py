@@ -27,8 +27,6 @@ GROUP = "armlink.drives"
 
 @dataclass(frozen=True)
 class Discovery:
-    """How the drives of a family are found."""
-
     how: str
     """The question that is asked, or what is listened for."""
     find: Callable[[SearchedBus], Sequence[FoundDrive] | FoundDrives]

@@ -99,8 +99,6 @@ HELD = 0.05
 
 
 class Checks:
-    """Results of a self-test, as they gather."""
-
     def __init__(self) -> None:
         self.results: list[Result] = []
 

@@ -75,7 +75,6 @@ class MitDrives(BasicDrives[K]):
         return None if grid is None else (joint, order_of(self.decoded(can_id, data, grid)))
 
     def grid_of(self, joint: int) -> Grid:
-        """The grid of a drive that was set up."""
         grid = self.memory[joint].grid
         if grid is None:
             raise BusFault(f"{self.names[joint]}: a command came before the set-up")

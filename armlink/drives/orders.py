@@ -199,8 +199,6 @@ class Setup:
 
 @dataclass(frozen=True)
 class DriveIdentity:
-    """One drive as `scan` finds it."""
-
     joint: int
     """Index among the joints of this `Drives`."""
     address: str

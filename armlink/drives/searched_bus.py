@@ -15,8 +15,6 @@ its heartbeat every 0.1 s unless it is set otherwise [s]."""
 
 
 class SearchedBus:
-    """An open bus that is searched; implements Ask."""
-
     def __init__(self, bus: CanBus) -> None:
         self.channel_info = bus.channel_info
         self.fd: bool = getattr(bus, "fd", True)

@@ -58,7 +58,6 @@ class Source:
         self.at, self.number = int(found["at"]), _number(found["code"])
 
     def value(self, data: bytes) -> float | None:
-        """The number in this frame, None if it has none."""
         if not data.startswith(self.prefix) or len(data) < self.at + self.number.size:
             return None
         number: float = self.number.unpack_from(data, self.at)[0]

@@ -56,8 +56,6 @@ ENDS: dict[EndCause, tuple[Response, Response]] = {
 
 
 class Ended(Parked, Protocol):
-    """The part of a link that its end needs."""
-
     @property
     def held(self) -> bool:
         """Whether the joints are held by the host alone."""
@@ -68,8 +66,7 @@ class Ended(Parked, Protocol):
 
     def stop(self) -> None: ...
 
-    def let_go(self) -> None:
-        """Stop every joint and hold none."""
+    def let_go(self) -> None: ...
 
 
 def cause_of(error: BaseException | None) -> EndCause:

@@ -143,6 +143,5 @@ def bus_fault(names: Sequence[str], watch: BusWatch, dropped: int) -> str | None
 
 
 def _culprit(names: Sequence[str], watch: BusWatch) -> str:
-    """The sender of most frames, in words."""
     most = watch.culprit
     return f"readings of {names[most]}" if isinstance(most, int) else most

@@ -28,8 +28,6 @@ def slowest_time(kp: float, kd: float) -> float:
 
 
 class Integral:
-    """Feed-forward torque of one joint."""
-
     def __init__(self) -> None:
         self.torque = 0.0
         """[N·m]."""

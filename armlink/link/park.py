@@ -35,8 +35,6 @@ LONGEST_LOWERING = 60.0
 
 
 class Parked(Protocol):
-    """The part of a link that parking needs."""
-
     arm: ArmFile
     section: LinkSection
     names: tuple[str, ...]

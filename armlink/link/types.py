@@ -48,8 +48,6 @@ class Command:
 
 @dataclass(eq=False)
 class Setpoints:
-    """Commands of K cycles to come."""
-
     mode: NDArray[np.int8]
     """(n,), see Command."""
     torque: Array

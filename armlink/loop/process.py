@@ -100,7 +100,6 @@ class DriveLoop:
         """Why the joints are not enabled."""
         self._beside = ThreadPoolExecutor(1)
         self._unpickled: Future[Controller] | None = None
-        """A controller that is on its way."""
         self._heard = time.monotonic()
         self._signed = -math.inf
         """When the job was last told that this process makes cycles [s]."""
@@ -130,7 +129,6 @@ class DriveLoop:
         return EndCause.INTERRUPTED
 
     def hear(self) -> None:
-        """Take what the job has said."""
         aside, self._aside = self._aside, []
         for message in (*aside, *self._channel.receive()):
             self._heard = time.monotonic()
@@ -183,7 +181,6 @@ class DriveLoop:
         self._source = self._controller = self._unpickled = None
 
     def _answer(self, call: Call) -> LoopAnswer:
-        """Carry a call out; every failure is in the answer."""
         link, tell = self.arm, lambda text: self._tell(call.id, text)
         if isinstance(link, Link):
             link.tell = tell
@@ -255,7 +252,6 @@ class DriveLoop:
         self._channel.put(Stopped(error))
 
     def _talk(self) -> None:
-        """Send what waits for the job."""
         self._channel.flush()
 
     def _next(self) -> tuple[int, Sample]:
@@ -374,7 +370,6 @@ class KeptLoop(DriveLoop):
         return answer
 
     def _talk(self) -> None:
-        """Say how bus and drives are, whose samples wait; a sign of life where there are none."""
         if self.arm is None:
             self._channel.put(Told(0, ""))
         else:

@@ -26,7 +26,6 @@ class View:
 
     sample: Sample
     rate_hz: float
-    """Cycles per second."""
     load: float
     """Share of the bus time taken by the frames received and sent."""
 
@@ -73,7 +72,6 @@ class Monitor(HeardArm):
 
     @property
     def errors(self) -> int:
-        """Frames with a wrong length."""
         return self._loop.stats.errors
 
     def watch(self, seconds: float) -> View:

@@ -85,7 +85,6 @@ class RerunStream:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
-        """Send what is left and disconnect."""
         with contextlib.suppress(Exception):
             self._stream.flush()
             self._stream.disconnect()

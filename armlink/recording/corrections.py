@@ -171,7 +171,6 @@ def _number(option: str, column: str, text: str) -> float:
 
 
 def _factors(column: str, text: str) -> tuple[float, ...]:
-    """Factors into SI from the name of a unit."""
     unit, _, values = text.partition(":")
     angle = _channel(column) in _ANGLES
     if values and (unit == "A" or (unit in ("counts", "percent") and angle)):

@@ -32,8 +32,6 @@ BLOCK_ROWS = 10_000
 
 @dataclass(frozen=True)
 class CsvLayout:
-    """How the text is to be read."""
-
     header: tuple[str, ...]
     lines: int
     """Lines up to the header row, which is the last of them."""
@@ -54,42 +52,30 @@ def layout_of(content: bytes | bytearray, source: str, header: tuple[str, ...] =
     except UnicodeDecodeError as error:
         raise BadInput(f"{source}: not a readable CSV file: {error}") from None
     above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    if header:
-        return _layout_without_header(lines[above] if above < len(lines) else "", above, source, header)
-    if above and above < len(lines) and _is_values(lines[above]):
+    if not header and above and above < len(lines) and _is_values(lines[above]):
         above -= 1
     text = lines[above] if above < len(lines) else ""
-    if _is_values(text):
+    if header and not _is_values(text):
+        raise BadInput(
+            f"{source}: its first row holds the names of the columns: leave `--columns` out, or rename columns "
+            "with `--map`"
+        )
+    if not header and _is_values(text):
         raise BadInput(
             f"{source}: its first row holds numbers instead of the names of the columns: give the names with "
             "--columns t,q_1,…"
         )
     text = text.lstrip("# ") if text.startswith("#") else text
     separator = _separator(text)
-    following = lines[above + 1] if above + 1 < len(lines) else ""
-    comma = separator != "," and re.search(r"\d,\d", following) is not None
-    return CsvLayout(
-        tuple(_cells(text, separator, source)),
-        above + 1,
-        separator,
-        "," if comma else ".",
-        tuple(_cells(following, separator, source)),
-    )
-
-
-def _layout_without_header(text: str, above: int, source: str, header: tuple[str, ...]) -> CsvLayout:
-    """Layout of a file whose first row of values is `text`, below so many lines of comment."""
-    if not _is_values(text):
-        raise BadInput(
-            f"{source}: its first row holds the names of the columns: leave `--columns` out, or rename columns "
-            "with `--map`"
-        )
-    separator = _separator(text)
-    cells = tuple(_cells(text, separator, source))
-    if len(cells) != len(header):
+    named, first = header, text
+    if not header:
+        named, above = tuple(_cells(text, separator, source)), above + 1
+        first = lines[above] if above < len(lines) else ""
+    cells = tuple(_cells(first, separator, source))
+    if header and len(cells) != len(header):
         raise BadInput(f"{source}: --columns names {len(header)} columns, but the rows of the file have {len(cells)}")
-    comma = separator != "," and re.search(r"\d,\d", text) is not None
-    return CsvLayout(header, above, separator, "," if comma else ".", cells)
+    comma = separator != "," and re.search(r"\d,\d", first) is not None
+    return CsvLayout(named, above, separator, "," if comma else ".", cells)
 
 
 def _separator(header: str) -> str:
@@ -108,15 +94,11 @@ def _cells(line: str, separator: str, source: str) -> list[str]:
 
 def _is_values(line: str) -> bool:
     """Whether a line holds numbers in all of its cells but one, in which may stand a date."""
-    cells = [cell for cell in _plain_cells(line) if cell]
+    separator = _separator(line)
+    plain = line if separator == "," else line.replace(",", ".")
+    cells = [cell.strip() for cell in plain.split(separator) if cell.strip()]
     numbers = sum(is_number(cell) for cell in cells)
     return numbers > 0 and numbers >= len(cells) - 1
-
-
-def _plain_cells(line: str) -> list[str]:
-    separator = _separator(line)
-    comma = separator != ","
-    return [cell.strip().replace(",", ".") if comma else cell.strip() for cell in line.split(separator)]
 
 
 def is_number(cell: str) -> bool:

@@ -95,7 +95,6 @@ def _of_folder(path: Path, stated: Corrections) -> dict[str, Recording]:
 
 
 def _chosen(recording: Recording, stated: Corrections, label: str) -> Recording:
-    """The joints that the user stated, in that order."""
     if not stated.joints:
         return recording
     missing = [name for name in stated.joints if name not in recording.names]

@@ -63,7 +63,6 @@ def load_lerobot(path: Path) -> dict[str, Recording]:
 
 
 def _features(path: Path) -> dict[str, Any]:
-    """Descriptions of the columns by name."""
     try:
         features = json.loads(read_whole(path / "meta" / "info.json", MOST_JSON))["features"]
     except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:

@@ -101,7 +101,6 @@ def require_size(size: int, source: str) -> None:
 
 
 def default_names(n: int) -> tuple[str, ...]:
-    """`joint_1` … `joint_n`, for files without joint names."""
     return tuple(f"joint_{i}" for i in range(1, n + 1))
 
 

@@ -71,7 +71,6 @@ def load_bag(path: Path | Sequence[Path], topic: str = "") -> Recording:
 
 
 def _state_connections(readable: Sequence[Any], topic: str, all_of_them: Iterable[Any], path: Path) -> list[Any]:
-    """Connections of the topic that holds the joint states."""
     topics = sorted({c.topic for c in readable if c.topic not in BESIDES})
     if topic and topic not in topics:
         known = ", ".join(topics) or ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in all_of_them})) or "nothing"

@@ -41,7 +41,6 @@ class JointState(NamedTuple):
 
 
 def _decoded(data: bytes) -> tuple[JointState, str]:
-    """A message, and the frame in its header."""
     from rosbags.serde import SerdeError
 
     try:

@@ -77,8 +77,6 @@ PAST_STOP = 1.03
 
 @dataclass(frozen=True)
 class Evidence:
-    """One ratio."""
-
     text: str
     ratio: float
     sigma: float

@@ -141,7 +141,6 @@ class LockStepBus(can.BusABC, InProcessBus):  # type: ignore[misc]
                 self.line.advance(min(self.arm.period, deadline - self.arm.time))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame from a node, or None."""
         frame = self._next(1.0 if timeout is None else timeout)
         if frame is None:
             return None

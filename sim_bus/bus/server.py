@@ -32,8 +32,6 @@ INTERRUPTED, TERMINATED = 130, 0
 
 
 class ArmServer:
-    """Passes frames between bus and arm."""
-
     def __init__(
         self,
         arm: SimulatedArm,

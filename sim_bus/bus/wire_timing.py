@@ -23,8 +23,6 @@ TRANSMIT_QUEUE = 10
 
 
 class TimedArm(Protocol):
-    """The arm, or what takes its place."""
-
     outbox: deque[Frame]
 
     def on_frame(self, can_id: int, data: bytes) -> None: ...

@@ -57,8 +57,6 @@ FALSE_READINGS = {
 
 
 class FalseReadings:
-    """Falsehoods of one joint's frames."""
-
     def __init__(self) -> None:
         self._faults: dict[str, float] = {}
         self._first: dict[str, float] = {}

@@ -29,7 +29,6 @@ FAMILIES: dict[str, Build] = {
     "moteus": _each(MoteusDrive),
     "odrive": _each(ODriveAxis),
 }
-"""Families that are simulated here, besides canopen."""
 GROUP = "armlink.simulated_drives"
 """Entry-point group of functions like those of FAMILIES, for families of other packages."""
 

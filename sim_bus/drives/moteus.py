@@ -233,7 +233,6 @@ class MoteusDrive(SimulatedDrive):
         self._damp()
 
     def lose_feedback(self) -> None:
-        """Encoder fault: free."""
         self.mode, self.fault_code = MoteusMode.FAULT, ENCODER_FAULT
         self.motor.free()
 

@@ -68,7 +68,6 @@ class Motor:
 
     @property
     def velocity(self) -> float:
-        """[rad/s]."""
         return self.ratio * self._value(self._readings.at(self._time).velocity)
 
     @property

@@ -181,8 +181,6 @@ class WrappingDrive(SimulatedDrive):
 
 
 class Front:
-    """The drives of one family on one bus."""
-
     def __init__(self, drives: Sequence[SimulatedDrive]) -> None:
         self.drives = drives
 

@@ -65,7 +65,6 @@ class SimulatedParameter:
         return f" of at least {least:g}" if least is not None else f" above {above:g}" if above is not None else ""
 
     def accepts(self, value: float) -> bool:
-        """Whether a number is within the bounds."""
         least, above = self.domain.least, self.domain.above
         return (least is None or value >= least) and (above is None or value > above)
 

@@ -65,7 +65,6 @@ def check_entry(effect_id: str, joint: str | None, parameters: Mapping[str, Any]
 
 
 def described(effect: SimulatedEffect) -> str:
-    """The effect's parameters with units, for messages and documentation."""
     return ", ".join(f"{parameter.name} [{parameter.unit}]" for parameter in effect.parameters)
 
 

@@ -53,7 +53,6 @@ class Protection:
 
     @property
     def producer_ms(self) -> int:
-        """Period of the joint's own heartbeat."""
         return milliseconds(self.deadline / 2)
 
 

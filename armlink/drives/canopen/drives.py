@@ -64,7 +64,6 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         self._deadline = section.deadline
         self._joint_of = {node: joint for joint, node in enumerate(self.nodes)}
         self.known = faults.JointStates(self.names)
-        """Newest state of the joints."""
         self._sound: tuple[list[int], list[int], list[int]] | None = None
         """Modes, mode displays and status words that were no fault when last seen, every mode being displayed."""
         self.beat_every = section.deadline / 2
@@ -133,7 +132,6 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         return frozenset((objects.SYNC_ID,))
 
     def services(self, ask: Ask) -> tuple[NodeServices, ...]:
-        """SDO access to each joint's controller."""
         if self._network is None:
             self._network = network = PumpedNetwork(ask.send)
             pairs = zip(self.rows, of_joints(self.arm, self.rows), strict=True)
@@ -231,7 +229,6 @@ class CanopenDrives(BasicDrives[DriveMemory]):
         ask.send(objects.NMT_ID, bytes([command, node]))
 
     def beat(self, ask: Ask) -> None:
-        """The host's heartbeat, at once."""
         ask.send(*self.cycle.heartbeat)
         self.cycle.beaten(ask.now())
 

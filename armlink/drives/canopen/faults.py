@@ -19,8 +19,6 @@ _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 
 
 class JointStates:
-    """Newest states, emergencies and faults of m joints."""
-
     def __init__(self, names: Sequence[str]) -> None:
         m = len(names)
         self.names = names

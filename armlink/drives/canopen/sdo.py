@@ -70,7 +70,6 @@ class PumpedResponses:
         self._items: deque[bytes] = deque()
 
     def put(self, item: bytes) -> None:
-        """Take a response that the loop received."""
         self._items.append(item)
 
     def empty(self) -> bool:

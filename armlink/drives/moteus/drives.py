@@ -339,7 +339,6 @@ def _finite(value: float) -> float:
 
 
 def find_drives(bus: SearchedBus) -> list[FoundDrive]:
-    """By the model of every controller id."""
     model = frames.pack({}, (MoteusRegister.MODEL,))
     heard = bus.gather([(_flagged(frames.identifier(0, each, True)), model) for each in range(1, 0x7F)])
     replies = [

@@ -54,8 +54,6 @@ HOMED_AT_OUTPUT = 2
 
 
 class MoteusMode(IntEnum):
-    """Modes that armlink uses."""
-
     STOPPED = 0
     FAULT = 1
     POSITION = 10

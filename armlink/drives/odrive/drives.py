@@ -154,7 +154,6 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
         return [known.position if Message.ESTIMATES in known.came else math.nan for known in self.memory]
 
     def set_up(self, ask: Ask, limits: Sequence[Limits]) -> list[Setup]:
-        """Idle, and its cyclic messages come."""
         for joint in range(self.m):
             ask.send(*self._message(joint, Message.AXIS_STATE, AxisState.IDLE))
         wanted = {Message.HEARTBEAT, Message.ESTIMATES, Message.TORQUES}
@@ -227,7 +226,6 @@ class ODriveDrives(BasicDrives[ODriveMemory]):
         return fed
 
     def _input(self, joint: int, order: Order) -> list[Frame]:
-        """Control mode where it changes, and the input."""
         limits = self.limits_of(joint)
         if order.mode == Mode.TORQUE:
             control, message = TORQUE_CONTROL, Message.INPUT_TORQUE

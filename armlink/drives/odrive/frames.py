@@ -36,8 +36,6 @@ class Message(IntEnum):
 
 
 class AxisState(IntEnum):
-    """Axis states that armlink uses."""
-
     UNDEFINED = 0
     IDLE = 1
     CLOSED_LOOP = 8

@@ -147,7 +147,6 @@ class RobStrideDrives(MitDrives[RobStrideMemory]):
     # ---- before the cycle
 
     def identity(self, joint: int, ask: Ask) -> DriveIdentity:
-        """By its 64-bit unique id."""
         settings = self.settings[joint]
 
         def unique_id(can_id: int, data: bytes) -> str | None:

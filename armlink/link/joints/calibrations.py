@@ -126,5 +126,4 @@ class Calibrations:
         group, number = by_joint(self.groups)[joint]
         return group.drives.write_calibration(number, self._ask(group), calibration, store)
 
-    def calibration_changed(self, joint: int) -> None:
-        """Called where the host's calibration of a joint has changed."""
+    def calibration_changed(self, joint: int) -> None: ...

@@ -14,8 +14,6 @@ from armlink.errors import BadInput
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Drives of one family on one bus."""
-
     family: Family
     drives: BasicDrives[Any]
     places: tuple[int, ...]

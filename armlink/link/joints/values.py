@@ -108,12 +108,10 @@ class JointValues:
         return self._zeros[joint]
 
     def turn_zero(self, joint: int, turns: int) -> None:
-        """Change the zero of one joint's drive by whole turns of the drive's output."""
         self._zeros[joint] += 2 * math.pi * turns
         self._place_zeros()
 
     def gains(self, joint: int, gains: Gains | None) -> Gains | None:
-        """Gains at the joint, of those at the output of its drive."""
         square = self._gears[joint] ** 2
         return gains and Gains(*(square * value for value in (gains.kp, gains.kd, gains.max_kp, gains.max_kd)))
 
@@ -159,7 +157,6 @@ class JointValues:
 
 
 def values_of(arm: ArmFile, groups: tuple[Group, ...]) -> JointValues:
-    """Conversions between the values of an arm's joints and of their drives."""
     traits = traits_of(groups)
     return JointValues(arm, np.array([each.torque == "current" for each in traits]))
 

@@ -189,7 +189,6 @@ class PowerTest:
         drives.known.emergencies.clear()
 
     def _quick_stop(self, joint: int) -> None:
-        """The command quick stop: reached, kept, and the joint holds."""
         self._progress(f"{self.link.names[joint]}: quick stop")
         control = [Power.ON] * self.link.n
         control[joint] = Power.STOPPED

@@ -197,5 +197,4 @@ def _written(services: NodeServices, entry: Entry, value: int) -> str:
 def self_test(
     link: Any, drives: CanopenDrives, limits: Sequence[Limits], power: bool, progress: Callable[[str], None]
 ) -> list[Result]:
-    """The self-test of an arm with these drives alone."""
     return CanopenSelfTest(link, drives, limits, progress).run(power)

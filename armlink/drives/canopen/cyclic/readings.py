@@ -27,7 +27,6 @@ class ReadingFrames:
         self._places: Sequence[int] = range(len(known.names))
 
     def use(self, wires: Sequence[Wire]) -> None:
-        """From now on these layouts and scales."""
         self._wires, self._rows = wires, []
         for wire in wires:
             profile, layout = wire.profile, wire.layouts[TPDO1.name]

@@ -34,12 +34,10 @@ class Wire:
 
     @cached_property
     def layouts(self) -> dict[str, struct.Struct]:
-        """Payload of each PDO, by its name."""
         return {each.name: each.layout for each in self.profile.pdos}
 
     @cached_property
     def with_torque(self) -> bool:
-        """Whether RPDO1 carries a target torque."""
         return objects.TARGET_TORQUE in self.entries[RPDO1.name]
 
     @cached_property
