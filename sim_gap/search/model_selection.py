@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from gcomp.estimate.choice import PRICE
 from sim_gap.effects.effect import Key
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet
@@ -14,26 +15,29 @@ from sim_gap.search.estimate import SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converge, fitted
 from sim_gap.search.term import Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
-from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
-
-MOMENTS, BODY = "link.mass_moment", "link.payload"
+from sim_gap.search.torque_constants import BODY, CONSTANT, LINKS, MASSES, most_are_off
 
 
-def one_body(store: ColumnStore, choice: TermChoice, offered: Sequence[Term]) -> list[Term] | None:
-    """The chosen terms with a payload in place of the mass moments, if that fits as well about itself; else None.
+def one_body(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
+    """The chosen terms with a payload in place of the mass moments of several links; none if that is no question.
 
     Linear in its mass and first moment, a payload lacks the inertia that its mass has where it hangs; mass moments of
-    all links together then fit a little better, and no single exchange leads back. `store` has the columns about the
-    nominal model.
+    all links together then fit a little better, and no single exchange leads back.
     """
     chosen = choice.current
     bodies = [term for term in offered if term.effect == BODY and not term.shape]
-    moments = [term for term in chosen if term.effect == MOMENTS]
-    if len(moments) < 2 or not bodies or any(term.effect == BODY for term in chosen):
-        return None
-    about, kept = converge(store, [*(term for term in chosen if term not in moments), bodies[0]])
-    found = TermChoice(TermEquations(about, kept), kept)
-    return found.current if found.score < choice.score else None
+    rest = [term for term in chosen if term.effect != MASSES]
+    several = len(chosen) - len(rest) > 1 and not any(term.effect == BODY for term in chosen)
+    return [*rest, bodies[0]] if several and bodies else []
+
+
+def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
+    """Every drive's torque constant free, the links as in the model, all else as chosen; none if no constant is off."""
+    chosen = {term.effect for term in choice.current}
+    if choice.equations.layout.sensor is not None or CONSTANT not in chosen:
+        return []
+    drives = [term for term in offered if term.effect == CONSTANT]
+    return [*drives, *(term for term in choice.current if term.effect not in (CONSTANT, *LINKS))]
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
@@ -41,13 +45,13 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
     offered, chosen = first_search(store, library)
     store.keep(offered)
     choice = search_again(store, chosen, offered)
-    if (body := one_body(store, choice, offered)) is not None:
-        again = search_again(store, body, offered)
+    if start := one_body(choice, offered):
+        again = search_again(store, start, offered)
         choice = again if again.score < choice.score else choice
-    if drives_are_off(choice):
-        again = search_again(store, every_constant(choice, offered), offered, CONSTANTS)
-        better = again.score + price_of_all() < choice.score
-        choice = again if better and most_are_off(again) else choice
+    if start := every_constant(choice, offered):
+        again = search_again(store, start, offered, frozenset({CONSTANT}))
+        together = PRICE * (1 + effects()[CONSTANT].plausibility.prior_penalty)  # of one effect that few arms have
+        choice = again if again.score + together < choice.score and most_are_off(again) else choice
     for held in (store, choice.equations.store.beside(None)):  # frees the columns of rivals and of the estimate before
         held.keep(choice.current)
     return choice

@@ -204,6 +204,6 @@ def test_one_body_in_place_of_several_errors_of_links_is_kept_if_it_scores_bette
     results = iter([found("first", 2.0), found("several", score)])
     monkeypatch.setattr(model_selection, "first_search", lambda store, library: ([], []))
     monkeypatch.setattr(model_selection, "search_again", lambda store, chosen, offered: next(results))
-    monkeypatch.setattr(model_selection, "one_body", lambda store, choice, offered: [PAYLOAD])
-    monkeypatch.setattr(model_selection, "drives_are_off", lambda choice: False)
+    monkeypatch.setattr(model_selection, "one_body", lambda choice, offered: [PAYLOAD])
+    monkeypatch.setattr(model_selection, "every_constant", lambda choice, offered: [])
     assert select_model(SimpleNamespace(keep=lambda terms: None), []).name == kept
