@@ -25,7 +25,9 @@ paid then, and the choice among the hundred changes that are looked at."""
 SCREENING_ROWS = 150
 """Rows that are enough to see that a hypothesis is wrong."""
 MOST_CANDIDATES = 8
-"""Hypotheses that are looked at closely."""
+"""Hypotheses that are looked at closely, and orders from which exchanges go on."""
+ORDER_ROWS = 30
+"""Rows on which orders are compared."""
 DISTINCT_FALL = 3.0 * PRICE
 """Difference of the negative log likelihoods from which one correction is likelier than another: errors of
 sound models alone make one order of two wrist joints likelier by some prices."""
@@ -122,7 +124,11 @@ def _likeliest(possible: Sequence[Hypothesis], falls: Array) -> list[Hypothesis]
 
 
 def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypothesis, known: bool) -> HypothesisTest:
-    falls = before - likelihood(arm, hypothesis.change(motion)).costs
+    changed = hypothesis.change(motion)
+    gone = np.isnan(changed.reading) & ~np.isnan(motion.reading)
+    if gone.any():  # both are judged on the same rows
+        before = likelihood(arm, replace(motion, reading=np.where(gone, np.nan, motion.reading))).costs
+    falls = before - likelihood(arm, changed).costs
     price = 0.0 if known else PRICE * hypothesis.choices
     return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN_FALL)
 
@@ -135,19 +141,16 @@ def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
 
 
 def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> list[Hypothesis]:
-    """Orders of more than two columns, of positions, of torques and of both: exchange after exchange, each the one that
-    explains most, as long as one explains more."""
-    found = []
+    """Orders of more than two columns, of positions, of torques and of both: exchange after exchange from those that
+    explain most after the one before."""
+    found, few = list[Hypothesis](), motion.rows(slice(None, None, max(1, len(motion.q) // ORDER_ROWS)))
     for channels, joints in exchangeable(arm, motion, follows):
-        order, best = tuple(range(arm.n)), 0.0
-        for _ in joints:
-            orders = [exchanged(order, pair) for pair in combinations(joints, 2)]
-            trials = [put_in_order(arm, each, channels, motion.channel) for each in orders]
-            falls = _quick_falls(arm, motion, trials) if trials else np.zeros(1)
-            if falls.max() <= best:
-                break
-            order, best = orders[int(falls.argmax())], float(falls.max())
-            found.append(trials[int(falls.argmax())])
+        orders = [tuple(range(arm.n))]
+        for _ in joints[1:MOST_CANDIDATES]:
+            pairs = dict.fromkeys(exchanged(order, pair) for order in orders for pair in combinations(joints, 2))
+            trials = [put_in_order(arm, order, channels, motion.channel) for order in pairs]
+            best = np.argsort(-_quick_falls(arm, few, trials))[:MOST_CANDIDATES].tolist()
+            orders, found = [[*pairs][k] for k in best], [*found, *(trials[k] for k in best)]
     return [each for each in found if len(each.joints) > 2]
 
 

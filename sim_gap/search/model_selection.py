@@ -13,9 +13,8 @@ from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converge, fitted
-from sim_gap.search.term import Term
+from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
-from sim_gap.search.torque_constants import BODY, CONSTANT, LINKS, MASSES, most_are_off
 
 
 def one_body(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
@@ -31,13 +30,28 @@ def one_body(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
     return [*rest, bodies[0]] if several and bodies else []
 
 
+OFF = 0.05
+"""A torque constant is off from this share on."""
+
+
 def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
-    """Every drive's torque constant free, the links as in the model, all else as chosen; none if no constant is off."""
+    """Every drive's torque constant free, the links as in the model, all else as chosen; none if no constant is chosen.
+
+    Where motor torque alone is recorded, one drive's constant is as doubtful as another's. A search that adds one
+    effect after the other may end with one constant as the model has it, and all masses changed in proportion.
+    """
     chosen = {term.effect for term in choice.current}
     if choice.equations.layout.sensor is not None or CONSTANT not in chosen:
         return []
     drives = [term for term in offered if term.effect == CONSTANT]
-    return [*drives, *(term for term in choice.current if term.effect not in (CONSTANT, *LINKS))]
+    links = (CONSTANT, MASSES, "link.inertia", BODY)
+    return [*drives, *(term for term in choice.current if term.effect not in links)]
+
+
+def most_are_off(choice: TermChoice) -> bool:
+    """Whether most drives have another constant: those of an arm come from one maker, and are in doubt together."""
+    off = [abs(float(c[0])) > OFF for term, c in choice.values().items() if term.effect == CONSTANT]
+    return 2 * sum(off) > choice.equations.layout.n
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
@@ -52,7 +66,7 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
         again = search_again(store, start, offered, frozenset({CONSTANT}))
         together = PRICE * (1 + effects()[CONSTANT].plausibility.prior_penalty)  # of one effect that few arms have
         choice = again if again.score + together < choice.score and most_are_off(again) else choice
-    for held in (store, choice.equations.store.beside(None)):  # frees the columns of rivals and of the estimate before
+    for held in (store, choice.equations.store):  # frees the columns of rivals and of the estimate before
         held.keep(choice.current)
     return choice
 
@@ -63,15 +77,13 @@ def search_again(
     """The terms offered, searched about the fit of those that are chosen, until both agree."""
     terms = refine(store, first_of_each([canonical_term(term) for term in chosen]))
     values: Values = {}
-    near: ColumnStore | None = None
     for _ in range(ROUNDS):
-        choice = refit_about_itself(store, terms, offered, values, near, usual)
+        choice = refit_about_itself(store, terms, offered, values, usual)
         keys = {term.key for term in choice.current}
         choice.run()
         if {term.key for term in choice.current} == keys:
             break
-        near = choice.equations.store
-        values = near.values
+        values = choice.equations.store.values
         terms = first_of_each([canonical_term(term) for term in choice.current])
     return choice
 
@@ -89,16 +101,14 @@ def refit_about_itself(
     chosen: list[Term],
     offered: Sequence[Term],
     start: Values,
-    near: ColumnStore | None = None,
     usual: frozenset[str] = frozenset(),
 ) -> TermChoice:
     """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
-    `start` on. `near` is the store of an earlier fit, whose columns of rivals serve if it is close."""
+    `start` on."""
     store, chosen = converge(nominal, chosen, start)
     refined = refine(store, chosen)
     if refined != chosen:
         store, chosen = converge(nominal, refined, store.values)
-    store = store.beside(near)
     keys = {term.key for term in chosen}
     others = [term for term in set_levels(store, offered) if term.key not in keys]
     rivals = relinearised_in_place(store, chosen, others)
