@@ -7,16 +7,11 @@ import numpy as np
 
 from armlink.errors import BadInput
 from gcomp.arrays import Array
-from sim_gap.residuals.layout import ChannelLayout
 from sim_gap.residuals.preprocess import ABSENT, PreparedSignals
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import EffectEstimate
-from sim_gap.search.model_selection import minimum_between
 from sim_gap.search.term import Term
-
-STARTING_ANGLES = 12
-"""Number of mounting angles, evenly over a turn, that are tried first."""
 
 
 def groups_of(given: Sequence[str], labels: Sequence[str]) -> list[tuple[str, ...]]:
@@ -73,9 +68,11 @@ def numbered_by_body(estimate: EffectEstimate, heldout: ResidualSet) -> Residual
             tried = tried[:1] if any({*s.groups} & {*names} for names in others) else tried[1:]
         left = [_left(estimate, ResidualSet((each,), heldout.layout)) for each in tried]
         best = tried[int(np.argmin(left))]
-        if tried[0].number != ABSENT and _has_alike(estimate, ResidualSet((tried[0],), heldout.layout), body):
-            turned = _mounted(estimate, tried[0], heldout.layout)
-            best = turned[1] if turned[0] < min(left) - CLEARLY else best
+        if tried[0].number != ABSENT:
+            alone = ResidualSet((tried[0],), heldout.layout)
+            own = _own(estimate, estimate.on(alone), body, 0).values
+            turned = replace(tried[0], mount=_turn(s, estimate.of(body), own))
+            best = turned if _left(estimate, replace(alone, signals=(turned,))) < min(left) - CLEARLY else best
         out.append(best)
     return ResidualSet(tuple(out), heldout.layout)
 
@@ -91,25 +88,6 @@ OF_A_BODY, NEAR = 0.1, 2.0
 gap."""
 OPPOSITE = 0.9
 """Cosine from which two moments are opposite."""
-
-
-def _has_alike(estimate: EffectEstimate, data: ResidualSet, body: Term) -> bool:
-    """Whether a body of about the same mass, elsewhere, would explain a recording far better than the one found."""
-    own, mass = _own(estimate, estimate.on(data), body, 0), float(estimate.of(body)[0])
-    return own.fall > CLEARLY and abs(own.values[0] - mass) < ALIKE * abs(mass)
-
-
-def _mounted(estimate: EffectEstimate, s: PreparedSignals, layout: ChannelLayout) -> tuple[float, PreparedSignals]:
-    """The recording with the body turned by the angle that leaves least, and what is left then."""
-
-    def left(angle: float) -> float:
-        return _left(estimate, ResidualSet((replace(s, mount=angle),), layout))
-
-    step = 2.0 * np.pi / STARTING_ANGLES
-    start = min((step * k for k in range(STARTING_ANGLES)), key=left)
-    angle = minimum_between(left, start - step, start + step)
-    angle = float((angle + np.pi) % (2.0 * np.pi) - np.pi)
-    return left(angle), replace(s, mount=angle)
 
 
 def mounts(estimate: EffectEstimate) -> tuple[float, ...]:

@@ -19,34 +19,6 @@ from sim_gap.search.estimate import EffectEstimate, Value
 from sim_gap.search.term import Term
 from sim_gap.search.term_equations import TermEquations
 
-STEADY = 2.0
-"""Least mean decrease of a row's sum of squares over the blocks, in standard errors."""
-
-
-def steadiness(estimate: EffectEstimate, heldout: ResidualSet, terms: Sequence[Term]) -> float:
-    """Decrease of some held-out row's sum of squares by these terms, all others fitted, in standard errors.
-
-    The mean over blocks of time of the decrease per block, divided by the standard error of that mean; the largest of
-    the rows.
-    """
-    store = estimate.on(heldout)
-    with_them = estimate.subset(list(estimate.terms))
-    without = estimate.subset([term for term in estimate.terms if term not in terms])
-    best = 0.0
-    for row in heldout.rows:
-        valid = heldout.valid[row]
-        touching = [term for term in estimate.terms if row in store.columns(term)]
-        if not valid.any() or not any(row in store.columns(term) for term in terms):
-            continue
-        columns = store.wide(touching, row, estimate.equations.fixed)[valid]
-        index = estimate.equations.index(touching)
-        left, more = (heldout.values[row][valid] - columns @ c[index] for c in (with_them, without))
-        falls = np.bincount(heldout.blocks[valid], more**2 - left**2)
-        falls = falls[np.unique(heldout.blocks[valid])]
-        if len(falls) > 2:
-            best = max(best, float(falls.mean() / (falls.std(ddof=1) / np.sqrt(len(falls)) + 1e-300)))
-    return best
-
 
 @dataclass(frozen=True)
 class CauseStep:
@@ -164,13 +136,13 @@ def _belongs(term: Term, terms: Sequence[Term], tip: int) -> str:
 MINOR, MINOR_INNER, MINOR_COMMAND = 0.009, 0.004, 0.001
 """Share of a joint's torque (RMS) by which a cause must lower some joint's RMS not to be minor: if it shows against the
 model, only in motor against sensor, only in command against motor."""
-QUIET_NM = 0.08
+WITHIN_NM = 0.08
 """Least decrease at a joint [N·m] if all rows are within their margins, for noise and the small friction of every arm
 could explain them."""
 
 
 def relevant_terms(
-    step: CauseStep, estimate: EffectEstimate, heldout: ResidualSet, scorer: _Scorer, quiet: bool
+    step: CauseStep, estimate: EffectEstimate, heldout: ResidualSet, scorer: _Scorer, within: bool
 ) -> tuple[Term, ...]:
     """Those of a step's terms that matter: without the others together, no joint's RMS rises by a relevant amount.
 
@@ -184,10 +156,10 @@ def relevant_terms(
     ):
         return step.terms
     shows = {row for term in step.terms for row in estimate.store.columns(term)}
-    absolute = heldout.least(QUIET_NM) if quiet else heldout.relevant_nm
+    absolute = heldout.least(WITHIN_NM) if within else heldout.relevant_nm
     least = np.maximum(_minor(shows, heldout.layout) * heldout.usual_torque, absolute)
     others = [term for term in estimate.terms if term not in step.terms]
-    by_row = quiet or {channel for channel, _ in shows} == {heldout.layout.command}
+    by_row = within or {channel for channel, _ in shows} == {heldout.layout.command}
     falls = scorer.falls(step.below, step.terms, by_row), scorer.falls(others, step.terms, by_row)
     if np.all(np.maximum(*falls) < least):
         return ()
@@ -223,13 +195,13 @@ def causes(
     heldout: ResidualSet,
     rivals: Rivals,
     names: tuple[str, ...],
-    quiet: bool = False,
     within: bool = False,
 ) -> tuple[list[Cause], list[Cause]]:
     """The causes, most important first, and the minor ones: whole effects, and joints at which an effect is small.
 
-    If all is `quiet`, noise could explain everything: a cause that does not show throughout the held-out data is minor,
-    too. So is one that may be nothing, by its own intervals, if all is `within` its margins.
+    If all rows are `within` their margins, noise could explain everything: a cause that may be nothing, by its own
+    intervals, is minor, too, and one that is a guess, even where general laws
+    or rivals that share its evidence would do as well.
     """
     found: list[Cause] = []
     minor: list[Cause] = []
@@ -238,9 +210,7 @@ def causes(
     law_test = LawTest(estimate.store, estimate.terms)
     hints: list[Term] = []
     for step in order_of_effects(estimate, scorer):
-        main = relevant_terms(step, estimate, heldout, scorer, quiet)
-        if quiet and main and steadiness(estimate, heldout, main) < STEADY:
-            main = ()
+        main = relevant_terms(step, estimate, heldout, scorer, within)
         if within and all(estimate.may_be_nothing(term) for term in main):
             main = ()
         rest = tuple(term for term in step.terms if term not in main)
@@ -250,17 +220,9 @@ def causes(
                 out.append(_cause(step, terms, fitted if bound else scorer, (rivals, law_test), names))
                 hints += terms if out is found and out[-1].confidence < HINT else ()
     missed = max(one.missed(hints) for one in (scorer, fitted))
-    return [replace(each, fall=min(each.fall, missed)) if each.confidence < HINT else each for each in found], minor
-
-
-def founded_causes(found: Sequence[Cause], minor: Sequence[Cause]) -> tuple[list[Cause], list[Cause]]:
-    """The causes that say more than that noise is uneven, for a gap within its margins; the others are minor.
-
-    They are more than a guess, even where a general law would do as well, or rivals share their evidence.
-    """
-    stands = [bool(cause.confounded_with) or cause.confidence >= FOUNDED for cause in found]
-    kept = [cause for cause, stays in zip(found, stands, strict=True) if stays]
-    return kept, [*minor, *(cause for cause, stays in zip(found, stands, strict=True) if not stays)]
+    found = [replace(each, fall=min(each.fall, missed)) if each.confidence < HINT else each for each in found]
+    guesses = [cause for cause in found if within and not (cause.confounded_with or cause.confidence >= FOUNDED)]
+    return [cause for cause in found if cause not in guesses], [*minor, *guesses]
 
 
 def _is_held_out(term: Term, heldout: ResidualSet) -> bool:

@@ -25,12 +25,12 @@ from sim_gap.attribution.bodies import (
     numbered_by_body,
     recordings_with_another_body,
 )
-from sim_gap.attribution.causes import causes, founded_causes
+from sim_gap.attribution.causes import causes
 from sim_gap.attribution.diagnosis import Diagnosis
 from sim_gap.attribution.friction_compensation import find_compensations, held_in_commands
 from sim_gap.attribution.position_answer import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
-from sim_gap.attribution.verdict import is_quiet, is_within
+from sim_gap.attribution.verdict import is_within
 from sim_gap.checks.check import check_recordings, times_in_motion, unchecked_note
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joints import match_joints
@@ -135,15 +135,12 @@ def diagnose(
                 f"; of {', '.join(judge.signals[k].label for k in lent)} only the second half is held out, {LENT}"
             )
     fit = estimate.store.data
-    quiet = not fit.impacts and is_quiet(judge) and is_quiet(fit)
-    within = is_within(judge) and is_within(fit)
-    found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, quiet=quiet, within=within)
-    if within:
-        found, minor = founded_causes(found, minor)
-    if quiet and not found:
-        made = answer(Internals(sim, fit, judge, None, tuple(heldout), estimate), [], [], heldout_is)
-    else:
-        made = answer(Internals(sim, fit, judge, estimate, tuple(heldout), estimate), found, minor, heldout_is)
+    within = not fit.impacts and is_within(judge) and is_within(fit)
+    found, minor = causes(estimate, judge, Rivals(search), sim.arm.names, within=within)
+    shown = estimate if found or not within else None
+    made = answer(
+        Internals(sim, fit, judge, shown, tuple(heldout), estimate), found, minor if shown else [], heldout_is
+    )
     compensated += find_compensations(estimate, (fit, judge))
     told = tuple(each.sentence() for each in compensated)
     aside = (*told, *unchecked_note(recordings))

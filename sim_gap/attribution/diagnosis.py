@@ -133,110 +133,83 @@ class Diagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """The dictionary of schema armlink.gap/2."""
-        roll = self.rollout
-        return {
+        roll: dict[str, Any] = {"horizon_s": None, "closed_loop": False, "before": [], "after": [], "effects": []}
+        if self.rollout:
+            roll = _fields(self.rollout) | {"effects": [_fields(each) for each in self.rollout.effects]}
+        gap = {
+            "unit": self.unit,
+            "joints": self.names,
+            "noise_floor": self.noise_floor,
+            "margin": self.margin,
+            "heldout_is": self.heldout_is,
+            "train": {"before": self.train_before, "after": self.train_after},
+            "heldout": {"before": self.heldout_before, "after": self.heldout_after},
+        }
+        band = self.band and {
+            "share": SHARE,
+            "holds": self.band.holds,
+            "half_width": self.band.width,
+            "unexplained": self.band.unexplained,
+        }
+        answer = {
             "schema": SCHEMA,
             "verdict": self.verdict,
-            "where": [
-                {
-                    "joint": place.joint,
-                    "channel": place.channel,
-                    "regime": place.regime,
-                    "rms": _round(place.rms),
-                    "noise": _round(place.noise),
-                    "share": _round(place.share),
-                    **({} if place.hz is None else {"hz": _round(place.hz)}),
-                }
-                for place in self.where
-            ],
-            "causes": [*(_cause(cause) for cause in self.causes), *(_law(law, self.names) for law in self.laws)],
-            "minor": [_cause(cause) for cause in self.minor],
-            "signs": [{name: _round(value) for name, value in vars(cause.signs).items()} for cause in self.causes],
-            "gap": {
-                "unit": self.unit,
-                "joints": list(self.names),
-                "noise_floor": _list(self.noise_floor),
-                "margin": _list(self.margin),
-                "heldout_is": self.heldout_is,
-                "train": {"before": _list(self.train_before), "after": _list(self.train_after)},
-                "heldout": {"before": _list(self.heldout_before), "after": _list(self.heldout_after)},
-            },
-            "rollout": {
-                "unit": "rad",
-                "horizon_s": roll.horizon_s if roll else None,
-                "closed_loop": roll.closed_loop if roll else False,
-                "before": _list(roll.before) if roll else [],
-                "after": _list(roll.after) if roll else [],
-                "effects": [
-                    {
-                        "effect": each.effect,
-                        "joints": list(each.joints),
-                        "alone": _list(each.alone),
-                        "without": _list(each.without),
-                    }
-                    for each in (roll.effects if roll else ())
-                ],
-            },
-            **({} if self.band is None else {"band": _band(self.band)}),
-            "unexplained": _round(self.unexplained),
-            "left_out": _round(self.left_out),
-            "notes": list(self.notes),
-            "friction_compensation": [each.to_json() for each in self.friction_compensation],
+            "where": [_fields(place, "clear", *(["hz"] if place.hz is None else [])) for place in self.where],
+            "causes": [*map(_cause, self.causes), *(_law(law, self.names) for law in self.laws)],
+            "minor": [*map(_cause, self.minor)],
+            "signs": [_fields(cause.signs) for cause in self.causes],
+            "gap": gap,
+            "rollout": {"unit": "rad", **roll},
+            **({"band": band} if band else {}),
+            "unexplained": self.unexplained,
+            "left_out": self.left_out,
+            "notes": self.notes,
+            "friction_compensation": [_fields(each) for each in self.friction_compensation],
             "checks": [finding.to_json() for finding in self.checks],
         }
+        return {name: _plain(value) for name, value in answer.items()}
 
 
-def _band(band: Band) -> dict[str, Any]:
-    values = {"holds": band.holds, "half_width": band.width, "unexplained": band.unexplained}
-    return {"share": SHARE, **{name: _list(x) for name, x in values.items()}}
+def _fields(record: Any, *left_out: str) -> dict[str, Any]:
+    return {name: value for name, value in vars(record).items() if name not in left_out}
 
 
 def _cause(cause: Cause) -> dict[str, Any]:
-    return {
-        "effect": cause.effect,
-        "joints": list(cause.joints),
-        "parameters": {
-            joint: {
-                name: {"value": _round(v.value), "ci95": [_round(v.low), _round(v.high)], "unit": v.unit}
-                for name, v in values.items()
-            }
-            for joint, values in cause.parameters.items()
-        },
-        "gap_before": _round(cause.gap_before),
-        "gap_after": _round(cause.gap_after),
-        "shrink": _round(cause.shrink),
-        "confidence": _round(cause.confidence),
-        "confounded_with": list(cause.confounded_with),
-        "separate_by": cause.separate_by,
+    parameters = {
+        joint: {name: {"value": v.value, "ci95": (v.low, v.high), "unit": v.unit} for name, v in values.items()}
+        for joint, values in cause.parameters.items()
     }
+    return {**_fields(cause, "fall", "signs", "law"), "parameters": parameters, "shrink": cause.shrink}
 
 
 def _law(law: ResidualLaw, names: tuple[str, ...]) -> dict[str, Any]:
     """A law among the causes: named after its quantity, and never surer than a hint."""
-    low, high = law.torque - law.band, law.torque + law.band
     return {
         "effect": f"law.{law.quantity}",
         "joints": [names[law.joint]],
         "parameters": {},
-        "gap_before": _round(law.before),
-        "gap_after": _round(law.after),
-        "shrink": _round(1.0 - law.after / law.before),
-        "confidence": _round(min(law.share, HINT)),
+        "gap_before": law.before,
+        "gap_after": law.after,
+        "shrink": 1.0 - law.after / law.before,
+        "confidence": min(law.share, HINT),
         "confounded_with": [],
         "separate_by": None,
         "law": {
             "channel": law.channel,
             "directed": law.directed,
-            "at": _list(law.at),
-            "torque": _list(law.torque),
-            "band": [_list(low), _list(high)],
+            "at": law.at,
+            "torque": law.torque,
+            "band": [law.torque - law.band, law.torque + law.band],
         },
     }
 
 
-def _round(x: float) -> float | None:
-    return float(f"{x:.6g}") if np.isfinite(x) else None
-
-
-def _list(x: Array) -> list[float | None]:
-    return [_round(float(value)) for value in x]
+def _plain(value: Any) -> Any:
+    """Value as in JSON: numbers with six digits, none that are not finite."""
+    if isinstance(value, dict):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(each) for each in value]
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.6g}") if np.isfinite(value) else None
+    return value

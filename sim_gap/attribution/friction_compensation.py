@@ -7,7 +7,6 @@ any friction, or negative friction, in a recording while the arm's other recordi
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,11 +68,6 @@ class Compensation:
             f"controller compensates friction with a torque that {self.channel} does not contain; leave this "
             "recording out, or record the whole command"
         )
-
-    def to_json(self) -> dict[str, Any]:
-        values = {name: getattr(self, name) for name in ("torque", "viscous", "usual")}
-        numbers = {name: None if value is None else float(f"{value:.6g}") for name, value in values.items()}
-        return {"recording": self.recording, "joint": self.joint, "channel": self.channel, "held": self.held, **numbers}
 
 
 def held_in_commands(recordings: Sequence[Recording], labels: Sequence[str]) -> list[Compensation]:

@@ -17,7 +17,7 @@ from sim_gap.residuals.location import Location, locate
 from sim_gap.residuals.preprocess import ABSENT
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.estimate import NOMINAL, EffectEstimate
-from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants, shares_a_factor
+from sim_gap.search.term import CONSTANT, MASSES, masses_may_be_constants, shares_a_factor
 
 WORSE = 1.1
 """Gap with the corrections over the one without them from which the corrections do not carry over; a choice."""

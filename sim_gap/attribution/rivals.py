@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sim_gap.search.gauss_newton import converge
-from sim_gap.search.term import Term
+from sim_gap.search.term import CONSTANT, MASSES, Term, masses_may_be_constants
 from sim_gap.search.term_equations import TermChoice, TermEquations
-from sim_gap.search.torque_constants import CONSTANT, MASSES, masses_may_be_constants
 
 AS_GOOD = 0.036
 """A rival is as good if its score, per independent measurement, is worse by no more than this: the price of three

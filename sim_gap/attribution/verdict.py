@@ -62,12 +62,8 @@ def row_rms(data: ResidualSet, left: dict[Row, Array] | None = None) -> dict[Row
     return {row: root_mean_square(values[row][data.valid[row]]) for row in data.rows if data.valid[row].any()}
 
 
-def is_quiet(data: ResidualSet) -> bool:
-    """Whether noise alone could explain every row."""
-    return all(rms <= data.quiet_threshold[row] for row, rms in row_rms(data).items())
-
-
 def is_within(data: ResidualSet) -> bool:
+    """Whether noise, and what every arm has, could explain every row."""
     return all(rms <= data.margin[row] for row, rms in row_rms(data).items())
 
 

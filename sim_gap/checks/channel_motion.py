@@ -21,6 +21,7 @@ class ChannelMotion:
     v: Array
     a: Array
     reading: Array
+    """NaN where there is none."""
     channel: str
     duration: float
     """Time from the first row to the last [s]."""
@@ -39,7 +40,7 @@ class ChannelMotion:
     @property
     def telling(self) -> Mask:
         """Rows that tell something of each joint, (K, n): friction at rest, which a motor holds, takes any value."""
-        return np.asarray((np.abs(self.v) > TURNING) | (self.channel == "tau"))
+        return np.asarray(((np.abs(self.v) > TURNING) | (self.channel == "tau")) & np.isfinite(self.reading))
 
     def rows(self, rows: slice) -> "ChannelMotion":
         q, v, a, reading = (x[rows] for x in (self.q, self.v, self.a, self.reading))

@@ -14,13 +14,13 @@ from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections, parse_co
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.checks.channel_motion import motion_of
+from sim_gap.checks.column_pairs import follows_position, sound_velocity
 from sim_gap.checks.columns import find_wrong_columns
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joint_range import find_beyond_range, find_counts
 from sim_gap.checks.jumps import find_jumps, find_seam, unwrap
 from sim_gap.checks.sampling import drop_held, drop_repeats, even_times, find_dropped, find_time_unit
 from sim_gap.checks.torque_source import find_gain_command, find_same, with_gravity
-from sim_gap.checks.velocity import follows_position, sound_velocity
 from sim_gap.model.rigid_body import RigidArm
 from sim_gap.residuals.preprocess import CHANNELS, PreparedSignals, prepare
 

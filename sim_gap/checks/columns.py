@@ -6,7 +6,7 @@ Where two corrections explain it alike, nothing is corrected, and both are said.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import combinations
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, SIGNIFICANT
 from sim_gap.checks.channel_motion import ChannelMotion
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.hypotheses import Hypothesis, hypotheses, in_both, put_in_order
-from sim_gap.checks.sound_arm import LEAST_RESIDUAL, likelihood, measurements, quick_costs
+from sim_gap.checks.hypotheses import Hypothesis, exchangeable, exchanged, hypotheses, put_in_order
+from sim_gap.checks.sound_arm import likelihood, quick_costs
 from sim_gap.model.rigid_body import RigidArm
 
 CERTAIN_FALL = 5.0 * PRICE
@@ -25,9 +25,9 @@ paid then, and the choice among the hundred changes that are looked at."""
 SCREENING_ROWS = 150
 """Rows that are enough to see that a hypothesis is wrong."""
 MOST_CANDIDATES = 8
-"""Hypotheses that are looked at closely."""
-MOST_ORDERED_JOINTS, ORDER_ROWS = 7, 30
-"""Joints up to which all orders are tried, of which there are 5,040; rows that they are compared on."""
+"""Hypotheses that are looked at closely, and orders from which exchanges go on."""
+ORDER_ROWS = 30
+"""Rows on which orders are compared."""
 DISTINCT_FALL = 3.0 * PRICE
 """Difference of the negative log likelihoods from which one correction is likelier than another: errors of
 sound models alone make one order of two wrist joints likelier by some prices."""
@@ -81,10 +81,9 @@ def find_wrong_columns(
     as_it_is = likelihood(arm, motion)
     motion = replace(motion, idle=as_it_is.idle)  # no reading becomes a dead one by a correction
     possible = list(hypotheses(arm, motion, stated, follows))
-    most, falls = _quick_falls(arm, motion, possible, SCREENING_ROWS)
-    if not (stated.order or stated.joints) and most > CERTAIN_FALL * arm.n:
-        possible += (orders := _likely_orders(arm, motion, follows))
-        falls = np.concatenate([falls, _quick_falls(arm, motion, orders, SCREENING_ROWS)[1]])
+    if not (stated.order or stated.joints):
+        possible += _likely_orders(arm, motion, follows)
+    falls = _quick_falls(arm, motion, possible)
     likely = [*(each for each in possible if each.option in known), *_likeliest(possible, falls)]
     tests = [_test(arm, motion, as_it_is.costs, each, each.option in known) for each in dict.fromkeys(likely)]
     tests = [test for test in tests if test.is_certain]
@@ -101,22 +100,16 @@ def find_wrong_columns(
     return _finding(arm, plainest, rivals)
 
 
-def _quick_falls(
-    arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis], rows: int
-) -> tuple[float, Array]:
-    """The most that the cost could fall by, all joints explained, and what it falls by with each hypothesis, less the
-    price, (M,), on about so many `rows`."""
-    few = slice(None, None, max(1, len(motion.q) // rows))
+def _quick_falls(arm: RigidArm, motion: ChannelMotion, possible: Sequence[Hypothesis]) -> Array:
+    """What the cost falls by with each hypothesis, less the price, on some of the rows, (M,)."""
+    few = slice(None, None, max(1, len(motion.q) // SCREENING_ROWS))
     changed = [motion, *(hypothesis.change(motion) for hypothesis in possible)]
     moved = [k for k, each in enumerate(changed) if k == 0 or each.q is not motion.q]
     motions = [each.rows(few) for each in changed]
     made = arm.carried(*(np.concatenate([getattr(motions[k], x) for k in moved]) for x in ("q", "v", "a")))
-    ends = np.cumsum([len(motions[k].q) for k in moved])[:-1]
-    models = dict(zip(moved, np.split(made, ends), strict=True))
-    costs = quick_costs(arm, [models.get(k, models[0]) for k in range(len(motions))], motions)
-    least = float(measurements(motion).sum() * np.log(LEAST_RESIDUAL))
-    prices = PRICE * np.array([hypothesis.choices for hypothesis in possible])
-    return float(costs[0].sum()) - least, costs[0].sum() - costs[1:].sum(1) - prices
+    models = dict(zip(moved, np.split(made, len(moved)), strict=True))
+    costs = quick_costs(arm, np.array([models.get(k, models[0]) for k in range(len(motions))]), motions)
+    return np.asarray(costs[0] - costs[1:] - PRICE * np.array([hypothesis.choices for hypothesis in possible]))
 
 
 def _likeliest(possible: Sequence[Hypothesis], falls: Array) -> list[Hypothesis]:
@@ -131,9 +124,11 @@ def _likeliest(possible: Sequence[Hypothesis], falls: Array) -> list[Hypothesis]
 
 
 def _test(arm: RigidArm, motion: ChannelMotion, before: Array, hypothesis: Hypothesis, known: bool) -> HypothesisTest:
-    if hypothesis.late:
-        before = likelihood(arm, motion.rows(in_both(len(motion.q), hypothesis.late))).costs
-    falls = before - likelihood(arm, hypothesis.change(motion)).costs
+    changed = hypothesis.change(motion)
+    gone = np.isnan(changed.reading) & ~np.isnan(motion.reading)
+    if gone.any():  # both are judged on the same rows
+        before = likelihood(arm, replace(motion, reading=np.where(gone, np.nan, motion.reading))).costs
+    falls = before - likelihood(arm, changed).costs
     price = 0.0 if known else PRICE * hypothesis.choices
     return HypothesisTest(hypothesis, falls - price / before.size, 0.0 if known else CERTAIN_FALL)
 
@@ -146,19 +141,17 @@ def _contains(more: HypothesisTest, less: HypothesisTest) -> bool:
 
 
 def _likely_orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> list[Hypothesis]:
-    """Orders of all joints' columns, of their positions and of their torques that fit best; none of an arm of many
-    joints, or where some are not judged."""
-    if not 3 < arm.n <= MOST_ORDERED_JOINTS or not measurements(motion).all():
-        return []
-    few = motion.rows(slice(None, None, max(1, len(motion.q) // ORDER_ROWS)))
-    found = []
-    positions, torque = ("q", *follows), motion.channel
-    orders = [order for order in permutations(range(arm.n)) if sum(j != k for j, k in enumerate(order)) > 3]
-    for channels in ((*positions, torque), positions, (torque,)):
-        possible = [put_in_order(arm, order, channels, torque) for order in orders]
-        falls = _quick_falls(arm, few, possible, ORDER_ROWS)[1]
-        found += [possible[k] for k in np.argsort(-falls)[:MOST_CANDIDATES].tolist()]
-    return found
+    """Orders of more than two columns, of positions, of torques and of both: exchange after exchange from those that
+    explain most after the one before."""
+    found, few = list[Hypothesis](), motion.rows(slice(None, None, max(1, len(motion.q) // ORDER_ROWS)))
+    for channels, joints in exchangeable(arm, motion, follows):
+        orders = [tuple(range(arm.n))]
+        for _ in joints[1:MOST_CANDIDATES]:
+            pairs = dict.fromkeys(exchanged(order, pair) for order in orders for pair in combinations(joints, 2))
+            trials = [put_in_order(arm, order, channels, motion.channel) for order in pairs]
+            best = np.argsort(-_quick_falls(arm, few, trials))[:MOST_CANDIDATES].tolist()
+            orders, found = [[*pairs][k] for k in best], [*found, *(trials[k] for k in best)]
+    return [each for each in found if len(each.joints) > 2]
 
 
 def _finding(arm: RigidArm, test: HypothesisTest, alike: Sequence[HypothesisTest]) -> RecordingFinding:

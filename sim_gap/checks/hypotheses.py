@@ -3,7 +3,8 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from functools import partial
+from itertools import combinations, product
 
 import numpy as np
 
@@ -47,8 +48,6 @@ class Hypothesis:
     """Number of things that are chosen in it, each as rare as an effect of the library."""
     corrects: bool = True
     """Whether the option can be carried out as it stands."""
-    late: int = 0
-    """Rows by which the readings are late; so many rows have no counterpart."""
 
 
 def hypotheses(
@@ -80,10 +79,18 @@ def _signs(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: S
         own = None if len(joints) == arm.n else joints[0]
         if not _settled(stated, "sign", channel, joints):
             text = _option("sign", [channel], "-1", own)
-            yield Hypothesis("sign", (channel,), joints, opposite, text, _turned(joints, torque=True))
+            yield Hypothesis("sign", (channel,), joints, opposite, text, partial(_torques, factor=_sign(arm.n, joints)))
         if len(joints) == 1 and not _settled(stated, "sign", "q", joints):
             text = _option("sign", positions, "-1", joints[0])
-            yield Hypothesis("sign", ("q",), joints, opposite, text, _turned(joints, torque=False), POSITION_CHOICES)
+            yield Hypothesis(
+                "sign",
+                ("q",),
+                joints,
+                opposite,
+                text,
+                partial(_positions, factor=_sign(arm.n, joints)),
+                POSITION_CHOICES,
+            )
     model = arm.carried(motion.q, motion.v, motion.a)
     for j in every:
         y, turns = motion.reading[:, j], np.mean(model[:, j] > 0.0)
@@ -95,7 +102,9 @@ def _signs(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: S
         ):
             option = f"record signed torque, or give --sign {channel}_{j + 1}=1 if this is right"
             what = "the torque never changes its sign, but the torque of the model does"
-            yield Hypothesis("unsigned", (channel,), (j,), what, option, _signed(arm, j), corrects=False)
+            yield Hypothesis(
+                "unsigned", (channel,), (j,), what, option, partial(_signed, arm=arm, joint=j), corrects=False
+            )
 
 
 def _zeros(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: Sequence[str]) -> Iterator[Hypothesis]:
@@ -103,7 +112,12 @@ def _zeros(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: S
     far = np.median(np.abs(motion.q).max(axis=0)) > math.pi  # as angles in degrees are, and those of one joint are not
     if far and not _settled(stated, "units", "q", every):
         yield Hypothesis(
-            "scale", ("q",), every, "the positions are in degrees", _option("units", positions, "deg"), _degrees
+            "scale",
+            ("q",),
+            every,
+            "the positions are in degrees",
+            _option("units", positions, "deg"),
+            partial(_positions, factor=DEGREE),
         )
     for j in every:
         if _settled(stated, "zero", "q", (j,)):
@@ -111,13 +125,15 @@ def _zeros(arm: RigidArm, motion: ChannelMotion, stated: Corrections, follows: S
         for angle in (0.5 * math.pi, -0.5 * math.pi, math.pi):
             text = _option("zero", [name for name in positions if name != "dq"], f"{angle:.5f}", j)
             what = f"the zero is off by {angle:+.2f} rad"
-            yield Hypothesis("zero", ("q",), (j,), what, text, _moved(j, angle), POSITION_CHOICES)
+            yield Hypothesis(
+                "zero", ("q",), (j,), what, text, partial(_positions, zero=angle * np.eye(arm.n)[j]), POSITION_CHOICES
+            )
 
 
 def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
     """A factor in all torques, or in those of one joint."""
-    channel = motion.channel
-    for joints in [tuple(range(arm.n)), *((j,) for j in range(arm.n) if arm.n > 1)]:
+    channel, every = motion.channel, tuple(range(arm.n))
+    for joints in [every, *((j,) for j in range(arm.n) if arm.n > 1)]:
         if _settled(stated, "units", channel, joints):
             continue
         column = channel if len(joints) == arm.n else f"{channel}_{joints[0] + 1}"
@@ -125,7 +141,7 @@ def _units(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterato
         option = f"--units {column}=A:K ({constant}), or {column}=N·m if this is right"
         for factor in UNIT_FACTORS.tolist():
             what = f"the torque is {factor:.2g} times what the model explains: is it in amperes, or in another unit?"
-            change = _in_unit(joints, factor)
+            change = partial(_torques, factor=np.where(np.isin(every, joints), 1.0 / factor, 1.0))
             yield Hypothesis("scale", (channel,), joints, what, option, change, choices=2, corrects=False)
 
 
@@ -136,13 +152,22 @@ def _sources(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Itera
             "the torque contains no gravity, so the program that recorded it has probably subtracted the gravity of "
             "the model"
         )
-        yield Hypothesis("effort_source", (channel,), every, what, f"--effort-is {WITHOUT_GRAVITY}", _weighed(arm))
+        yield Hypothesis(
+            "effort_source", (channel,), every, what, f"--effort-is {WITHOUT_GRAVITY}", partial(_weighed, arm=arm)
+        )
     if not (motion.rubs or stated.effort) and arm.n > 1:
         what = (
             "the torque contains friction, which a sensor on the link side does not feel, so it is the torque "
             "of the motors"
         )
-        yield Hypothesis("effort_source", (channel,), every, what, "--effort-is motor", _of_motor)
+        yield Hypothesis(
+            "effort_source",
+            (channel,),
+            every,
+            what,
+            "--effort-is motor",
+            partial(replace, channel="tau_motor", rubs=True),
+        )
 
 
 def _delays(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterator[Hypothesis]:
@@ -157,49 +182,43 @@ def _delays(arm: RigidArm, motion: ChannelMotion, stated: Corrections) -> Iterat
         if early <= lag <= late or 4 * abs(rows) > len(motion.q):
             continue
         what = f"the torque is {abs(lag):.2f} s {'later' if lag > 0 else 'earlier'} than the positions"
-        yield Hypothesis(
-            "clock", (channel,), every, what, f"--clock {channel}={-lag:.3f}", _delayed(rows), choices=2, late=rows
-        )
+        change = partial(_delayed, rows=rows)
+        yield Hypothesis("clock", (channel,), every, what, f"--clock {channel}={-lag:.3f}", change, choices=2)
 
 
 def _orders(arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]) -> Iterator[Hypothesis]:
-    """Exchanged columns; of torques or positions alone only among joints that are all judged, or the readings that
-    count would not be the same before and after."""
-    channel, positions = motion.channel, ("q", *follows)
-    judged = np.flatnonzero(measurements(motion)).tolist()
-    for chosen in combinations(judged, 2):
-        order = _cycle(arm.n, chosen)
-        whole = put_in_order(arm, order, (channel,), channel)
-        for late in (False, True):
-            for share in ORDER_CHANGES:
+    """Two exchanged columns, and two torques that change places within the recording."""
+    for channels, joints in exchangeable(arm, motion, follows):
+        for pair in combinations(joints, 2):
+            order = exchanged(tuple(range(arm.n)), pair)
+            whole = put_in_order(arm, order, channels, motion.channel)
+            yield whole
+            for late, share in product((False, True), ORDER_CHANGES.tolist()) if "q" not in channels else ():
                 part = f"in the part {'after' if late else 'before'} {share:.0%} of the recording"
-                option = (
-                    f"give both parts as separate recordings, the {'later' if late else 'earlier'} part with "
-                    f"{whole.option}"
-                )
-                change = _in_part(order, late, float(share))
                 yield replace(
                     whole,
                     what=f"{whole.what}, but only {part}, since the model then explains more",
-                    option=option,
-                    change=change,
+                    option=f"give both parts as separate recordings, the {'later' if late else 'earlier'} part with "
+                    f"{whole.option}",
+                    change=partial(_in_part, order=order, late=late, share=share),
                     choices=3,
                     corrects=False,
                 )
-    cycles: list[tuple[int, ...]] = [*combinations(range(arm.n), 2)]
-    for i, j, k in combinations(range(arm.n), 3):
-        cycles += [(i, j, k), (i, k, j)]
-    for cycle in cycles:
-        alone = (positions, (channel,)) if {*cycle} <= {*judged} else ()
-        for channels in ((*positions, channel), *alone):
-            yield put_in_order(arm, _cycle(arm.n, cycle), channels, channel)
 
 
-def _cycle(n: int, chosen: Sequence[int]) -> tuple[int, ...]:
-    order = list(range(n))
-    for place, other in zip(chosen, [*chosen[1:], chosen[0]], strict=True):
-        order[place] = other
-    return tuple(order)
+def exchangeable(
+    arm: RigidArm, motion: ChannelMotion, follows: Sequence[str]
+) -> list[tuple[tuple[str, ...], list[int]]]:
+    """Channels whose columns may be in another order, and the joints: of torques or positions alone only those that
+    are judged, or the readings that count would not be the same before and after."""
+    positions, judged = ("q", *follows), np.flatnonzero(measurements(motion)).tolist()
+    return [((*positions, motion.channel), [*range(arm.n)]), (positions, judged), ((motion.channel,), judged)]
+
+
+def exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]:
+    """An order with two places exchanged."""
+    places = dict(zip(pair, pair[::-1], strict=True))
+    return tuple(order[places.get(j, j)] for j in range(len(order)))
 
 
 def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str], torque: str) -> Hypothesis:
@@ -211,109 +230,63 @@ def put_in_order(arm: RigidArm, order: tuple[int, ...], channels: Sequence[str],
         f"{', '.join(arm.names[order[j]] for j in touched)})"
     )
     option = "--map " + ",".join(f"{name}_{j + 1}={name}_{order[j] + 1}" for name in channels for j in touched)
-    values = [
-        *(("q", "v", "a") if "q" in channels else ()),
-        *(("reading", "size", "idle") if torque in channels else ()),
-    ]
-    return Hypothesis("order", tuple(channels), touched, what, option, permute(order, values), choices=len(touched) - 1)
-
-
-def _turned(joints: tuple[int, ...], torque: bool) -> Callable[[ChannelMotion], ChannelMotion]:
-    """Change of sign of the torques, or of the positions, of some joints."""
 
     def change(motion: ChannelMotion) -> ChannelMotion:
-        sign = np.ones(motion.q.shape[1])
-        sign[list(joints)] = -1.0
-        if torque:
-            return replace(motion, reading=motion.reading * sign)
-        return replace(motion, q=motion.q * sign, v=motion.v * sign, a=motion.a * sign)
+        motion = _positions(motion, order) if "q" in channels else motion
+        return _torques(motion, order) if torque in channels else motion
 
-    return change
+    return Hypothesis("order", tuple(channels), touched, what, option, change, choices=len(touched) - 1)
 
 
-def _signed(arm: RigidArm, joint: int) -> Callable[[ChannelMotion], ChannelMotion]:
+def _sign(n: int, joints: Sequence[int]) -> Array:
+    """Factors that turn the signs of some joints, (n,)."""
+    return np.where(np.isin(np.arange(n), joints), -1.0, 1.0)
+
+
+def _positions(
+    motion: ChannelMotion, order: Sequence[int] | None = None, factor: Array | float = 1.0, zero: Array | float = 0.0
+) -> ChannelMotion:
+    """The motion with positions in another order, unit or sign, or with other zeros, and with what follows them."""
+    every = range(motion.q.shape[1]) if order is None else order
+    q, v, a = (factor * x[:, list(every)] for x in (motion.q, motion.v, motion.a))
+    return replace(motion, q=q + zero, v=v, a=a)
+
+
+def _torques(motion: ChannelMotion, order: Sequence[int] | None = None, factor: Array | float = 1.0) -> ChannelMotion:
+    """The motion with readings in another order, unit or sign."""
+    every = list(range(motion.q.shape[1]) if order is None else order)
+    size = np.abs(factor) * motion.size[every]
+    return replace(motion, reading=factor * motion.reading[:, every], size=size, idle=motion.idle[every])
+
+
+def _signed(motion: ChannelMotion, arm: RigidArm, joint: int) -> ChannelMotion:
     """A reading with the sign of the torque that the model, friction and an offset predict for it."""
-
-    def change(motion: ChannelMotion) -> ChannelMotion:
-        model, way = arm.carried(motion.q, motion.v, motion.a)[:, joint], motion.direction[:, joint]
-        amount = np.abs(motion.reading[:, joint])
-        columns = np.stack([model, way, motion.v[:, joint], np.ones_like(way)], axis=1)
-        predicted = model if motion.channel == "tau" else model + np.median(amount) * way
-        for _ in range(SIGN_FITS):
-            signed = amount * np.sign(predicted)
-            predicted = columns @ np.linalg.lstsq(columns, signed, rcond=None)[0]
-        reading = motion.reading.copy()
-        reading[:, joint] = signed
-        return replace(motion, reading=reading)
-
-    return change
+    model, way = arm.carried(motion.q, motion.v, motion.a)[:, joint], motion.direction[:, joint]
+    amount = np.abs(motion.reading[:, joint])
+    columns = np.stack([model, way, motion.v[:, joint], np.ones_like(way)], axis=1)
+    predicted = model if motion.channel == "tau" else model + np.median(amount) * way
+    for _ in range(SIGN_FITS):
+        signed = amount * np.sign(predicted)
+        predicted = columns @ np.linalg.lstsq(columns, signed, rcond=None)[0]
+    reading = motion.reading.copy()
+    reading[:, joint] = signed
+    return replace(motion, reading=reading)
 
 
-def _moved(joint: int, angle: float) -> Callable[[ChannelMotion], ChannelMotion]:
-    def change(motion: ChannelMotion) -> ChannelMotion:
-        q = motion.q.copy()
-        q[:, joint] += angle
-        return replace(motion, q=q)
-
-    return change
+def _weighed(motion: ChannelMotion, arm: RigidArm) -> ChannelMotion:
+    still = np.zeros_like(motion.q)
+    return replace(motion, reading=motion.reading + arm.torque(motion.q, still, still))
 
 
-def _degrees(motion: ChannelMotion) -> ChannelMotion:
-    return replace(motion, q=motion.q * DEGREE, v=motion.v * DEGREE, a=motion.a * DEGREE)
+def _delayed(motion: ChannelMotion, rows: int) -> ChannelMotion:
+    """Readings taken so many rows later than the motion; NaN where there is none."""
+    reading = np.full_like(motion.reading, np.nan)
+    reading[max(0, -rows) : len(reading) - max(0, rows)] = motion.reading[max(0, rows) : len(reading) + min(0, rows)]
+    return replace(motion, reading=reading)
 
 
-def _in_unit(joints: tuple[int, ...], factor: float) -> Callable[[ChannelMotion], ChannelMotion]:
-    def change(motion: ChannelMotion) -> ChannelMotion:
-        recorded = np.ones(motion.q.shape[1])
-        recorded[list(joints)] = factor
-        return replace(motion, reading=motion.reading / recorded, size=motion.size / recorded)
-
-    return change
-
-
-def _weighed(arm: RigidArm) -> Callable[[ChannelMotion], ChannelMotion]:
-    def change(motion: ChannelMotion) -> ChannelMotion:
-        still = np.zeros_like(motion.q)
-        return replace(motion, reading=motion.reading + arm.torque(motion.q, still, still))
-
-    return change
-
-
-def _of_motor(motion: ChannelMotion) -> ChannelMotion:
-    return replace(motion, channel="tau_motor", rubs=True)
-
-
-def _delayed(rows: int) -> Callable[[ChannelMotion], ChannelMotion]:
-    """Readings taken so many rows later than the motion."""
-
-    def change(motion: ChannelMotion) -> ChannelMotion:
-        reading = motion.reading[max(0, rows) : len(motion.q) + min(0, rows)]
-        return replace(motion.rows(in_both(len(motion.q), rows)), reading=reading)
-
-    return change
-
-
-def in_both(count: int, late: int) -> slice:
-    """Rows, of so many, of a motion that have a reading which is late by some rows."""
-    return slice(max(0, -late), count - max(0, late))
-
-
-def _in_part(order: Sequence[int], late: bool, share: float) -> Callable[[ChannelMotion], ChannelMotion]:
+def _in_part(motion: ChannelMotion, order: Sequence[int], late: bool, share: float) -> ChannelMotion:
     """An order of the readings before, or after, a share of the rows."""
-
-    def change(motion: ChannelMotion) -> ChannelMotion:
-        row, moved = round(share * len(motion.q)), motion.reading[:, list(order)]
-        before, after = (motion.reading, moved) if late else (moved, motion.reading)
-        return replace(motion, reading=np.concatenate([before[:row], after[row:]]))
-
-    return change
-
-
-def permute(order: Sequence[int], names: Sequence[str]) -> Callable[[ChannelMotion], ChannelMotion]:
-    """Columns of some fields of a motion in another order."""
-
-    def change(motion: ChannelMotion) -> ChannelMotion:
-        values: dict[str, Array] = {name: getattr(motion, name)[..., list(order)] for name in names}
-        return replace(motion, **values)  # type: ignore[arg-type]
-
-    return change
+    row, moved = round(share * len(motion.q)), motion.reading[:, list(order)]
+    before, after = (motion.reading, moved) if late else (moved, motion.reading)
+    return replace(motion, reading=np.concatenate([before[:row], after[row:]]))

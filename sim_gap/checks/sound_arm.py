@@ -88,26 +88,21 @@ def _own_columns(
     return columns, np.concatenate([usual, friction], axis=-1)
 
 
-def quick_costs(arm: RigidArm, models: Sequence[Array], motions: Sequence[ChannelMotion]) -> Array:
-    """Negative log likelihood of each joint in each of several motions, by its own effects alone, (M, n); model torques
-    (K, n)."""
-    out = np.empty((len(motions), arm.n))
-    rows = np.array([len(motion.q) for motion in motions])
-    for length in np.unique(rows):
-        same = np.flatnonzero(rows == length)
-        for part in np.array_split(same, -(-len(same) * length // ROWS_AT_ONCE)):
-            chosen = [motions[k] for k in part]
-            out[part] = _stacked_costs(arm, np.array([models[k] for k in part]), chosen)
-    return out
+def quick_costs(arm: RigidArm, models: Array, motions: Sequence[ChannelMotion]) -> Array:
+    """Negative log likelihood of each of several motions, by each joint's own effects alone, (M,); model torques
+    (M, K, n)."""
+    parts = np.array_split(np.arange(len(motions)), -(-len(motions) * models.shape[1] // ROWS_AT_ONCE))
+    costs = [_stacked_costs(arm, models[part], [motions[k] for k in part]) for part in parts]
+    return np.asarray(np.concatenate(costs).sum(1))
 
 
 def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]) -> Array:
-    """The same of motions with as many rows, model torques (M, K, n)."""
-    q, v, a, reading, telling = (
-        np.array([getattr(motion, name) for motion in motions]) for name in ("q", "v", "a", "reading", "telling")
+    """The same by joint, (M, n)."""
+    q, v, a, read, telling, size, idle, rubs = (
+        np.array([getattr(motion, name) for motion in motions])
+        for name in ("q", "v", "a", "reading", "telling", "size", "idle", "rubs")
     )
-    rubs = np.array([motion.rubs for motion in motions])
-    size = np.array([motion.size for motion in motions])
+    reading = np.where(np.isfinite(read), read, model)
     columns, spread = _own_columns(arm, rubs, model, reading, q, v, a)
     own = np.concatenate([columns, (reading - model).swapaxes(1, 2)[:, :, None]], axis=2)
     weight = telling / np.maximum(telling.sum(1, keepdims=True), 1)
@@ -121,8 +116,7 @@ def _stacked_costs(arm: RigidArm, model: Array, motions: Sequence[ChannelMotion]
     without = turn @ gram @ turn.swapaxes(2, 3)  # with the reading itself in place of what the model leaves of it
     without[..., 0, :], without[..., :, 0] = 0.0, 0.0
     other = _fitted_cost(without, spread, np.full_like(low, -np.inf), high, count, floor) + PRICE
-    idle = np.array([motion.idle for motion in motions]) & (reading.std(1) < model.std(1))
-    whole = np.where(idle, np.minimum(whole, other), whole)
+    whole = np.where(idle & (reading.std(1) < model.std(1)), np.minimum(whole, other), whole)
     whole += RANGE_COST * np.array([beyond_range(arm, positions) for positions in q])
     return np.asarray(whole - count * np.log(np.maximum(size, SMALLEST_TORQUE)))
 
@@ -184,17 +178,17 @@ def _likelihood(arm: RigidArm, motion: ChannelMotion) -> ChannelLikelihood:
     """The same of the arm as it is given. The reading of a motor that is idle, or of a dead sensor, is less than the
     model's torque and has nothing of it, at a price."""
     model = arm.carried(motion.q, motion.v, motion.a)
-    rubs = np.array(motion.rubs)
-    own, spread = _own_columns(arm, rubs, model, motion.reading, motion.q, motion.v, motion.a)
+    reading = np.where(np.isfinite(motion.reading), motion.reading, model)
+    own, spread = _own_columns(arm, np.array(motion.rubs), model, reading, motion.q, motion.v, motion.a)
     limits = _own_limits(spread)
     shared = _shared_columns(arm, motion)
-    left = (motion.reading - model).T
+    left = (reading - model).T
     costs = _fit(motion, left, own, spread, limits, shared)
-    idle = motion.idle & (motion.reading.std(0) < model.std(0))
+    idle = motion.idle & (reading.std(0) < model.std(0))
     if idle.any():
         free = np.full_like(spread[:, 1:], -np.inf), np.full_like(spread[:, 1:], np.inf)
         none = np.zeros((0, *left.shape)), np.zeros(0), np.zeros((2, 0))
-        without = _fit(motion, motion.reading.T, own[:, 1:], spread[:, 1:], free, none) + PRICE / FOLDS
+        without = _fit(motion, reading.T, own[:, 1:], spread[:, 1:], free, none) + PRICE / FOLDS
         idle &= without.sum(1) < costs.sum(1)
     if idle.any():
         costs = np.where(idle[:, None], without, _fit(motion, left, own, spread, limits, shared, ~idle))
@@ -220,7 +214,8 @@ def _fit(
     n, width, _ = own.shape
     telling = motion.telling
     spread = np.concatenate([own_spread.ravel(), shared_spread])
-    fold = np.arange(len(telling)) * FOLDS // len(telling)
+    read = np.cumsum(np.isfinite(motion.reading).any(1))
+    fold = np.maximum(read - 1, 0) * FOLDS // read[-1]
     rows = np.stack([telling[fold == f].sum(0) for f in range(FOLDS)], axis=1)
     each = measurements(motion) / np.maximum(rows.sum(1), 1) * np.broadcast_to(counted, n)
     acting, squares, products = list[Index](), list[Array](), list[Array]()
@@ -285,8 +280,8 @@ def _turned_arm(arm: RigidArm, motion: ChannelMotion) -> RigidArm | None:
     still = np.zeros_like(motion.q)
     weightless = arm.torque(motion.q, motion.v, motion.a, np.zeros(3)) + arm.spring_torque(motion.q)
     columns = np.stack([arm.torque(motion.q, still, still, axis) for axis in np.eye(3)], axis=-1)
-    weight = motion.telling / (motion.reading.std(0) + 1e-9)
-    left = ((motion.reading - weightless) * weight).ravel()
+    weight = motion.telling / (np.nanstd(motion.reading, axis=0) + 1e-9)
+    left = (np.nan_to_num(motion.reading - weightless) * weight).ravel()
     gravity = np.linalg.lstsq((columns * weight[:, :, None]).reshape(-1, 3), left, rcond=None)[0]
     size, nominal = float(np.linalg.norm(gravity)), float(np.linalg.norm(arm.gravity))
     if size < 1e-6 or nominal < 1e-6 or float(gravity @ arm.gravity) > np.cos(ERROR_STD) * size * nominal:

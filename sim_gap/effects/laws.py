@@ -20,10 +20,13 @@ from sim_gap.residuals.preprocess import PreparedSignals
 @dataclass(frozen=True)
 class Law:
     id: str
-    family: str
-    """Effects of this family that are a case of the law say the same."""
     description: str
     signature: Signature
+    cases: frozenset[str] = frozenset()
+    """Effects at the same place that are a case of the law, and so say the same."""
+    with_sensor: frozenset[str] = frozenset()
+    without_sensor: frozenset[str] = frozenset()
+    """Further ones of an arm that has a torque sensor, and of one that has none, whose offsets are the drive's."""
 
     @property
     def effect(self) -> InverseEffect:
@@ -64,66 +67,76 @@ def _gravity(signals: PreparedSignals, layout: ChannelLayout, _place: int, _shap
 _LAWS = (
     Law(
         "law.position",
-        "transmission",
         "any torque on the link that is a smooth function of the joint's position",
         Signature.at_link(_smooth_in_position),
+        frozenset({"transmission.spring"}),
     ),
     Law(
         "law.motor_position",
-        "transmission",
         "any loss in the drive train that is a smooth function of the joint's position",
         Signature.at_motor(_smooth_in_position, "motor"),
+        without_sensor=frozenset({"transmission.spring"}),
     ),
     Law(
         "law.load",
-        "torque",
         "any sensor error that is constant or proportional to the torque",
         Signature.at_sensor(lambda s, joint, _: _linear(s.model[:, joint])),
+        frozenset({"torque.offset", "torque.gain"}),
     ),
     Law(
         "law.motor_load",
-        "actuator",
         "any drive error that is constant or proportional to the torque",
         Signature.at_motor(lambda s, joint, _: _linear(s.motor_model[:, joint]), "motor"),
+        frozenset({"actuator.gain"}),
+        without_sensor=frozenset({"torque.offset"}),
     ),
     Law(
         "law.motor_velocity",
-        "friction",
         "any loss in the drive train that is a smooth function of the joint's velocity",
         Signature.at_motor(_smooth_in_velocity),
+        frozenset({"friction.viscous"}),
     ),
     Law(
         "law.motor_acceleration",
-        "actuator",
         "any torque in the drive train that is proportional to the joint's acceleration",
         Signature.at_motor(lambda s, joint, _: s.a[:, joint], "motor"),
+        frozenset({"actuator.rotor_inertia"}),
     ),
     Law(
         "law.time",
-        "torque",
         "any sensor error that drifts with time",
         Signature.at_sensor(lambda s, _joint, _shape: _linear(s.t), "any"),
+        frozenset({"torque.drift"}),
+        with_sensor=frozenset({"torque.offset"}),
     ),
     Law(
         "law.late_reading",
-        "timing",
         "any delay or lag of the sensor's reading",
         Signature.at_sensor(lambda s, joint, _: _derivatives(s.smooth_model[:, joint], s.rate), "any"),
     ),
     Law(
         "law.late_drive",
-        "actuator",
         "any delay or lag of the drive",
         Signature.at_command(lambda s, joint, _: _derivatives(s.reading["tau_cmd"][:, joint], s.rate)),
     ),
     Law(
         "law.position_reading",
-        "position",
         "any error of the position sensor that is constant or proportional to the position",
         position_effect(reading_moves(lambda q: (np.ones_like(q), q, 0 * q, np.ones_like(q), 0 * q, 0 * q))),
+        frozenset({"position.offset", "position.gain"}),
     ),
-    Law("law.body", "link", "any rigid body fixed to a link", Signature(_body)),
-    Law("law.gravity", "base", "gravity of another direction or size", Signature(_gravity, whole_arm=True)),
+    Law(
+        "law.body",
+        "any rigid body fixed to a link",
+        Signature(_body),
+        frozenset({"link.mass_moment", "link.inertia", "link.payload"}),
+    ),
+    Law(
+        "law.gravity",
+        "gravity of another direction or size",
+        Signature(_gravity, whole_arm=True),
+        frozenset({"base.tilt"}),
+    ),
 )
 LAWS = {law.id: law for law in _LAWS}
 """All laws by id."""

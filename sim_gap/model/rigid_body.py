@@ -19,8 +19,8 @@ INERTIAL = ("mass", "mx", "my", "mz", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 LinkMotion = tuple[list[Array], list[tuple[Array, Array, Array]]]
 """Rotation of each link to its parent (3, 3, K); angular velocity, angular acceleration and acceleration of its origin
 less gravity, in its own frame, (3, K) each."""
-Wrenches = tuple[list[Array], list[Array]]
-"""Force [N] and couple about its origin [N·m] that each joint passes on to its link, in its frame, (3, K) each."""
+POSITION_STEP = 1e-5
+"""Step of differences in a position [rad]: rounding and curvature then leave 1e-10 of the torque."""
 
 
 @dataclass(frozen=True)
@@ -116,13 +116,7 @@ class RigidArm:
 
         q, v, a (K, n) in rad, rad/s, rad/s²; gravity (3,) in the base frame, by default the model's.
         """
-        motion = self.motion(q, v, a, gravity)
-        _, couples = self.wrenches(motion)
-        return np.stack([axis @ couple for axis, couple in zip(self.axis, couples, strict=True)], axis=1)
-
-    def wrenches(self, motion: LinkMotion) -> Wrenches:
-        """Forces and couples that the joints pass on to the links that they carry so that they move so."""
-        turns, moves = motion
+        turns, moves = self.motion(q, v, a, gravity)
         forces, couples = [], []
         for j, (omega, alpha, push) in enumerate(moves):
             mass, moment, inertia = self.inertial[j, 0], self.inertial[j, 1:4], symmetric(self.inertial[j, 4:])
@@ -134,7 +128,7 @@ class RigidArm:
                 force = out_of_frame(turns[j], forces[j])
                 forces[up] = forces[up] + force
                 couples[up] = couples[up] + out_of_frame(turns[j], couples[j]) - cross(force, self.offset[j])
-        return forces, couples
+        return np.stack([axis @ couple for axis, couple in zip(self.axis, couples, strict=True)], axis=1)
 
     def regressor(self, q: Array, v: Array, a: Array, gravity: Array | None = None) -> Array:
         """Columns of `torque` in the inertial parameters: τ = Σ_j Y[:, i, j] · inertial[j]; (K, n, n, 10)."""
@@ -248,74 +242,15 @@ def inertial_of(mass: float, centre: Array, inertia: Array) -> Array:
     return np.concatenate([[mass], mass * centre, about[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]])
 
 
-Change = tuple[Array, Array, Array]
-"""Change of a link's angular velocity, angular acceleration and acceleration of its origin, in its frame, (3, K)."""
+def torque_slopes(arm: RigidArm, q: Array, v: Array, a: Array, joint: int) -> tuple[Array, Array, Array]:
+    """∂τ/∂q, ∂τ/∂v and ∂τ/∂a of one joint, (K, n) each.
 
-
-def torque_slopes(
-    arm: RigidArm, motion: LinkMotion, wrenches: Wrenches, v: Array, joint: int
-) -> tuple[Array, Array, Array]:
-    """∂τ/∂q, ∂τ/∂v and ∂τ/∂a of one joint, at a motion with velocities v (K, n) and its wrenches, (K, n) each.
-
-    The Newton-Euler recursion, differentiated: a joint changes the motion of the links that it carries, and its
-    position the frame in which their forces are passed on.
+    By central differences, which are exact in v and a: the torque is quadratic in the one and linear in the other.
     """
-    omega, alpha, push = motion[1][joint]
-    none = np.zeros_like(omega)
-    axis = none + arm.axis[joint][:, None]
-    spin = axis * v[:, joint]
-    entering = omega - spin
-    turning = cross(entering, axis)
-    by_position = turning, cross(alpha - cross(entering, spin), axis) + cross(turning, spin), cross(push, axis)
-    force, couple = (cross(axis, parts[joint]) for parts in wrenches)
-
-    def slope(start: Change, turned: tuple[Array, Array] | None = None) -> Array:
-        return _passed_on(arm, motion, _below(arm, motion, v, joint, start), joint, turned)
-
-    return slope(by_position, (force, couple)), slope((axis, turning, none)), slope((none, axis, none))
-
-
-def _below(arm: RigidArm, motion: LinkMotion, v: Array, joint: int, start: Change) -> dict[int, Change]:
-    """Changes of all links that a joint carries, from that of its own."""
-    turns, moves = motion
-    changes = {joint: start}
-    for link in range(joint + 1, arm.n):
-        up = arm.parent[link]
-        if up not in changes:
-            continue
-        (omega, alpha, push), above, lever = changes[up], moves[up][0], arm.offset[link]
-        push = push + cross(alpha, lever) + cross(omega, cross(above, lever)) + cross(above, cross(omega, lever))
-        omega, alpha, push = (into_frame(turns[link], x) for x in (omega, alpha, push))
-        changes[link] = omega, alpha + cross(omega, arm.axis[link][:, None] * v[:, link]), push
-    return changes
-
-
-def _passed_on(
-    arm: RigidArm, motion: LinkMotion, changes: dict[int, Change], joint: int, turned: tuple[Array, Array] | None
-) -> Array:
-    """Change of every joint's torque with those of the links' motion, (K, n); `turned` is what force and couple of the
-    joint change by as its link turns, for those before it."""
-    turns, moves = motion
-    rows = changes[joint][0].shape[1]
-    out, passed = np.zeros((rows, arm.n)), np.zeros((arm.n, 2, 3, rows))
-    for link, (omega, alpha, push) in changes.items():
-        mass, moment, inertia = arm.inertial[link, 0], arm.inertial[link, 1:4], symmetric(arm.inertial[link, 4:])
-        now = moves[link][0]
-        bent = cross(omega, cross(now, moment)) + cross(now, cross(omega, moment))
-        passed[link, 0] = mass * push + cross(alpha, moment) + bent
-        gyro = cross(omega, inertia @ now) + cross(now, inertia @ omega)
-        passed[link, 1] = inertia @ alpha + gyro - cross(push, moment)
-    for link in reversed(range(arm.n)):
-        if link not in changes and not arm.carries[link, joint]:
-            continue
-        force, couple = passed[link]
-        out[:, link] = arm.axis[link] @ couple
-        up = arm.parent[link]
-        if up < 0:
-            continue
-        if link == joint and turned is not None:
-            force, couple = force + turned[0], couple + turned[1]
-        force = out_of_frame(turns[link], force)
-        passed[up, 0] += force
-        passed[up, 1] += out_of_frame(turns[link], couple) - cross(force, arm.offset[link])
-    return out
+    unit, slopes = np.eye(arm.n)[joint], []
+    for k, step in enumerate((POSITION_STEP, 1.0, 1.0)):
+        more, less = (
+            arm.torque(*(x + sign * step * unit * (i == k) for i, x in enumerate((q, v, a)))) for sign in (1.0, -1.0)
+        )
+        slopes.append((more - less) / (2.0 * step))
+    return slopes[0], slopes[1], slopes[2]

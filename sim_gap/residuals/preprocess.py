@@ -10,14 +10,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.interpolate import make_interp_spline
 from scipy.signal import butter, sosfiltfilt, sosfreqz
 
 from armlink.errors import BadInput
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.model.rigid_body import CREEP, LinkMotion, RigidArm, Wrenches, torque_slopes
+from sim_gap.model.rigid_body import CREEP, LinkMotion, RigidArm, torque_slopes
 from sim_gap.residuals.channel_quality import (
     Spikes,
     Stuck,
@@ -44,8 +43,6 @@ PAD_S = 1.0
 """Length of the reflection at either end of a signal that is filtered [s]."""
 TRIM_S = 0.3
 """Length cut off at both ends after filtering [s]."""
-COLUMNS = 8
-"""Number of columns that are filtered at a time."""
 SHORTEST_S, SHORTEST_PIECE_S = 3.0, 1.0
 """Least length of all recordings together, and of one of them with torques, whose ends are lost to a filter [s]."""
 MOST_SAMPLES_PER_ROW = 100.0
@@ -155,14 +152,10 @@ class PreparedSignals:
     def _motion(self) -> LinkMotion:
         return self.arm.motion(self.q, self.v, self.a)
 
-    @cached_property
-    def _wrenches(self) -> Wrenches:
-        return self.arm.wrenches(self._motion)
-
     def sensitivity(self, joint: int) -> tuple[Array, Array, Array]:
         """Derivatives of the model torque with respect to one joint's position, velocity, acceleration, (K, n) each."""
         if joint not in self._sensitivities:
-            self._sensitivities[joint] = torque_slopes(self.arm, self._motion, self._wrenches, self.v, joint)
+            self._sensitivities[joint] = torque_slopes(self.arm, self.q, self.v, self.a, joint)
         return self._sensitivities[joint]
 
     @cached_property
@@ -181,8 +174,7 @@ class PreparedSignals:
 
     def release(self) -> None:
         """Free what is large and can be computed again; of signals as they were read, not what is asked for again."""
-        once, again = ("_sensitivities", "_wrenches"), ("_motion", "gravity_columns")
-        for name in (*once, *(again if self.found is not None else ())):
+        for name in ("_sensitivities", *(("_motion", "gravity_columns") if self.found is not None else ())):
             self.__dict__.pop(name, None)
 
     @property
@@ -191,34 +183,9 @@ class PreparedSignals:
         return max(1, round(self.rate / (4.0 * self.band)))
 
     def filtered(self, x: Array) -> Array:
-        """Low-pass (4th-order Butterworth, forward and backward), trimmed and decimated; (K, …) → (k, …).
-
-        As a product of spectra, of the signal extended by its reflection in its ends.
-        """
-        trim, pad = max(1, round(TRIM_S * self.rate)), min(round(PAD_S * self.rate), len(x) - 1)
-        size = next_fast_len(len(x) + 2 * pad, real=True)
-        columns = np.reshape(x, (len(x), -1)).T
-        out = np.empty((len(columns), len(range(trim, len(x) - trim, self.step))))
-        for start in range(0, len(columns), COLUMNS):
-            part = np.ascontiguousarray(columns[start : start + COLUMNS])
-            first, last = part[:, :1], part[:, -1:]
-            before, after = 2.0 * first - part[:, pad:0:-1], 2.0 * last - part[:, -2 : -2 - pad : -1]
-            spectrum = rfft(np.hstack([before, part, after]), size, axis=1)
-            spectrum *= self._passed(size)
-            whole = irfft(spectrum, size, axis=1)
-            out[start : start + COLUMNS] = whole[:, pad + trim : pad + len(x) - trim : self.step]
-        return np.ascontiguousarray(out.T).reshape(-1, *np.shape(x)[1:])
-
-    def _passed(self, size: int) -> Array:
-        """Share of each frequency that the filter passes, forward and backward, for a spectrum of `size` samples."""
-        if size not in self._responses:
-            frequency = rfftfreq(size, 1.0 / self.rate)
-            self._responses[size] = np.abs(sosfreqz(self._sections, frequency, fs=self.rate)[1]) ** 2
-        return self._responses[size]
-
-    @cached_property
-    def _responses(self) -> dict[int, Array]:
-        return {}
+        """Low-pass (4th-order Butterworth, forward and backward), trimmed and decimated; (K, …) → (k, …)."""
+        pad = min(round(PAD_S * self.rate), len(x) - 1)
+        return np.ascontiguousarray(self.sampled(sosfiltfilt(self._sections, x, axis=0, padlen=pad)))
 
     @cached_property
     def _sections(self) -> Array:

@@ -58,8 +58,6 @@ hundredths are a tenth of all it does."""
 RELEVANT, RELEVANT_INNER, RELEVANT_COMMAND = 0.016, 0.007, 0.001
 """Smallest relevant gap as a share of the joint's torque (RMS): against the model, motor against sensor, command
 against motor."""
-QUIET = 0.5
-"""Share of the relevant gap below which there is nothing to search for."""
 FOLDS = 6
 """Number of folds for cross-validation, of all recordings together."""
 MOVING_SHARE = 0.95
@@ -233,13 +231,6 @@ class ResidualSet:
             return RELEVANT
         command = (row[0], reference) == (self.layout.command, self.layout.motor)
         return RELEVANT_COMMAND if command else RELEVANT_INNER
-
-    @cached_property
-    def quiet_threshold(self) -> dict[Row, float]:
-        """RMS of each row below which it may be noise alone: an effect must then show steadily [N·m]."""
-        noise = {row: 2.0 * floor for row, floor in self.floor.items()}
-        least = self.relevant_nm
-        return {row: noise[row] + max(QUIET * (self.margin[row] - noise[row]), least) for row in self.rows}
 
 
 def residual_sets(

@@ -12,18 +12,9 @@ from sim_gap.search.estimate_signals import EstimateSignals, Values, signals_abo
 from sim_gap.search.term import Term
 
 UNCHANGED, LINEAR = 1e-12, 1e-9
-CLOSE, CLOSE_RAD = 0.1, 0.02
-"""Change of torques and gravity, as a share of them, and of angles [rad] between two estimates up to which columns of
-rivals serve for both."""
-GAINS = ("sensor_gain", "motor_gain", "motor_slope")
-UNAFFECTED = frozenset(
-    {
-        "friction.coulomb", "friction.viscous", "friction.stribeck", "friction.asymmetric", "actuator.rotor_inertia",
-        "transmission.ripple", "torque.offset", "torque.drift", "actuator.lag", "actuator.delay", "actuator.saturation",
-        "law.time", "law.late_drive", "law.motor_velocity", "law.motor_acceleration", "law.motor_position",
-    }
-)  # fmt: skip
-"""Effects whose columns follow from the readings alone, apart from a drive's gain."""
+CLOSE = 0.1
+"""Change of a joint's torque between nominal model and estimate, as a share of it, up to which levels found from the
+nominal torque serve for both."""
 
 
 class ColumnStore:
@@ -37,49 +28,15 @@ class ColumnStore:
         pins: Values | None = None,
         slopes: "ColumnStore | None" = None,
     ) -> None:
-        """`nominal` is the store about the nominal model, of which columns that the estimate does not change are;
-        `pins` are coefficients that every fit on these columns keeps. `slopes` is a store about another estimate whose
-        derivatives stand in for this one's."""
+        """`nominal` is the store about the nominal model; `pins` are coefficients that every fit on it keeps.
+        `slopes` is a store about another estimate whose derivatives stand in for this one's."""
         self.data, self.values, self.nominal, self.pins = data, dict(values or {}), nominal, dict(pins or {})
         self.slopes = slopes
-        self.near: ColumnStore | None = None
         self._columns: dict[Term, Columns] = {}
         self._offsets: dict[Term, Columns] = {}
 
     def at(self, values: Values, pins: Values | None = None, slopes: "ColumnStore | None" = None) -> "ColumnStore":
         return ColumnStore(self.data, values, self.nominal or self, pins, slopes=slopes)
-
-    def beside(self, near: "ColumnStore | None") -> "ColumnStore":
-        """This store, with columns of rivals from another one where both are close."""
-        self.near = near
-        if near is not None:
-            near.near = None
-        return self
-
-    @cached_property
-    def _close(self) -> "list[tuple[ColumnStore, Mask]]":
-        """Stores about estimates with the same poses, gravity and gains, and the joints with the same torque, (n,)."""
-        stores = [store for store in (self.nominal, self.near) if store is not None]
-        found = [(store, _alike(self.about, store.about)) for store in stores]
-        return [(store, joints) for store, joints in found if joints is not None]
-
-    def _source(self, term: Term) -> "ColumnStore | None":
-        """The store whose columns of a term are those about this estimate; None if they are its own."""
-        if self.nominal is None:
-            return None
-        if term.effect in UNAFFECTED:
-            return self.nominal if all(one.motor_gain[term.place] == 1.0 for one in self.about) else None
-        if term in self.values or term.effect.startswith("law."):  # a law has to contain the effects that it contains
-            return None
-        signature = term.form.signature
-        if any(one.entering(term) is not one.stages[0] for one in self.about if signature.side == "distortion"):
-            return None
-        rigid = signature.side == "link" and signature.moves is None
-        everywhere = signature.side == "link" or term.effect == "torque.crosstalk"
-        for store, same in self._close:
-            if rigid or (same.all() if everywhere else same[term.place]):
-                return store
-        return None
 
     @cached_property
     def other_torques(self) -> Mask:
@@ -127,10 +84,6 @@ class ColumnStore:
         return np.hstack([*own, *beside, np.zeros((total, 0))])
 
     def _compute(self, term: Term) -> None:
-        source = self._source(term)
-        if source is not None:
-            self._columns[term], self._offsets[term] = source.columns(term), source.offset(term)
-            return
         known = self._in_slopes(term)
         if known is not None:
             self._columns[term] = known
@@ -217,22 +170,6 @@ class ColumnStore:
                 if np.abs(made - read).max(initial=0.0) > UNCHANGED:
                     out[layout.motor, i] = made - read
         return out
-
-
-def _alike(ours: Sequence[EstimateSignals], theirs: Sequence[EstimateSignals]) -> Mask | None:
-    """Joints with torques close in two estimates, (n,); None unless angles, gravity and gains are close."""
-    same = np.ones(len(ours[0].motor_gain), bool)
-    for one, other in zip(ours, theirs, strict=True):
-        s, at = one.signals, other.signals
-        if s.q is not at.q and np.abs(s.q - at.q).max() > CLOSE_RAD:
-            return None
-        if np.linalg.norm(s.arm.gravity - at.arm.gravity) > CLOSE * np.linalg.norm(at.arm.gravity):
-            return None
-        if any(np.abs(getattr(one, x) - getattr(other, x)).max() > CLOSE for x in GAINS):
-            return None
-        moved, size = (np.sqrt(np.mean(x**2, axis=0)) for x in (s.model - at.model, at.model))
-        same &= moved <= CLOSE * size
-    return same
 
 
 def _own_gain(one: EstimateSignals, joint: int) -> float:

@@ -12,9 +12,8 @@ from gcomp.arrays import Array
 from sim_gap.residuals.layout import Row
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
-from sim_gap.search.term import Term
+from sim_gap.search.term import Term, shares_a_factor
 from sim_gap.search.term_equations import TermEquations
-from sim_gap.search.torque_constants import shares_a_factor
 
 NOMINAL, WORSE, WORST = 0.01, 0.5, 0.2
 """Undetected error of the nominal mass moments of all links, relative: NOMINAL, or WORSE times the largest error found

@@ -6,34 +6,52 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from gcomp.estimate.choice import PRICE
 from sim_gap.effects.effect import Key
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.residual_set import ResidualSet
 from sim_gap.search.column_store import ColumnStore
 from sim_gap.search.estimate import SYSTEMATIC
 from sim_gap.search.gauss_newton import Values, converge, fitted
-from sim_gap.search.term import Term
+from sim_gap.search.term import BODY, CONSTANT, MASSES, Term
 from sim_gap.search.term_equations import TermChoice, TermEquations
-from sim_gap.search.torque_constants import CONSTANTS, drives_are_off, every_constant, most_are_off, price_of_all
-
-MOMENTS, BODY = "link.mass_moment", "link.payload"
 
 
-def one_body(store: ColumnStore, choice: TermChoice, offered: Sequence[Term]) -> list[Term] | None:
-    """The chosen terms with a payload in place of the mass moments, if that fits as well about itself; else None.
+def one_body(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
+    """The chosen terms with a payload in place of the mass moments of several links; none if that is no question.
 
     Linear in its mass and first moment, a payload lacks the inertia that its mass has where it hangs; mass moments of
-    all links together then fit a little better, and no single exchange leads back. `store` has the columns about the
-    nominal model.
+    all links together then fit a little better, and no single exchange leads back.
     """
     chosen = choice.current
     bodies = [term for term in offered if term.effect == BODY and not term.shape]
-    moments = [term for term in chosen if term.effect == MOMENTS]
-    if len(moments) < 2 or not bodies or any(term.effect == BODY for term in chosen):
-        return None
-    about, kept = converge(store, [*(term for term in chosen if term not in moments), bodies[0]])
-    found = TermChoice(TermEquations(about, kept), kept)
-    return found.current if found.score < choice.score else None
+    rest = [term for term in chosen if term.effect != MASSES]
+    several = len(chosen) - len(rest) > 1 and not any(term.effect == BODY for term in chosen)
+    return [*rest, bodies[0]] if several and bodies else []
+
+
+OFF = 0.05
+"""A torque constant is off from this share on."""
+
+
+def every_constant(choice: TermChoice, offered: Sequence[Term]) -> list[Term]:
+    """Every drive's torque constant free, the links as in the model, all else as chosen; none if no constant is chosen.
+
+    Where motor torque alone is recorded, one drive's constant is as doubtful as another's. A search that adds one
+    effect after the other may end with one constant as the model has it, and all masses changed in proportion.
+    """
+    chosen = {term.effect for term in choice.current}
+    if choice.equations.layout.sensor is not None or CONSTANT not in chosen:
+        return []
+    drives = [term for term in offered if term.effect == CONSTANT]
+    links = (CONSTANT, MASSES, "link.inertia", BODY)
+    return [*drives, *(term for term in choice.current if term.effect not in links)]
+
+
+def most_are_off(choice: TermChoice) -> bool:
+    """Whether most drives have another constant: those of an arm come from one maker, and are in doubt together."""
+    off = [abs(float(c[0])) > OFF for term, c in choice.values().items() if term.effect == CONSTANT]
+    return 2 * sum(off) > choice.equations.layout.n
 
 
 def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
@@ -41,14 +59,14 @@ def select_model(store: ColumnStore, library: Sequence[str]) -> TermChoice:
     offered, chosen = first_search(store, library)
     store.keep(offered)
     choice = search_again(store, chosen, offered)
-    if (body := one_body(store, choice, offered)) is not None:
-        again = search_again(store, body, offered)
+    if start := one_body(choice, offered):
+        again = search_again(store, start, offered)
         choice = again if again.score < choice.score else choice
-    if drives_are_off(choice):
-        again = search_again(store, every_constant(choice, offered), offered, CONSTANTS)
-        better = again.score + price_of_all() < choice.score
-        choice = again if better and most_are_off(again) else choice
-    for held in (store, choice.equations.store.beside(None)):  # frees the columns of rivals and of the estimate before
+    if start := every_constant(choice, offered):
+        again = search_again(store, start, offered, frozenset({CONSTANT}))
+        together = PRICE * (1 + effects()[CONSTANT].plausibility.prior_penalty)  # of one effect that few arms have
+        choice = again if again.score + together < choice.score and most_are_off(again) else choice
+    for held in (store, choice.equations.store):  # frees the columns of rivals and of the estimate before
         held.keep(choice.current)
     return choice
 
@@ -59,15 +77,13 @@ def search_again(
     """The terms offered, searched about the fit of those that are chosen, until both agree."""
     terms = refine(store, first_of_each([canonical_term(term) for term in chosen]))
     values: Values = {}
-    near: ColumnStore | None = None
     for _ in range(ROUNDS):
-        choice = refit_about_itself(store, terms, offered, values, near, usual)
+        choice = refit_about_itself(store, terms, offered, values, usual)
         keys = {term.key for term in choice.current}
         choice.run()
         if {term.key for term in choice.current} == keys:
             break
-        near = choice.equations.store
-        values = near.values
+        values = choice.equations.store.values
         terms = first_of_each([canonical_term(term) for term in choice.current])
     return choice
 
@@ -85,16 +101,14 @@ def refit_about_itself(
     chosen: list[Term],
     offered: Sequence[Term],
     start: Values,
-    near: ColumnStore | None = None,
     usual: frozenset[str] = frozenset(),
 ) -> TermChoice:
     """The chosen terms and their rivals with columns evaluated about the fit of the chosen ones, from coefficients
-    `start` on. `near` is the store of an earlier fit, whose columns of rivals serve if it is close."""
+    `start` on."""
     store, chosen = converge(nominal, chosen, start)
     refined = refine(store, chosen)
     if refined != chosen:
         store, chosen = converge(nominal, refined, store.values)
-    store = store.beside(near)
     keys = {term.key for term in chosen}
     others = [term for term in set_levels(store, offered) if term.key not in keys]
     rivals = relinearised_in_place(store, chosen, others)

@@ -1,4 +1,4 @@
-"""Single figures of an answer: order of the causes, steadiness, notes, shares, roll-outs."""
+"""Single figures of an answer: order of the causes, notes, shares, roll-outs."""
 
 from types import SimpleNamespace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_gap.attribution import notes, rollout
-from sim_gap.attribution.causes import order_of_effects, steadiness
+from sim_gap.attribution.causes import order_of_effects
 from sim_gap.attribution.diagnosis import Rollout
 from sim_gap.attribution.position_answer import _where
 from sim_gap.attribution.position_notes import running_free
@@ -31,29 +31,6 @@ def test_the_effect_that_takes_most_off_any_joint_comes_first() -> None:
     steps = order_of_effects(SimpleNamespace(terms=(COULOMB, OFFSET)), scorer)
     assert [step.effect for step in steps] == ["torque.offset", "friction.coulomb"]
     np.testing.assert_allclose(steps[1].before, [0.5, 1.0])
-
-
-def steady(falls: np.ndarray) -> float:
-    """Steadiness of a constant that takes so much off the squares of each block of time, of ten samples each."""
-    row, blocks = ("tau", 0), np.repeat(np.arange(len(falls)), 10)
-    # with the constant 1, what is left is y − 1 and the square falls by 2 y − 1
-    y = np.repeat(0.5 * (falls / 10.0 + 1.0), 10)
-    ones = np.ones((len(y), 1))
-    store = SimpleNamespace(columns=lambda term: {row: ones}, wide=lambda terms, row, fixed: ones)
-    estimate = SimpleNamespace(
-        terms=(OFFSET,),
-        on=lambda data: store,
-        subset=lambda terms: np.ones(1) if terms else np.zeros(1),
-        equations=SimpleNamespace(fixed={}, index=lambda terms: np.array([0])),
-    )
-    heldout = SimpleNamespace(rows=(row,), valid={row: np.full(len(y), True)}, values={row: y}, blocks=blocks)
-    return steadiness(estimate, heldout, [OFFSET])
-
-
-def test_steadiness_is_the_mean_fall_over_its_standard_error() -> None:
-    falls = np.array([3.0, 4.0, 5.0, 2.0, 6.0])
-    assert steady(falls) == pytest.approx(falls.mean() / (falls.std(ddof=1) / np.sqrt(5)))
-    assert steady(np.array([50.0, 0.0, 0.0, 0.0, 0.0])) == pytest.approx(1.0)
 
 
 def test_a_remaining_gap_is_noted_with_its_regime_where_one_is_clear(monkeypatch: pytest.MonkeyPatch) -> None:

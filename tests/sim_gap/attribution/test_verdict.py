@@ -7,7 +7,7 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution import diagnose
-from sim_gap.attribution.causes import _Scorer, founded_causes
+from sim_gap.attribution.causes import _Scorer
 from sim_gap.attribution.diagnosis import Cause, Signs
 from sim_gap.attribution.verdict import carries, is_founded
 from sim_gap.model.load import load_model
@@ -49,13 +49,6 @@ def test_a_cause_that_its_rival_could_replace_is_founded_together_with_it():
     assert not is_founded(replaceable)
     assert is_founded(replaceable, rivals=1)
     assert not is_founded(replace(replaceable, left=1.0, elsewhere=0.5), rivals=1)
-
-
-def test_within_the_margins_a_cause_that_nothing_founds_is_minor():
-    """An arm that is within its margins has no gap; rivals share their evidence, which founds them together."""
-    sure, weak = cause("friction.coulomb", 1.0, 0.9), cause("torque.offset", 0.5, 0.2)
-    rival = replace(weak, confounded_with=("link.mass_moment",))
-    assert founded_causes([sure, weak, rival], []) == ([sure, rival], [weak])
 
 
 @pytest.mark.sample(1)

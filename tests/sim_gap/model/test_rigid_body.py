@@ -1,7 +1,5 @@
 """The rigid arm against MuJoCo and Pinocchio: torque, regressor, payload and moved masses."""
 
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from wrong_arms import THREE
 from armlink.errors import BadInput
 from sim_gap.effects.link import moment_to_inertia
 from sim_gap.model.load import load_model, rigid_arm
-from sim_gap.model.rigid_body import RigidArm, torque_slopes
+from sim_gap.model.rigid_body import RigidArm
 
 
 def random_arm(n: int, seed: int) -> str:
@@ -50,24 +48,6 @@ def test_torque_is_that_of_mujoco_on_random_arms(n: int):
     arm = rigid_arm(model, range(n))
     q, v, a = states(n)
     np.testing.assert_allclose(arm.torque(q, v, a), inverse(model, q, v, a), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("parents", [(-1, 0, 1, 2, 3), (-1, 0, 0, 2, 1)])
-def test_slopes_of_the_torque_are_finite_differences(parents: tuple[int, ...]):
-    """In position by central differences; the torque is quadratic in velocity and linear in acceleration."""
-    arm = replace(rigid_arm(mujoco.MjModel.from_xml_string(random_arm(5, seed=3)), range(5)), parent=parents)
-    q, v, a = states(5)
-    motion = arm.motion(q, v, a)
-    for joint in range(5):
-        unit = np.eye(5)[joint]
-        by = [[h * unit * (k == place) for place in range(3)] for k, h in enumerate((1e-5, 1.0, 1.0))]
-        expected = [
-            (arm.torque(q + p, v + s, a + u) - arm.torque(q - p, v - s, a - u)) / (2.0 * np.max([p, s, u]))
-            for p, s, u in by
-        ]
-        slopes = torque_slopes(arm, motion, arm.wrenches(motion), v, joint)
-        for ours, theirs in zip(slopes, expected, strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("n", [3, 6])

@@ -63,22 +63,6 @@ def test_the_motor_of_an_estimate_makes_up_for_its_friction(data: ResidualSet) -
     np.testing.assert_allclose(share[moving], 0.5 * np.sign(read.v[moving, 1]), atol=1e-9)
 
 
-def test_columns_that_the_readings_alone_tell_are_those_of_the_nominal_model(data: ResidualSet) -> None:
-    """Unless the drive's gain, by which they are reported, is part of the estimate."""
-    nominal = ColumnStore(data)
-    assert nominal.at({PAYLOAD: np.array([0.4, 0.0, 0.0, 0.1])})._source(COULOMB) is nominal
-    assert nominal.at({GAIN: np.array([0.2])})._source(COULOMB) is None
-
-
-def test_columns_of_what_an_estimate_holds_are_its_own(data: ResidualSet) -> None:
-    """Those of another effect of the links are the nominal model's where the estimate is close to it."""
-    nominal, c = ColumnStore(data), np.array([1e-4, 0.0, 0.0, 1e-5])
-    own = nominal.at({PAYLOAD: c})
-    assert own._source(PAYLOAD) is None
-    assert own._source(Term("link.mass_moment", 0)) is nominal
-    assert own._source(Term("law.velocity", 0)) is None
-
-
 def test_between_motor_and_sensor_less_of_a_gap_is_worth_a_parameter(data: ResidualSet) -> None:
     for joint, usual in enumerate(data.usual_torque):
         for channel, share in (("tau", FLOOR), ("tau_motor", FLOOR_INNER)):
@@ -198,12 +182,12 @@ def test_nonlinear_effects_are_offered_at_the_size_that_they_have_in_place_of_a_
 @pytest.mark.parametrize(("score", "kept"), [(1.0, "several"), (3.0, "first")])
 def test_one_body_in_place_of_several_errors_of_links_is_kept_if_it_scores_better(monkeypatch, score, kept) -> None:
     def found(name: str, score: float) -> SimpleNamespace:
-        store = SimpleNamespace(beside=lambda near: SimpleNamespace(keep=lambda terms: None))
+        store = SimpleNamespace(keep=lambda terms: None)
         return SimpleNamespace(name=name, score=score, current=[], equations=SimpleNamespace(store=store))
 
     results = iter([found("first", 2.0), found("several", score)])
     monkeypatch.setattr(model_selection, "first_search", lambda store, library: ([], []))
     monkeypatch.setattr(model_selection, "search_again", lambda store, chosen, offered: next(results))
-    monkeypatch.setattr(model_selection, "one_body", lambda store, choice, offered: [PAYLOAD])
-    monkeypatch.setattr(model_selection, "drives_are_off", lambda choice: False)
+    monkeypatch.setattr(model_selection, "one_body", lambda choice, offered: [PAYLOAD])
+    monkeypatch.setattr(model_selection, "every_constant", lambda choice, offered: [])
     assert select_model(SimpleNamespace(keep=lambda terms: None), []).name == kept
