@@ -6,6 +6,7 @@ family is asked after those whose drives its requests could command, and only wh
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,9 @@ class AskedDrives:
         arm = parse_arm({"name": "found", "kinematics": {"joints": rows}, "link": link}, Path(bus.channel_info))
         self._drives = family(found[0].family).build(arm, arm.require_link().joints)
         bus.take = self._drives.take
-        self.nodes += map(_node, self.found, self._drives.identify(bus))
+        told = self._drives.identify(bus)
+        self.nodes += map(_node, self.found, told)
+        self.found = [replace(drive, serial=each.serial) for drive, each in zip(self.found, told, strict=True)]
 
     def positions(self) -> dict[str, float]:
         self._bus.take = self._drives.take

@@ -10,7 +10,6 @@ import numpy as np
 
 from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.model_sizes import model_budget
-from armlink.drives.findings import FoundDrive
 from calib.commissioning.chain import Chain
 from calib.commissioning.clear_range import ClearRange
 from gcomp.arm.load import compile_model
@@ -59,10 +58,6 @@ class JointDraft:
     stops: tuple[float, float] | None = None
     """Only where the model has none, or others were given [rad]."""
     notes: list[str] = field(default_factory=list)
-    identity: dict[str, int] | None = None
-    """Vendor and product of the drive found at its node."""
-    drive: FoundDrive | None = None
-    """The drive found at its node."""
 
 
 @dataclass
@@ -76,8 +71,6 @@ class Draft:
     joints: list[JointDraft]
     aside: tuple[tuple[str, str], ...]
     notes: list[str]
-    bus: dict[str, str | int] | None = None
-    """None: the simulated arm that this file describes."""
     serial: str = "unknown"
     base: str | None = None
     servo: str | None = None

@@ -16,7 +16,7 @@ from armlink.drives.canopen.check.scan import FoundNodes
 from armlink.errors import BadInput, BusFault
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.bus_arm import arm_of_bus
-from calib.commissioning.new_arm import NewArm, match_drives, new_arm
+from calib.commissioning.new_arm import NewArm, new_arm
 from calib.plan.collisions import Geometry
 from gcomp.errors import BadModel
 from sim_bus.bus.lock_step import LockStepBus
@@ -211,11 +211,15 @@ def hands(arm: SimulatedArm, made: NewArm):
     return ask
 
 
+def comments(path: str) -> list[str]:
+    lines = (line.strip() for line in Path(path).read_text().splitlines())
+    return [line.removeprefix("# ") for line in lines if line.startswith("#")]
+
+
 def test_permuted_ids_a_turned_sign_and_another_gear_are_found_by_hand(made, tmp_path):
     arm = real_arm(made, tmp_path, nodes=[12, 10, 11, 13], position_gain=[1.0, -1.0, 2.0, 1.01])
     drives = FoundNodes(LockStepBus(arm=arm))
-    matches = match_drives(made, drives, "the bus", hands(arm, made))
-    assert [match.drive.node for match in matches] == [12, 10, 11, 13]
+    made.wire(drives, "the bus", hands(arm, made))
     assert [(each.level, each.where) for each in made.findings] == [
         ("error", "j2 (node 10)"),
         ("error", "j3 (node 11)"),
@@ -277,8 +281,7 @@ def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doct
     first = load_arm("mine.yaml").require_link().joints[0].settings
     assert (first.id, first.reply, first.direction, first.kp) == (3, 0x13, -1, 33)
     assert first.zero == pytest.approx(0.7, abs=2e-3)
-    del content["link"]["joints"][0]["drive"]
-    content["link"]["joints"][0]["node"] = 3
+    content["link"]["joints"][0]["drive"] = {"family": "canopen", "node": 3}
     (tmp_path / "mixed.yaml").write_text(yaml.safe_dump(content))
     assert cli.run(["new", "mixed.yaml", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
     assert "j1 has a drive of family canopen, id 03h is one of family damiao" in capsys.readouterr().err
@@ -311,7 +314,7 @@ def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_b
 
 def test_in_order_of_ids_a_doubtful_rating_is_named(made, tmp_path):
     arm = real_arm(made, tmp_path, nodes=[4, 3, 2, 1], position_gain=[1.0] * 4)
-    match_drives(made, FoundNodes(LockStepBus(arm=arm)), "the bus", None)
+    made.wire(FoundNodes(LockStepBus(arm=arm)), "the bus", None)
     assert [each.where for each in made.findings] == ["j1 (node 1)", "j4 (node 4)"]
     assert "--by-hand" in made.findings[0].remedy
 
@@ -320,10 +323,10 @@ def test_a_joint_that_nobody_turned_and_a_drive_that_is_missing(made, tmp_path):
     arm = real_arm(made, tmp_path, nodes=[1, 2, 3, 4], position_gain=[1.0] * 4)
     drives = FoundNodes(LockStepBus(arm=arm))
     with pytest.raises(BusFault, match="no drive read the motion of j1"):
-        match_drives(made, drives, "the bus", lambda text: None)
+        made.wire(drives, "the bus", lambda text: None)
     drives.found.pop()
     with pytest.raises(BusFault, match=r"3 drives answer \(node 1, node 2, node 3\), the arm has 4 joints"):
-        match_drives(made, drives, "the bus", None)
+        made.wire(drives, "the bus", None)
 
 
 def test_the_command_writes_a_file_that_plan_and_check_take(tmp_path, capsys, monkeypatch):
@@ -343,7 +346,7 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
     monkeypatch.chdir(tmp_path)
     real_arm(made, tmp_path, nodes=[7, 8, 9, 10], position_gain=[1.0] * 4)
     made.write()
-    marks = [line for line in Path("arm4.yaml").read_text().splitlines() if line.lstrip().startswith("#")]
+    marks = comments("arm4.yaml")
     assert cli.run(["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
     assert cli.run(["check", "found.yaml"]) == 0
     assert cli.run(["new", "arm4.yaml", "--out", "rewired.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
@@ -355,9 +358,10 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
         for joint, found in zip(joints, load_arm("found.yaml").link.joints, strict=True)
     )
     assert len(marks) > 10
-    assert [line for line in Path("rewired.yaml").read_text().splitlines() if line.lstrip().startswith("#")][
-        1:
-    ] == marks
+    told_by_the_drives = ("rated_torque assumed", "assumed: there is no bus yet")
+    title, *rewired = [each for each in comments("rewired.yaml") if not each.startswith("node ")]
+    assert title.startswith("arm4 with the drives on ")
+    assert rewired == [each for each in marks if not each.startswith(told_by_the_drives)]
     assert cli.run(["new", "arm4.urdf", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
     assert "no terminal to ask" in capsys.readouterr().err
 
@@ -375,9 +379,14 @@ def test_drives_that_are_known_by_ids_must_all_answer_and_are_not_found_by_hand(
     assert "--by-hand" in capsys.readouterr().err
     assert not (tmp_path / "mine.yaml").exists()
     assert cli.run(["new", "six-damiao", "--out", "mine.yaml", "--bus", "armlink_sim:there.yaml"]) == 0
-    own = load_arm(tmp_path / "mine.yaml")
-    assert "sim" not in yaml.safe_load(own.path.read_text())
-    assert own.serial != content["serial"]
+    assert load_arm("mine.yaml").serial != content["serial"]
+    text = bundled_arms()["six-damiao"].read_text()
+    assert comments("mine.yaml")[1:] == comments(bundled_arms()["six-damiao"])
+    assert yaml.safe_load(Path("mine.yaml").read_text())["sim"] == yaml.safe_load(text)["sim"]
+    edited = Path("mine.yaml").read_text().replace("rate: 250", "rate: 200  # assumed")
+    Path("mine.yaml").write_text(edited)
+    assert cli.run(["new", "mine.yaml", "--force", "--bus", "armlink_sim:there.yaml"]) == 0
+    assert Path("mine.yaml").read_text() == edited
 
 
 def test_an_arm_file_without_a_bus_has_nothing_to_find(tmp_path):
