@@ -16,7 +16,7 @@ from calib.commissioning.clear_range import clear_ranges, sweep_problem
 from calib.commissioning.draft import Draft, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask
 from calib.commissioning.model_checks import file_findings
-from calib.commissioning.model_joints import model_joints
+from calib.commissioning.model_joints import ModelJoint, model_joints
 from calib.commissioning.model_judgement import model_errors
 from calib.commissioning.wiring import match_drives, wired_text
 
@@ -26,7 +26,7 @@ class Questions(Protocol):
 
     def which(self, chains: Sequence[Chain]) -> Chain: ...
 
-    def stops(self, joint: str) -> tuple[float, float] | None:
+    def stops(self, joint: ModelJoint) -> tuple[float, float] | None:
         """Stops [rad] of a joint for which the model has none; None where they are not known."""
         ...
 
@@ -129,8 +129,8 @@ def _given_stops(
     names = [joint.name for joint in chain.joints]
     _refuse_other_joints("--stops", stops, names, f"of the arm in {model}")
     for joint in chain.joints:
-        if joint.limits is None and joint.name not in stops and questions is not None:
-            answer = questions.stops(joint.name)
+        if not joint.has_stops and joint.name not in stops and questions is not None:
+            answer = questions.stops(joint)
             if answer is not None:
                 stops[joint.name] = answer
     return stops

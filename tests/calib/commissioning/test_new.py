@@ -2,9 +2,11 @@
 
 import copy
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -55,6 +57,7 @@ def test_limits_torques_and_speeds_are_the_model_s(made):
 
 
 def test_every_assumed_value_is_a_comment_of_the_file(made):
+    assert re.search(r"^  gravity: .*# .*assumed", made.text, re.MULTILINE)
     assert made.draft.assumed
     for each in made.draft.assumed:
         assert f"# {each.partition(': ')[2]}" in made.text
@@ -62,6 +65,7 @@ def test_every_assumed_value_is_a_comment_of_the_file(made):
 
 def test_a_joint_without_stops_is_not_pressed_on_any(made, tmp_path):
     assert made.parsed().sweep.hold == "servo"
+    assert "# assumed: j4 has no stop to be pressed on" in made.text
     given = new_arm(MODELS / "arm4.urdf", tmp_path / "arm4.yaml", stops={"j4": (-1.5, 1.0)})
     assert given.parsed().sweep is None
     assert gcomp_arm(given.parsed()).upper[3] == 1.0
@@ -71,6 +75,8 @@ def test_prismatic_fingers_are_set_aside_and_a_range_is_chosen_where_nothing_tou
     made = new_arm(MODELS / "own.xml", tmp_path / "own.yaml")
     assert [joint.name for joint in made.draft.joints] == ["yaw", "pitch", "elbow", "roll"]
     made.write()
+    marked = [each for each in comments(made.out) if each.startswith("stops assumed")]
+    assert len(marked) == sum(joint.stops is not None for joint in made.draft.joints) == 4
     arm = load_arm(made.out)
     geometry, limits = Geometry(arm), gcomp_arm(arm)
     poses = np.random.default_rng(5).uniform(limits.lower, limits.upper, (300, limits.n))
@@ -88,6 +94,11 @@ def test_limits_more_than_a_turn_apart_are_no_stops(tmp_path, monkeypatch):
     assert made.parsed().sweep.hold == "servo"
     limits = gcomp_arm(made.parsed())
     assert (limits.upper - limits.lower <= 2 * np.pi).all()
+    asked = []
+    questions = SimpleNamespace(stops=lambda joint: asked.append(joint.name) or (-3.0, 3.0))
+    told = new_arm(MODELS / "ur10e.urdf", tmp_path / "ur10e.yaml", questions=questions)
+    assert asked == [joint.name for joint in told.draft.joints if joint.stops == (-3.0, 3.0)] != []
+    assert told.parsed().sweep is None
 
 
 def test_two_arms_in_a_model(tmp_path, monkeypatch):
@@ -276,6 +287,10 @@ def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doct
     assert "damping ratio" not in capsys.readouterr().out
     assert cli.run(["check", "found.yaml", "--passive"]) == 0
     content["link"]["joints"][0]["drive"] |= {"id": 9, "reply": 0x19, "direction": 1, "zero": 0.0, "kp": 33}
+    made.write()
+    assert cli.run(["new", "arm4.yaml", "--force", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 0
+    assert [joint.settings for joint in load_arm("arm4.yaml").require_link().joints] == drives
+    assert "kp, kd assumed: the torque range over one radian, damped as armlink doctor asks" in comments("arm4.yaml")
     (tmp_path / "old.yaml").write_text(yaml.safe_dump(content))
     assert cli.run(["new", "old.yaml", "--out", "mine.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 0
     first = load_arm("mine.yaml").require_link().joints[0].settings
@@ -285,6 +300,25 @@ def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doct
     (tmp_path / "mixed.yaml").write_text(yaml.safe_dump(content))
     assert cli.run(["new", "mixed.yaml", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
     assert "j1 has a drive of family canopen, id 03h is one of family damiao" in capsys.readouterr().err
+
+
+def test_a_rating_beyond_the_torque_field_of_the_drive_is_cut_and_said(made, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    content = yaml.safe_load(made.text)
+    for number, row in enumerate(content["link"]["joints"], start=1):
+        del row["node"]
+        keys = {"id": number, "reply": number + 0x10, "model": "DM4310", "kp": 10, "kd": 1}
+        row |= {"drive": {"family": "damiao", **keys}, "rated_torque": 5.0, "max_torque": 8.0}
+    (tmp_path / "real.yaml").write_text(yaml.safe_dump(content))
+    assert cli.run(["new", "arm4.urdf", "--bus", "armlink_sim:real.yaml"]) == 0
+    said = capsys.readouterr().out
+    for joint, torque in (("j1 (id 01h)", 40), ("j2 (id 02h)", 40), ("j3 (id 03h)", 20)):
+        what = "the drive has a torque field that ends at 10 N·m, but the joint was to have a rated torque of"
+        assert f"{joint}: {what} {torque} N·m" in said
+    assert "j4 (id 04h): the drive" not in said
+    joints = load_arm("arm4.yaml").require_link().joints
+    assert [joint.rated_torque for joint in joints] == [joint.max_torque for joint in joints] == [10, 10, 10, 8]
+    assert comments("arm4.yaml").count("rated_torque assumed: the end of the drive's torque field") == 3
 
 
 def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_be_missing(
