@@ -29,8 +29,6 @@ GROUP = "armlink.drives"
 class Discovery:
     """How the drives of a family are found."""
 
-    how: str
-    """The question that is asked, or what is listened for."""
     find: Callable[[SearchedBus], Sequence[FoundDrive] | FoundDrives]
     """Sends nothing but frames that read."""
     spares: tuple[str, ...] = ()

@@ -119,10 +119,11 @@ def search(opened: "CanBus") -> "BusDrives":
     from armlink.commands.plain_console import PlainConsole
     from armlink.drives.discovery import BusDrives
 
-    with PlainConsole().status(f"looking for drives on {opened.channel_info}"):
+    console = PlainConsole()
+    with console.status(f"looking for drives on {opened.channel_info}"):
         drives = BusDrives(opened)
     for line in (drives.told, *(f"{node['address']}: {node['wrong']}" for node in drives.nodes if node["wrong"])):
-        PlainConsole().print(line)
+        console.print(line)
     return drives
 
 
