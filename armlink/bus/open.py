@@ -61,11 +61,11 @@ def open_bus(spec: str | None, section: Bus) -> MessageBus:
     options: dict[str, Any] = {} if bus.interface == "socketcan" else {"bitrate": bus.bitrate}
     if bus.fd:
         options |= {"protocol": can.CanProtocol.CAN_FD} if bus.interface == "virtual" else {"fd": True}
-    if bus.interface in EXTRAS:
-        require_extra(f"bus {name}", EXTRAS[bus.interface])
     try:
         return adapt(can.Bus(interface=bus.interface, channel=bus.channel, **options, **bus.options), name)
     except CanInterfaceNotImplementedError as error:
+        if bus.interface in EXTRAS:  # python-can has the interface, which lacks what it is made of
+            require_extra(f"bus {name}", EXTRAS[bus.interface])
         known = bus.interface in can.VALID_INTERFACES
         hint = "install the driver of this interface" if known else "python-can does not know this interface"
         raise BadInput(f"bus {name}: {error}: {hint}") from None

@@ -19,7 +19,7 @@ WRITE_TIMEOUT = 0.1
 """Longest time for which the port takes no bytes before the adapter counts as gone [s]."""
 
 
-class SerialAdapterBus(can.BusABC):
+class SerialAdapterBus(can.BusABC):  # type: ignore[misc]
     """A serial port whose bytes are packets of one CAN frame each."""
 
     hello = b""
@@ -142,7 +142,7 @@ class RobStrideSerialBus(SerialAdapterBus):
     @staticmethod
     def packet(message: can.Message) -> bytes:
         extended, remote = message.is_extended_id, message.is_remote_frame
-        register = message.arbitration_id << (3 if extended else 21) | extended << 2 | remote << 1
+        register = int(message.arbitration_id) << (3 if extended else 21) | extended << 2 | remote << 1
         data = b"" if remote else bytes(message.data)
         return b"AT" + register.to_bytes(4, "big") + bytes([message.dlc]) + data + b"\r\n"
 

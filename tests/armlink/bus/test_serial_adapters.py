@@ -15,7 +15,7 @@ from armlink.arm_file import Bus
 from armlink.bus.open import open_bus
 from armlink.bus.port import EXTENDED
 from armlink.bus.serial_adapters import DamiaoSerialBus, RobStrideSerialBus
-from armlink.errors import ArmlinkError, BadInput, BusFault
+from armlink.errors import ArmlinkError, BusFault
 
 DAMIAO_ENABLE = bytes.fromhex("55aa1e03010000000a000000000100000000080000fffffffffffffffc00")
 """To drive 1, as Damiao's DM_CAN.py sends it."""
@@ -136,8 +136,7 @@ def test_an_adapter_that_is_unplugged_is_a_fault_of_the_bus(terminal) -> None:
         port = bus.open_port()
         os.close(adapter)
         with pytest.raises(BusFault, match=rf"^bus damiao_serial:{name}: cannot receive: "):
-            for _ in range(3):
-                port.receive(0.1)
+            [port.receive(0.1) for _ in range(3)]
     finally:
         bus.shutdown()
 
@@ -147,12 +146,3 @@ def test_one_line_for_what_is_not_there(tmp_path: Path) -> None:
         with pytest.raises(ArmlinkError, match=rf"^bus {interface}:{tmp_path}/none: cannot open it: ") as caught:
             open_bus(f"{interface}:{tmp_path}/none", Bus())
         assert "\n" not in str(caught.value)
-
-
-def test_a_missing_library_is_named_by_its_extra(monkeypatch) -> None:
-    import armlink.extras
-
-    monkeypatch.setattr(armlink.extras, "_is_installed", lambda module: False)
-    for interface in ("damiao_serial", "gs_usb", "slcan"):
-        with pytest.raises(BadInput, match=r"armlink\[adapters\]"):
-            open_bus(f"{interface}:none", Bus())
