@@ -142,7 +142,7 @@ class RobStrideSerialBus(SerialAdapterBus):
     @staticmethod
     def packet(message: can.Message) -> bytes:
         extended, remote = message.is_extended_id, message.is_remote_frame
-        register = int(message.arbitration_id) << (3 if extended else 21) | extended << 2 | remote << 1
+        register: int = message.arbitration_id << (3 if extended else 21) | extended << 2 | remote << 1
         data = b"" if remote else bytes(message.data)
         return b"AT" + register.to_bytes(4, "big") + bytes([message.dlc]) + data + b"\r\n"
 
