@@ -280,6 +280,12 @@ class ArmFile(Section):
         return is_serial(self.serial)
 
     @property
+    def has_geometry(self) -> bool:
+        """Whether it is known where the joints are: of drives alone, Denavit-Hartenberg rows are all zero."""
+        rows = self.kinematics.joints
+        return self.kinematics.model is not None or any(row.a or row.alpha or row.d for row in rows)
+
+    @property
     def joint_names(self) -> tuple[str, ...]:
         """Joint names from base to tip; empty where only a model file would tell."""
         return tuple(joint.name for joint in self.kinematics.joints or (self.link.joints if self.link else ()))

@@ -10,6 +10,10 @@ from armlink.errors import BadInput
 from armlink.extras import require_extra
 
 VIRTUAL_INTERFACES = ("virtual", "udp_multicast")
+EXTRAS = {"udp_multicast": "simulator"} | dict.fromkeys(
+    ("damiao_serial", "gs_usb", "robotell", "robstride_serial", "seeedstudio", "serial", "slcan"), "adapters"
+)
+"""Interface → the extra that brings what python-can needs for it."""
 FORM = "INTERFACE:CHANNEL[@BITRATE], for example socketcan:can0@1000000, or with CAN FD socketcan:can0@1000000/5000000"
 
 
@@ -60,8 +64,8 @@ def open_bus(spec: str | None, section: Bus) -> MessageBus:
     try:
         return adapt(can.Bus(interface=bus.interface, channel=bus.channel, **options, **bus.options), name)
     except CanInterfaceNotImplementedError as error:
-        if "msgpack" in str(error):  # python-can finds the interface, which lacks what it is made of
-            require_extra(f"bus {name}", "simulator")
+        if bus.interface in EXTRAS:  # python-can has the interface, which lacks what it is made of
+            require_extra(f"bus {name}", EXTRAS[bus.interface])
         known = bus.interface in can.VALID_INTERFACES
         hint = "install the driver of this interface" if known else "python-can does not know this interface"
         raise BadInput(f"bus {name}: {error}: {hint}") from None

@@ -82,8 +82,5 @@ def interface_fault(error: Exception, name: str, doing: str) -> ArmlinkError:
     if isinstance(error, NameError | AttributeError | ImportError):  # its library is missed this late
         reason = f"{reason}: is the driver of the interface installed?"
     if errno.EAFNOSUPPORT in numbers:
-        reason = (
-            f"{reason}: this kernel has no SocketCAN: load the module with `modprobe can`, or try without it: "
-            "`--bus udp_multicast:239.74.163.2`"
-        )
+        reason = f"{reason}: this kernel has no SocketCAN: load its module with `sudo modprobe can`"
     return (InterfaceDown if down else BusFault)(f"bus {name}: cannot {doing}: {reason}")

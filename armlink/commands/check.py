@@ -19,14 +19,6 @@ if TYPE_CHECKING:
 SCHEMA = "armlink.check/1"
 HOST_SCHEMA = "armlink.check-host/1"
 SCALES_SCHEMA = "armlink.check-scales/1"
-WARNING = (
-    "This test enables every joint of {arm} and lets it hold where it stands (with at most its max_torque). "
-    "One joint after the other is then quick-stopped, and later gets no commands for {deadline:.0f} ms; at "
-    "last no joint gets the heartbeat of this host for {heartbeat:.0f} ms. Nothing is moved on purpose, but "
-    "a drive that does not hold after a quick stop may let its joint fall: put the arm where no joint can "
-    "fall, keep clear, and keep a hand on the emergency stop. At the end the joints hold, in quick stop; if "
-    "drives cannot hold without this host, the arm is parked or lowered, and its power is switched off."
-)
 
 
 def check(
@@ -55,7 +47,7 @@ def check(
     ] = 20.0,
     json: Json = None,
 ) -> int:
-    """Check identity, objects, PDO mapping, limits, calibration; then, with power, quick stop, deadline and heartbeat.
+    """Check identity, set-up and calibration of the drives; then, with power, what they do without their host.
 
     The command shows that each drive stops by itself when its host falls silent, and how long that takes. It first says
     what it will do to the joints and asks, except with --yes or on a simulated arm in this process. At the end the
@@ -75,7 +67,7 @@ def check(
     from armlink.errors import BadInput, BusFault, Refused
     from armlink.link.link import Link
     from armlink.loop.open import open_arm
-    from armlink.selftest.self_test import self_test
+    from armlink.selftest.self_test import announcement, self_test
 
     console = PlainConsole()
     described = load_arm(arm)
@@ -86,9 +78,7 @@ def check(
     with early_end(described) as work, open_arm(described, bus) as link:
         simulated = isinstance(link, Link) and link.bus.clock is not None
         if not (passive or yes or simulated):
-            deadline = described.require_link().deadline * 1e3
-            times = {"deadline": deadline, "heartbeat": 2 * deadline}
-            console.print(WARNING.format(arm=described.name, **times))
+            console.print(announcement(described))
             if not console.is_terminal:
                 raise BadInput(
                     "check: there is no terminal to ask for confirmation: give `--yes`, or `--passive` for the "
@@ -117,7 +107,13 @@ def check(
         )
     passed = sum(each.outcome == "passed" for each in found)
     out.print(f"all {passed} checks passed; {'the joints were not enabled' if passive else joints_left(described)}")
-    suggest(command_line("sweep", arm, "--plan", bus=bus))
+    if passive:
+        step = command_line("check", arm, bus=bus)
+    elif described.has_geometry:
+        step = command_line("sweep", arm, "--plan", bus=bus)
+    else:
+        step = command_line("doctor", arm, bus=bus)
+    suggest(step)
     return 0
 
 

@@ -26,7 +26,7 @@ def scan(
     """
     from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import command_line, results, suggest
+    from armlink.commands.plain_console import first_check, results, suggest
     from armlink.drives.family import family
     from armlink.errors import BadInput
 
@@ -42,7 +42,7 @@ def scan(
     else:
         status = _ask_all(described, bus, json)
     if status == 0:
-        suggest(command_line("check", arm, bus=bus))
+        suggest(first_check(described, arm, bus))
     return status
 
 
@@ -50,12 +50,13 @@ def _look_for_all(bus: str, json: Path | None) -> int:
     from armlink.arm_file import Bus
     from armlink.bus.open import open_bus
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import command_line, results, suggest
+    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
     from armlink.drives.discovery import BusDrives
 
     opened = open_bus(bus, Bus())
     try:
-        drives, channel = BusDrives(opened), str(opened.channel_info)
+        with PlainConsole().status(f"looking for drives on {opened.channel_info}"):
+            drives, channel = BusDrives(opened), str(opened.channel_info)
     finally:
         opened.shutdown()
     nodes, out = drives.nodes, results(json)

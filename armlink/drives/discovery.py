@@ -6,6 +6,7 @@ family is asked after those whose drives its requests could command, and only wh
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,9 @@ class AskedDrives:
         arm = parse_arm({"name": "found", "kinematics": {"joints": rows}, "link": link}, Path(bus.channel_info))
         self._drives = family(found[0].family).build(arm, arm.require_link().joints)
         bus.take = self._drives.take
-        self.nodes += map(_node, self.found, self._drives.identify(bus))
+        told = self._drives.identify(bus)
+        self.nodes += map(_node, self.found, told)
+        self.found = [replace(drive, serial=each.serial) for drive, each in zip(self.found, told, strict=True)]
 
     def positions(self) -> dict[str, float]:
         self._bus.take = self._drives.take
@@ -66,7 +69,7 @@ class BusDrives:
         found = {name: family(name).discovery for name in family_names()}
         ways = {name: way for name, way in found.items() if way is not None}
         self.parts: list[FoundDrives] = []
-        asked, others = list[str](), [f"{name} (by the ids of an arm file alone)" for name in found.keys() - ways]
+        asked, others = list[str](), [f"{name} (found by the ids of an arm file alone)" for name in found.keys() - ways]
         order = TopologicalSorter({name: way.spares for name, way in ways.items()}).static_order()
         for name in filter(ways.__contains__, order):
             way, lack = ways[name], ""
@@ -74,11 +77,13 @@ class BusDrives:
                 lack = "the bus is classical CAN, for CAN FD: INTERFACE:CHANNEL@1000000/5000000"
             if beside := {node["family"] for node in self.nodes}.intersection(way.spares):
                 lack = f"its frames could be taken for those of {beside.pop()}, or command its drives"
-            (others if lack else asked).append(f"{name} ({lack or way.how})")
-            if not lack:
-                part = way.find(searched)
-                self.parts.append(AskedDrives(searched, part) if isinstance(part, Sequence) else part)
-        self.told = f"looked for: {', '.join(asked)}; not looked for: {', '.join(others) or 'none'}"
+            if lack:
+                others.append(f"{name} ({lack})")
+                continue
+            asked.append(name)
+            part = way.find(searched)
+            self.parts.append(AskedDrives(searched, part) if isinstance(part, Sequence) else part)
+        self.told = f"looked for {', '.join(sorted(asked))}" + (f"; not for {', '.join(others)}" if others else "")
         self._channel = searched.channel_info
 
     @property

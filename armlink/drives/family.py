@@ -27,8 +27,8 @@ GROUP = "armlink.drives"
 
 @dataclass(frozen=True)
 class Discovery:
-    how: str
-    """The question that is asked, or what is listened for."""
+    """How the drives of a family are found."""
+
     find: Callable[[SearchedBus], Sequence[FoundDrive] | FoundDrives]
     """Sends nothing but frames that read."""
     spares: tuple[str, ...] = ()
@@ -48,6 +48,8 @@ class Family:
     self_test: Callable[..., list[Result]] | None = None
     """`self_test(link, drives, limits, power, progress)` of an arm with these drives alone, open and not started, where
     it goes further than the one for all families."""
+    self_test_steps: str = ""
+    """Sentences on what that test does to joints with power; `{deadline}` is `link.deadline` [ms]."""
     search: Callable[..., int] | None = None
     """`search(arm, bus or None, json, write, show)`: `armlink scan` of an arm; None: each drive is asked by its id."""
     discovery: Discovery | None = None

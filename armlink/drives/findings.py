@@ -30,6 +30,7 @@ class FoundDrive:
     """Identifier of its answers, where that is set in the drive."""
     model: str = ""
     """As on the label."""
+    serial: str = ""
     largest_gains: tuple[float, float] | None = None
     """Most kp [N·m/rad] and kd [N·m·s/rad] that its frames carry; None: it has a position controller of its own."""
     note: str = ""

@@ -8,12 +8,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from armlink.arm_file import ArmFile
 from armlink.drives.findings import ANSWER_CYCLES, ANSWERED, HELD, PATIENCE, Checks, Result
 from armlink.drives.orders import Power
 from armlink.drives.traits import Silence
 from armlink.errors import ArmlinkError, BusFault, Refused
 from armlink.link.faults import bus_fault
-from armlink.link.joints.groups import by_joint, traits_of
+from armlink.link.joints.groups import by_joint, make_groups, traits_of
 from armlink.link.link import Link
 from armlink.link.park import falling, park, speeds, straight
 from armlink.link.types import Command, Sample, Tell
@@ -27,6 +28,45 @@ LEAN = 0.2
 KEEPS_ON = "nothing stops this joint when its host dies: do not drive it"
 ASKED_CYCLES = 5
 """Cycles that a drive has to tell its state when it is asked."""
+
+
+REACTIONS: dict[Silence, str] = {
+    "holds": "holds",
+    "damps": "sinks, damped",
+    "falls": "falls free",
+    "keeps on": "keeps on, so no joint is driven",
+}
+
+
+def announcement(arm: ArmFile) -> str:
+    """The test with power in sentences, for a person who is asked before it begins."""
+    groups, deadline = make_groups(arm), arm.require_link().deadline * 1e3
+    joints = zip(arm.joint_names, by_joint(groups), traits_of(groups), strict=True)
+    reactions: dict[str, list[str]] = {}
+    for name, (group, _), traits in joints:
+        reactions.setdefault(f"{REACTIONS[traits.silence]} ({group.family.name})", []).append(name)
+    steps = groups[0].family.self_test_steps.format(deadline=deadline) if len(groups) == 1 else ""
+    if not steps:
+        who = {
+            does: f"{', '.join(names)}:" if len(reactions) > 1 else "every joint" for does, names in reactions.items()
+        }
+        told = "; ".join(f"{names} {does}" for does, names in who.items())
+        steps = (
+            f"One joint after the other then gets no commands for up to {PATIENCE * deadline:.0f} ms, until its drive "
+            f"reacts. By the traits of the drives, {told}. A joint whose drive does not report its state is turned by "
+            f"{LEAN} rad before that."
+        )
+    if all(traits.silence == "holds" for traits in traits_of(groups)):
+        end = "At the end the joints hold, in quick stop."
+    elif arm.require_link().park is None:
+        end = "At the end the arm is slowly lowered, and its power is switched off."
+    else:
+        end = "At the end the arm moves to link.park, and its power is switched off."
+    return (
+        f"This test enables every joint of {arm.name} and lets it hold where it stands (with at most its max_torque). "
+        f"{steps} {end} A drive that reacts in another way may let its joint fall: put the arm where no joint can "
+        "fall, keep clear, and keep a hand on the emergency stop."
+    )
 
 
 def self_test(link: Link, tell: Tell, power: bool) -> tuple[list[Result], str]:

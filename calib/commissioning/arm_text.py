@@ -4,8 +4,11 @@ import os
 from pathlib import Path
 from typing import Any
 
+from armlink.arm_file import SIMULATED
 from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from calib.commissioning.draft import FRICTION, Draft, JointDraft
+
+NO_BUS = "assumed: there is no bus yet"
 
 
 def assumed_lines(text: str) -> list[int]:
@@ -32,7 +35,11 @@ def arm_text(draft: Draft, out: Path) -> str:
     if draft.locked:
         lines.append("  locked:  # joints that these drives do not move [rad, m]")
         lines += [yaml_entry(name, position, 4) for name, position in draft.locked.items()]
-    lines.append(yaml_entry("gravity", list(draft.gravity), 2, "m/s² in the model's frame"))
+    lines.append(
+        yaml_entry(
+            "gravity", list(draft.gravity), 2, "m/s² in the model's frame; assumed: the arm stands as in the model"
+        )
+    )
     lines += [
         yaml_comment(f"joint {name} {why}: not part of the arm, it stays at its position in the model", 2)
         for name, why in draft.aside
@@ -42,7 +49,11 @@ def arm_text(draft: Draft, out: Path) -> str:
     if given:
         lines.append(f"  stops:  # {'working range' if draft.servo else 'mechanical stops'} [rad]")
         lines += [yaml_entry(name, stops, 4) for name, stops in given.items()]
-    lines += ["link:", *_bus(draft, out), yaml_entry("rate", 250, 2, "Hz, assumed"), "  joints:"]
+    simulated = {"interface": SIMULATED, "channel": out.name, "bitrate": 1000000}
+    real = "{interface: socketcan, channel: can0}"
+    note = f"{NO_BUS}, this is the simulated arm; for a real arm write {real}"
+    lines += ["link:", yaml_entry("bus", simulated, 2), yaml_comment(note, 2)]
+    lines += [yaml_entry("rate", 250, 2, "Hz, assumed"), "  joints:"]
     for joint in draft.joints:
         lines += [yaml_item(_joint(joint), 4), *(yaml_comment(note, 6) for note in joint.notes)]
     if draft.servo is not None:
@@ -58,22 +69,12 @@ def arm_text(draft: Draft, out: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _bus(draft: Draft, out: Path) -> list[str]:
-    if draft.bus is None:
-        simulated = {"interface": "armlink_sim", "channel": out.name, "bitrate": 1000000}
-        real = "{interface: socketcan, channel: can0}"
-        note = f"assumed: there is no bus yet, this is the simulated arm; for a real arm write {real}"
-        return [yaml_entry("bus", simulated, 2), yaml_comment(note, 2)]
-    return [yaml_entry("bus", draft.bus, 2)]
-
-
 def _joint(joint: JointDraft) -> dict[str, Any]:
-    row = {
+    return {
         "name": joint.name,
-        **({"node": joint.node} if joint.drive is None else joint.drive.keys),
+        "node": joint.node,
         "rated_torque": joint.rated_torque,
         "max_torque": joint.max_torque,
         "max_torque_rate": joint.max_torque_rate,
         "max_velocity": joint.max_velocity,
     }
-    return row if joint.identity is None else {**row, "identity": joint.identity}

@@ -7,6 +7,7 @@ from typing import get_args
 from armlink.arm_file import ArmFile, BadKeys, bundled_arms, load_arm
 from armlink.drives.findings import Level, SetupFinding
 from armlink.errors import ArmlinkError
+from armlink.loop.open import is_in_process
 from calib.commissioning.arm_text import assumed_lines
 from calib.commissioning.bus_checks import bus_findings, turn_findings
 from calib.commissioning.model_checks import model_findings
@@ -56,7 +57,7 @@ def _all(arm: str, bus: str | None, offline: bool) -> Iterator[SetupFinding]:
             f"add the key `link`: {FORMATS}",
         )
     else:
-        yield from _serial(arm_file)
+        yield from _serial(arm_file, bus)
         yield from turn_findings(arm_file)
         if not offline and not impossible:
             yield from bus_findings(arm_file, bus)
@@ -70,15 +71,15 @@ def _as_finding(error: Exception, arm_file: ArmFile) -> SetupFinding:
     return SetupFinding("error", what, str(arm_file.path), remedy)
 
 
-def _serial(arm_file: ArmFile) -> Iterator[SetupFinding]:
+def _serial(arm_file: ArmFile, bus: str | None) -> Iterator[SetupFinding]:
     """Records are kept under name and serial number: without one, two arms would share them."""
     if not arm_file.has_serial:
         yield SetupFinding(
-            "warning",
+            "hint" if is_in_process(arm_file, bus) else "warning",
             f"serial is {arm_file.serial}: another arm of this name would share the calibrations of this "
-            "arm, so no calibration is written to its drives",
+            "arm, so none is written to drives outside this process",
             str(arm_file.path),
-            "give the arm a serial number before its first sweep (`serial: …`)",
+            "give the real arm a serial number before its first sweep (`serial: …`)",
         )
 
 

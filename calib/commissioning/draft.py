@@ -10,7 +10,6 @@ import numpy as np
 
 from armlink.arm_file import STANDARD_GRAVITY
 from armlink.content.model_sizes import model_budget
-from armlink.drives.findings import FoundDrive
 from calib.commissioning.chain import Chain
 from calib.commissioning.clear_range import ClearRange
 from gcomp.arm.load import compile_model
@@ -18,8 +17,6 @@ from gcomp.arrays import Array
 
 ASSUMED_STOP = 2.9
 """Working range of a joint without stops, to either side [rad]; assumed."""
-TURN = 2 * np.pi
-"""A joint whose limits are further apart has no mechanical stop that it could be pressed on [rad]."""
 SPEED = 1.0
 """Largest speed, where the model allows more [rad/s]: cautious for the first motion; assumed."""
 RATE_TIME = 0.4
@@ -59,10 +56,6 @@ class JointDraft:
     stops: tuple[float, float] | None = None
     """Only where the model has none, or others were given [rad]."""
     notes: list[str] = field(default_factory=list)
-    identity: dict[str, int] | None = None
-    """Vendor and product of the drive found at its node."""
-    drive: FoundDrive | None = None
-    """The drive found at its node."""
 
 
 @dataclass
@@ -76,8 +69,6 @@ class Draft:
     joints: list[JointDraft]
     aside: tuple[tuple[str, str], ...]
     notes: list[str]
-    bus: dict[str, str | int] | None = None
-    """None: the simulated arm that this file describes."""
     serial: str = "unknown"
     base: str | None = None
     servo: str | None = None
@@ -122,7 +113,7 @@ def draft_of_model(
         )
     joints = [_joint(place, chain, stops.get(joint.name), rated[place]) for place, joint in enumerate(chain.joints)]
     free = [joint.name for joint in joints if joint.stops is not None and joint.name not in stops]
-    servo = f"{', '.join(free)} have no stop to be pressed on" if free else None
+    servo = f"{', '.join(free)} {'have' if len(free) > 1 else 'has'} no stop to be pressed on" if free else None
     ends = path.stem, path, tip, gravity, joints, chain.aside, notes
     return Draft(*ends, base=chain.base, servo=servo, locked=locked or {})
 
@@ -131,7 +122,7 @@ def narrow(draft: Draft, found: ClearRange) -> None:
     """Take a narrower range of every joint into the draft, which is no range between stops any more."""
     for joint, low, high in zip(draft.joints, found.lower, found.upper, strict=True):
         joint.stops = (math.ceil(low * 1000) / 1000, math.floor(high * 1000) / 1000)
-        joint.notes = [note for note in joint.notes if not note.startswith("stops")]
+        joint.notes = [note.replace("to be the limits", "to lie within the limits") for note in joint.notes]
     draft.servo = f"the range under kinematics.stops is narrower than the model's limits: {found.reason}"
 
 
@@ -198,16 +189,10 @@ def _joint(place: int, chain: Chain, given: tuple[float, float] | None, rating: 
     joint, effort = chain.joints[place], rating.torque
     notes = [rating.note] if rating.note else []
     stops = given
-    if given is None and joint.limits is None:
-        stops = (-ASSUMED_STOP, ASSUMED_STOP)
-        notes.append(f"stops assumed: ±{ASSUMED_STOP} rad, since the model has no limits")
-    elif given is None and joint.limits is not None and joint.limits[1] - joint.limits[0] > TURN:
-        middle = sum(joint.limits) / 2
+    if given is None and not joint.has_stops:
+        middle = sum(joint.limits or (0.0, 0.0)) / 2
         stops = (round(middle - ASSUMED_STOP, 4), round(middle + ASSUMED_STOP, 4))
-        notes.append(
-            f"stops assumed: {ASSUMED_STOP} rad to either side, since the limits of the model are more than a "
-            "turn apart"
-        )
+        notes.append(f"stops assumed: {ASSUMED_STOP} rad to either side, since the model has {joint.limits_in_words}")
     elif given is None:
         notes.append("stops assumed to be the limits of the model")
     speed = SPEED if joint.speed is None else min(SPEED, joint.speed)

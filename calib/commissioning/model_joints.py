@@ -42,6 +42,15 @@ class ModelJoint:
     locked: float | None = None
     """Position [rad, m] at which something else than the arm's drives holds it; None: it is not held."""
 
+    @property
+    def has_stops(self) -> bool:
+        """Whether its limits may be mechanical stops: those more than a turn apart are none."""
+        return self.limits is not None and self.limits[1] - self.limits[0] <= 2 * np.pi
+
+    @property
+    def limits_in_words(self) -> str:
+        return "no limits" if self.limits is None else "limits more than a turn apart"
+
 
 def model_joints(
     path: Path, locked: Mapping[str, float] | None = None

@@ -49,7 +49,7 @@ def arm_errors(arm_file: ArmFile) -> list[SetupFinding]:
     found, where = list(model_errors(arm_file)), str(arm_file.path)
     if found:
         return found
-    if arm_file.model_path is None and not any(row.a or row.alpha or row.d for row in arm_file.kinematics.joints):
+    if not arm_file.has_geometry:
         remedy = (
             "give a, alpha and d of every joint, or make the arm file from the arm's URDF or MJCF: armlink new --help"
         )

@@ -1,7 +1,5 @@
 """Makes an arm file from a model: chain, ranges, drives; asks where somebody can answer, else assumes and says so."""
 
-import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,26 +7,18 @@ from typing import Any, Protocol
 
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile, parse_arm
 from armlink.content.atomic_file import write_whole
-from armlink.content.file_content import MOST_YAML, parse_yaml, read_whole
-from armlink.content.yaml_text import EditedYaml
+from armlink.content.file_content import parse_yaml
 from armlink.drives.findings import FoundDrives, SetupFinding
 from armlink.errors import BadInput
-from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.arm_text import arm_text
-from calib.commissioning.bus_arm import drive_notes, with_gains
 from calib.commissioning.chain import Chain, find_chains
 from calib.commissioning.clear_range import clear_ranges, sweep_problem
-from calib.commissioning.draft import Draft, JointDraft, draft_of_model, narrow
-from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
+from calib.commissioning.draft import Draft, draft_of_model, narrow
+from calib.commissioning.drive_match import Ask
 from calib.commissioning.model_checks import file_findings
-from calib.commissioning.model_joints import model_joints
+from calib.commissioning.model_joints import ModelJoint, model_joints
 from calib.commissioning.model_judgement import model_errors
-from calib.commissioning.motion_checks import largest_inertias
-
-PLACES = ("node", "id", "reply", "direction", "zero")
-"""Keys of a drive that come with the bus; the others are the arm file's own."""
-RATING_FACTOR = 2.5
-"""A drive whose rated torque differs from the model's effort limit by more is doubted; a choice."""
+from calib.commissioning.wiring import match_drives, wired_text
 
 
 class Questions(Protocol):
@@ -36,7 +26,7 @@ class Questions(Protocol):
 
     def which(self, chains: Sequence[Chain]) -> Chain: ...
 
-    def stops(self, joint: str) -> tuple[float, float] | None:
+    def stops(self, joint: ModelJoint) -> tuple[float, float] | None:
         """Stops [rad] of a joint for which the model has none; None where they are not known."""
         ...
 
@@ -48,14 +38,23 @@ class NewArm:
     out: Path
     draft: Draft
     findings: list[SetupFinding] = field(default_factory=list)
+    wired: str = ""
+    """The text with the drives of a bus."""
 
     @property
     def text(self) -> str:
-        return arm_text(self.draft, self.out)
+        return self.wired or arm_text(self.draft, self.out)
 
     def parsed(self) -> ArmFile:
         """The arm file, validated as if it lay there already."""
         return parse_arm(parse_yaml(self.text, self.out), self.out)
+
+    def wire(self, drives: FoundDrives, channel: str, ask: Ask | None, bus: dict[str, Any] | None = None) -> None:
+        """Find the drive of every joint and take it into the text; raises BusFault, BadInput."""
+        arm = self.parsed()
+        matches, findings = match_drives(arm, drives, channel, ask)
+        self.wired, doubts = wired_text(self.text, arm, matches, self.out, bus)
+        self.findings += findings + doubts
 
     def write(self) -> None:
         """Write the file; raises BadInput."""
@@ -130,8 +129,8 @@ def _given_stops(
     names = [joint.name for joint in chain.joints]
     _refuse_other_joints("--stops", stops, names, f"of the arm in {model}")
     for joint in chain.joints:
-        if joint.limits is None and joint.name not in stops and questions is not None:
-            answer = questions.stops(joint.name)
+        if not joint.has_stops and joint.name not in stops and questions is not None:
+            answer = questions.stops(joint)
             if answer is not None:
                 stops[joint.name] = answer
     return stops
@@ -141,89 +140,3 @@ def _refuse_other_joints(option: str, given: Mapping[str, object], names: Sequen
     for name in given:
         if name not in names:
             raise BadInput(f"{option} {name}: there is no such joint {place}; there are {', '.join(names)}")
-
-
-def match_drives(made: NewArm, drives: FoundDrives, bus: str, ask: Ask | None) -> list[Match]:
-    """Find the drive of every joint and take its node, identity and ratings into the draft; raises BusFault, BadInput.
-
-    With `ask` each joint is turned by hand, else the order of node ids counts.
-    """
-    names = [joint.name for joint in made.draft.joints]
-    if ask is None:
-        matches = match_in_order(names, drives, bus)
-    else:
-        arm = gcomp_arm(made.parsed())
-        turned = [TurnedJoint(*each) for each in zip(arm.names, arm.lower, arm.upper, strict=True)]
-        matches, findings = match_by_hand(turned, drives, bus, ask)
-        made.findings += findings
-    damped = any(match.drive.largest_gains is not None for match in matches)
-    inertias = largest_inertias(made.parsed()) if damped else {}
-    for joint, match in zip(made.draft.joints, matches, strict=True):
-        drive = with_gains(match.drive, inertias.get(joint.name, 0.0))
-        joint.node, joint.drive = drive.node, drive
-        joint.notes += drive_notes(drive, rating=False)
-        if math.isfinite(drive.rated_torque):
-            _take_ratings(made, joint, match)
-        elif math.isfinite(drive.max_torque):
-            joint.max_torque = min(joint.max_torque, drive.max_torque)
-        joint.max_torque_rate = float(f"{2.5 * joint.max_torque:.3g}")
-        joint.notes.append(
-            "node found by turning the joint by hand"
-            if match.by_hand
-            else "node assumed: taken in the order of the node ids"
-        )
-    return matches
-
-
-def _take_ratings(made: NewArm, joint: JointDraft, match: Match) -> None:
-    """Rating, limit and identity as the drive tells them."""
-    drive = match.drive
-    ratio = drive.rated_torque / joint.rated_torque
-    from_model = not any(note.startswith("rated_torque assumed: ") for note in joint.notes)
-    if from_model and not 1 / RATING_FACTOR < ratio < RATING_FACTOR:
-        made.findings.append(_doubtful_rating(match, joint.rated_torque))
-    joint.rated_torque = drive.rated_torque
-    joint.max_torque = min(joint.max_torque, drive.max_torque) if from_model else drive.max_torque
-    joint.identity = {"vendor": drive.vendor, "product": drive.product}
-    joint.notes = [note for note in joint.notes if not note.startswith("rated_torque")]
-
-
-def _doubtful_rating(match: Match, effort: float) -> SetupFinding:
-    drive = match.drive
-    remedy = "check that this drive moves this joint" + (
-        "" if match.by_hand else " (--by-hand finds the drive of each joint)"
-    )
-    what = f"the drive is rated {drive.rated_torque:g} N·m, but the effort limit of the model is {effort:g} N·m"
-    return SetupFinding("warning", what, f"{match.joint} ({drive.address})", remedy)
-
-
-def rewired_text(arm: ArmFile, matches: Sequence[Match], bus: dict[str, str | int], out: Path) -> str:
-    """An arm file's text, to stand at `out`, with the drives found on a bus; its comments and its order stay.
-
-    Of each joint it writes node, rated torque and identity, and the bus.
-    """
-    edited = EditedYaml(read_whole(arm.path, MOST_YAML).decode())
-    link: Any = edited.content["link"]
-    for row, match in zip(link["joints"], matches, strict=True):
-        drive = match.drive
-        family = row["drive"]["family"] if "drive" in row else "canopen"
-        if drive.family != family:
-            what = f"{row['name']} has a drive of family {family}, {drive.address} is one of family {drive.family}"
-            raise BadInput(f"{arm.path}: {what}: disconnect the others, or correct link.joints")
-        if family != "canopen":
-            row["drive"].update({key: value for key, value in (drive.drive or {}).items() if key in PLACES})
-            continue
-        if "drive" in row:
-            row["drive"]["node"] = drive.node
-        elif drive.drive is None:
-            row["node"] = drive.node
-        else:
-            del row["node"]
-            row["drive"] = edited.in_line(drive.keys["drive"])
-        row["rated_torque"] = drive.rated_torque
-        row["max_torque"] = min(float(row["max_torque"]), drive.max_torque)
-        row["identity"] = edited.in_line({"vendor": drive.vendor, "product": drive.product})
-    link["bus"] = edited.in_line(bus)
-    if arm.model_path is not None:
-        edited.content["kinematics"]["model"] = os.path.relpath(arm.model_path, out.resolve().parent)
-    return edited.text

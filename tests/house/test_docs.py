@@ -19,6 +19,7 @@ import yaml
 
 from armlink import cli
 from armlink.arm_file import parse_arm
+from calib.commissioning.doctor import examine
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -143,10 +144,13 @@ def test_commands_and_options_in_the_documentation_exist(capsys):
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "yaml")], ids=name)
-def test_arm_files_in_the_documentation_are_valid(page):
+def test_arm_files_in_the_documentation_are_valid(page, tmp_path):
     for text in blocks(page, "yaml"):
         if text.startswith("name:"):
             assert parse_arm(yaml.safe_load(text), page).joint_names
+            (tmp_path / "my-arm.yaml").write_text(text)
+            found = examine(str(tmp_path / "my-arm.yaml"), offline=True)
+            assert [str(each) for each in found if each.level == "error"] == []
 
 
 @pytest.mark.sample(1)  # `test_docs_walk.py` types the others' in this process

@@ -1,6 +1,7 @@
 """Without extras: every command loads, works on what the core holds, and names the extra that it needs."""
 
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from armlink.recording.recording import Recording
 
 ROOT = Path(__file__).parents[2]
 EXTRAS = {
+    "adapters": ("serial", "usb"),
     "bags": ("lz4", "mcap", "rosbags", "zstandard"),
     "cluster": ("cryptography", "dask", "distributed"),
     "daemon": ("fastapi", "prometheus_client", "uvicorn"),
@@ -25,6 +27,8 @@ EXTRAS = {
     "simulator": ("msgpack",),
 }
 """Extra → the modules that it alone brings."""
+PACKAGES = {"foxglove": "foxglove-sdk", "rerun": "rerun-sdk", "serial": "pyserial", "usb": "gs-usb"}
+"""Module → its package, where that has another name."""
 WITHOUT = """
 import sys
 from importlib.abc import MetaPathFinder
@@ -105,6 +109,10 @@ def test_the_core_and_its_commands_need_no_extra(folder):
 
 
 NAMED = {
+    "adapters": [
+        (f"bus {interface}:none", ["scan", "--bus", f"{interface}:none"])
+        for interface in ("damiao_serial", "gs_usb", "robstride_serial", "slcan")
+    ],
     "bags": [
         ("run.mcap", ["convert", "run.mcap", "other.csv"]),
         ("other.mcap", ["convert", "run.csv", "other.mcap"]),
@@ -138,11 +146,13 @@ NAMED = {
 def test_a_command_names_the_extra_that_it_needs(folder, extra):
     purposes, commands = zip(*NAMED[extra], strict=True)
     for purpose, (status, said) in zip(purposes, outcomes([extra], list(commands), folder), strict=True):
-        lines = {
-            f"armlink: {purpose}: {module} is not installed: pip install 'armlink[{extra}]'\n"
-            for module in EXTRAS[extra]
-        }
-        assert (status, said in lines) == (2, True), said
+        before, _, remedy = said.partition(" is not installed: ")
+        lines = {f"armlink: {purpose}: {module} (extra {extra})" for module in EXTRAS[extra]}
+        assert (status, before in lines) == (2, True), said
+        program, *install = shlex.split(remedy)
+        assert (program, install[:3]) == (sys.executable, ["-m", "pip", "install"])
+        packages = {each.partition(">")[0].partition("[")[0] for each in install[3:]}
+        assert packages == {PACKAGES.get(module, module.replace("_", "-")) for module in EXTRAS[extra]}
 
 
 def test_the_table_has_every_extra_of_the_project():
@@ -150,7 +160,7 @@ def test_the_table_has_every_extra_of_the_project():
 
     known = set(metadata("armlink").get_all("Provides-Extra"))
     assert known - {"all", "demo", "dev", "notebooks"} == EXTRAS.keys()
-    assert all(has_extra(extra) for extra in EXTRAS if extra != "rerun")
+    assert all(has_extra(extra) for extra in EXTRAS if extra not in ("adapters", "rerun"))
     assert REQUIREMENT.match('psycopg[binary]>=3.2; extra == "postgresql"')["extra"] == "postgresql"
 
 
@@ -161,7 +171,7 @@ def test_without_the_extra_that_draws_its_report_the_demo_does_not_begin(tmp_pat
     source = DEMO.format(words=["demo", str(ROOT / "examples" / "planar3.yaml"), "--out", "demo"])
     lacking = run_without(["reports"], source, tmp_path)
     assert lacking.returncode == 2
-    assert lacking.stderr.strip().endswith("is not installed: pip install 'armlink[reports]'")
+    assert "(extra reports) is not installed: " in lacking.stderr
     assert not (tmp_path / "demo").exists()
 
 

@@ -83,6 +83,13 @@ def write_small_arm(path: Path) -> Path:
     return path
 
 
+def write_documented_arm(path: Path) -> Path:
+    """The arm file of docs/real-hardware.md, which its reader rehearses first."""
+    page = (ROOT / "docs" / "real-hardware.md").read_text()
+    path.write_text(re.search(r"^```yaml\n(name: .*?)^```$", page, re.MULTILINE | re.DOTALL)[1])
+    return path
+
+
 def demo_of(out: Path, *arm: str) -> Path:
     """What a demo of this arm, by default of the default one, wrote; without any extra but what draws its report."""
     source = DEMO.format(words=["demo", "--seed", "3", "--out", str(out), *arm])
@@ -97,16 +104,15 @@ def demo_of(out: Path, *arm: str) -> Path:
 
 @pytest.fixture(
     scope="module",
-    params=["small arm", *(pytest.param(name, marks=pytest.mark.long) for name in ("page", "default arm"))],
+    params=["small arm", *(pytest.param(name, marks=pytest.mark.long) for name in ("page", "default arm", "real arm"))],
 )
 def folder(request, tmp_path_factory):
     """What a demo wrote."""
     if request.param == "page":
         return request.getfixturevalue("typed")[0] / "armlink-demo"
     place = tmp_path_factory.mktemp("demo")
-    return demo_of(
-        place / "out", *(("--arm", str(write_small_arm(place / "small.yaml"))) if request.param == "small arm" else ())
-    )
+    write = {"small arm": write_small_arm, "real arm": write_documented_arm}.get(request.param)
+    return demo_of(place / "out", *(() if write is None else ("--arm", str(write(place / "arm.yaml")))))
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +152,7 @@ def test_sensors_are_found(summary):
         if interval is not None
     ]
     assert len(inside) == 3 * n - len(unknown)
-    missed = {7: 5, 4: 3, 3: 3}[n]  # more of 21 intervals miss once in 2000 runs, of 9 or 10 once in 1000
+    missed = {7: 5, 4: 3, 3: 3, 2: 3}[n]  # more of 21 intervals miss once in 2000 runs, of 9 or 10 once in 1000
     assert sum(inside) >= len(inside) - missed
 
 
@@ -179,7 +185,7 @@ def test_frames_travelled(summary):
     rate = 50 if n == 3 else 250
     assert bus["rate_hz"] == pytest.approx(rate)
     assert bus["frames"] > (2 * n + 1) * rate * summary["sim_s"]
-    low, high = {7: (0.3, 0.6), 4: (0.2, 0.4), 3: (0.03, 0.06)}[n]
+    low, high = {7: (0.3, 0.6), 4: (0.2, 0.4), 3: (0.03, 0.06), 2: (0.1, 0.2)}[n]
     assert low < bus["load"] < high
 
 

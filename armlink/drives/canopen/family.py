@@ -30,8 +30,10 @@ FAMILY = Family(
     CanopenSettings,
     build=_late("drives", "CanopenDrives"),
     self_test=_late("check.self_test", "self_test"),
+    self_test_steps="One joint after the other is then quick-stopped, and later gets no commands for {deadline:.0f} "
+    "ms; last, no joint gets the heartbeat of this host for twice as long.",
     search=_late("check.scan", "scan_report"),
-    discovery=Discovery("device type of nodes 1 to 127", _late("check.scan", "FoundNodes"), ("moteus", "odrive")),
+    discovery=Discovery(_late("check.scan", "FoundNodes"), ("moteus", "odrive")),
     examine=_late("check.scan", "arm_findings"),
     state_name=state_name,
     summary="CiA 402 (CANopen), with or without our torque sensor object 2100h",

@@ -303,6 +303,6 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     ]
 
 
-SEARCH = Discovery("only heard: whatever asks them commands them", find_drives, ("damiao", "odrive"))
+SEARCH = Discovery(find_drives, ("damiao", "odrive"))
 SUMMARY = "CubeMars AK (firmware 1 and 2), MIT mode"
 FAMILY = Family("cubemars", TRAITS, CubeMarsSettings, CubeMarsDrives, discovery=SEARCH, summary=SUMMARY)

@@ -388,7 +388,6 @@ def _answers(bus: SearchedBus, asked: Sequence[tuple[int, int]]) -> list[tuple[i
     ]
 
 
-HOW = "register 8 of ids 01h to FFh; of 0Dh to 0Fh if another answers"
-SEARCH = Discovery(HOW, find_drives, ("canopen", "moteus", "odrive"))
+SEARCH = Discovery(find_drives, ("canopen", "moteus", "odrive"))
 SUMMARY = "Damiao DM-J (OpenArm, YAM, reBot B601-DM), MIT mode"
 FAMILY = Family("damiao", TRAITS, DamiaoSettings, DamiaoDrives, discovery=SEARCH, summary=SUMMARY)

@@ -352,7 +352,7 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     ]
 
 
-SEARCH = Discovery("model of controllers 1 to 126, register 100h", find_drives)
+SEARCH = Discovery(find_drives)
 FAMILY = Family(
     "moteus", TRAITS, MoteusSettings, MoteusDrives, discovery=SEARCH, summary="mjbots moteus r4, c1, n1, x1, on CAN FD"
 )

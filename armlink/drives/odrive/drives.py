@@ -377,6 +377,6 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     ]
 
 
-SEARCH = Discovery("heartbeats heard, then the version by a remote frame", find_drives)
+SEARCH = Discovery(find_drives)
 SUMMARY = "ODrive Pro, S1, Micro with firmware 0.6, CANSimple"
 FAMILY = Family("odrive", TRAITS, ODriveSettings, ODriveDrives, discovery=SEARCH, summary=SUMMARY)

@@ -306,6 +306,6 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     return found
 
 
-SEARCH = Discovery("device id of motors 1 to 127, by type 0", find_drives, ("moteus",))
+SEARCH = Discovery(find_drives, ("moteus",))
 SUMMARY = "RobStride RS00 to RS06 (reBot B601-RS), private protocol"
 FAMILY = Family("robstride", TRAITS, RobStrideSettings, RobStrideDrives, discovery=SEARCH, summary=SUMMARY)

@@ -23,8 +23,9 @@ def doctor(
 
     Example: armlink doctor sarcos --json -
     """
+    from armlink.arm_file import load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
+    from armlink.commands.plain_console import PlainConsole, first_check, results, suggest
     from calib.commissioning.doctor import examine
 
     console = results(json_file)
@@ -38,6 +39,6 @@ def doctor(
         console.print(f"{errors} {'error' if errors == 1 else 'errors'} to correct first")
     else:
         console.print("no errors")
-        suggest(command_line("check", arm, bus=bus))
+        suggest(first_check(load_arm(arm), arm, bus))
     write_json(json_file, {"schema": "armlink.doctor/1", "arm": arm, "findings": [vars(each) for each in findings]})
     return 1 if errors else 0

@@ -9,6 +9,7 @@ import typer
 from calib.commands.options import JsonFile
 
 if TYPE_CHECKING:
+    from armlink.arm_file import ArmFile
     from calib.commissioning.new_arm import NewArm
 
 
@@ -88,22 +89,22 @@ def new(
 
     Example: armlink new arm.urdf --out arm.yaml
     """
-    from armlink.arm_file import MODEL_SUFFIXES, bundled_arms
+    from armlink.arm_file import MODEL_SUFFIXES, bundled_arms, load_arm
     from armlink.commands.output import write_json
-    from armlink.commands.plain_console import PlainConsole, command_line, results, suggest
+    from armlink.commands.plain_console import PlainConsole, command_line, first_check, results, suggest
     from armlink.errors import BadInput
     from armlink.model_file import expanded
     from calib.commands.setup.bus_setup import (
         begin_with_drives,
         bus_keys,
-        copy,
-        drives_by_ids,
+        exit_status,
         open_named,
         rewire,
         search,
     )
     from calib.commands.setup.terminal import Terminal, hand, parse_locks, parse_ratings, parse_stops
     from calib.commissioning.new_arm import new_arm
+    from calib.commissioning.wiring import drives_have_ids
 
     console = PlainConsole()
     interactive = sys.stdin is not None and sys.stdin.isatty()
@@ -140,10 +141,10 @@ def new(
     if is_xacro:
         model = expanded(model, out.with_suffix(".urdf"))
     if is_arm_file:
-        found = bundled or model
-        if drives_by_ids(found) and not by_hand:
-            return copy(found, out, str(bus), bundled is not None, json_file)
-        return rewire(found, out, str(bus), hand(by_hand, interactive), json_file)
+        found, is_bundled = bundled or model, bundled is not None
+        by_ids = not by_hand and drives_have_ids(load_arm(found))
+        ask = None if by_ids else hand(by_hand, interactive)
+        return rewire(found, out, str(bus), ask, by_ids=by_ids, bundled=is_bundled, json=json_file)
     if bus is not None:
         open_named(bus).shutdown()  # before anything is asked: answers are not lost to a bus that is not there
     with console.status(f"reading {model} and looking for collisions"):
@@ -160,22 +161,20 @@ def new(
             questions=asked,
         )
     if bus is not None:
-        from calib.commissioning.new_arm import match_drives
-
         opened = open_named(bus)
         try:
             drives = search(opened)
-            match_drives(made, drives, str(opened.channel_info), hand(by_hand, interactive))
-            made.draft.bus = bus_keys(bus, out, drives)
+            keys = bus_keys(bus, out, {each.family for each in drives.found})
+            made.wire(drives, str(opened.channel_info), hand(by_hand, interactive), keys)
         finally:
             opened.shutdown()
-    made.parsed()
+    arm = made.parsed()
     made.write()
-    _show(results(json_file), made)
-    step = command_line("demo", arm=out) if bus is None else command_line("check", str(out))
+    _show(results(json_file), made, arm)
+    step = command_line("demo", arm=out) if bus is None else first_check(arm, str(out))
     suggest(step)
-    write_json(json_file, _answer(made, step))
-    return 1 if any(found.level == "error" for found in made.findings) else 0
+    write_json(json_file, _answer(made, arm, step))
+    return exit_status(made.findings)
 
 
 def _require_free(out: Path, force: bool, interactive: bool) -> None:
@@ -191,17 +190,18 @@ def _require_free(out: Path, force: bool, interactive: bool) -> None:
     confirm(f"{out} exists. Replace it?")
 
 
-def _show(console: Any, made: "NewArm") -> None:
+def _show(console: Any, made: "NewArm", arm: "ArmFile") -> None:
     from rich.table import Table
 
+    from calib.commands.setup.bus_setup import show_findings
     from calib.commissioning.arm_text import assumed_lines
 
     draft = made.draft
     ends = "stops [rad]" if draft.servo is None else "range [rad]"
-    table = Table("joint", "node", ends, "rated [N·m]", "largest [N·m]", title=f"{draft.name}: {made.out}")
-    for joint in draft.joints:
-        stops = "from the model" if joint.stops is None else f"{joint.stops[0]:+.2f} {joint.stops[1]:+.2f}"
-        table.add_row(joint.name, str(joint.node), stops, f"{joint.rated_torque:g}", f"{joint.max_torque:g}")
+    table = Table("joint", "drive", ends, "rated [N·m]", "largest [N·m]", title=f"{draft.name}: {made.out}")
+    for planned, joint in zip(draft.joints, arm.require_link().joints, strict=True):
+        stops = "from the model" if planned.stops is None else f"{planned.stops[0]:+.2f} {planned.stops[1]:+.2f}"
+        table.add_row(joint.name, joint.settings.address, stops, f"{joint.rated_torque:g}", f"{joint.max_torque:g}")
     console.print(table)
     for name, why in draft.aside:
         console.print(f"joint {name} {why}, so it is not part of the arm")
@@ -209,15 +209,15 @@ def _show(console: Any, made: "NewArm") -> None:
         console.print(note, style="yellow")
     if draft.servo is not None:
         console.print(f"joints at rest are held by their position loops: {draft.servo}", style="yellow")
-    for found in made.findings:
-        console.print(str(found), style="red" if found.level == "error" else "yellow")
+    show_findings(console, made.findings)
     console.print(
         f"{made.out} is written; {len(assumed_lines(made.text))} values are assumed, each is marked in the file"
     )
 
 
-def _answer(made: "NewArm", step: str) -> dict[str, Any]:
+def _answer(made: "NewArm", arm: "ArmFile", step: str) -> dict[str, Any]:
     from calib.commands.setup.bus_setup import SCHEMA
+    from calib.commissioning.wiring import drive_id
 
     draft = made.draft
     return {
@@ -230,13 +230,13 @@ def _answer(made: "NewArm", step: str) -> dict[str, Any]:
         "joints": [
             {
                 "name": joint.name,
-                "node": joint.node,
+                "node": drive_id(joint),
                 "rated_torque": joint.rated_torque,
                 "max_torque": joint.max_torque,
                 "max_velocity": joint.max_velocity,
-                "stops": joint.stops,
+                "stops": planned.stops,
             }
-            for joint in draft.joints
+            for planned, joint in zip(draft.joints, arm.require_link().joints, strict=True)
         ],
         "aside": [{"joint": name, "why": why} for name, why in draft.aside],
         "assumed": draft.assumed,

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from calib.commissioning.chain import Chain
     from calib.commissioning.drive_match import Ask
+    from calib.commissioning.model_joints import ModelJoint
 
 
 def parse_stops(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -93,12 +94,16 @@ class Terminal:
         answer: Chain = ask("The model has several arms. Which arm?", default="1", value_proc=chosen)
         return answer
 
-    def stops(self, joint: str) -> tuple[float, float] | None:
+    def stops(self, joint: "ModelJoint") -> tuple[float, float] | None:
         """Asked again until the answer can be read: what was answered before is not lost."""
-        question = "Give its lower and upper stop [rad], such as -2.9 2.9, or Enter for none"
-        given: tuple[float, float] | None = ask(
-            f"{joint} has no limits in the model. {question}", default="", show_default=False, value_proc=_two_stops
+        from calib.commissioning.draft import ASSUMED_STOP
+
+        question = (
+            f"{joint.name} has {joint.limits_in_words} in the model. Give its lower and upper stop [rad], such as "
+            f"-2.1 2.1, or Enter if it has none: then it turns by {ASSUMED_STOP} rad to either side, and joints are "
+            "held by their servos"
         )
+        given: tuple[float, float] | None = ask(question, default="", show_default=False, value_proc=_two_stops)
         return given
 
 

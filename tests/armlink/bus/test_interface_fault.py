@@ -1,6 +1,7 @@
 """Whatever a driver of python-can raises is one line, and a fault of the bus or of what was asked of it."""
 
 import ctypes
+import errno
 import struct
 from collections.abc import Callable
 
@@ -12,6 +13,7 @@ from armlink.arm_file import Bus
 from armlink.bus.adapters import PythonCanBus
 from armlink.bus.message_port import MessagePort
 from armlink.bus.open import open_bus
+from armlink.bus.port import interface_fault
 from armlink.bus.taps import TappedBus
 from armlink.cli import run
 from armlink.errors import ArmlinkError, BusFault
@@ -67,6 +69,11 @@ def test_opening_is_one_line(monkeypatch, error):
         open_bus("pcan:0", Bus())
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) > len("bus pcan:0: cannot open it: ")
+
+
+def test_a_kernel_without_socketcan_is_told_the_command_that_brings_it():
+    fault = interface_fault(OSError(errno.EAFNOSUPPORT, "Address family not supported"), "socketcan:can0", "open it")
+    assert str(fault).endswith(": this kernel has no SocketCAN: load its module with `sudo modprobe can`")
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)

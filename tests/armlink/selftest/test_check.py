@@ -15,7 +15,7 @@ from armlink.commands.check import _outcomes
 from armlink.drives.canopen.check.power_test import PowerTest
 from armlink.drives.findings import HELD, Result
 from armlink.link.link import Link
-from armlink.selftest.self_test import SelfTest
+from armlink.selftest.self_test import SelfTest, announcement
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.node import supervision
 from sim_bus.node.drives import SimulatedDrives
@@ -23,6 +23,7 @@ from sim_bus.node.supervision import Supervision
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 
+ROOT = Path(__file__).parents[3]
 QUICK_STOP = 0x07
 
 HOLDING = ("sarcos", "parallel6", "six-cia402")
@@ -195,6 +196,50 @@ def test_on_another_bus_it_asks_first(capsys):
         "armlink: check: there is no terminal to ask for confirmation: give `--yes`, or `--passive` for "
         "the checks without power"
     )
+
+
+@pytest.mark.parametrize(
+    ("arm", "says", "never"),
+    [
+        ("sarcos", ("quick-stopped", "for 100 ms", "heartbeat", "hold, in quick stop"), ("lowered", "link.park")),
+        (
+            "six-damiao",
+            ("up to 300 ms", "every joint falls free (damiao)", "moves to link.park"),
+            ("quick", "heartbeat"),
+        ),
+        ("six-moteus", ("every joint sinks, damped (moteus)",), ("quick", "heartbeat")),
+    ],
+)
+def test_it_announces_what_it_tests_of_these_drives(arm, says, never, capsys):
+    assert run(["check", arm, "--bus", "virtual:nobody"]) == 2
+    announced = capsys.readouterr().err
+    assert all(each in announced for each in says), announced
+    assert not any(each in announced for each in never), announced
+
+
+def test_the_joints_of_a_mixed_arm_are_named_by_what_their_drives_do():
+    content = yaml.safe_load(bundled_arms()["six-damiao"].read_text())
+    content["link"]["joints"][0] |= {"drive": {"family": "canopen", "node": 99}}
+    del content["link"]["park"]
+    announced = announcement(parse_arm(content, Path("mixed.yaml")))
+    assert "base: holds (canopen); shoulder, elbow, wrist_1, wrist_2, wrist_3: falls free (damiao)" in announced
+    assert "the arm is slowly lowered" in announced
+
+
+@pytest.mark.parametrize(
+    ("geometry", "options", "step"),
+    [(True, ["--passive"], "check here.yaml"), (True, [], "sweep here.yaml --plan"), (False, [], "doctor here.yaml")],
+)
+def test_what_comes_next(geometry, options, step, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    content = yaml.safe_load((ROOT / "examples" / "planar3.yaml").read_text())
+    content["link"]["bus"]["channel"] = str(ROOT / "examples" / "planar3.yaml")
+    if not geometry:
+        for row in content["kinematics"]["joints"]:
+            row |= {"a": 0.0, "alpha": 0.0, "d": 0.0}
+    Path("here.yaml").write_text(yaml.safe_dump(content))
+    assert run(["check", "here.yaml", *options]) == 0
+    assert f"next: armlink {step}\n" in capsys.readouterr().err
 
 
 def test_an_arm_that_is_not_there_is_a_bus_fault(capsys):

@@ -94,7 +94,7 @@ def test_a_sound_arm_has_no_error(tmp_path):
         (("kinematics", "gravity"), [0, 0, -9.81], "error", ["kinematics.gravity", "gravity loads no joint"]),
         (("kinematics", "gravity"), [0, -1.6, 0], "warning", ["kinematics.gravity", "1.6"]),
         (("kinematics", "joints", 0, "upper"), -1.95, "error", ["shoulder", "leaves nothing of its range"]),
-        (("serial",), "FILL-IN", "warning", ["serial is FILL-IN", "serial: …"]),
+        (("serial",), "FILL-IN", "hint", ["serial is FILL-IN", "serial: …"]),
         (("link", "joints", 0, "max_torque"), 400.0, "warning", ["shoulder", "three times"]),
         (("link", "joints", 0, "max_torque_rate"), 9000.0, "hint", ["shoulder", "usual"]),
         (("link", "bus"), {"channel": "nosuch0"}, "error", ["nosuch0", "no interface"]),
@@ -108,6 +108,17 @@ def test_what_is_wrong_is_named_with_its_remedy(tmp_path, keys, value, level, wo
     lines = [str(each) for each in found if each.level == level]
     assert any(all(word in line for word in words) for line in lines), found
     assert all(each.remedy and each.what and each.where for each in found)
+
+
+def test_without_a_serial_number_a_warning_comes_where_nothing_would_be_written_to_the_drives(tmp_path):
+    """The demo writes to drives that end with it."""
+    (found,) = [
+        each for each in examine(written(tmp_path, (("serial",), "unknown")), offline=True) if "serial" in each.what
+    ]
+    assert found.level == "hint"
+    real = written(tmp_path, (("serial",), "unknown"), (("link", "bus"), {"channel": "can0"}))
+    (found,) = [each for each in examine(real, offline=True) if "serial" in each.what]
+    assert found.level == "warning"
 
 
 def test_a_drive_that_does_not_answer_and_one_that_nobody_knows(tmp_path):

@@ -2,9 +2,11 @@
 
 import copy
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from armlink.drives.canopen.check.scan import FoundNodes
 from armlink.errors import BadInput, BusFault
 from calib.arm.kinematics import gcomp_arm
 from calib.commissioning.bus_arm import arm_of_bus
-from calib.commissioning.new_arm import NewArm, match_drives, new_arm
+from calib.commissioning.new_arm import NewArm, new_arm
 from calib.plan.collisions import Geometry
 from gcomp.errors import BadModel
 from sim_bus.bus.lock_step import LockStepBus
@@ -55,6 +57,7 @@ def test_limits_torques_and_speeds_are_the_model_s(made):
 
 
 def test_every_assumed_value_is_a_comment_of_the_file(made):
+    assert re.search(r"^  gravity: .*# .*assumed", made.text, re.MULTILINE)
     assert made.draft.assumed
     for each in made.draft.assumed:
         assert f"# {each.partition(': ')[2]}" in made.text
@@ -62,6 +65,7 @@ def test_every_assumed_value_is_a_comment_of_the_file(made):
 
 def test_a_joint_without_stops_is_not_pressed_on_any(made, tmp_path):
     assert made.parsed().sweep.hold == "servo"
+    assert "# assumed: j4 has no stop to be pressed on" in made.text
     given = new_arm(MODELS / "arm4.urdf", tmp_path / "arm4.yaml", stops={"j4": (-1.5, 1.0)})
     assert given.parsed().sweep is None
     assert gcomp_arm(given.parsed()).upper[3] == 1.0
@@ -71,6 +75,8 @@ def test_prismatic_fingers_are_set_aside_and_a_range_is_chosen_where_nothing_tou
     made = new_arm(MODELS / "own.xml", tmp_path / "own.yaml")
     assert [joint.name for joint in made.draft.joints] == ["yaw", "pitch", "elbow", "roll"]
     made.write()
+    marked = [each for each in comments(made.out) if each.startswith("stops assumed")]
+    assert len(marked) == sum(joint.stops is not None for joint in made.draft.joints) == 4
     arm = load_arm(made.out)
     geometry, limits = Geometry(arm), gcomp_arm(arm)
     poses = np.random.default_rng(5).uniform(limits.lower, limits.upper, (300, limits.n))
@@ -88,6 +94,11 @@ def test_limits_more_than_a_turn_apart_are_no_stops(tmp_path, monkeypatch):
     assert made.parsed().sweep.hold == "servo"
     limits = gcomp_arm(made.parsed())
     assert (limits.upper - limits.lower <= 2 * np.pi).all()
+    asked = []
+    questions = SimpleNamespace(stops=lambda joint: asked.append(joint.name) or (-3.0, 3.0))
+    told = new_arm(MODELS / "ur10e.urdf", tmp_path / "ur10e.yaml", questions=questions)
+    assert asked == [joint.name for joint in told.draft.joints if joint.stops == (-3.0, 3.0)] != []
+    assert told.parsed().sweep is None
 
 
 def test_two_arms_in_a_model(tmp_path, monkeypatch):
@@ -211,11 +222,15 @@ def hands(arm: SimulatedArm, made: NewArm):
     return ask
 
 
+def comments(path: str) -> list[str]:
+    lines = (line.strip() for line in Path(path).read_text().splitlines())
+    return [line.removeprefix("# ") for line in lines if line.startswith("#")]
+
+
 def test_permuted_ids_a_turned_sign_and_another_gear_are_found_by_hand(made, tmp_path):
     arm = real_arm(made, tmp_path, nodes=[12, 10, 11, 13], position_gain=[1.0, -1.0, 2.0, 1.01])
     drives = FoundNodes(LockStepBus(arm=arm))
-    matches = match_drives(made, drives, "the bus", hands(arm, made))
-    assert [match.drive.node for match in matches] == [12, 10, 11, 13]
+    made.wire(drives, "the bus", hands(arm, made))
     assert [(each.level, each.where) for each in made.findings] == [
         ("error", "j2 (node 10)"),
         ("error", "j3 (node 11)"),
@@ -272,16 +287,38 @@ def test_damiao_drives_are_found_by_hand_with_direction_zero_and_gains_that_doct
     assert "damping ratio" not in capsys.readouterr().out
     assert cli.run(["check", "found.yaml", "--passive"]) == 0
     content["link"]["joints"][0]["drive"] |= {"id": 9, "reply": 0x19, "direction": 1, "zero": 0.0, "kp": 33}
+    made.write()
+    assert cli.run(["new", "arm4.yaml", "--force", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 0
+    assert [joint.settings for joint in load_arm("arm4.yaml").require_link().joints] == drives
+    assert "kp, kd assumed: the torque range over one radian, damped as armlink doctor asks" in comments("arm4.yaml")
     (tmp_path / "old.yaml").write_text(yaml.safe_dump(content))
     assert cli.run(["new", "old.yaml", "--out", "mine.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 0
     first = load_arm("mine.yaml").require_link().joints[0].settings
     assert (first.id, first.reply, first.direction, first.kp) == (3, 0x13, -1, 33)
     assert first.zero == pytest.approx(0.7, abs=2e-3)
-    del content["link"]["joints"][0]["drive"]
-    content["link"]["joints"][0]["node"] = 3
+    content["link"]["joints"][0]["drive"] = {"family": "canopen", "node": 3}
     (tmp_path / "mixed.yaml").write_text(yaml.safe_dump(content))
     assert cli.run(["new", "mixed.yaml", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
     assert "j1 has a drive of family canopen, id 03h is one of family damiao" in capsys.readouterr().err
+
+
+def test_a_rating_beyond_the_torque_field_of_the_drive_is_cut_and_said(made, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    content = yaml.safe_load(made.text)
+    for number, row in enumerate(content["link"]["joints"], start=1):
+        del row["node"]
+        keys = {"id": number, "reply": number + 0x10, "model": "DM4310", "kp": 10, "kd": 1}
+        row |= {"drive": {"family": "damiao", **keys}, "rated_torque": 5.0, "max_torque": 8.0}
+    (tmp_path / "real.yaml").write_text(yaml.safe_dump(content))
+    assert cli.run(["new", "arm4.urdf", "--bus", "armlink_sim:real.yaml"]) == 0
+    said = capsys.readouterr().out
+    for joint, torque in (("j1 (id 01h)", 40), ("j2 (id 02h)", 40), ("j3 (id 03h)", 20)):
+        what = "the drive has a torque field that ends at 10 N·m, but the joint was to have a rated torque of"
+        assert f"{joint}: {what} {torque} N·m" in said
+    assert "j4 (id 04h): the drive" not in said
+    joints = load_arm("arm4.yaml").require_link().joints
+    assert [joint.rated_torque for joint in joints] == [joint.max_torque for joint in joints] == [10, 10, 10, 8]
+    assert comments("arm4.yaml").count("rated_torque assumed: the end of the drive's torque field") == 3
 
 
 def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_be_missing(
@@ -311,7 +348,7 @@ def test_of_a_bus_alone_drives_and_stops_are_known_and_the_geometry_is_said_to_b
 
 def test_in_order_of_ids_a_doubtful_rating_is_named(made, tmp_path):
     arm = real_arm(made, tmp_path, nodes=[4, 3, 2, 1], position_gain=[1.0] * 4)
-    match_drives(made, FoundNodes(LockStepBus(arm=arm)), "the bus", None)
+    made.wire(FoundNodes(LockStepBus(arm=arm)), "the bus", None)
     assert [each.where for each in made.findings] == ["j1 (node 1)", "j4 (node 4)"]
     assert "--by-hand" in made.findings[0].remedy
 
@@ -320,10 +357,10 @@ def test_a_joint_that_nobody_turned_and_a_drive_that_is_missing(made, tmp_path):
     arm = real_arm(made, tmp_path, nodes=[1, 2, 3, 4], position_gain=[1.0] * 4)
     drives = FoundNodes(LockStepBus(arm=arm))
     with pytest.raises(BusFault, match="no drive read the motion of j1"):
-        match_drives(made, drives, "the bus", lambda text: None)
+        made.wire(drives, "the bus", lambda text: None)
     drives.found.pop()
     with pytest.raises(BusFault, match=r"3 drives answer \(node 1, node 2, node 3\), the arm has 4 joints"):
-        match_drives(made, drives, "the bus", None)
+        made.wire(drives, "the bus", None)
 
 
 def test_the_command_writes_a_file_that_plan_and_check_take(tmp_path, capsys, monkeypatch):
@@ -343,7 +380,7 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
     monkeypatch.chdir(tmp_path)
     real_arm(made, tmp_path, nodes=[7, 8, 9, 10], position_gain=[1.0] * 4)
     made.write()
-    marks = [line for line in Path("arm4.yaml").read_text().splitlines() if line.lstrip().startswith("#")]
+    marks = comments("arm4.yaml")
     assert cli.run(["new", "arm4.urdf", "--out", "found.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
     assert cli.run(["check", "found.yaml"]) == 0
     assert cli.run(["new", "arm4.yaml", "--out", "rewired.yaml", "--bus", "armlink_sim:real.yaml"]) == 0
@@ -355,9 +392,10 @@ def test_with_a_bus_the_file_passes_the_check_on_that_bus(made, tmp_path, capsys
         for joint, found in zip(joints, load_arm("found.yaml").link.joints, strict=True)
     )
     assert len(marks) > 10
-    assert [line for line in Path("rewired.yaml").read_text().splitlines() if line.lstrip().startswith("#")][
-        1:
-    ] == marks
+    told_by_the_drives = ("rated_torque assumed", "assumed: there is no bus yet")
+    title, *rewired = [each for each in comments("rewired.yaml") if not each.startswith("node ")]
+    assert title.startswith("arm4 with the drives on ")
+    assert rewired == [each for each in marks if not each.startswith(told_by_the_drives)]
     assert cli.run(["new", "arm4.urdf", "--out", "x.yaml", "--bus", "armlink_sim:real.yaml", "--by-hand"]) == 2
     assert "no terminal to ask" in capsys.readouterr().err
 
@@ -375,9 +413,14 @@ def test_drives_that_are_known_by_ids_must_all_answer_and_are_not_found_by_hand(
     assert "--by-hand" in capsys.readouterr().err
     assert not (tmp_path / "mine.yaml").exists()
     assert cli.run(["new", "six-damiao", "--out", "mine.yaml", "--bus", "armlink_sim:there.yaml"]) == 0
-    own = load_arm(tmp_path / "mine.yaml")
-    assert "sim" not in yaml.safe_load(own.path.read_text())
-    assert own.serial != content["serial"]
+    assert load_arm("mine.yaml").serial != content["serial"]
+    text = bundled_arms()["six-damiao"].read_text()
+    assert comments("mine.yaml")[1:] == comments(bundled_arms()["six-damiao"])
+    assert yaml.safe_load(Path("mine.yaml").read_text())["sim"] == yaml.safe_load(text)["sim"]
+    edited = Path("mine.yaml").read_text().replace("rate: 250", "rate: 200  # assumed")
+    Path("mine.yaml").write_text(edited)
+    assert cli.run(["new", "mine.yaml", "--force", "--bus", "armlink_sim:there.yaml"]) == 0
+    assert Path("mine.yaml").read_text() == edited
 
 
 def test_an_arm_file_without_a_bus_has_nothing_to_find(tmp_path):

@@ -144,7 +144,7 @@ class FoundNodes:
         own = services.has(objects.TORQUE_READING)
         keys = None if own else {"node": identity.node, "torque": "motor", "calibration": "host"}
         ids = identity.node, f"node {identity.node}", keys, identity.vendor, identity.product
-        return FoundDrive("canopen", *ids, rated * 1e-3, most, units.position)
+        return FoundDrive("canopen", *ids, rated * 1e-3, most, units.position, serial=str(identity.serial or ""))
 
 
 def arm_findings(arm_file: ArmFile, opened: CanBus, bus: str) -> Iterator[SetupFinding]:
