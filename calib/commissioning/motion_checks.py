@@ -9,13 +9,13 @@ from armlink.arm_file import ArmFile
 from armlink.drives.findings import SetupFinding
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm, model_chain
 from calib.arm.sweep_section import sweep_motion, sweep_section
-from calib.commissioning.model_judgement import gravity_need
-from calib.plan.bias_torque import pressable_joints
+from calib.commissioning.model_checks import gravity_need
 from calib.plan.collisions import check_plan
 from calib.plan.creep_plan import plan_creep
 from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
+from calib.plan.sweep_options import pressable_joints
 from calib.plan.sweep_plan import plan_sweep
 from gcomp.arm.load import ModelArm, joint_inertias
 

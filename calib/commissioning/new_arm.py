@@ -14,15 +14,12 @@ from armlink.content.yaml_text import EditedYaml
 from armlink.drives.findings import FoundDrives, SetupFinding
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
-from calib.commissioning.arm_text import arm_text
 from calib.commissioning.bus_arm import drive_notes, with_gains
-from calib.commissioning.chain import Chain, find_chains
+from calib.commissioning.chain import Chain, find_chains, model_joints
 from calib.commissioning.clear_range import clear_ranges, sweep_problem
-from calib.commissioning.draft import Draft, JointDraft, draft_of_model, narrow
+from calib.commissioning.draft import Draft, JointDraft, arm_text, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
-from calib.commissioning.model_checks import file_findings
-from calib.commissioning.model_joints import model_joints
-from calib.commissioning.model_judgement import model_errors
+from calib.commissioning.model_checks import file_findings, model_errors
 from calib.commissioning.motion_checks import largest_inertias
 
 PLACES = ("node", "id", "reply", "direction", "zero")

@@ -12,7 +12,7 @@ from armlink.drives.family import family
 from armlink.drives.findings import SetupFinding
 from armlink.errors import BusFault
 from armlink.link.link import Link
-from calib.commissioning.bus_checks import another_drive
+from calib.commissioning.doctor import another_drive
 
 
 @dataclass(frozen=True)

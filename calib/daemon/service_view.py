@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
-from calib.arm.skeleton import skeleton
 from calib.daemon import view
+from calib.daemon.drawn_arm import drawn_arm
 from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.service import Service
 from calib.daemon.state.events import Client
 from calib.daemon.state.journal_rows import HistoryReader
-from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
+from calib.daemon.view import Decisions, NoSuch, Window
 from gcomp.arrays import Array
 
 
@@ -64,20 +63,18 @@ class ServiceView:
         )
 
     def joints(self) -> tuple[view.JointNow, ...]:
-        names, arm_state = self._service.configuration.names, self._service.arm_state
-        batch = arm_state.batch
-        if batch is None:
-            missing = np.full(len(names), math.nan)
-            columns = (names, missing, missing, missing, missing, ["unknown"] * len(names), missing)
-            return tuple(_joint(*column) for column in zip(*columns, strict=True))
-        position, torque = batch.channels["position"][-1], batch.channels["torque"][-1]
-        torque, model = self._torques(position[None], torque[None])
-        temperature = np.full(len(names), math.nan) if batch.temperature is None else batch.temperature
-        arm = self._service.configuration.arm
-        states = [state_name(arm, joint, code) for joint, code in enumerate(batch.status.tolist())]
-        ages = batch.age + arm_state.late
-        columns = (names, position, torque[0], model[0], temperature, states, ages)
-        return tuple(_joint(*column) for column in zip(*columns, strict=True))
+        arm, arm_state = self._service.configuration.arm, self._service.arm_state
+        batch, names = arm_state.batch, arm.joint_names
+        position = torque = temperature = ages = np.full(len(names), math.nan)
+        states = ["unknown"] * len(names)
+        if batch is not None:
+            position, torque = batch.channels["position"][-1], batch.channels["torque"][-1]
+            temperature = temperature if batch.temperature is None else batch.temperature
+            states = [state_name(arm, joint, code) for joint, code in enumerate(batch.status.tolist())]
+            ages = batch.age + arm_state.late
+        (torque,), (model,) = self._torques(position[None], torque[None])
+        columns = zip(names, position, torque, model, torque - model, temperature, states, ages, strict=True)
+        return tuple(view.JointNow(**dict(zip(view.JointNow.model_fields, column, strict=True))) for column in columns)
 
     def window(self, seconds: float, most: int) -> Window:
         """Readings of the last `seconds`, thinned evenly to at most `most` rows; the model's torque is today's."""
@@ -126,10 +123,10 @@ class ServiceView:
                 offset_std=estimate.offset_std[j],
                 samples=estimate.accepted[j],
                 last_accepted=last_accepted.get(name),
-                installed_gain=_number(gain[j]),
-                installed_offset=_number(offset[j]),
-                gain_limit=_number(limits.gain[j]),
-                offset_limit=_number(limits.offset[j]),
+                installed_gain=gain[j],
+                installed_offset=offset[j],
+                gain_limit=limits.gain[j],
+                offset_limit=limits.offset[j],
                 limit_rests=limits.rests,
             )
             for j, name in enumerate(feed.names)
@@ -186,26 +183,6 @@ class ServiceView:
         return view.BusHealth(connected=bool(arm_state.connected), fault=fault, **counted)
 
 
-def _number(value: float) -> float | None:
-    value = float(value)
-    return value if math.isfinite(value) else None
-
-
-def _joint(
-    name: str, position: float, torque: float, model: float, temperature: float, state: str, age: float
-) -> view.JointNow:
-    return view.JointNow(
-        joint=name,
-        position=_number(position),
-        torque=_number(torque),
-        model_torque=_number(model),
-        residual=_number(torque - model),
-        temperature=_number(temperature),
-        state=state,
-        sample_age_s=_number(age),
-    )
-
-
 def _point(
     joint: str, j: int, time: datetime, t: float, record: str | None, estimate: dict[str, list[float]]
 ) -> view.HistoryPoint | None:
@@ -215,19 +192,3 @@ def _point(
         return view.HistoryPoint(time=time, t=t, joint=joint, record=record, **values)
     except (LookupError, TypeError, ValueError):
         return None
-
-
-def drawn_arm(arm: ArmFile) -> DrawnArm:
-    """The arm of an arm file; reads its model file, if it has one, and raises BadInput or OSError if it cannot."""
-    drawn = skeleton(arm)
-    columns = zip(
-        arm.joint_names,
-        drawn.axes.tolist(),
-        drawn.points.tolist(),
-        drawn.reference.tolist(),
-        (link.tolist() for link in drawn.links),
-        strict=True,
-    )
-    keys = ("joint", "axis", "point", "reference", "link")
-    joints = tuple(DrawnJoint.model_validate(dict(zip(keys, column, strict=True))) for column in columns)
-    return DrawnArm.model_validate({"up": drawn.up.tolist(), "joints": joints})

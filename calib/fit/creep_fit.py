@@ -13,13 +13,20 @@ from armlink.torque_calibration import GAIN_RANGE
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.dataset import SweepData, digests
-from calib.fit.calibration import FittedCalibration
-from calib.fit.findings import FitFinding
+from calib.fit.calibration import FitFinding, FittedCalibration
+from calib.fit.creep_residuals import (
+    NOISE_ROUNDS,
+    SPRING_SHARE,
+    Scatter,
+    contact_finding,
+    disturbed_sweep,
+    ripple_cycles,
+    scatter,
+    springs,
+)
 from calib.fit.gravity_fit import GravityFit
-from calib.fit.pushes import SPRING_SHARE, contact_finding, disturbed_sweep, ripple_cycles, springs
-from calib.fit.scatter import NOISE_ROUNDS, Scatter, scatter
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
-from calib.plan.levers import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
+from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.records.records import MotorTorque, Parameter
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask

@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.observer.discrepancy.kernel import Kernel
-from calib.observer.discrepancy.level import DiscrepancyLevel
-from calib.observer.discrepancy.posterior import Posterior
-from calib.observer.discrepancy.reference import Reference, Rows
+from calib.observer.discrepancy import DiscrepancyLevel, Kernel, Posterior, Reference, Rows
 from calib.observer.saved_values import restored
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns

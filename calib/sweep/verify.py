@@ -24,7 +24,7 @@ from calib.motion.static_reading import stack
 from calib.plan.creep_plan import CreepGround
 from calib.plan.poses import nearest_first, sweep_range
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.sweep.stalls import OnStall, give_up, repeat_work
+from calib.sweep.sweep_pass import OnStall, give_up, repeat_work
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque, torque_covariance
 

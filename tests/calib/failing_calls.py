@@ -26,7 +26,8 @@ from armlink.loop.channel import Channel, Closed
 from armlink.loop.kept_arm import BatchMaker, KeptArm, KeptMessage
 from armlink.loop.messages import Call, LoopAnswer, Progress, RunController, Up
 from armlink.recording.mcap import RecordingWriter
-from calib.daemon import main_loop, notify
+from calib.daemon import main_loop
+from calib.daemon import main_loop as notify
 from calib.daemon.environment import Immediate
 from calib.daemon.main_loop import Daemon
 from calib.daemon.settings import DaemonSection, Options

@@ -194,7 +194,7 @@ def _require_free(out: Path, force: bool, interactive: bool) -> None:
 def _show(console: Any, made: "NewArm") -> None:
     from rich.table import Table
 
-    from calib.commissioning.arm_text import assumed_lines
+    from calib.commissioning.draft import assumed_lines
 
     draft = made.draft
     ends = "stops [rad]" if draft.servo is None else "range [rad]"

@@ -14,7 +14,7 @@ from calib.daemon.environment import Environment
 from calib.daemon.settings import Configuration
 from calib.daemon.state.events import EventLog
 from calib.daemon.view import State
-from calib.motion.random_work import RandomMotion
+from calib.motion.trajectory import RandomMotion
 from calib.observer.config import LONGEST_WINDOW
 from gcomp.arrays import Array
 

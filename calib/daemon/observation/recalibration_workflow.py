@@ -13,9 +13,8 @@ from calib.daemon.state.events import EventLog
 from calib.daemon.state.journal import Journal
 from calib.daemon.state.journal_rows import ProposalRow
 from calib.daemon.view import NoSuch, NotPossible, Proposal
-from calib.observer.check_at_rests import Checked
 from calib.observer.decision import DriftFinding
-from calib.observer.recalibrator import APPLIED_BY, Recalibration, Recalibrator
+from calib.observer.recalibrator import APPLIED_BY, Checked, Recalibration, Recalibrator
 from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
