@@ -69,8 +69,6 @@ class JointDraft:
 
 @dataclass
 class Draft:
-    """Content of the arm file to be."""
-
     name: str
     model: Path
     tip: str | None

@@ -136,7 +136,6 @@ def _usual(density: float, length: float) -> str:
 
 
 def _strength_errors(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
-    """Joints whose drives cannot hold the arm everywhere in its range."""
     most = DriveLimits.of(arm_file).max_torque
     for name, need, limit in zip(model.arm.names, gravity_need(model), most, strict=True):
         if need > limit:

@@ -14,11 +14,18 @@ from armlink.content.yaml_text import EditedYaml
 from armlink.drives.findings import FoundDrives, SetupFinding
 from armlink.errors import BadInput
 from calib.arm.kinematics import gcomp_arm
-from calib.commissioning.bus_arm import drive_notes, with_gains
 from calib.commissioning.chain import Chain, find_chains, model_joints
 from calib.commissioning.clear_range import clear_ranges, sweep_problem
 from calib.commissioning.draft import Draft, JointDraft, arm_text, draft_of_model, narrow
-from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
+from calib.commissioning.drive_match import (
+    Ask,
+    Match,
+    TurnedJoint,
+    drive_notes,
+    match_by_hand,
+    match_in_order,
+    with_gains,
+)
 from calib.commissioning.model_checks import file_findings, model_errors
 from calib.commissioning.motion_checks import largest_inertias
 
@@ -29,8 +36,6 @@ RATING_FACTOR = 2.5
 
 
 class Questions(Protocol):
-    """Questions to a person at a terminal."""
-
     def which(self, chains: Sequence[Chain]) -> Chain: ...
 
     def stops(self, joint: str) -> tuple[float, float] | None:
@@ -40,8 +45,6 @@ class Questions(Protocol):
 
 @dataclass
 class NewArm:
-    """An arm file about to be written, and how it came about."""
-
     out: Path
     draft: Draft
     findings: list[SetupFinding] = field(default_factory=list)

@@ -17,8 +17,6 @@ from calib.commissioning.doctor import another_drive
 
 @dataclass(frozen=True)
 class OwnCopy:
-    """An arm file about to be written."""
-
     text: str
     drives: list[tuple[str, str, str]]
     """Name, address and serial number of each joint's drive."""

@@ -24,9 +24,9 @@ from armlink.loop.kept_arm import KeptArm, KeptControllers
 from armlink.loop.messages import BATCH_SECONDS, Down, LoopAnswer, Told
 from armlink.loop.realtime import Realtime
 from armlink.termination import Presses, said
-from calib.daemon.environment import Environment, Worker
+from calib.daemon.environment import CLOSING_SECONDS, Environment, Worker
 from calib.daemon.logs import log_in_thread
-from calib.daemon.service import CLOSING_SECONDS, Service
+from calib.daemon.service import Service
 from calib.daemon.service_view import ServiceView
 from calib.daemon.settings import DaemonSection, Options
 from calib.records.store import RecordStore

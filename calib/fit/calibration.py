@@ -26,6 +26,12 @@ VERY_STRONG_EVIDENCE = 10.0
 """BIC difference that counts as decided: odds of 150 to 1 (docs/theory.md, 4.3 and 6.4)."""
 SIGNIFICANCE = 5.0
 """A change or an effect counts only if it is this many standard deviations (docs/theory.md, 6.6)."""
+NOISE_ROUNDS = 4
+"""Fits, each with the noise that the residuals of the one before show."""
+USUAL_ROWS = 5
+"""Rows that the usual scatter, or what is assumed at first, counts for beside those that are measured."""
+LOOSEST_GAIN = 0.02
+"""Standard deviation of a gain, as a share of it, above which it is of no use."""
 NOMINAL: dict[Parameter, float] = {"position_gain": 1.0, "position_offset": 0.0}
 """Values of position sensors that were not fitted."""
 

@@ -29,16 +29,12 @@ from numpy.typing import NDArray
 from scipy.signal import lombscargle
 
 from calib.dataset import StallLine, SweepData
-from calib.fit.calibration import OUTLIER, SIGNIFICANCE, FitFinding
-from calib.fit.sweep_readings import SweepReadings
+from calib.fit.calibration import OUTLIER, SIGNIFICANCE, USUAL_ROWS, FitFinding
+from calib.fit.sweep_readings import FEWEST, SweepReadings
 from gcomp.arrays import Array
 
 LEAST_STD_SHARE = 1e-4
 """Least standard deviation of a row, as a share of rated torque: rounding of the sums that the readings are."""
-NOISE_ROUNDS = 4
-"""Fits, each with the noise that the residuals of the one before show."""
-USUAL_BINS = 5
-"""Bins that the usual scatter of a joint's sweeps counts for, beside those of a sweep itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +66,7 @@ def scatter(
     """Scatter of the rows as their residuals (R,) [N·m] have it.
 
     A sweep in which the arm swung scatters more than others of its joint: its own scatter counts, drawn towards the
-    joint's as by `USUAL_BINS` further bins. `freedom` is rows less unknowns, as a share of the rows; `by_degree` (R,)
+    joint's as by `USUAL_ROWS` further bins. `freedom` is rows less unknowns, as a share of the rows; `by_degree` (R,)
     [N·m] is what the temperature's uncertainty makes of each reading, alike in all rows of a sweep. Without
     `apart` both directions have one variance, and nothing in common: a contact would pass for scatter of the half sums.
     """
@@ -115,7 +111,7 @@ def _spread(series: list[Array], floor: float) -> list[float]:
     """Variance of each of a joint's sweeps, with what neighbouring bins have in common."""
     means = [float(np.mean(one**2)) for one in series if one.size]
     usual = max(float(np.median(means)) if means else 0.0, floor)
-    variances = [max((float(one @ one) + USUAL_BINS * usual) / (one.size + USUAL_BINS), floor) for one in series]
+    variances = [max((float(one @ one) + USUAL_ROWS * usual) / (one.size + USUAL_ROWS), floor) for one in series]
     common = inflation([one / np.sqrt(each) for one, each in zip(series, variances, strict=True) if one.size >= 4])
     return [common * each for each in variances]
 
@@ -149,8 +145,6 @@ LEAST_PERIODS = 2.0
 """Periods over the way of a sweep that a ripple has at least: slower ones could be gravity's."""
 OVERSAMPLING = 16
 """Tried frequencies per reciprocal of the joint's way."""
-LEAST_BINS = 8
-"""Bins of a joint, over all its sweeps, in which a ripple is searched for."""
 RIPPLE_POWER = 12.0
 """Least power of a line, in twice the variance that is left without it: chance gives it once in 160,000 frequencies."""
 
@@ -218,7 +212,7 @@ def ripple_cycles(rows: SweepReadings, residual: Array) -> Array:
     cycles = np.zeros(rows.readings.position.shape[1])
     for joint in range(len(cycles)):
         own = np.flatnonzero(rows.swept == joint)
-        if own.size >= 2 * LEAST_BINS:
+        if own.size >= 2 * FEWEST:
             cycles[joint] = _clearest_cycles(rows, residual, joint, own)
     return cycles
 

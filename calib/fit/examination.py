@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from calib.fit.calibration import OUTLIER, FitFinding
-from calib.fit.refinement import FEWEST, Extra, Refined, refine
+from calib.fit.refinement import Extra, Refined, refine
 from calib.fit.small_troubles import FAMILIES, HELD, UNITS, Lags, PositionField, Setting, troubles
-from calib.fit.sweep_readings import SweepReadings
+from calib.fit.sweep_readings import FEWEST, SweepReadings
 from calib.fit.unmodelled_effects import (
     UnmodelledEffect,
     effect_finding,

@@ -19,8 +19,8 @@ from armlink.torque_calibration import UNCALIBRATED, TorqueCalibration, per_join
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.dataset import SweepData
-from calib.fit.calibration import VERY_STRONG_EVIDENCE, FittedCalibration
-from calib.fit.creep_residuals import NOISE_ROUNDS, inflation
+from calib.fit.calibration import LOOSEST_GAIN, NOISE_ROUNDS, VERY_STRONG_EVIDENCE, FittedCalibration
+from calib.fit.creep_residuals import inflation
 from calib.fit.heldout import held_out
 from calib.fit.small_troubles import PositionField
 from calib.fit.sweep_readings import FEWEST, sweep_readings
@@ -37,8 +37,6 @@ HYSTERESIS = 0.01
 """Prior standard deviation of f_i, as a share of rated torque (docs/theory.md, section 4.3)."""
 UNKNOWN_MOMENT = 10.0
 """Prior standard deviation of a mass moment that is not identifiable in the gravity record [kg·m]."""
-GAIN_STD = 0.02
-"""Relative standard deviation above which a gain counts as not separable from the offset."""
 OFFSET_STD = 0.005
 """Likewise of an offset, as a share of rated torque."""
 DRIFT = 0.05
@@ -208,7 +206,7 @@ def fit_field(
         solved = problem.solve(columns, noise, np.ones(n))
         residual = problem.table(rows.torque[rows.counted] - columns @ solved.x)
         gain, noise = solved.x[:n], rows.sigma * np.maximum(_scatter(residual, rows), 1.0)
-    unseen = np.sqrt(np.diag(solved.covariance)[:n]) > GAIN_STD * np.abs(gain)
+    unseen = np.sqrt(np.diag(solved.covariance)[:n]) > LOOSEST_GAIN * np.abs(gain)
     if unseen.any():
         columns = problem.columns(np.where(unseen, problem.installed.gain, gain))
         solved = problem.solve(columns, noise, np.where(unseen, DRIFT, 1.0))
@@ -377,7 +375,6 @@ def rows_of_sweeps(data: SweepData, number: int) -> StaticReadings:
 
 
 def _windows(t: Array) -> list[slice]:
-    """Windows of WINDOW seconds with enough samples and without gaps."""
     windows, begin = [], 0
     while begin < len(t):
         end = int(np.searchsorted(t, t[begin] + WINDOW))

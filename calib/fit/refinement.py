@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg
 
-from calib.fit.creep_residuals import NOISE_ROUNDS
+from calib.fit.calibration import NOISE_ROUNDS
 from calib.fit.small_troubles import FAMILIES, LARGEST, UNITS, Setting, Troubles, troubles
-from calib.fit.sweep_readings import SweepReadings
+from calib.fit.sweep_readings import FEWEST, SweepReadings
 from gcomp.arrays import Array
 from gcomp.identify.global_fit import GlobalFit
 from gcomp.identify.identifiability import analyse, describe_null_space
@@ -74,8 +74,6 @@ class RandomEffects:
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Levels found."""
-
     level: Array
     """One a family, in its unit (F,)."""
     freedom: Array
@@ -133,8 +131,6 @@ LEAST_FACTOR = 0.5
 cut off at 1, the intervals of perfect arms were 5 % too wide."""
 NEGLIGIBLE = 0.1
 """Share of a reading's noise below which rounding is neglected: it adds 0.5 % to the standard deviation."""
-FEWEST = 8.0
-"""Free readings of a joint for an estimate of its scatter: known to 25 % then (1/√(2 · 8))."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -174,8 +174,6 @@ class Troubles:
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Inputs of the columns beside the readings."""
-
     arm: Arm
     rated: Array
     """Rated torques (n,) [N·m]."""

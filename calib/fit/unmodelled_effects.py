@@ -222,7 +222,6 @@ def effect_finding(
 
 
 def encoder_findings(names: tuple[str, ...], rows: SweepReadings) -> list[FitFinding]:
-    """Findings of position sensors with a bit that never changes."""
     found = []
     for joint, bit, step in stuck_bits(rows.readings.position, rows.resolution, rows.target):
         text = (

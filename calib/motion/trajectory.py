@@ -57,8 +57,6 @@ SLOW_SETTLING = 0.5
 
 @dataclass(frozen=True)
 class WorkMotion:
-    """How the arm moves."""
-
     reach: float = 0.8
     """Longest move of a joint from one waypoint to the next [rad]."""
     margin: float = 0.1

@@ -72,8 +72,6 @@ class DriftFinding:
 
 @dataclass(frozen=True)
 class Agreeing:
-    """Rows that agree on a drift of these joints."""
-
     rows: list[StaticReading]
     test: CauseTest
     joints: frozenset[int]

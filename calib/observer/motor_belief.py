@@ -16,7 +16,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from calib.observer.config import LONGEST_GAP, NOISE_ROWS
+from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS
+from calib.motion.static_reading import LEAST_SAMPLES
+from calib.observer.config import LONGEST_GAP
 from calib.observer.saved_values import known
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque
 from gcomp.arm.arm import Arm
@@ -29,8 +31,6 @@ WIDTH = 0.1
 """A stretch is complete when some joint has moved this far [rad]: two or three periods of a motor's cogging."""
 LEAST_SECONDS, MOST_SECONDS = 0.2, 3.0
 """Shortest and longest stretch [s]: a slower joint creeps below the speeds at which its friction is known."""
-LEAST_SAMPLES = 8
-"""Samples that a stretch has at least."""
 SLOWEST = 0.03
 """Below this speed friction depends on the time at rest [rad/s]: such a joint gives no row."""
 STEADY = 0.15
@@ -141,8 +141,6 @@ FITTED = 5
 """Rows of a joint that its own parameters take up."""
 NEIGHBOUR_DISTANCE = 0.2
 """Rows of a joint are neighbours if it moved less between them [rad]."""
-LEARNING_ROUNDS = 3
-"""Linearisations of learning, each with the scatter found by the one before."""
 UNKNOWN_WARMTH_STD = 0.01
 """Doubt of a gain where no temperature is known: a drive that warms by 10 K loses a hundredth."""
 KNOWN_WARMTH_STD = 5e-4
@@ -221,7 +219,7 @@ class MotorBelief:
         first_mean, first_covariance, belief.sigma = self._first
         model = MotorModel(self.arm, self.rows(belief.learnt))
         belief.mean = first_mean
-        for _ in range(LEARNING_ROUNDS):
+        for _ in range(NOISE_ROUNDS):
             predicted, jacobian = model.linearised(belief.mean)
             noise = belief.sigma[model.joint] ** 2
             target = model.reading - predicted + jacobian @ (belief.mean - first_mean)
@@ -241,7 +239,7 @@ class MotorBelief:
         for j in range(self.arm.n):
             own = np.flatnonzero(model.joint == j)
             square = residual[own] ** 2
-            variance = (square.sum() + NOISE_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + NOISE_ROWS)
+            variance = (square.sum() + USUAL_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + USUAL_ROWS)
             near = np.abs(np.diff(model.readings.position[own, j])) < NEIGHBOUR_DISTANCE
             common = float((residual[own][1:] * residual[own][:-1])[near].sum() / max(square[1:][near].sum(), 1e-12))
             found[j] = np.sqrt(variance * (1 + 2 * min(max(common, 0.0), 1.0)))

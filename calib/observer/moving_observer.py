@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.fit.calibration import VERY_STRONG_EVIDENCE
-from calib.observer.cause_test import DetectionLimits
-from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD, NOISE_ROWS
+from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS, VERY_STRONG_EVIDENCE
+from calib.fit.sweep_readings import FEWEST
+from calib.observer.cause_test import INEXACT, DetectionLimits
+from calib.observer.config import INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW
 from calib.observer.decision import AGREEMENT, DriftFinding, Event, verdict_evidence
 from calib.observer.evidence import ChangeFit, ChangeHypothesis, ResidualTest, Verdict
 from calib.observer.motor_belief import MotorBelief, Passage, PassageDetector
@@ -30,15 +31,9 @@ from gcomp.arrays import Array, as_array
 from gcomp.estimate.posterior import linear_posterior
 from gcomp.identify.motor_model import family_slices
 
-LEAST_ROWS = 6
-"""Rows of a joint from which a change of its drive can be told."""
 MISFIT = 8.0
 """χ² above its degrees of freedom, in standard deviations, from which nothing explains the rows: 120 rows then scatter
 by 1.4 times what was learned. Friction of a joint is never quite what it was; a contact is far beyond."""
-INEXACT = 0.03
-"""Most that a change's own shape may be off, as a share."""
-PAYLOAD_ROUNDS = 2
-"""Further linearisations of a payload."""
 
 UNSEEN_STD = 10 * np.array([INITIAL_GAIN_STD, INITIAL_OFFSET_STD])
 """Standard deviations of a joint's gain and offset [N·m] where rows of motion tell nothing; a choice."""
@@ -116,7 +111,7 @@ class ChangeTest:
     def _fit(self, index: int) -> ChangeFit:
         """A payload is linearised again at the load found: friction goes with torque, whose sign a load may turn."""
         fit, own = self.found.fit(index), self.found.hypotheses[index]
-        for _ in range(PAYLOAD_ROUNDS if own.cause == "payload" else 0):
+        for _ in range(NOISE_ROUNDS if own.cause == "payload" else 0):
             arm, values = self._belief.arm, fit.values
             per_unit = np.column_stack(payload_columns(arm))
             residual, jacobian, _ = self._belief.linearised(self._passages, per_unit @ values)
@@ -127,7 +122,7 @@ class ChangeTest:
         return fit
 
     def _misfit(self, chi2: float, parameters: int) -> float:
-        known = len(self._belief.learnt) + NOISE_ROWS
+        known = len(self._belief.learnt) + USUAL_ROWS
         return self.found.misfit(chi2, parameters, (len(self._passages) - parameters) / known)
 
 
@@ -137,7 +132,7 @@ def _candidates(belief: MotorBelief, jacobian: Array, joint: Array) -> list[Chan
     coulomb, load = belief.mean[at["coulomb"]], belief.mean[at["load"]]
     uneven = np.arange(at["uneven"].start, at["uneven"].stop).reshape(n, -1)
     for j in range(n):
-        if (joint == j).sum() < LEAST_ROWS:
+        if (joint == j).sum() < FEWEST:
             continue
         column = {name: jacobian[:, at[name].start + j] for name in ("gain", "offset", "coulomb", "load")}
         friction = coulomb[j] * column["coulomb"] + load[j] * column["load"]
@@ -156,12 +151,11 @@ def _with_cause(verdict: Verdict, cause: str, rivals: tuple[str, ...] = ()) -> V
     return Verdict(cause, joint, verdict.confidence, verdict.values, verdict.covariance, verdict.evidence, rivals)
 
 
-BLOCK = 60
-"""Rows of one test: of seven joints that creep in turn, 40 s."""
 REFERENCE = 360
 """Rows without a change that the belief is learned from: four minutes of creeping."""
-LONGEST = 2 * BLOCK
-"""Rows of a test at most: the latest."""
+LONGEST = 2 * LONGEST_WINDOW
+"""Rows of a test at most: the latest. There is one after each LONGEST_WINDOW rows: of seven joints that creep in turn,
+40 s."""
 AGREEING = 2
 """Tests in a row that must say the same until it is an event."""
 UNEXPLAINED = 3
@@ -225,7 +219,7 @@ class MovingObserver:
         """Take one row, with true angles."""
         self._count[passage.joint] += 1
         self._block.append(passage)
-        if len(self._block) < BLOCK:
+        if len(self._block) < LONGEST_WINDOW:
             return []
         block, self._block = self._block, []
         self._recent = (self._recent + block)[-LONGEST:]
@@ -253,7 +247,6 @@ class MovingObserver:
         return [Event(passage.t, "verdict", joint, verdict_evidence(verdict, self.arm.names) | {"motor": True})]
 
     def estimate(self) -> Estimate:
-        """Gain and offset of every joint against the records, by the latest rows."""
         test = self._test()
         gain, offset = np.ones(self.arm.n), np.zeros(self.arm.n)
         std = np.tile(UNSEEN_STD[:, None], self.arm.n)
@@ -268,9 +261,9 @@ class MovingObserver:
         """The changes of each joint that would be noticed now, by motion like the latest; NaN where it tells none."""
         test, n = self._test(), self.arm.n
         if test is None:
-            return DetectionLimits(np.full(n, np.nan), np.full(n, np.nan), LONGEST + BLOCK)
+            return DetectionLimits(np.full(n, np.nan), np.full(n, np.nan), LONGEST + LONGEST_WINDOW)
         gain, offset = (np.array([test.noticed(cause, j) for j in range(n)]) for cause in ("gain", "offset"))
-        return DetectionLimits(gain, offset, LONGEST + BLOCK)
+        return DetectionLimits(gain, offset, LONGEST + LONGEST_WINDOW)
 
     def model_torque(self, position: Array) -> Array:
         torque = self._belief.gravity_torque(np.atleast_2d(self._angle(position)))
@@ -313,7 +306,7 @@ class MovingObserver:
     def _test(self) -> ChangeTest | None:
         """The test of the latest rows; None while there are too few."""
         rows = (self._recent + self._block)[-LONGEST:]
-        if len(rows) < BLOCK // 2:
+        if len(rows) < LONGEST_WINDOW // 2:
             return None
         if self._tested is None or self._tested[0] != self.rows:
             self._tested = (self.rows, ChangeTest(self._belief, rows))

@@ -130,7 +130,6 @@ class Observer:
         return []
 
     def estimate(self) -> Estimate:
-        """Current gain and offset of every joint against the installed calibration."""
         return self._tracking.filter.estimate()
 
     def limits(self) -> DetectionLimits:

@@ -94,8 +94,6 @@ RESTORED_BY = "daemon, policy apply"
 
 @dataclass(frozen=True)
 class Recalibration:
-    """Result of a finding or of a roll-back."""
-
     joint: str
     record: CalibrationRecord
     gain: float

@@ -10,16 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from calib.fit.calibration import USUAL_ROWS
 from calib.motion.static_reading import StaticReading, batch, stack
 from calib.observer.cause_test import CauseTest, DetectionLimits, limits
-from calib.observer.config import (
-    AUDIT_ROWS,
-    INITIAL_GAIN_STD,
-    INITIAL_OFFSET_STD,
-    LONGEST_WINDOW,
-    NOISE_ROWS,
-    ObserverConfig,
-)
+from calib.observer.config import AUDIT_ROWS, INITIAL_GAIN_STD, INITIAL_OFFSET_STD, LONGEST_WINDOW, ObserverConfig
 from calib.observer.decision import DriftFinding
 from calib.observer.gravity_belief import GravityBelief
 from calib.observer.saved_values import read_rows, restored, save_rows
@@ -287,7 +281,7 @@ class Tracking:
         steady = bool((row.torque_error <= STEADY * self.sigma).all())
         self.rows += steady
         error = np.minimum(row.torque_error, CHANCE * self.sigma)
-        weight = 1 / min(self.rows + NOISE_ROWS, NOISE_MEMORY)
+        weight = 1 / min(self.rows + USUAL_ROWS, NOISE_MEMORY)
         self.sigma = np.sqrt((1 - weight) * self.sigma**2 + weight * error**2)
         return steady
 

@@ -15,8 +15,9 @@ from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.plan.collisions import POINTS, Geometry
 from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
-from calib.plan.poses import require_range
 from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
+from calib.plan.sweep_options import require_range
+from calib.plan.sweep_plan import MASS_SHARES
 from calib.plan.types import Side, Sweep, SweepPlan
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
@@ -99,10 +100,8 @@ CANDIDATES = 24
 """Creeps of each joint among which the plan chooses."""
 DRAWS = 40
 """Draws for each candidate before too much of the range counts as blocked."""
-MASS_SHARE = 0.3
-"""Share of max_torque that the reference mass may take at the joint that it loads most."""
 BLIND_SHARE = 0.15
-"""The same where no model file tells what the arm itself weighs."""
+"""Share of max_torque that the reference mass may take where no model file tells what the arm itself weighs."""
 WORST_CONSTANT = 1.6
 """A drive may have to be asked for so many times the true torque."""
 TRAVEL_ACCELERATION = 1.5
@@ -166,7 +165,7 @@ class CreepGround:
         at_origin, by_point = payload_columns(self.arm)
         each = gravity_regressor(self.arm, poses)
         per_kg = np.abs(each @ at_origin) + HAND * np.linalg.norm(each @ by_point, axis=-1)
-        share = MASS_SHARE if self.weighed else BLIND_SHARE
+        share = MASS_SHARES[0] if self.weighed else BLIND_SHARE
         most = share * self.limits.max_torque / np.maximum(per_kg.max(axis=0), 1e-9)
         return float(f"{float(most.min()):.2g}")
 

@@ -11,17 +11,19 @@ from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits
 from calib.plan.plan_limits import SERVO_GAP
-from calib.plan.poses import Poses, scout_poses, sweep_range
 from calib.plan.rough_gravity import HAND, GravityGuess, reach
 from calib.plan.stop_selection import PRIOR_GAIN, Candidates, StopDesign, guessed_moments
 from calib.plan.sweep_options import (
     PlannedArm,
+    Poses,
     bias_and_acceleration,
     hold_torque,
     pressable_joints,
     reaction_bound,
     required_bias,
+    scout_poses,
     sweep_options,
+    sweep_range,
     travel_acceleration,
 )
 from calib.plan.types import Sweep, SweepPlan
@@ -191,7 +193,6 @@ def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess |
 
 
 def _choose(planned: PlannedArm, design: StopDesign, poses: int) -> tuple[Sweep, ...]:
-    """The best sweeps, `poses` of each joint."""
     counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in design.candidates]
     picks = design.choose(counts, planned.section.travel_speed * planned.limits.speed)
     return tuple(

@@ -21,7 +21,6 @@ T = TypeVar("T")
 
 
 def give_up(stall: Stall) -> bool:
-    """An OnStall that does not go on."""
     return False
 
 

@@ -20,8 +20,7 @@ SCHEMA = "armlink.new/1"
 def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None) -> int:
     """An arm file of nothing but a bus: its drives, and no geometry."""
     from armlink.arm_file import parse_arm
-    from calib.commissioning.bus_arm import arm_of_bus
-    from calib.commissioning.drive_match import addresses
+    from calib.commissioning.drive_match import addresses, arm_of_bus
 
     opened = open_named(bus)
     try:
@@ -37,7 +36,6 @@ def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", 
 
 
 def rewire(model: Path, out: Path, bus: str, ask: "Ask | None", json_file: Path | None) -> int:
-    """An arm file with the drives of a bus."""
     from armlink.arm_file import load_arm, parse_arm
     from armlink.content.file_content import parse_yaml
     from armlink.content.yaml_text import yaml_comment

@@ -33,8 +33,6 @@ THINNING_FACTOR = 10
 
 
 class ObserverFeed:
-    """An observer with the records that it measures against."""
-
     def __init__(
         self, arm: ArmFile, calibration: CalibrationRecord, gravity: GravityRecord, config: ObserverConfig
     ) -> None:

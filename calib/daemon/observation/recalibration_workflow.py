@@ -86,7 +86,6 @@ class RecalibrationWorkflow:
     # ---- what the observer found
 
     def found(self, finding: DriftFinding) -> None:
-        """Do with a finding what the policy says."""
         policy = self._configuration.settings.policy
         if policy == "observe":
             return
@@ -253,7 +252,6 @@ class RecalibrationWorkflow:
     # ---- after a write
 
     def _keep_failure(self, row: ProposalRow, error: ArmlinkError) -> None:
-        """Keep and report that a proposal's record could not be written."""
         with self._journal.transaction():
             self._decided(row, "failed", "daemon", str(error))
             self._refused(row.finding, error, row.number)

@@ -53,7 +53,7 @@ HEAD_LIMIT = 16384
 """Largest request line and headers together [bytes]."""
 LINGER_BYTES, LINGER_SECONDS = 1024 * 1024, 1.5
 """Bytes, and seconds, for which a client may go on sending after a refusal; shorter than the server's own end
-(`server.CLOSING_SECONDS`)."""
+(`calib.daemon.environment.CLOSING_SECONDS`)."""
 REQUESTS = Rate(burst=60, per_second=20)
 """Per TCP address; the page needs three requests to load, then four in two seconds."""
 WRONG_TOKENS = Rate(burst=5, per_second=0.2)

@@ -15,6 +15,7 @@ import uvicorn
 
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
+from calib.daemon.environment import CLOSING_SECONDS
 from calib.daemon.view import DaemonView
 from calib.daemon.web.app import make_app
 from calib.daemon.web.connection import PATIENCE_SECONDS, protocol_of
@@ -28,7 +29,6 @@ MOST_CONNECTIONS = 1280
 """Connections at once; a request on a further one is answered with 503."""
 FILES = 4096
 """Open files that the daemon asks the system for, as far as its hard limit allows."""
-CLOSING_SECONDS = 2
 
 
 async def serve(view: DaemonView, *, socket: Path | None, tcp: tuple[str, int] | None, token: str | None) -> None:
@@ -135,7 +135,7 @@ async def _run(view: DaemonView, listening: list[sockets.socket], access: Access
         server_header=False,
         proxy_headers=False,
         limit_concurrency=MOST_CONNECTIONS,
-        timeout_graceful_shutdown=CLOSING_SECONDS,
+        timeout_graceful_shutdown=round(CLOSING_SECONDS),
     )
     server = _ApiServer(config)
     running = asyncio.create_task(server.serve(sockets=listening))

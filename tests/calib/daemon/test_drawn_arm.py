@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from armlink.arm_file import load_arm, parse_arm
 from calib.arm.kinematics import gcomp_arm
-from calib.daemon.drawn_arm import drawn_arm
+from calib.daemon.service_view import drawn_arm
 from calib.daemon.view import DrawnArm
 from gcomp.arm.arm import bar_frames
 from gcomp.arm.load import place_chain

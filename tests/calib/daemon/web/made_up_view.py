@@ -8,7 +8,7 @@ import numpy as np
 
 from armlink.arm_file import load_arm
 from calib.daemon import view
-from calib.daemon.drawn_arm import drawn_arm
+from calib.daemon.service_view import drawn_arm
 from calib.daemon.state.events import Client, Hub
 from calib.daemon.view import NoSuch, NotPossible, Window
 
