@@ -18,13 +18,13 @@ from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
 from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_motion
-from calib.commissioning.model_judgement import refuse_impossible_sweep
+from calib.commissioning.model_checks import refuse_impossible_sweep
 from calib.dataset import SweepData, all_creep, data_sets
 from calib.fit.creep_fit import CreepFit, fit_creep
 from calib.fit.gravity_fit import GravityFit, identify_gravity
 from calib.fit.sensor_fit import SensorFit, fit_sensors
 from calib.observer.config import ObserverConfig
-from calib.observer.events import Event
+from calib.observer.decision import Event
 from calib.observer.observer import observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
 from calib.sweep.run import run_sweep

@@ -134,8 +134,6 @@ def encode(line: Line) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class SweepData:
-    """A data set as read back from its directory."""
-
     path: Path
     manifest: Manifest
     readings: tuple[StaticReading, ...]

@@ -7,7 +7,7 @@ import numpy as np
 from armlink.arm_file import load_arm
 from armlink.link.link import Link
 from calib.arm.kinematics import gcomp_arm
-from calib.motion.random_work import work_targets
+from calib.motion.trajectory import work_targets
 from calib.observer.observer import Observer
 from calib.observer.watch_loop import watch
 from sim_bus.bus.lock_step import LockStepBus

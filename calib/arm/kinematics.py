@@ -95,7 +95,6 @@ class DriveLimits:
 
     @classmethod
     def of(cls, arm_file: ArmFile) -> "DriveLimits":
-        """From the arm file's link section and joint range."""
         kinematics, link = gcomp_arm(arm_file), arm_file.require_link()
         return cls(
             kinematics.lower,

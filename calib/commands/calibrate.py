@@ -55,9 +55,8 @@ def calibrate(
     from calib.arm.kinematics import gcomp_arm
     from calib.commands.options import load_sweeps
     from calib.dataset import all_creep, drives_of
-    from calib.fit.felt_mass import felt_mass
     from calib.fit.heldout import held_out_steps
-    from calib.fit.sensor_fit import SensorFit
+    from calib.fit.sensor_fit import SensorFit, felt_mass
     from calib.install.apply import Apply, apply_creep, apply_record
     from calib.install.plausibility import replaced_record
     from calib.records.records import CalibrationRecord, GravityRecord, HeldOut

@@ -79,7 +79,7 @@ def _model(arm_file: "ArmFile", record: str | None, store: str | None) -> "tuple
     """Mass moments (2n,) [kg·m], the calibration record if any, and where the moments come from; raises Refused."""
     from calib.arm.kinematics import model_arm
     from calib.commands.options import gravity_model
-    from calib.commissioning.model_judgement import refuse_impossible_model
+    from calib.commissioning.model_checks import refuse_impossible_model
     from calib.records.records import CalibrationRecord
     from calib.records.store import RecordStore, no_record
 

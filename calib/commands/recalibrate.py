@@ -99,7 +99,7 @@ def _rows(
     from armlink.recording.files import load_recording
     from armlink.torque_calibration import UNCALIBRATED, per_joint
     from calib.dataset import labels, load_data
-    from calib.fit.slow_windows import rows_of_recording, rows_of_sweeps
+    from calib.fit.field_fit import rows_of_recording, rows_of_sweeps
 
     n = len(arm_file.joint_names)
     blank = per_joint([UNCALIBRATED] * n)

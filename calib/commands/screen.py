@@ -82,7 +82,6 @@ class SweepScreen:
         return on_stall
 
     def say(self, text: str) -> None:
-        """One line below the bar."""
         _CONSOLE.print(text)
 
     def __enter__(self) -> Self:

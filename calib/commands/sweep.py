@@ -74,7 +74,7 @@ def sweep(
     from calib.api import open_link
     from calib.arm.sweep_section import with_hold
     from calib.commands.screen import SweepScreen, confirm, warn_late
-    from calib.commissioning.model_judgement import refuse_impossible_sweep
+    from calib.commissioning.model_checks import refuse_impossible_sweep
     from calib.dataset import MANIFEST, require_vacant
 
     if picture is not None:
@@ -180,7 +180,7 @@ def _run(
     from calib.arm.sweep_section import sweep_motion
     from calib.sweep.preflight import find_stops, listen
     from calib.sweep.run import run_sweep
-    from calib.sweep.stalls import repeat_work
+    from calib.sweep.sweep_pass import repeat_work
 
     def pushed(done: int, total: int) -> None:
         screen.count(done, total, "stops, each touched by its joint")

@@ -69,9 +69,9 @@ def verify(
     if result.passed:
         suggest(command_line("daemon", arm, bus=bus, store=store))
     if report is not None:
-        from calib.report.verification import write_report
+        from calib.report.calibration import write_verification
 
-        write_report(result, arm_file, gravity, calibration, report)
+        write_verification(result, arm_file, gravity, calibration, report)
     write_json(json_file, _answer(result, gravity, calibration))
     return 0 if result.passed else 1
 

@@ -1,20 +1,23 @@
-"""Draft of an arm file from a model: every value with where it comes from."""
+"""Draft of an arm file from a model: every value with where it comes from; its text marks what was assumed."""
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from armlink.arm_file import STANDARD_GRAVITY
+from armlink.arm_file import SIMULATED, STANDARD_GRAVITY
 from armlink.content.model_sizes import model_budget
+from armlink.content.yaml_text import yaml_comment, yaml_entry, yaml_item
 from calib.commissioning.chain import Chain
 from calib.commissioning.clear_range import ClearRange
 from gcomp.arm.load import compile_model
 from gcomp.arrays import Array
 
+NO_BUS = "assumed: there is no bus yet"
 ASSUMED_STOP = 2.9
 """Working range of a joint without stops, to either side [rad]; assumed."""
 SPEED = 1.0
@@ -60,8 +63,6 @@ class JointDraft:
 
 @dataclass
 class Draft:
-    """Content of the arm file to be."""
-
     name: str
     model: Path
     tip: str | None
@@ -236,3 +237,72 @@ def _load_torque(path: Path, names: Sequence[str], gravity: Sequence[float], loc
             least = abs(data.qfrc_bias[dof[joint]]) + ACCELERATION * column[dof[joint]]
             need[joint] = max(need[joint], least)
     return need
+
+
+def assumed_lines(text: str) -> list[int]:
+    """Numbers of the lines of an arm file whose comment says that a value is assumed."""
+    return [place for place, line in enumerate(text.splitlines(), start=1) if "assumed" in line.partition("#")[2]]
+
+
+def arm_text(draft: Draft, out: Path) -> str:
+    """The YAML text of the draft, to stand at `out`: the model's path is relative to it."""
+    lines = [
+        yaml_comment(f"{draft.name}: made from {draft.model.name} by `armlink new`."),
+        yaml_comment(
+            "Comments mark guessed values: check each value before a real arm moves, then remove its comment."
+        ),
+        yaml_entry("name", draft.name),
+        yaml_entry("serial", draft.serial),
+        "kinematics:",
+        yaml_entry("model", os.path.relpath(draft.model.resolve(), out.resolve().parent), 2),
+    ]
+    if draft.base is not None:
+        lines.append(yaml_entry("base", draft.base, 2))
+    if draft.tip is not None:
+        lines.append(yaml_entry("tip", draft.tip, 2))
+    if draft.locked:
+        lines.append("  locked:  # joints that these drives do not move [rad, m]")
+        lines += [yaml_entry(name, position, 4) for name, position in draft.locked.items()]
+    lines.append(
+        yaml_entry(
+            "gravity", list(draft.gravity), 2, "m/s² in the model's frame; assumed: the arm stands as in the model"
+        )
+    )
+    lines += [
+        yaml_comment(f"joint {name} {why}: not part of the arm, it stays at its position in the model", 2)
+        for name, why in draft.aside
+        if name not in draft.locked
+    ]
+    given = {joint.name: list(joint.stops) for joint in draft.joints if joint.stops is not None}
+    if given:
+        lines.append(f"  stops:  # {'working range' if draft.servo else 'mechanical stops'} [rad]")
+        lines += [yaml_entry(name, stops, 4) for name, stops in given.items()]
+    simulated = {"interface": SIMULATED, "channel": out.name, "bitrate": 1000000}
+    real = "{interface: socketcan, channel: can0}"
+    note = f"{NO_BUS}, this is the simulated arm; for a real arm write {real}"
+    lines += ["link:", yaml_entry("bus", simulated, 2), yaml_comment(note, 2)]
+    lines += [yaml_entry("rate", 250, 2, "Hz, assumed"), "  joints:"]
+    for joint in draft.joints:
+        lines += [yaml_item(_joint_row(joint), 4), *(yaml_comment(note, 6) for note in joint.notes)]
+    if draft.servo is not None:
+        lines += ["sweep:", yaml_entry("hold", "servo", 2), yaml_comment(f"assumed: {draft.servo}", 2)]
+    lines += [
+        "sim:  # the simulated arm, for example for `armlink demo`; its masses are the masses of the model",
+        f"  effects:  # assumed: friction of {FRICTION:.0%} of the torque that the drives need, and rotor inertias",
+    ]
+    effects = [("friction.coulomb", joint.name, "torque", joint.friction) for joint in draft.joints]
+    effects += [("actuator.rotor_inertia", joint.name, "inertia", joint.rotor) for joint in draft.joints if joint.rotor]
+    lines += [yaml_item({"effect": effect, "joint": joint, key: value}, 4) for effect, joint, key, value in effects]
+    lines += [yaml_comment(note) for note in draft.notes]
+    return "\n".join(lines) + "\n"
+
+
+def _joint_row(joint: JointDraft) -> dict[str, Any]:
+    return {
+        "name": joint.name,
+        "node": joint.node,
+        "rated_torque": joint.rated_torque,
+        "max_torque": joint.max_torque,
+        "max_torque_rate": joint.max_torque_rate,
+        "max_velocity": joint.max_velocity,
+    }

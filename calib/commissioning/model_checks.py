@@ -1,4 +1,7 @@
-"""Findings about an arm file's model: joints, limits, meshes, gravity."""
+"""Whether a model and its torque limits can be those of an arm: one judgement for all that rests upon them.
+
+And findings about joints, limits, meshes and gravity.
+"""
 
 from collections.abc import Iterator
 
@@ -6,10 +9,142 @@ import numpy as np
 
 from armlink.arm_file import ArmFile
 from armlink.drives.findings import SetupFinding
+from armlink.errors import BadInput
+from armlink.link.joints.values import try_limits
 from armlink.model_file import NOT_FOUND, UNFETCHED, read_model
-from calib.arm.kinematics import gcomp_arm, model_arm
-from calib.commissioning.model_judgement import NO_MASS, largest_levers
-from calib.plan.sweep_plan import DEAD_LEVER
+from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
+from calib.arm.sweep_section import sweep_motion
+from calib.plan.creep_plan import refuse_unbearable_creeps
+from calib.plan.rough_gravity import HAND, guess_of_file, reach
+from calib.plan.sweep_plan import DEAD_LEVER, refuse_unbearable_mass
+from gcomp.arm.arm import Arm
+from gcomp.arm.load import ModelArm
+from gcomp.arrays import Array
+from gcomp.gravity.torque import gravity_levers, gravity_torque
+
+NO_MASS = 1e-9
+"""Mass of all moving links that stands for none [kg]: the reader gives massless bodies a negligible one."""
+LIGHTEST, HEAVIEST = 0.3, 1000.0
+"""Mass of the moving links over the cube of the reach [kg/m³] that an arm may have. Published arms, legs and hands have
+1.2 to 81 (57 models of example-robot-data and rtb-data); with grams taken for kilograms they have 1200 or more."""
+POSES = 500
+"""Random poses at which the torque against gravity is looked at."""
+
+
+def refuse_impossible_model(arm_file: ArmFile) -> None:
+    """Raise BadInput in the words of doctor where a model's masses or the torque limits cannot be those of an arm."""
+    for found in arm_errors(arm_file):
+        raise BadInput(str(found))
+
+
+def refuse_impossible_sweep(arm_file: ArmFile, reference_mass: float) -> None:
+    """Raise BadInput as `refuse_impossible_model`, and where the drives cannot hold a reference mass [kg] in sweeps."""
+    refuse_impossible_model(arm_file)
+    if not reference_mass:
+        return
+    if sweep_motion(arm_file) == "creep":
+        refuse_unbearable_creeps(arm_file, reference_mass)
+    else:
+        refuse_unbearable_mass(arm_file, reference_mass, guess_of_file(arm_file))
+
+
+def arm_errors(arm_file: ArmFile) -> list[SetupFinding]:
+    """Errors of the model, of an arm without geometry, or of one that stands so that gravity loads no joint."""
+    found, where = list(model_errors(arm_file)), str(arm_file.path)
+    if found:
+        return found
+    if not arm_file.has_geometry:
+        remedy = (
+            "give a, alpha and d of every joint, or make the arm file from the arm's URDF or MJCF: armlink new --help"
+        )
+        return [
+            SetupFinding(
+                "error", "the geometry of the arm is not known, so nothing can be swept or identified", where, remedy
+            )
+        ]
+    if (largest_levers(gcomp_arm(arm_file)) < DEAD_LEVER).all():
+        what, remedy = (
+            "gravity loads no joint in any pose, so nothing can be calibrated",
+            "incline the base, then give the inclined gravity here",
+        )
+        return [SetupFinding("error", what, f"{where}: kinematics.gravity", remedy)]
+    return []
+
+
+def model_errors(arm_file: ArmFile) -> Iterator[SetupFinding]:
+    """Errors in masses or torque limits, each with its remedy; those that follow from another are left out."""
+    model = None if arm_file.model_path is None else model_arm(arm_file)
+    impossible = None if model is None else _mass_error(arm_file, model)
+    if impossible is not None:
+        yield impossible
+        return
+    if arm_file.link is None:
+        return
+    try:
+        try_limits(arm_file)
+    except BadInput as error:
+        what, _, remedy = str(error).rpartition(": ")
+        yield SetupFinding("error", what, f"{arm_file.path}: link.joints", remedy)
+        return
+    if model is not None:
+        yield from _strength_errors(arm_file, model)
+
+
+def largest_levers(arm: Arm) -> Array:
+    """Γ/g (n,) of each joint at its largest in the range of the joints; NaN where there is no gravity."""
+    with np.errstate(invalid="ignore"):
+        levers: Array = gravity_levers(arm, _poses(arm)).max(axis=0) / np.linalg.norm(arm.gravity)
+    return levers
+
+
+def gravity_need(model: ModelArm) -> Array:
+    """Largest torque against gravity (n,) [N·m] in the range of the joints."""
+    need: Array = np.abs(gravity_torque(model.arm, model.beta, _poses(model.arm))).max(axis=0)
+    return need
+
+
+def _poses(arm: Arm) -> Array:
+    low, high = np.nan_to_num([arm.lower, arm.upper], neginf=-np.pi, posinf=np.pi)
+    return np.random.default_rng(0).uniform(low, high, (POSES, arm.n))
+
+
+def _mass_error(arm_file: ArmFile, model: ModelArm) -> SetupFinding | None:
+    mass, where = float(model.mass.sum()), str(arm_file.model_path)
+    if mass < NO_MASS:
+        return SetupFinding(
+            "error",
+            "the model states no masses, so there is no gravity to calibrate with or to simulate",
+            where,
+            "give the links the masses and centres of mass that the maker states (URDF: inertial), or use a "
+            "model that has them",
+        )
+    last = 2 * float(np.linalg.norm(model.beta[-2:])) / max(float(model.mass[-1]), NO_MASS)
+    length = float(reach(model.arm, max(HAND, last))[0])
+    if LIGHTEST < mass / length**3 < HEAVIEST:
+        return None
+    usual = f"arms of this size weigh {_usual(LIGHTEST, length)} to {_usual(HEAVIEST, length)} kg"
+    return SetupFinding(
+        "error",
+        f"the moving links weigh {mass:.3g} kg at a reach of {length:.2g} m, but {usual}",
+        where,
+        "write masses in kg and lengths in m",
+    )
+
+
+def _usual(density: float, length: float) -> str:
+    return f"{float(f'{density * length**3:.1g}'):g}"
+
+
+def _strength_errors(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
+    most = DriveLimits.of(arm_file).max_torque
+    for name, need, limit in zip(model.arm.names, gravity_need(model), most, strict=True):
+        if need > limit:
+            what = (
+                f"according to the model, gravity needs up to {need:.3g} N·m, but max_torque is {limit:g} N·m: "
+                "the arm would fall"
+            )
+            yield SetupFinding("error", what, name, "check the model's masses and max_torque, or narrow the ranges")
+
 
 SMALL_LEVER = 0.2
 """Γ/g below which the torque gain becomes imprecise; a choice."""

@@ -9,13 +9,12 @@ from armlink.arm_file import ArmFile
 from armlink.drives.findings import SetupFinding
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm, model_chain
 from calib.arm.sweep_section import sweep_motion, sweep_section
-from calib.commissioning.model_judgement import gravity_need
-from calib.plan.bias_torque import pressable_joints
+from calib.commissioning.model_checks import gravity_need
 from calib.plan.collisions import check_plan
 from calib.plan.creep_plan import plan_creep
-from calib.plan.poses import sweep_range
 from calib.plan.rough_gravity import GravityGuess, guess_of_model
 from calib.plan.stop_selection import stop_combinations
+from calib.plan.sweep_options import pressable_joints, sweep_range
 from calib.plan.sweep_plan import plan_sweep
 from gcomp.arm.load import ModelArm, joint_inertias
 
@@ -68,7 +67,6 @@ def motion_findings(arm_file: ArmFile) -> Iterator[SetupFinding]:
 
 
 def _strength(arm_file: ArmFile, model: ModelArm) -> Iterator[SetupFinding]:
-    """Joints whose drives can hold the arm and do little more."""
     limits = DriveLimits.of(arm_file)
     for name, need, most in zip(model.arm.names, gravity_need(model), limits.max_torque, strict=True):
         if need <= most < TORQUE_RESERVE * need:

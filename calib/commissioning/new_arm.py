@@ -10,14 +10,11 @@ from armlink.content.atomic_file import write_whole
 from armlink.content.file_content import parse_yaml
 from armlink.drives.findings import FoundDrives, SetupFinding
 from armlink.errors import BadInput
-from calib.commissioning.arm_text import arm_text
-from calib.commissioning.chain import Chain, find_chains
+from calib.commissioning.chain import Chain, ModelJoint, find_chains, model_joints
 from calib.commissioning.clear_range import clear_ranges, sweep_problem
-from calib.commissioning.draft import Draft, draft_of_model, narrow
+from calib.commissioning.draft import Draft, arm_text, draft_of_model, narrow
 from calib.commissioning.drive_match import Ask
-from calib.commissioning.model_checks import file_findings
-from calib.commissioning.model_joints import ModelJoint, model_joints
-from calib.commissioning.model_judgement import model_errors
+from calib.commissioning.model_checks import file_findings, model_errors
 from calib.commissioning.wiring import match_drives, wired_text
 
 

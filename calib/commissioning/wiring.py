@@ -16,10 +16,17 @@ from armlink.drives.findings import FoundDrive, FoundDrives, SetupFinding
 from armlink.errors import BadInput, BusFault
 from armlink.link.link import Link
 from calib.arm.kinematics import gcomp_arm
-from calib.commissioning.arm_text import NO_BUS
-from calib.commissioning.bus_arm import drive_notes, with_gains
-from calib.commissioning.bus_checks import another_drive
-from calib.commissioning.drive_match import Ask, Match, TurnedJoint, match_by_hand, match_in_order
+from calib.commissioning.doctor import another_drive
+from calib.commissioning.draft import NO_BUS
+from calib.commissioning.drive_match import (
+    Ask,
+    Match,
+    TurnedJoint,
+    drive_notes,
+    match_by_hand,
+    match_in_order,
+    with_gains,
+)
 from calib.commissioning.motion_checks import largest_inertias
 
 PLACES = ("node", "id", "reply", "direction", "zero")

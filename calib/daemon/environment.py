@@ -16,6 +16,10 @@ from armlink.link.types import Controller
 from armlink.loop.driver import Controllers
 
 T = TypeVar("T")
+CLOSING_SECONDS = 2.0
+"""Time that each of the threads, and the clients of the web part, have at the end [s]."""
+RETRY_SECONDS = 1.0
+"""Time from a failure of a disk or a database to the next attempt [s]."""
 
 
 class RunAside(Protocol):
@@ -49,8 +53,6 @@ class Immediate:
 
 
 class BusAccess(Protocol):
-    """Access to the bus loop."""
-
     @property
     def controllers(self) -> Controllers:
         """Reads and writes the calibration of every joint; waits for the answer, so only for work that runs aside."""

@@ -9,11 +9,10 @@ from datetime import UTC, datetime
 from typing import TextIO
 
 from armlink.content.printable_text import printable_json, printable_text
+from calib.daemon.environment import CLOSING_SECONDS
 
 MOST_LINES = 10_000
 """Lines that wait for a reader of stderr that takes none; further ones are dropped."""
-DRAIN_SECONDS = 2.0
-"""Time at the end for the lines that wait [s]."""
 _KNOWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 
 
@@ -53,7 +52,7 @@ class LineQueue:
         self._to = to
         self._lines = queue.Queue[str](MOST_LINES)
         threading.Thread(target=self._run, name="log", daemon=True).start()
-        atexit.register(self.drain, DRAIN_SECONDS)
+        atexit.register(self.drain, CLOSING_SECONDS)
 
     def write(self, text: str) -> None:
         try:

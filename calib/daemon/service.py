@@ -21,7 +21,7 @@ from pathlib import Path
 from armlink.arm_file import ArmFile
 from armlink.loop.kept_arm import KeptMessage
 from armlink.loop.messages import Batch, Down, Progress, Stopped, Up
-from calib.daemon.environment import BusJobs, Environment
+from calib.daemon.environment import CLOSING_SECONDS, BusJobs, Environment
 from calib.daemon.observation.active_records import ActiveRecords
 from calib.daemon.observation.daily_diagnosis import DailyDiagnosis
 from calib.daemon.observation.observation import ActiveObservation, ObserverFeed, ObserverStorage
@@ -40,8 +40,6 @@ from calib.records.store import RecordStore
 
 FLUSH_SECONDS = 25.0
 """Time that the disk has at the end for what is not written yet [s]: one fsync of 10 s under way, one more."""
-CLOSING_SECONDS = 2.0
-"""Likewise for closing the journal, which SQLite tidies up for that; a file that was not closed is whole too [s]."""
 
 log = logging.getLogger("armlink.daemon")
 
@@ -108,7 +106,6 @@ class Service:
         return self.journal.trouble or self.records.store_fault
 
     def take(self, message: KeptMessage) -> None:
-        """Route one message of the bus loop."""
         if isinstance(message, Batch):
             self.arm_state.heard(message)
             self.window.append(message)

@@ -11,13 +11,15 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from armlink.link.joints.groups import state_name
-from calib.arm.skeleton import skeleton
+from calib.arm.kinematics import gcomp_arm, model_chain
 from calib.daemon import view
 from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.service import Service
 from calib.daemon.state.events import Client
 from calib.daemon.state.journal_rows import HistoryReader
 from calib.daemon.view import Decisions, DrawnArm, DrawnJoint, NoSuch, Window
+from gcomp.arm.arm import Arm
+from gcomp.arm.load import PlacedChain
 from gcomp.arrays import Array
 
 
@@ -64,20 +66,18 @@ class ServiceView:
         )
 
     def joints(self) -> tuple[view.JointNow, ...]:
-        names, arm_state = self._service.configuration.names, self._service.arm_state
-        batch = arm_state.batch
-        if batch is None:
-            missing = np.full(len(names), math.nan)
-            columns = (names, missing, missing, missing, missing, ["unknown"] * len(names), missing)
-            return tuple(_joint(*column) for column in zip(*columns, strict=True))
-        position, torque = batch.channels["position"][-1], batch.channels["torque"][-1]
-        torque, model = self._torques(position[None], torque[None])
-        temperature = np.full(len(names), math.nan) if batch.temperature is None else batch.temperature
-        arm = self._service.configuration.arm
-        states = [state_name(arm, joint, code) for joint, code in enumerate(batch.status.tolist())]
-        ages = batch.age + arm_state.late
-        columns = (names, position, torque[0], model[0], temperature, states, ages)
-        return tuple(_joint(*column) for column in zip(*columns, strict=True))
+        arm, arm_state = self._service.configuration.arm, self._service.arm_state
+        batch, names = arm_state.batch, arm.joint_names
+        position = torque = temperature = ages = np.full(len(names), math.nan)
+        states = ["unknown"] * len(names)
+        if batch is not None:
+            position, torque = batch.channels["position"][-1], batch.channels["torque"][-1]
+            temperature = temperature if batch.temperature is None else batch.temperature
+            states = [state_name(arm, joint, code) for joint, code in enumerate(batch.status.tolist())]
+            ages = batch.age + arm_state.late
+        (torque,), (model,) = self._torques(position[None], torque[None])
+        columns = zip(names, position, torque, model, torque - model, temperature, states, ages, strict=True)
+        return tuple(view.JointNow(**dict(zip(view.JointNow.model_fields, column, strict=True))) for column in columns)
 
     def window(self, seconds: float, most: int) -> Window:
         """Readings of the last `seconds`, thinned evenly to at most `most` rows; the model's torque is today's."""
@@ -126,10 +126,10 @@ class ServiceView:
                 offset_std=estimate.offset_std[j],
                 samples=estimate.accepted[j],
                 last_accepted=last_accepted.get(name),
-                installed_gain=_number(gain[j]),
-                installed_offset=_number(offset[j]),
-                gain_limit=_number(limits.gain[j]),
-                offset_limit=_number(limits.offset[j]),
+                installed_gain=gain[j],
+                installed_offset=offset[j],
+                gain_limit=limits.gain[j],
+                offset_limit=limits.offset[j],
                 limit_rests=limits.rests,
             )
             for j, name in enumerate(feed.names)
@@ -186,26 +186,6 @@ class ServiceView:
         return view.BusHealth(connected=bool(arm_state.connected), fault=fault, **counted)
 
 
-def _number(value: float) -> float | None:
-    value = float(value)
-    return value if math.isfinite(value) else None
-
-
-def _joint(
-    name: str, position: float, torque: float, model: float, temperature: float, state: str, age: float
-) -> view.JointNow:
-    return view.JointNow(
-        joint=name,
-        position=_number(position),
-        torque=_number(torque),
-        model_torque=_number(model),
-        residual=_number(torque - model),
-        temperature=_number(temperature),
-        state=state,
-        sample_age_s=_number(age),
-    )
-
-
 def _point(
     joint: str, j: int, time: datetime, t: float, record: str | None, estimate: dict[str, list[float]]
 ) -> view.HistoryPoint | None:
@@ -217,17 +197,63 @@ def _point(
         return None
 
 
-def drawn_arm(arm: ArmFile) -> DrawnArm:
-    """The arm of an arm file; reads its model file, if it has one, and raises BadInput or OSError if it cannot."""
-    drawn = skeleton(arm)
-    columns = zip(
-        arm.joint_names,
-        drawn.axes.tolist(),
-        drawn.points.tolist(),
-        drawn.reference.tolist(),
-        (link.tolist() for link in drawn.links),
-        strict=True,
-    )
-    keys = ("joint", "axis", "point", "reference", "link")
-    joints = tuple(DrawnJoint.model_validate(dict(zip(keys, column, strict=True))) for column in columns)
-    return DrawnArm.model_validate({"up": drawn.up.tolist(), "joints": joints})
+def drawn_arm(arm_file: ArmFile) -> DrawnArm:
+    """The arm of an arm file, in the base frame, or its model's world frame; raises BadInput or OSError.
+
+    At joint positions q, link i stands where the rotations by q_j − reference_j about axes j ≤ i bring it, the last
+    one first.
+    """
+    arm = gcomp_arm(arm_file)  # which also says what is wrong with a model file
+    if arm_file.model_path is None:
+        gravity, reference, (axes, links) = arm.gravity, np.zeros(arm.n), _of_rows(arm)
+    else:
+        placed = model_chain(arm_file)
+        gravity, reference, (axes, links) = placed.model.opt.gravity, placed.reference, _of_model(placed)
+    if len(links[-1]) < 2:  # a last link without length gets a stub of 8 cm
+        links[-1] = np.stack([links[-1][0], links[-1][0] + 0.08 * axes[-1]])
+    size = float(np.linalg.norm(gravity))
+    up = -gravity / size if size > 0 else np.array([0.0, 0.0, 1.0])
+    joints = [
+        {"joint": name, "axis": axis.tolist(), "point": link[0].tolist(), "reference": zero, "link": link.tolist()}
+        for name, axis, zero, link in zip(arm.names, axes, reference, links, strict=True)
+    ]
+    return DrawnArm(up=up.tolist(), joints=tuple(map(DrawnJoint.model_validate, joints)))
+
+
+def _of_rows(arm: Arm) -> tuple[Array, list[Array]]:
+    """Axes and links of Denavit-Hartenberg rows: a link leads along its joint's axis by d, then along x by a."""
+    rotation, origin = np.eye(3), np.zeros(3)
+    axes, links = np.empty((arm.n, 3)), []
+    for i in range(arm.n):
+        axes[i] = rotation[:, 2]
+        rotation = rotation @ _turn(arm.theta_offset[i], 2)
+        foot = origin + arm.d[i] * rotation[:, 2]
+        end = foot + arm.a[i] * rotation[:, 0]
+        links.append(_corners(origin, foot, end))
+        rotation, origin = rotation @ _turn(arm.alpha[i], 0), end
+    return axes, links
+
+
+def _of_model(placed: PlacedChain) -> tuple[Array, list[Array]]:
+    """Axes and links: straight from joint to joint, the last link to the body of it that is farthest away."""
+    anchors, ends = placed.anchors, [placed.data.xpos[body] for body in placed.bodies[-1]]
+    tip = max(ends, key=lambda end: float(np.linalg.norm(end - anchors[-1])))
+    links = [_corners(start, end) for start, end in zip(anchors, [*anchors[1:], tip], strict=True)]
+    return placed.geometry.bar[:, :, 2], links
+
+
+def _corners(*points: Array) -> Array:
+    """The points without those that repeat the one before."""
+    kept = [points[0]]
+    for point in points[1:]:
+        if np.linalg.norm(point - kept[-1]) > 1e-6:
+            kept.append(point)
+    return np.array(kept)
+
+
+def _turn(angle: float, axis: int) -> Array:
+    """Rotation matrix about the x (0) or z (2) axis."""
+    c, s = np.cos(angle), np.sin(angle)
+    if axis == 0:
+        return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

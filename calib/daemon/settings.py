@@ -110,8 +110,6 @@ class Configuration:
 
 @dataclass(frozen=True)
 class Options:
-    """Options of `armlink daemon`."""
-
     arm: str
     bus: str | None = None
     listen_only: bool = False

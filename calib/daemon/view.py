@@ -9,10 +9,11 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field
 
 from gcomp.arrays import Array
 
@@ -31,6 +32,8 @@ ProposalState = Literal["pending", "approved", "applied", "rejected", "failed", 
 
 
 Vector = tuple[float, float, float]
+Number = Annotated[float | None, BeforeValidator(lambda value: value if value is None or isfinite(value) else None)]
+"""None for NaN and infinities, which JSON does not have."""
 
 
 class Answer(BaseModel):
@@ -103,19 +106,19 @@ class JointNow(Answer):
     """One joint of GET /api/joints, and of the stream."""
 
     joint: str
-    position: float | None
+    position: Number
     """[rad]"""
-    torque: float | None
+    torque: Number
     """Sensor as the controller calibrates it [N·m]."""
-    model_torque: float | None
+    model_torque: Number
     """Gravity model at this position [N·m]."""
-    residual: float | None
+    residual: Number
     """Torque minus model torque [N·m]; meaningful at rest."""
-    temperature: float | None = None
+    temperature: Number = None
     """Of the drive [°C]; None if it does not tell it."""
     state: str
     """State of the drive in words; "unknown" before its first reading."""
-    sample_age_s: float | None
+    sample_age_s: Number
     """Time since position and torque last arrived; None if they never did."""
 
 
@@ -131,12 +134,12 @@ class JointEstimate(Answer):
     samples: int
     """Rests of the arm used for the estimate."""
     last_accepted: AwareDatetime | None
-    installed_gain: float | None
+    installed_gain: Number
     """Gain and offset [N·m] of the record in force."""
-    installed_offset: float | None
-    gain_limit: float | None = None
+    installed_offset: Number
+    gain_limit: Number = None
     """Smallest change of gain that would be noticed now, relative; None if gravity does not load the joint."""
-    offset_limit: float | None = None
+    offset_limit: Number = None
     """Smallest change of offset that would be noticed now [N·m]."""
     limit_rests: int | None = None
     """Rests at other poses after which changes of this size are noticed; larger ones are sooner."""

@@ -2,12 +2,12 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from calib.fit.findings import FitFinding
 from calib.records.records import (
     PARAMETERS,
     CalibrationRecord,
@@ -26,8 +26,52 @@ VERY_STRONG_EVIDENCE = 10.0
 """BIC difference that counts as decided: odds of 150 to 1 (docs/theory.md, 4.3 and 6.4)."""
 SIGNIFICANCE = 5.0
 """A change or an effect counts only if it is this many standard deviations (docs/theory.md, 6.6)."""
+NOISE_ROUNDS = 4
+"""Fits, each with the noise that the residuals of the one before show."""
+USUAL_ROWS = 5
+"""Rows that the usual scatter, or what is assumed at first, counts for beside those that are measured."""
+LOOSEST_GAIN = 0.02
+"""Standard deviation of a gain, as a share of it, above which it is of no use."""
 NOMINAL: dict[Parameter, float] = {"position_gain": 1.0, "position_offset": 0.0}
 """Values of position sensors that were not fitted."""
+
+
+Kind = Literal[
+    "spring",
+    "direction",
+    "hysteresis",
+    "nonlinear",
+    "saturation",
+    "drift",
+    "eccentricity",
+    "encoder",
+    "outliers",
+    "scatter",
+    "contact",
+]
+OUTLIER = 6.0
+"""Robust standard deviations of a joint's residuals from which a reading, or a sweep, is not one of the others
+(docs/theory.md, 5.4)."""
+HOLDING: tuple[Kind, ...] = ("direction", "hysteresis", "outliers", "contact")
+"""Findings that the fit removes completely: with them removed the model holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitFinding:
+    """An effect in the readings that the sensor model does not have."""
+
+    joint: str
+    kind: Kind
+    size: float
+    """In `unit`; NaN if no single number describes it."""
+    unit: str
+    text: str
+    """One sentence for the user."""
+
+    @property
+    def breaks_model(self) -> bool:
+        """Whether the joint's values must not be used as they are."""
+        return self.kind not in HOLDING
 
 
 class FittedCalibration(ABC):

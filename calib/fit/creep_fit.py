@@ -13,13 +13,19 @@ from armlink.torque_calibration import GAIN_RANGE
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import sweep_section
 from calib.dataset import SweepData, digests
-from calib.fit.calibration import FittedCalibration
-from calib.fit.findings import FitFinding
+from calib.fit.calibration import LOOSEST_GAIN, NOISE_ROUNDS, FitFinding, FittedCalibration
+from calib.fit.creep_residuals import (
+    SPRING_SHARE,
+    Scatter,
+    contact_finding,
+    disturbed_sweep,
+    ripple_cycles,
+    scatter,
+    springs,
+)
 from calib.fit.gravity_fit import GravityFit
-from calib.fit.pushes import SPRING_SHARE, contact_finding, disturbed_sweep, ripple_cycles, springs
-from calib.fit.scatter import NOISE_ROUNDS, Scatter, scatter
 from calib.fit.sweep_readings import SweepReadings, sweep_readings
-from calib.plan.levers import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
+from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.records.records import MotorTorque, Parameter
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array, Mask
@@ -28,8 +34,6 @@ from gcomp.identify.motor_model import HARMONICS, LAST_ZERO, MotorDoubt, MotorMo
 
 SEEN = 0.3
 """A parameter is found if the data leave so much of what was doubted beforehand, as a share of it."""
-LOOSEST = 0.02
-"""Largest standard deviation of a gain that is of use, as a share of it."""
 LEAST_COULOMB = 1e-3
 """Least friction that scales its unevenness, as a share of rated torque."""
 ASSUMED = 4.0
@@ -71,7 +75,6 @@ class CreepFit(FittedCalibration):
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """Place of each family in the vector."""
         return family_slices(self.arm.n)
 
     def estimate(self, parameter: str) -> tuple[Array, Array]:
@@ -92,7 +95,7 @@ class CreepFit(FittedCalibration):
         """Gains that the data determine (n,); without a mass none, since nothing tells the scale."""
         value, std = self.estimate("gain")
         low, high = GAIN_RANGE
-        sure = (std < SEEN * self.prior_std[self.slices["gain"]]) & (std < LOOSEST * np.abs(value))
+        sure = (std < SEEN * self.prior_std[self.slices["gain"]]) & (std < LOOSEST_GAIN * np.abs(value))
         return np.asarray(sure & (low <= value) & (value <= high) & (self.rows.readings.load > 0).any())
 
     @cached_property

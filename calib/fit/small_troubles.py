@@ -2,6 +2,10 @@
 
 A family is one kind of trouble; its coefficients on all joints are drawn from one normal distribution of unknown
 level. Units are chosen so that a level of 1 is what good arms have.
+
+A sensor's reading lags behind torque, a cable's pull behind the joint's turn, each as a play: it stays until the end of
+the play takes it along. Joints that are held keep the lag that their last change left. What no named trouble explains
+is a Gaussian field over joint positions, as a few columns.
 """
 
 from collections.abc import Iterator
@@ -11,15 +15,114 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from calib.fit.lags import Lags
-from calib.fit.position_field import PositionField
 from calib.fit.sweep_readings import SweepReadings
+from calib.plan.types import APPROACH
 from gcomp.arm.arm import Arm, bar_frames
 from gcomp.arm.mass_moments import base_parameter_names
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import composite_moments
 from gcomp.identify.parameters import Parameters
-from gcomp.identify.sensor_model import joint_positions, row_moments
+from gcomp.identify.readings import StaticReadings
+from gcomp.identify.sensor_model import joint_positions, predict, row_moments
+
+FIELD_REST = 1e-2
+"""Share of the field's variance that may be left out of its columns; it is added to the noise by the caller."""
+
+
+@dataclass(frozen=True, eq=False)
+class PositionField:
+    """A field of unit level, expanded in landmark poses: φ(q) φ(q')ᵀ = its covariance, up to FIELD_REST."""
+
+    landmarks: Array
+    """Poses (L, n) [rad]."""
+    length: float
+    """Distance over which the field is alike [rad]."""
+    root: Array
+    """Inverse of the Cholesky factor of the landmarks' covariance (L, L)."""
+
+    @classmethod
+    def over(cls, poses: Array, length: float) -> "PositionField":
+        """The field for poses (K, n) [rad], by pivoted Cholesky decomposition."""
+        chosen, left = list[int](), np.ones(len(poses))
+        rows = np.zeros((0, len(poses)))
+        while len(chosen) < len(poses) and left.max() > FIELD_REST:
+            pivot = int(np.argmax(left))
+            row = kernel(poses[pivot : pivot + 1], poses, length)[0] - rows[:, pivot] @ rows
+            row /= np.sqrt(left[pivot])
+            rows = np.vstack([rows, row])
+            left = left - row**2
+            left[[*chosen, pivot]] = 0.0
+            chosen.append(pivot)
+        landmarks = poses[chosen]
+        square = kernel(landmarks, landmarks, length) + 1e-9 * np.eye(len(chosen))
+        return cls(landmarks, length, np.linalg.inv(np.linalg.cholesky(square)))
+
+    def columns(self, poses: Array) -> Array:
+        """φ at poses (K, n) → (K, L)."""
+        columns: Array = kernel(poses, self.landmarks, self.length) @ self.root.T
+        return columns
+
+
+def kernel(one: Array, other: Array, length: float) -> Array:
+    """Correlation (K, M) of a field of this length [rad] at poses (K, n) and (M, n) [rad]."""
+    return np.asarray(np.exp(-squared_distance(one, other) / (2 * length**2)))
+
+
+def squared_distance(one: Array, other: Array) -> Array:
+    """Squared distance (K, M) of poses: Σ_l (2 sin(Δ_l/2))² = 2 Σ_l (1 − cos Δ_l), a turn of a joint being none."""
+    cos, sin = np.cos(one) @ np.cos(other).T, np.sin(one) @ np.sin(other).T
+    distance: Array = np.maximum(2 * (one.shape[1] - cos - sin), 0.0)
+    return distance
+
+
+TURNS = (0.1, 0.3, 0.8)
+"""Half widths of a cable's play in a joint's turn [rad]: short and long ones, between which real ones lie; the longest
+for a cable that this joint bends less than another."""
+TORQUE = 5e-4
+"""Half width of a sensor's play, as a share of rated torque: accuracy class 0.05."""
+STEPS = 4
+"""Points on a straight way at which the torque is computed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lags:
+    """Place of each play at K readings, -1 to 1; all zeros where the way is not known."""
+
+    cable: Array
+    """Of each of TURNS and joint (3, K, n)."""
+    sensor: Array
+    """Of each joint's torque sensor (K, n)."""
+
+    @classmethod
+    def unknown(cls, count: int, n: int) -> "Lags":
+        """Of readings whose way is not known."""
+        return cls(np.zeros((len(TURNS), count, n)), np.zeros((count, n)))
+
+    @classmethod
+    def of(cls, arm: Arm, rows: SweepReadings, parameters: Parameters, rated: Array) -> "Lags":
+        """On straight ways between the readings, each approached from the side that it tells; rated (n,) [N·m]."""
+        position, load = rows.readings.position, rows.readings.load
+        approach = position - APPROACH * rows.readings.direction * rows.own
+        way = np.stack([approach, position], axis=1).reshape(-1, arm.n)
+        cable = np.array([play(way, np.full(arm.n, width))[1::2] for width in TURNS])
+        before = np.vstack([way[:1], way[:-1]])
+        shares = np.arange(1, STEPS + 1) / STEPS
+        finer = (before[:, None] + shares[:, None] * (way - before)[:, None]).reshape(-1, arm.n)
+        nothing = np.zeros((len(finer), arm.n))
+        loads = np.repeat(load, 2 * STEPS)
+        torque = predict(arm, parameters, StaticReadings.of(finer, nothing, 1.0, loads)) - parameters.offset
+        sensor = play(torque / np.where(parameters.gain == 0, 1.0, parameters.gain), TORQUE * rated)
+        return cls(cable, -sensor[2 * STEPS - 1 :: 2 * STEPS])
+
+
+def play(values: Array, half: Array) -> Array:
+    """How far values (K, n), one after the other, are ahead of a play of half widths (n,), in these (K, n)."""
+    held, ahead = values[0].copy(), np.empty_like(values)
+    for row, value in enumerate(values):
+        held = np.minimum(np.maximum(held, value - half), value + half)
+        ahead[row] = value - held
+    return ahead / half
+
 
 UNITS = {
     "axes": (6e-4, "rad"),
@@ -71,8 +174,6 @@ class Troubles:
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Inputs of the columns beside the readings."""
-
     arm: Arm
     rated: Array
     """Rated torques (n,) [N·m]."""

@@ -15,8 +15,7 @@ from armlink.loop.driver import ArmDriver
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import SweepSection
 from calib.motion.encoder_check import EncoderCheck
-from calib.motion.settle_rule import SettleRule
-from calib.motion.static_reading import StaticReading, average, stack
+from calib.motion.static_reading import SettleRule, StaticReading, average, stack
 from calib.motion.trajectory import trajectory
 from gcomp.arrays import Array, Mask
 
@@ -156,7 +155,6 @@ class Mover:
         self.command.guard = ReadingBounds(lower, upper, np.full(self.link.n, np.inf)) if self.pressed.any() else None
 
     def hold_all(self) -> None:
-        """Every joint under position control where it stands."""
         self.pressed[:] = False
         self.side[:] = 0.0
         self.command.guard = None

@@ -15,8 +15,6 @@ INITIAL_GAIN_STD = 5e-3
 """Standard deviation of a gain just installed: the accuracy asked of a calibration."""
 INITIAL_OFFSET_STD = 0.05
 """Standard deviation of an offset just installed [N·m]: likewise."""
-NOISE_ROWS = 5
-"""Rows that the standard deviation of a row assumed at first counts for; then it is measured."""
 LONGEST_GAP = 0.05
 """A rest or a stretch of motion with samples missing for longer starts again [s]: 12 cycles at 250 Hz."""
 AUDIT_ROWS = 10

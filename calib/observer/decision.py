@@ -1,6 +1,6 @@
-"""From a drift verdict to a finding that may be written: the rules at the end of docs/theory.md, section 6."""
+"""From a drift verdict to a finding that may be written: the rules at the end of docs/theory.md, section 6; events."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -72,8 +72,6 @@ class DriftFinding:
 
 @dataclass(frozen=True)
 class Agreeing:
-    """Rows that agree on a drift of these joints."""
-
     rows: list[StaticReading]
     test: CauseTest
     joints: frozenset[int]
@@ -162,3 +160,39 @@ def _joints_alike(test: CauseTest, joint: int) -> int:
         np.abs(changes - changes[joint]) <= 3 * np.hypot(stds, stds[joint])
     )
     return int(alike.sum())
+
+
+@dataclass(frozen=True)
+class Event:
+    """One event. `kind`: alarm, outliers, verdict, proposal or undecided."""
+
+    t: float
+    kind: str
+    joint: str | None
+    evidence: dict[str, Any] = field(default_factory=dict)
+    finding: DriftFinding | None = None
+    """The change to write, for a proposal."""
+
+
+def verdict_evidence(verdict: Verdict, names: tuple[str, ...]) -> dict[str, Any]:
+    """A verdict as the evidence of an event: cause, confidence, BIC of the other classes, parameters.
+
+    A payload has `mass` [kg] and `com`, its centre of mass in the last link's bar frame [m]; None if no lever shows it.
+    """
+    beside: dict[str, Any] = {} if verdict.beside is None else {"beside": names[verdict.beside]}
+    if verdict.cause in ("payload", "tool"):  # parameters: mass and first moment
+        mass, (shown, *told) = float(verdict.values[0]), (np.diag(verdict.covariance) > 0).tolist()
+        known = [shown and each for each in told]
+        place = [
+            moment / mass if here else None for moment, here in zip(verdict.values[1:].tolist(), known, strict=True)
+        ]
+        beside = {"mass": mass if shown else None, "com": place}
+    return {
+        "cause": verdict.cause,
+        **beside,
+        "confidence": verdict.confidence,
+        "bic": verdict.evidence,
+        "values": verdict.values.tolist(),
+        "std": np.sqrt(np.diag(verdict.covariance)).tolist(),
+        "rivals": list(verdict.rivals),
+    }

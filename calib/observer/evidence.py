@@ -27,7 +27,6 @@ class ChangeHypothesis:
 
     @property
     def parameters(self) -> int:
-        """Number of parameters charged in the BIC."""
         return self.columns.shape[1] if self.price is None else self.price
 
 
@@ -106,7 +105,6 @@ class ResidualTest:
         return [(each.cause, each.joint) for each in self.hypotheses].index((cause, joint))
 
     def fit(self, *indices: int) -> ChangeFit:
-        """Least squares of hypotheses together."""
         columns = np.hstack([self.columns[index] for index in indices])
         return self.fit_columns([self.hypotheses[index] for index in indices], columns, self.residual)
 

@@ -11,20 +11,17 @@ from typing import Any
 import numpy as np
 
 from calib.motion.static_reading import StaticReading
-from calib.observer.audit import DOUBTED, audit, is_confirmed, may_adapt
 from calib.observer.cause_test import CauseTest, DetectionLimits
 from calib.observer.config import AUDIT_ROWS, LONGEST_WINDOW, ObserverConfig
-from calib.observer.decision import Agreeing, DriftFinding, decide, windows_agree
-from calib.observer.discrepancy.level import DiscrepancyLevel
-from calib.observer.events import Event, verdict_evidence
+from calib.observer.decision import Agreeing, DriftFinding, Event, decide, verdict_evidence, windows_agree
+from calib.observer.discrepancy import DiscrepancyLevel
 from calib.observer.evidence import Verdict
 from calib.observer.gravity_belief import GravityBelief
-from calib.observer.investigation import Investigation
-from calib.observer.motion.observer import MovingObserver
+from calib.observer.investigation import DOUBTED, Investigation, audit, is_confirmed, may_adapt
+from calib.observer.moving_observer import MovingObserver
 from calib.observer.rest_detector import RestDetector
 from calib.observer.saved_values import UNREADABLE, restored
-from calib.observer.tracking.sensor_filter import Estimate
-from calib.observer.tracking.tracking import Tracking
+from calib.observer.tracking import Estimate, Tracking
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arm.arm import Arm
 from gcomp.arrays import Array
@@ -133,7 +130,6 @@ class Observer:
         return []
 
     def estimate(self) -> Estimate:
-        """Current gain and offset of every joint against the installed calibration."""
         return self._tracking.filter.estimate()
 
     def limits(self) -> DetectionLimits:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from armlink.errors import Refused
 from armlink.link.types import Command, Sample
 from armlink.loop.driver import ArmDriver
-from calib.observer.events import Event
+from calib.observer.decision import Event
 from calib.observer.observer import Observer
 from calib.observer.recalibrator import Recalibration, Recalibrator
 from gcomp.arrays import Array

@@ -28,8 +28,6 @@ class Collided(Refused):
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Two bodies that overlap."""
-
     bodies: Pair
     depth: float
     """[m]"""

@@ -1,4 +1,8 @@
-"""Plan of a pass of creep sweeps, tip to base: free of collisions, within the drives' torque."""
+"""Plan of a pass of creep sweeps, tip to base: free of collisions, within the drives' torque.
+
+Of the creeps that are possible, those are chosen whose poses of the other joints leave the torque constants least
+uncertain.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,24 +14,94 @@ from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits, gcomp_arm, model_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
 from calib.plan.collisions import POINTS, Geometry
-from calib.plan.creep_design import CreepCandidate, choose
-from calib.plan.levers import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
 from calib.plan.plan_limits import ROUNDING, PoseBounds, refuse_unfit, require_bounds
-from calib.plan.poses import require_range
+from calib.plan.rough_gravity import NO_LEVER, SHORTEST, VERTICAL, is_vertical, known_lever
+from calib.plan.sweep_options import require_range
+from calib.plan.sweep_plan import MASS_SHARES
 from calib.plan.types import Side, Sweep, SweepPlan
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array
+from gcomp.estimate.posterior import invert
 from gcomp.gravity.torque import gravity_levers, gravity_regressor
+from gcomp.identify.motor_model import MotorDoubt, MotorModel, family_slices
+from gcomp.identify.readings import StaticReadings
+
+SCATTER_SHARE = 0.003
+"""Scatter of a row, as a share of rated torque, that the choice assumes."""
+BINS = 10
+"""Rows per direction with which a candidate is judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class CreepCandidate:
+    """One creep: the other joints' poses, and both ends of the joint's way."""
+
+    joint: int
+    rest: Array
+    """(n,) [rad]; the creeping joint's entry is not used."""
+    lower: float
+    """[rad]."""
+    upper: float
+    """[rad]."""
+
+    def poses(self, count: int) -> Array:
+        """Poses along the way (count, n) [rad]."""
+        poses = np.tile(self.rest, (count, 1))
+        poses[:, self.joint] = np.linspace(self.lower, self.upper, count)
+        return poses
+
+
+def choose(
+    arm: Arm, beta: Array, rated: Array, candidates: list[list[CreepCandidate]], count: int, speeds: tuple[float, ...],
+    mass: float, doubt: MotorDoubt,
+) -> tuple[list[list[CreepCandidate]], Array]:  # fmt: skip
+    """(`count` candidates of each list, tip to base; standard deviations of the gains that they promise (n,)).
+
+    Greedy: each choice makes the sum of the gains' variances least, with one pass without and one with the mass [kg].
+    beta (2n,) [kg·m] is a guess of the mass moments.
+    """
+    mean, std = doubt.prior(arm, rated, True, 0.02 * rated)
+    x, at = mean.copy(), family_slices(arm.n)
+    x[at["beta"]], x[at["coulomb"]], x[at["load"]] = beta, 0.02 * rated, 0.05
+    information = np.diag(1 / std**2)
+    rows = [[_information(arm, x, one, speeds[0], mass, rated) for one in each] for each in candidates]
+    chosen: list[list[CreepCandidate]] = [[] for _ in candidates]
+    gains = at["gain"]
+    for _ in range(count):
+        for place, each in enumerate(candidates):
+            costs = [float(np.diag(invert(information + one))[gains].sum()) for one in rows[place]]
+            best = int(np.argmin(costs))
+            information = information + rows[place][best]
+            chosen[place].append(each[best])
+    return chosen, np.sqrt(np.diag(invert(information))[gains])
+
+
+def _information(arm: Arm, x: Array, one: CreepCandidate, speed: float, mass: float, rated: Array) -> Array:
+    """Information of a creep both ways, without and with the mass (P, P)."""
+    poses = np.tile(one.poses(BINS), (4, 1))
+    side, loads = np.repeat([1.0, -1.0, 1.0, -1.0], BINS), np.repeat([0.0, 0.0, mass, mass], BINS)
+    own = np.arange(arm.n) == one.joint
+    readings = StaticReadings(
+        poses,
+        np.where(own, 0.0, np.nan) * np.ones((len(poses), 1)),
+        np.ones(arm.n),
+        load=loads,
+        velocity=np.outer(side * speed, own),
+        warmth=np.outer(np.repeat([-10.0, -10.0, -5.0, -5.0], BINS), own),
+    )
+    _, jacobian = MotorModel(arm, readings).linearised(x)
+    jacobian /= SCATTER_SHARE * rated[one.joint]
+    information: Array = jacobian.T @ jacobian
+    return information
+
 
 CANDIDATES = 24
 """Creeps of each joint among which the plan chooses."""
 DRAWS = 40
 """Draws for each candidate before too much of the range counts as blocked."""
-MASS_SHARE = 0.3
-"""Share of max_torque that the reference mass may take at the joint that it loads most."""
 BLIND_SHARE = 0.15
-"""The same where no model file tells what the arm itself weighs."""
+"""Share of max_torque that the reference mass may take where no model file tells what the arm itself weighs."""
 WORST_CONSTANT = 1.6
 """A drive may have to be asked for so many times the true torque."""
 TRAVEL_ACCELERATION = 1.5
@@ -91,7 +165,7 @@ class CreepGround:
         at_origin, by_point = payload_columns(self.arm)
         each = gravity_regressor(self.arm, poses)
         per_kg = np.abs(each @ at_origin) + HAND * np.linalg.norm(each @ by_point, axis=-1)
-        share = MASS_SHARE if self.weighed else BLIND_SHARE
+        share = MASS_SHARES[0] if self.weighed else BLIND_SHARE
         most = share * self.limits.max_torque / np.maximum(per_kg.max(axis=0), 1e-9)
         return float(f"{float(most.min()):.2g}")
 

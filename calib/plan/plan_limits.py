@@ -12,8 +12,7 @@ from armlink.arm_file import ArmFile
 from armlink.errors import Refused
 from calib.arm.kinematics import DriveLimits
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.plan.bias_torque import FASTEST, SLOWEST
-from calib.plan.poses import sweep_range
+from calib.plan.sweep_options import FASTEST, SLOWEST, sweep_range
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arrays import Array
 

@@ -121,7 +121,6 @@ def _seconds(candidates: list[Candidates], chosen: list[list[int]], place: int, 
 def _information(
     kinematics: Arm, guess: Parameters, candidates: Candidates, sigma: Array, free: Mask, mass: float
 ) -> Array:
-    """JᵀJ (C, p, p) of each candidate sweep, made without and with the mass."""
     return sweep_information(
         sweep_jacobian(kinematics, guess, candidates.joint, candidates.poses, sigma, free, (0.0, mass))
     )

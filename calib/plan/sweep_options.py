@@ -1,20 +1,89 @@
-"""Stop combinations among which sweeps are chosen: held by the drives, felt by the sensor, free of collisions."""
+"""Stop combinations among which sweeps are chosen: held by the drives, felt by the sensor, free of collisions.
+
+And the torques that press resting joints on their stops, with the accelerations that these allow; ranges of sweeps,
+poses of the scout, and an order of poses with little travel.
+"""
 
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits, gcomp_arm
 from calib.arm.sweep_section import SweepSection, sweep_section
-from calib.plan.bias_torque import hold_torque, pressable_joints
 from calib.plan.collisions import POINTS, Collided, Geometry
-from calib.plan.poses import require_range, sweep_range
 from calib.plan.rough_gravity import GravityGuess
 from calib.plan.stop_selection import Candidates, stop_combinations, with_lever
 from gcomp.arm.arm import Arm
+from gcomp.arrays import Array, Mask
+from gcomp.design.selection import select
+from gcomp.gravity.torque import gravity_regressor
+
+UNKNOWN = 1e-6
+"""Prior information on each parameter: negligible, but it keeps the first poses' matrices regular."""
+Poses = tuple[tuple[float, ...], ...]
+"""(P, n) [rad]"""
+
+
+def sweep_range(section: SweepSection, limits: DriveLimits, joint: int) -> tuple[float, float]:
+    """First and last step [rad] of a joint; the margin grows with the angle, since the position gain is unknown."""
+    low, high = float(limits.lower[joint]), float(limits.upper[joint])
+    margin = section.range_margin
+    return low + margin + 0.02 * abs(low), high - margin - 0.02 * abs(high)
+
+
+def scout_poses(
+    kinematics: Arm,
+    section: SweepSection,
+    limits: DriveLimits,
+    seed: int,
+    geometry: Geometry | None = None,
+) -> Poses:
+    """n + 3 poses that determine mass moments and sensor offsets well, in an order with little travel.
+
+    Poses in which bodies of `geometry` touch are left out; raises BadInput if too few remain.
+    """
+    n = kinematics.n
+    ends = np.array([sweep_range(section, limits, joint) for joint in range(n)])
+    generator = np.random.default_rng(seed)
+    poses = ends[:, 0] + generator.random((300, n)) * (ends[:, 1] - ends[:, 0])
+    if geometry is not None:
+        poses = poses[geometry.free(poses)]
+        if len(poses) < 2 * (n + 3):
+            raise BadInput("almost every pose within the joint ranges collides: narrow lower and upper in the arm file")
+    regressor = gravity_regressor(kinematics, poses)
+    offsets = np.broadcast_to(np.eye(n), (len(poses), n, n))
+    rows = np.concatenate([regressor, 10 * offsets], axis=2) / limits.rated[:, None]
+    information = np.einsum("kip,kiq->kpq", rows, rows)
+    (chosen,) = select([information[None]], UNKNOWN * np.eye(3 * n)[None], [n + 3], exchanges=0)
+    return tuple(tuple(pose.tolist()) for pose in nearest_first(poses[chosen], ends.mean(axis=1)))
+
+
+def nearest_first(poses: Array, begin: Array) -> Array:
+    """The same poses (K, n) [rad], each followed by the nearest of the remaining ones, from `begin` (n,) on."""
+    left, way = list(range(len(poses))), []
+    here = begin
+    while left:
+        nearest = min(left, key=lambda k: float(np.abs(poses[k] - here).max()))
+        left.remove(nearest)
+        way.append(nearest)
+        here = poses[nearest]
+    return poses[way]
+
+
+def require_range(section: SweepSection, limits: DriveLimits, kinematics: Arm) -> None:
+    """Raise BadInput, naming the joint, if a range leaves nothing to sweep."""
+    for joint, name in enumerate(kinematics.names):
+        first, last = sweep_range(section, limits, joint)
+        if not np.isfinite([first, last]).all() or last - first < 0.2:
+            raise BadInput(
+                f"joint {name}: range_margin {section.range_margin} rad leaves nothing of its range "
+                f"{limits.lower[joint]} to {limits.upper[joint]} rad to sweep: check lower and upper, or "
+                "reduce range_margin"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,3 +160,75 @@ def _without_collision(candidates: Candidates, geometry: Geometry, name: str) ->
         f"joint {name}: in every combination of stops two bodies touch, for example {first} and {second}: "
         "narrow lower and upper in the arm file"
     )
+
+
+SLOWEST = 0.3
+"""Acceleration that every planned sweep must allow [rad/s²]: a step of 0.5 rad then takes 2.6 s; a choice."""
+FASTEST = 2.0
+"""Largest acceleration between sweeps [rad/s²]; a choice, swept in tests/campaigns/random_arms.py."""
+
+
+def hold_torque(
+    guess: GravityGuess, section: SweepSection, limits: DriveLimits, poses: Array
+) -> tuple[Array, Array, Array]:
+    """(Least, largest, allowance) holding torque (C, n) [N·m] along candidate sweeps with poses (C, S, n).
+
+    The allowance covers the rough model's error, the torque scale and friction, but not the margin.
+    """
+    torque = guess.torque(poses)
+    doubt = (guess.uncertainty(poses) + section.gain_tolerance * np.abs(torque)).max(axis=1)
+    return torque.min(axis=1), torque.max(axis=1), doubt + section.friction * limits.rated
+
+
+def required_bias(
+    guess: GravityGuess, section: SweepSection, limits: DriveLimits, stops: npt.NDArray[np.int8], poses: Array
+) -> Array:
+    """Size of the torque (C, n) [N·m] that keeps each resting joint pressed along candidate sweeps; 0 if swept."""
+    least, largest, allowance = hold_torque(guess, section, limits, poses)
+    against = np.where(stops > 0, largest, -least)
+    floor = section.bias_margin * limits.max_torque + section.friction * limits.rated
+    needed = np.maximum(against + allowance + section.bias_margin * limits.max_torque, floor)
+    return np.where(stops == 0, 0.0, needed)
+
+
+def pressable_joints(guess: GravityGuess, section: SweepSection, limits: DriveLimits, candidates: Candidates) -> Mask:
+    """Resting joints (C, n) that can be pressed on their stop within max_torque; True for the swept joint."""
+    needed = required_bias(guess, section, limits, candidates.stops, candidates.poses)
+    needed = needed + SLOWEST * reaction_bound(guess, candidates.joint)
+    given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
+    flags: Mask = (needed <= np.minimum(given, limits.max_torque)) | (candidates.stops == 0)
+    return flags
+
+
+def reaction_bound(guess: GravityGuess, joint: int) -> Array:
+    """Bound of the torque (n,) [N·m] at every joint per rad/s² of the swept one: √(M_ii M_jj)."""
+    inertia = guess.inertia()
+    bound: Array = np.sqrt(inertia * inertia[joint])
+    return bound
+
+
+def bias_and_acceleration(
+    needed: Array, spare: Array, reaction: Array, pressed: Mask, section: SweepSection, limits: DriveLimits, joint: int
+) -> tuple[Array, float]:
+    """(Bias size (n,) [N·m], acceleration [rad/s²]), the largest acceleration that every joint's torque allows.
+
+    `spare` (n,) [N·m] is the drives' torque beyond gravity: a servo-held joint resists the swept one's reaction with
+    it, and the swept joint accelerates with half of it.
+    """
+    given = limits.max_torque if section.bias_torque is None else np.array(section.bias_torque)
+    left = np.where(pressed, given - needed, spare)
+    left[joint] = spare[joint] / 2
+    room = left / np.maximum(reaction, 1e-9)
+    acceleration = float(np.clip(room.min(), SLOWEST, section.acceleration))
+    if section.bias_torque is not None:
+        return given, acceleration
+    return np.minimum(needed + acceleration * reaction, limits.max_torque), acceleration
+
+
+def travel_acceleration(limits: DriveLimits, options: list[Candidates], guess: GravityGuess | None) -> float:
+    """Acceleration [rad/s²] that the drives have beyond gravity at the poses between which they travel."""
+    if guess is None:
+        return 1.0
+    poses = np.concatenate([each.poses.reshape(-1, guess.kinematics.n) for each in options])
+    spare = limits.max_torque - np.abs(guess.torque(poses)).max(axis=0)
+    return float(np.clip(np.min(spare / np.maximum(2 * guess.inertia(), 1e-9)), SLOWEST, FASTEST))

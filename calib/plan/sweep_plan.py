@@ -1,4 +1,7 @@
-"""Planning of sweeps: from the arm file alone, then once more with the scout's rough gravity model."""
+"""Planning of sweeps: from the arm file alone, then once more with the scout's rough gravity model.
+
+With that model the precision of a plan is predicted before anything moves: the covariance that the fit would report.
+"""
 
 from collections.abc import Sequence
 
@@ -7,25 +10,91 @@ import numpy as np
 from armlink.arm_file import ArmFile
 from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits
-from calib.plan.bias_torque import (
+from calib.plan.plan_limits import SERVO_GAP
+from calib.plan.rough_gravity import HAND, GravityGuess, reach
+from calib.plan.stop_selection import PRIOR_GAIN, Candidates, StopDesign, guessed_moments
+from calib.plan.sweep_options import (
+    PlannedArm,
+    Poses,
     bias_and_acceleration,
     hold_torque,
     pressable_joints,
     reaction_bound,
     required_bias,
+    scout_poses,
+    sweep_options,
+    sweep_range,
     travel_acceleration,
 )
-from calib.plan.plan_limits import SERVO_GAP
-from calib.plan.poses import Poses, scout_poses, sweep_range
-from calib.plan.predicted_precision import predicted_gain_std, worst_gain_std
-from calib.plan.rough_gravity import HAND, GravityGuess, reach
-from calib.plan.stop_selection import Candidates, StopDesign, guessed_moments
-from calib.plan.sweep_options import PlannedArm, sweep_options
 from calib.plan.types import Sweep, SweepPlan
 from gcomp.arm.arm import Arm
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.arrays import Array, Mask
 from gcomp.gravity.torque import gravity_regressor
+from gcomp.identify.global_fit import predict_covariance
+from gcomp.identify.parameters import Parameters, Prior
+from gcomp.identify.readings import StaticReadings
+
+SIDE = 0.05
+"""Lateral offset at which the reference mass is assumed to hang [m]; a choice."""
+SCATTER = 1.3
+"""Scatter of readings over the noise of their samples, since joints never rest completely: as the fits of
+tests/campaigns/random_arms.py find it."""
+
+
+def predicted_gain_std(
+    guess: GravityGuess,
+    sweeps: Sequence[Sweep],
+    scout: Array,
+    mass: float,
+    sigma: Array,
+    position_offset_std: float,
+    position_sigma: Array | float = 0.0,
+    point: Prior | None = None,
+) -> Array:
+    """Standard deviations (n,) of the torque gains after passes without and with `mass` [kg]; inf if not observable.
+
+    scout (P, n) [rad] are poses at which all sensors count; sigma (n,) [N·m] is that of one reading, position_sigma
+    (n,) [rad] that of its positions; `point` is the prior on the place of the mass.
+    """
+    kinematics = guess.kinematics
+    positions, counted = [scout], [np.ones(scout.shape, dtype=bool)]
+    for sweep in sweeps:
+        poses = np.tile(np.array(sweep.rest), (sweep.readings, 1))
+        poses[:, sweep.joint] = [sweep.target(index)[0] for index in range(sweep.readings)]
+        counts = np.array(sweep.servo)
+        counts[sweep.joint] = True
+        positions.append(poses)
+        counted.append(np.tile(counts, (sweep.readings, 1)))
+    position, counts = np.concatenate(positions), np.concatenate(counted)
+    torque = np.where(counts, 0.0, np.nan)
+    rows = len(position)
+    both = StaticReadings.of(
+        np.concatenate([position, position]),
+        np.concatenate([torque, torque]),
+        SCATTER * sigma,
+        np.repeat([0.0, mass], rows),
+    )
+    unknown = {"gain", "offset", "position_gain", "beta", "rho"}
+    priors = {}
+    if position_offset_std > 0:
+        unknown.add("position_offset")
+        priors["position_offset"] = Prior(0.0, position_offset_std)
+    tip = kinematics.span[-1] + [SIDE, SIDE, 0.0]
+    if point is not None:
+        priors["rho"], tip = point, np.asarray(point.mean, dtype=np.float64)
+    start = Parameters.nominal(kinematics.n, beta=guess.beta, rho=tip)
+    std: Array = predict_covariance(
+        kinematics, both, start, unknown=unknown, priors=priors, position_sigma=position_sigma
+    ).std.gain
+    return std
+
+
+def worst_gain_std(std: Array) -> float:
+    """Largest standard deviation among the gains that averaging can improve; 0 if there is none."""
+    known = std[std < PRIOR_GAIN]  # beyond it more averaging cannot help
+    return float(known.max()) if len(known) else 0.0
+
 
 MASS_SHARES = (0.3, 0.5, 0.7)
 """Shares of the torque beyond gravity that the reference mass may take, tried from the smallest; a choice."""
@@ -124,7 +193,6 @@ def refuse_unbearable_mass(arm_file: ArmFile, mass: float, guess: GravityGuess |
 
 
 def _choose(planned: PlannedArm, design: StopDesign, poses: int) -> tuple[Sweep, ...]:
-    """The best sweeps, `poses` of each joint."""
     counts = [1 if each.lever.max() < DEAD_LEVER else poses for each in design.candidates]
     picks = design.choose(counts, planned.section.travel_speed * planned.limits.speed)
     return tuple(

@@ -41,7 +41,7 @@ LARGEST_GRAVITY = 25.0
 TURN = 2 * np.pi
 """Largest position offset [rad]: a sensor of one turn cannot be further off."""
 LARGEST_LENGTH = 100.0
-"""Of a discrepancy [rad]; the fit gives 0.18 to 5 (`calib.fit.remaining_doubt`)."""
+"""Of a discrepancy [rad]; the fit gives 0.18 to 5 (`calib.fit.examination`)."""
 LARGEST_FRICTION = 10.0
 """Friction over rated torque, and friction per transmitted torque, at most [1]: beyond 1 a gear is self-locking;
 tenfold for values that sweeps hardly determine."""

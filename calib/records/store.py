@@ -13,9 +13,18 @@ from armlink.arm_file import ArmFile, read_yaml
 from armlink.errors import BadInput, Refused
 from armlink.torque_calibration import Calibration
 from calib.records.bounds import require_sound
-from calib.records.database import StoreFault, default_url, first_line, open_database, reading, transaction
+from calib.records.database import (
+    ACTIVATIONS,
+    RECORDS,
+    WRITES,
+    StoreFault,
+    default_url,
+    first_line,
+    open_database,
+    reading,
+    transaction,
+)
 from calib.records.records import CalibrationRecord, GravityRecord, digest_id, parse_record
-from calib.records.schema import ACTIVATIONS, RECORDS, WRITES
 
 R = TypeVar("R", CalibrationRecord, GravityRecord)
 AnyRecord = CalibrationRecord | GravityRecord
@@ -218,7 +227,6 @@ class RecordStore:
         return log[-1] if log and log[-1].stage == "begun" else None
 
     def writes(self, arm: ArmFile) -> list[ControllerWrite]:
-        """The journal of writes to this arm's controllers, oldest first."""
         log = WRITES.c
         wanted = sa.select(log.number, log.record, log.at, log.by, log.stage, log.body)
         wanted = wanted.where(log.arm == arm.name, log.serial == arm.serial).order_by(log.number)

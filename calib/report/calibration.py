@@ -1,4 +1,7 @@
-"""Report of a calibration as one HTML page: sources, results per joint and sweep, comparison with the last record."""
+"""Reports as one HTML page each: of a calibration, and of a verification with the paper's Figure 6.
+
+Of a calibration: sources, results per joint and sweep, comparison with the last record.
+"""
 
 import shlex
 from collections.abc import Sequence
@@ -16,10 +19,19 @@ from calib.fit.creep_fit import CreepFit
 from calib.fit.heldout import heldout_scores
 from calib.fit.sensor_fit import SensorFit
 from calib.records.compare import differences
-from calib.records.records import CalibrationRecord
-from calib.report.figures import before_after_figure, creep_figure, joint_figure, left_out_figure, sweep_rows, sweeps_of
+from calib.records.records import CalibrationRecord, GravityRecord
+from calib.report.figures import (
+    before_after_figure,
+    creep_figure,
+    joint_figure,
+    left_out_figure,
+    sweep_rows,
+    sweeps_of,
+    verify_figure,
+)
 from calib.report.page import ReportSection, html_of, paragraph, paragraphs, render, verdict_line
 from calib.report.tables import ReportTable, columns_of, interval_table
+from calib.sweep.verify import Verification
 from gcomp.arrays import Array
 from gcomp.gravity.torque import gravity_torque
 
@@ -44,7 +56,6 @@ def write_report(done: Calibrated, path: Path) -> None:
 
 
 def sections(done: Calibrated) -> list[ReportSection]:
-    """The results, for a part of another report."""
     if isinstance(done.fit, CreepFit):
         return [_values(done.fit), _creeps(done.fit)]
     return [_comparison(done, done.fit), _values(done.fit), *_sweeps(done, done.fit), _left_out(done, done.fit)]
@@ -255,4 +266,46 @@ def _creeps(fit: CreepFit) -> ReportSection:
     )
     return ReportSection(
         "Creep sweeps", paragraph(text) + paragraphs(each.text for each in fit.findings), [creep_figure(fit)]
+    )
+
+
+def write_verification(
+    result: Verification, arm: ArmFile, gravity: GravityRecord, calibration: CalibrationRecord | None, path: Path
+) -> None:
+    """Write one self-contained HTML file; raises OSError."""
+    verdict = "passed" if result.passed else "not passed"
+    sensors = "the calibration in the drives" if calibration is None else f"calibration record {calibration.id}"
+    skipped = f" {result.skipped} poses were skipped, since the drives cannot reach them." if result.skipped else ""
+    html = verdict_line(verdict) + paragraph(
+        f"Gravity record {gravity.id} compared with the torque sensors with {sensors}, at "
+        f"{len(result.sensor)} random poses that were used for no fit.{skipped}"
+    )
+    header = (
+        "joint",
+        "RMS [N·m]",
+        "allowed RMS",
+        "largest [N·m]",
+        "standard deviation of the model",
+        "largest torque",
+    )
+    numbers = (
+        result.rms,
+        result.tolerance,
+        result.max_error,
+        result.model_std.mean(axis=0),
+        abs(result.model).max(axis=0),
+    )
+    rows = [[name, *(f"{column[joint]:.4f}" for column in numbers)] for joint, name in enumerate(result.names)]
+    section = ReportSection(
+        "Model against sensor (as Figure 6 of Ma and Hollerbach)",
+        html,
+        [verify_figure(result)],
+        [ReportTable(header, rows)],
+    )
+    title = f"Verification: {arm.name} {arm.serial}"
+    render(
+        path,
+        title,
+        [section],
+        f"gravity record {gravity.id} of {gravity.created:%Y-%m-%d %H:%M} UTC, {gravity.software}",
     )

@@ -10,9 +10,8 @@ from calib.dataset import DataWriter, Manifest, SweepData, load_data
 from calib.motion.mover import Mover
 from calib.plan.types import SweepPlan
 from calib.sweep.creep_pass import CreepPass
-from calib.sweep.stalls import OnStall, give_up, repeat_work
 from calib.sweep.step_pass import StepPass
-from calib.sweep.sweep_pass import Progress
+from calib.sweep.sweep_pass import OnStall, Progress, give_up, repeat_work
 
 
 def run_sweep(

@@ -1,15 +1,60 @@
-"""A pass of sweeps under way: what steps at rest and creeps at constant speed have in common."""
+"""A pass of sweeps under way: what steps at rest and creeps at constant speed have in common.
+
+After a stall of the cycle the joints are stopped: ask, enable them again, repeat the reading.
+"""
 
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from armlink.arm_file import ArmFile
 from armlink.errors import HostLate, Stall
+from armlink.loop.driver import ArmDriver
 from calib.dataset import DataWriter, PlanLine, StallLine, SweepData
 from calib.motion.mover import Mover
 from calib.plan.types import Sweep, SweepPlan
-from calib.sweep.stalls import OnStall, repeat_work, restart
+
+OnStall = Callable[[Stall], bool]
+"""Told why the joints were stopped; whether to enable them again and go on."""
+T = TypeVar("T")
+
+
+def give_up(stall: Stall) -> bool:
+    return False
+
+
+def restart(
+    link: ArmDriver, on_stall: OnStall, stall: Stall, note: Callable[[Stall], None] = lambda stall: None
+) -> None:
+    """Enable the joints again as often as it takes; raises the Stall that `on_stall` does not accept."""
+    while True:
+        if not on_stall(stall):
+            raise stall
+        note(stall)
+        try:
+            link.recover()
+        except Stall as again:
+            stall = again
+        else:
+            return
+
+
+def repeat_work(
+    link: ArmDriver, on_stall: OnStall, work: Callable[[], T], resume: Callable[[], object] | None = None
+) -> T:
+    """Return the result of `work`; it is repeated from its beginning after each Stall that `on_stall` accepts.
+
+    Work that moves the arm gives its mover's `resume`: the arm then holds where it stands first.
+    """
+    while True:
+        try:
+            return work()
+        except Stall as stall:
+            restart(link, on_stall, stall)
+            if resume is not None:
+                repeat_work(link, on_stall, resume)
+
 
 Progress = Callable[[int, int, float, str], None]
 """Called with (readings or sweeps done, how many in all, seconds left, what is being done)."""

@@ -24,14 +24,14 @@ from armlink.link.types import Sample
 from calib.api import Calibrated
 from calib.arm.kinematics import model_arm
 from calib.arm.sweep_section import CreepSection, sweep_motion, sweep_section
-from calib.commissioning.arm_text import assumed_lines
-from calib.commissioning.model_judgement import refuse_impossible_model
+from calib.commissioning.draft import assumed_lines
+from calib.commissioning.model_checks import refuse_impossible_model
 from calib.commissioning.new_arm import new_arm
 from calib.dataset import SweepData
 from calib.fit.creep_fit import CreepFit
 from calib.install.journaled_write import install
 from calib.install.plausibility import admit
-from calib.motion.random_work import WorkMotion, work_targets
+from calib.motion.trajectory import WorkMotion, work_targets
 from calib.observer.observer import Observer
 from calib.observer.recalibrator import Recalibrator
 from calib.observer.watch_loop import WatchHistory, watch

@@ -9,7 +9,7 @@ from armlink.arm_file import ArmFile
 from armlink.arrays import Array
 from armlink.torque_calibration import TorqueCalibration
 from calib.arm.kinematics import gcomp_arm
-from calib.observer.motion.passages import WIDTH, Passage
+from calib.observer.motor_belief import WIDTH, Passage
 from calib.records.records import CalibrationRecord
 
 SPEEDS = (0.1, 0.6)

@@ -11,7 +11,7 @@ from calib.dataset import SweepData
 from calib.fit.sensor_fit import SensorFit
 from calib.motion.static_reading import StaticReading
 from calib.plan.sweep_plan import plan_sweep
-from calib.sweep.scout import rough_model
+from calib.sweep.step_pass import rough_model
 from sim_bus.truth import Truth
 
 JOINT = 1

@@ -26,7 +26,7 @@ from armlink.loop.channel import Channel, Closed
 from armlink.loop.kept_arm import BatchMaker, KeptArm, KeptMessage
 from armlink.loop.messages import Call, LoopAnswer, Progress, RunController, Up
 from armlink.recording.mcap import RecordingWriter
-from calib.daemon import main_loop, notify
+from calib.daemon import main_loop
 from calib.daemon.environment import Immediate
 from calib.daemon.main_loop import Daemon
 from calib.daemon.settings import DaemonSection, Options
@@ -216,10 +216,11 @@ class FailingDaemon(FastDaemon):
         patch.setattr(main_loop, "Worker", lambda loop, name: Immediate())
         patch.setattr(Options, "keep", lambda options, arm: BusProcess(self))
         patch.setattr(main_loop, "watchdog_seconds", lambda: WATCHDOG)
-        patch.setattr(main_loop, "Notifier", lambda: notify.Notifier("systemd"))
+        notifier = main_loop.Notifier
+        patch.setattr(main_loop, "Notifier", lambda: notifier("systemd"))
         kinds = {name: getattr(socket, name) for name in ("AF_UNIX", "SOCK_DGRAM", "SOCK_NONBLOCK")}
         patch.setattr(
-            notify, "socket", SimpleNamespace(socket=lambda *_: NotifySocket(self.failing, self.heard), **kinds)
+            main_loop, "socket", SimpleNamespace(socket=lambda *_: NotifySocket(self.failing, self.heard), **kinds)
         )
 
     def _attach(self) -> None:

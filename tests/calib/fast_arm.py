@@ -9,8 +9,7 @@ import numpy as np
 
 from armlink.arm_file import ArmFile, load_arm
 from calib.arm.kinematics import gcomp_arm
-from calib.motion.random_work import WorkMotion
-from calib.motion.trajectory import trajectory
+from calib.motion.trajectory import WorkMotion, trajectory
 from calib.observer.config import ObserverConfig
 from calib.observer.observer import Observer
 from gcomp.arm.mass_moments import base_parameters, payload_columns

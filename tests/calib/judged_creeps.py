@@ -17,7 +17,7 @@ from calib.fit.creep_fit import CreepFit, fit_creep
 from calib.fit.gravity_fit import identify_gravity
 from calib.fit.sensor_fit import fit_sensors
 from calib.plan.creep_plan import plan_creep
-from calib.plan.levers import is_vertical
+from calib.plan.rough_gravity import is_vertical
 from calib.plan.types import SweepPlan
 from calib.sweep.run import run_sweep
 from gcomp.arm.mass_moments import base_parameters

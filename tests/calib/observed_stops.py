@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
-from calib.observer.events import Event
+from calib.observer.decision import Event
 from calib.observer.observer import Observer
 from gcomp.arm.arm import Arm
 from gcomp.gravity.torque import gravity_torque

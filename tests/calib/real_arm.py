@@ -6,7 +6,7 @@ from rest_arm import RestArm
 
 from armlink.arm_file import ArmFile
 from calib.observer.config import ObserverConfig
-from calib.observer.discrepancy.level import DiscrepancyLevel
+from calib.observer.discrepancy import DiscrepancyLevel
 from calib.observer.observer import Observer
 from gcomp.gravity.torque import gravity_regressor
 from sim_bus.effects.realism import add_realism

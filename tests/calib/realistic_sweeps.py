@@ -15,7 +15,7 @@ from armlink.arm_file import ArmFile
 from calib.dataset import Manifest, SweepData
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import APPROACH, SweepPlan
-from calib.sweep.scout import rough_model
+from calib.sweep.step_pass import rough_model
 from sim_bus.physics.joint_torques import Cables, unevenness
 from sim_bus.physics.sensors import NOISE_BLOCK
 from sim_bus.simulated_arm import SimulatedArm

@@ -7,7 +7,7 @@ from fast_arm import NOISE_SHARE, FastArm
 
 from armlink.arm_file import ArmFile
 from calib.motion.static_reading import StaticReading
-from calib.observer.events import Event
+from calib.observer.decision import Event
 from calib.observer.observer import Observer
 from gcomp.gravity.torque import gravity_regressor
 

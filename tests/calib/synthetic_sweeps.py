@@ -7,7 +7,7 @@ from armlink.arm_file import ArmFile
 from calib.dataset import SweepData
 from calib.plan.sweep_plan import plan_sweep
 from calib.plan.types import SweepPlan
-from calib.sweep.scout import rough_model
+from calib.sweep.step_pass import rough_model
 from sim_bus.truth import Truth
 
 

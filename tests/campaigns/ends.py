@@ -33,7 +33,7 @@ from armlink.errors import BusFault, Refused, Stall
 from armlink.link.types import Command
 from armlink.termination import terminate_as_interrupt
 from calib.arm.kinematics import gcomp_arm
-from calib.motion.random_work import WorkMotion, work_pieces
+from calib.motion.trajectory import WorkMotion, work_pieces
 
 CAUSES: dict[str, Callable[[], BaseException | None]] = {
     "done": lambda: None,

@@ -21,7 +21,7 @@ from judged_creeps import creep_arm
 
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.creep_fit import fit_rows
-from calib.observer.motion.observer import MovingObserver
+from calib.observer.moving_observer import MovingObserver
 from calib.plan.creep_plan import plan_creep
 
 GAIN, FRICTION, PAYLOAD = 0.05, 1.3, 0.3

@@ -21,7 +21,7 @@ from bounds import exit_status
 from drawn_arms import drawn_arm
 from real_arm import RealArm
 
-from calib.observer.events import Event
+from calib.observer.decision import Event
 from calib.observer.evidence import DRIFT
 from calib.observer.observer import Observer
 

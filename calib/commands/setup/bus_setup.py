@@ -21,7 +21,7 @@ SCHEMA = "armlink.new/1"
 def begin_with_drives(out: Path, bus: str, name: str | None, ask: "Ask | None", json_file: Path | None) -> int:
     """An arm file of nothing but a bus: its drives, and no geometry."""
     from armlink.arm_file import parse_arm
-    from calib.commissioning.bus_arm import arm_of_bus
+    from calib.commissioning.drive_match import arm_of_bus
 
     opened = open_named(bus)
     try:

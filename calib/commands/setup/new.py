@@ -194,7 +194,7 @@ def _show(console: Any, made: "NewArm", arm: "ArmFile") -> None:
     from rich.table import Table
 
     from calib.commands.setup.bus_setup import show_findings
-    from calib.commissioning.arm_text import assumed_lines
+    from calib.commissioning.draft import assumed_lines
 
     draft = made.draft
     ends = "stops [rad]" if draft.servo is None else "range [rad]"

@@ -12,9 +12,8 @@ from armlink.errors import BadInput
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from calib.commissioning.chain import Chain
+    from calib.commissioning.chain import Chain, ModelJoint
     from calib.commissioning.drive_match import Ask
-    from calib.commissioning.model_joints import ModelJoint
 
 
 def parse_stops(texts: Sequence[str]) -> dict[str, tuple[float, float]]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from armlink.errors import ArmlinkError
 from armlink.link.types import Calibration
-from calib.daemon.environment import BusJobs, Environment
+from calib.daemon.environment import RETRY_SECONDS, BusJobs, Environment
 from calib.daemon.observation.observation import ActiveObservation
 from calib.daemon.settings import Configuration
 from calib.daemon.state.arm_state import ArmState
@@ -21,8 +21,6 @@ RECORDS_SECONDS = 5.0
 """Time between two looks at the record store, where other commands may have made another record current [s]. A look
 that takes longer shows as a fault: a new connection to a PostgreSQL may take as long (`database.py`)."""
 
-STORE_SECONDS = 1.0
-"""Likewise while it fails [s]."""
 Found = tuple[CalibrationRecord | None, GravityRecord | None]
 Held = tuple[Calibration, ...] | None
 """In every controller; None if the daemon only listens."""
@@ -62,7 +60,6 @@ class ActiveRecords:
         return f"record store {self._store.url} has not answered for {waited:.0f} s"
 
     def tick(self) -> None:
-        """Look at the record store when it is time."""
         if self._jobs.busy:
             return
         if self._unchecked:
@@ -110,7 +107,7 @@ class ActiveRecords:
             self.detail = str(error)
 
     def _store_failed(self, fault: StoreFault) -> None:
-        self._looked = self._environment.monotonic() - RECORDS_SECONDS + STORE_SECONDS
+        self._looked = self._environment.monotonic() - RECORDS_SECONDS + RETRY_SECONDS
         if not self._store_fault:
             kept = "" if self.observation is None else "; the records in force stay in force"
             self._events.say("fault", None, f"{fault}{kept}", {})

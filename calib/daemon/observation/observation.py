@@ -14,8 +14,7 @@ from calib.daemon.observation.recalibration_workflow import DAY, RecalibrationWo
 from calib.daemon.state.events import EventLog, describe, one_alarm_a_joint
 from calib.daemon.state.journal import Journal
 from calib.observer.config import ObserverConfig
-from calib.observer.decision import DriftFinding
-from calib.observer.events import Event
+from calib.observer.decision import DriftFinding, Event
 from calib.observer.observer import observer_of
 from calib.records.records import CalibrationRecord, GravityRecord
 from gcomp.arrays import Array
@@ -34,8 +33,6 @@ THINNING_FACTOR = 10
 
 
 class ObserverFeed:
-    """An observer with the records that it measures against."""
-
     def __init__(
         self, arm: ArmFile, calibration: CalibrationRecord, gravity: GravityRecord, config: ObserverConfig
     ) -> None:

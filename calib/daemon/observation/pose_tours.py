@@ -14,7 +14,7 @@ from calib.daemon.environment import Environment
 from calib.daemon.settings import Configuration
 from calib.daemon.state.events import EventLog
 from calib.daemon.view import State
-from calib.motion.random_work import RandomMotion
+from calib.motion.trajectory import RandomMotion
 from calib.observer.config import LONGEST_WINDOW
 from gcomp.arrays import Array
 
@@ -50,7 +50,6 @@ class PoseTours:
         self._move(LONGEST_WINDOW, int(self._last))
 
     def up(self) -> None:
-        """The bus is open."""
         self._here = None
 
     def heard(self, batch: Batch) -> None:
@@ -75,7 +74,6 @@ class PoseTours:
             self.request(why)
 
     def tick(self) -> None:
-        """Begin a tour if the schedule says so."""
         hours = self._configuration.settings.sweep_every_hours
         if hours is None or self._configuration.listen_only or self._state() is not State.OBSERVING:
             return
@@ -86,7 +84,6 @@ class PoseTours:
             self.request(f"every {hours:g} h")
 
     def advanced(self, progress: Progress) -> None:
-        """The bus loop reports how far it is."""
         self.progress = progress
         if progress.done >= progress.total:
             self.progress = None
@@ -99,5 +96,4 @@ class PoseTours:
             self._events.say("refused", None, f"sweep: {error}", {})
 
     def stopped(self) -> None:
-        """The bus is gone, and the tour with it."""
         self.progress = None

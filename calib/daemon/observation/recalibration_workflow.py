@@ -13,9 +13,8 @@ from calib.daemon.state.events import EventLog
 from calib.daemon.state.journal import Journal
 from calib.daemon.state.journal_rows import ProposalRow
 from calib.daemon.view import NoSuch, NotPossible, Proposal
-from calib.observer.check_at_rests import Checked
 from calib.observer.decision import DriftFinding
-from calib.observer.recalibrator import APPLIED_BY, Recalibration, Recalibrator
+from calib.observer.recalibrator import APPLIED_BY, Checked, Recalibration, Recalibrator
 from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
@@ -87,7 +86,6 @@ class RecalibrationWorkflow:
     # ---- what the observer found
 
     def found(self, finding: DriftFinding) -> None:
-        """Do with a finding what the policy says."""
         policy = self._configuration.settings.policy
         if policy == "observe":
             return
@@ -254,7 +252,6 @@ class RecalibrationWorkflow:
     # ---- after a write
 
     def _keep_failure(self, row: ProposalRow, error: ArmlinkError) -> None:
-        """Keep and report that a proposal's record could not be written."""
         with self._journal.transaction():
             self._decided(row, "failed", "daemon", str(error))
             self._refused(row.finding, error, row.number)

@@ -8,8 +8,9 @@ from armlink.arm_file import ArmFile
 from armlink.loop.messages import Batch
 from calib.daemon.state.events import EventLog
 
-STALE = 1.0
-"""A joint that is silent for longer is a fault [s]: ten batches."""
+LONGEST_PAUSE = 1.0
+"""A joint that is silent for longer is a fault, and a longer pause in the samples begins a new recording [s]: ten
+batches."""
 FAULT_EVENTS_AN_HOUR = 20
 """Further faults within the hour go to the process's log only, so that a loose plug does not fill the journal."""
 
@@ -49,7 +50,9 @@ class ArmState:
         late = self.late if self.connected else 0.0
         ages = [float(age) + late for age in self.batch.age]
         worst = max(range(len(ages)), key=ages.__getitem__)
-        return f"{self._names[worst]}: no reading has come for {ages[worst]:.1f} s" if ages[worst] > STALE else ""
+        if ages[worst] <= LONGEST_PAUSE:
+            return ""
+        return f"{self._names[worst]}: no reading has come for {ages[worst]:.1f} s"
 
     def heard(self, batch: Batch) -> None:
         """Take samples and the emergencies among them."""
@@ -59,7 +62,6 @@ class ArmState:
             self._report("fault", name, f"{name}: {event.text}", dict(event.evidence))
 
     def calibrated(self, joints: Collection[str]) -> None:
-        """A calibration was written for these joints."""
         self.uncalibrated = tuple(name for name in self.uncalibrated if name not in joints)
 
     def tick(self) -> None:

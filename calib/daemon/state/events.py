@@ -11,7 +11,7 @@ from typing import Any
 
 from calib.daemon.state.journal import Journal
 from calib.daemon.view import EventItem, EventRecord, JointsItem
-from calib.observer.events import Event
+from calib.observer.decision import Event
 from calib.observer.evidence import DRIFT
 
 Item = JointsItem | EventItem

@@ -22,7 +22,7 @@ from typing import Any, TypeVar, cast
 
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
-from calib.daemon.environment import Immediate, RunAside
+from calib.daemon.environment import RETRY_SECONDS, Immediate, RunAside
 from calib.daemon.state.journal_rows import PROPOSALS, HistoryReader, ProposalRow, proposal_of
 from calib.daemon.view import EventRecord
 from calib.observer.decision import DriftFinding
@@ -34,8 +34,6 @@ LOCK_SECONDS = 0.05
 """Wait for another program's lock [s]; what cannot be kept now is kept later."""
 OPEN_SECONDS = 10.0
 """Likewise at the start [s]."""
-RETRY_SECONDS = 1.0
-"""Time from a failure to the next attempt [s]."""
 SILENT_SECONDS = 2.0
 """A disk that takes longer for a write is said to be in trouble [s]: four times what the SD specification (4.6.2.2)
 allows a card for one."""

@@ -15,6 +15,7 @@ from armlink.loop.messages import Batch
 from armlink.recording.mcap import RecordingWriter
 from calib.daemon.environment import RunAside
 from calib.daemon.settings import Configuration, RecordingSettings
+from calib.daemon.state.arm_state import LONGEST_PAUSE
 
 WINDOW_SECONDS = 600.0
 """Older readings are dropped [s]."""
@@ -54,8 +55,6 @@ class LiveWindow:
         return np.array([row[0] for row in kept]), channels
 
 
-LONGEST_PAUSE = 1.0
-"""A longer pause in the samples ends a minute, and begins a new recording [s]."""
 ROW_RATE = 250.0
 """Rows are thinned to about this rate if the bus is faster [Hz]."""
 

@@ -3,14 +3,19 @@
 import asyncio
 import hmac
 import ipaddress
-import json
 import math
 import re
 import socket
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
+
+import h11
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse
 
 from calib.daemon.web.connection import PATIENCE_SECONDS, App, Message, Peer, Receive, Scope, Send, peer_of
 
@@ -46,6 +51,9 @@ BODY_LIMIT = 4096
 """Largest body [bytes]; the only bodies are names."""
 HEAD_LIMIT = 16384
 """Largest request line and headers together [bytes]."""
+LINGER_BYTES, LINGER_SECONDS = 1024 * 1024, 1.5
+"""Bytes, and seconds, for which a client may go on sending after a refusal; shorter than the server's own end
+(`calib.daemon.environment.CLOSING_SECONDS`)."""
 REQUESTS = Rate(burst=60, per_second=20)
 """Per TCP address; the page needs three requests to load, then four in two seconds."""
 WRONG_TOKENS = Rate(burst=5, per_second=0.2)
@@ -103,25 +111,25 @@ class RequestGuard:
         if peer.connection is not None:
             peer.connection.request_begins()
         try:
-            await self._pass(scope, peer, receive, send)
+            with suppress(h11.LocalProtocolError):  # uvicorn has refused the rest of the request meanwhile
+                await self._pass(scope, peer, receive, send)
         finally:
             if peer.connection is not None:
                 peer.connection.request_ends()
 
     async def _pass(self, scope: Scope, peer: Peer, receive: Receive, send: Send) -> None:
-        headers = _headers(scope)
+        headers, send = Headers(scope=scope), _with_headers(send)
         try:
-            self._check(scope, peer)
-            body = await _read_body(headers, receive)
+            self._check(scope, peer, headers)
+            body = await _read_body(Request(scope, receive))
         except Denied as denied:
-            if _has_body(headers):  # the connection discards the rest of it, within bounds
+            if _has_body(headers):
                 denied.headers["connection"] = "close"
-            await _answer(denied, send)
+            await _refuse(denied, receive, send)
             return
-        await self.app(scope, _replay(body, receive), _with_headers(send))
+        await self.app(scope, _replay(body, receive), send)
 
-    def _check(self, scope: Scope, peer: Peer) -> None:
-        headers = _headers(scope)
+    def _check(self, scope: Scope, peer: Peer, headers: Headers) -> None:
         line = len(scope.get("raw_path", b"")) + len(scope["query_string"])
         if line + sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_LIMIT:
             raise Denied(431, f"request line and headers may have at most {HEAD_LIMIT} bytes", {"connection": "close"})
@@ -136,8 +144,8 @@ class RequestGuard:
                 raise Denied(403, f"a page of {origin[:100]!r} may not decide anything on this daemon")
         if peer.tcp and scope["path"] not in self.access.open_paths:
             self._check_token(headers.get("authorization", ""), peer)
-            if peer.connection is not None and not peer.connection.trust():
-                raise Denied(503, "too many clients over TCP: try again later", {"connection": "close"})
+            if peer.connection is not None:
+                peer.connection.trust()
 
     def _is_ours(self, host: str, peer: Peer) -> bool:
         if _is_loopback(host):
@@ -166,10 +174,6 @@ def names_of_host(host: str) -> frozenset[str]:
     return frozenset({host.lower(), machine, f"{machine}.local"})
 
 
-def _headers(scope: Scope) -> dict[str, str]:
-    return {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-
-
 def _host_name(header: str) -> str:
     """Host header without its port, in lower case; empty if it is not valid."""
     host = header.strip().lower()
@@ -188,30 +192,28 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _has_body(headers: dict[str, str]) -> bool:
+def _has_body(headers: Headers) -> bool:
     return headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
 
 
-async def _read_body(headers: dict[str, str], receive: Receive) -> bytes:
+async def _read_body(request: Request) -> bytes:
     """The whole body; raises Denied if it is too large or too slow."""
     too_large = Denied(413, f"the body of a request may have at most {BODY_LIMIT} bytes")
-    length = headers.get("content-length", "0")
+    length = request.headers.get("content-length", "0")
     if not length.isdigit() or int(length[:20]) > BODY_LIMIT:
         raise too_large
-    if not _has_body(headers):
+    if not _has_body(request.headers):
         return b""
     body = b""
     try:
         async with asyncio.timeout(PATIENCE_SECONDS):
-            while True:
-                message = await receive()
-                if message["type"] == "http.disconnect":
-                    raise Denied(400, "the connection ended before the end of the body")
-                body += bytes(message.get("body", b""))
+            async for piece in request.stream():
+                body += piece
                 if len(body) > BODY_LIMIT:
                     raise too_large
-                if not message.get("more_body", False):
-                    return body
+            return body
+    except ClientDisconnect:
+        raise Denied(400, "the connection ended before the end of the body") from None
     except TimeoutError:
         raise Denied(408, f"the body was not received within {PATIENCE_SECONDS:.0f} s") from None
 
@@ -233,18 +235,26 @@ def _replay(body: bytes, receive: Receive) -> Receive:
 def _with_headers(send: Send) -> Send:
     async def with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":
-            given = {name for name, _ in message.get("headers", [])}
-            more = [(name.encode(), value.encode()) for name, value in HEADERS.items() if name.encode() not in given]
-            message = {**message, "headers": [*message.get("headers", []), *more]}
+            given = MutableHeaders(raw=[*message.get("headers", ())])
+            for name, value in HEADERS.items():
+                given.setdefault(name, value)
+            message = {**message, "headers": given.raw}
         await send(message)
 
     return with_headers
 
 
-async def _answer(denied: Denied, send: Send) -> None:
-    body = json.dumps({"error": str(denied)}, ensure_ascii=False).encode()
-    headers = {"content-type": "application/json", "content-length": str(len(body)), **denied.headers}
-    start = [(name.encode(), value.encode()) for name, value in headers.items()]
-    send = _with_headers(send)
-    await send({"type": "http.response.start", "status": denied.status, "headers": start})
-    await send({"type": "http.response.body", "body": body})
+async def _refuse(denied: Denied, receive: Receive, send: Send) -> None:
+    """Answer, and discard what the client still sends: a connection that is closed with bytes unread is reset, and the
+    client gets an error instead of the answer (RFC 9112, section 9.6)."""
+    answer = JSONResponse({"error": str(denied)}, denied.status, denied.headers)
+    await send({"type": "http.response.start", "status": denied.status, "headers": answer.raw_headers})
+    await send({"type": "http.response.body", "body": answer.body, "more_body": True})
+    left, more = LINGER_BYTES, "connection" in denied.headers
+    with suppress(TimeoutError):
+        async with asyncio.timeout(LINGER_SECONDS):
+            while more and left > 0:
+                message = await receive()
+                left -= len(message.get("body", b""))
+                more = message["type"] == "http.request" and message.get("more_body", False)
+    await send({"type": "http.response.body", "body": b""})

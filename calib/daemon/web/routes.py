@@ -26,19 +26,21 @@ from calib.daemon.view import (
     Status,
 )
 from calib.daemon.web.connection import Owner, peer_of
-from calib.daemon.web.history import DISK_SECONDS, Histories, TooMany
-from calib.daemon.web.parameters import (
+from calib.daemon.web.history import (
+    DISK_SECONDS,
     LARGEST_ID,
     ApiError,
     Decision,
     EventsQuery,
+    Histories,
     HistoryQuery,
     Id,
     OverviewQuery,
     StreamQuery,
+    TooMany,
+    add_window,
 )
 from calib.daemon.web.stream import StreamResponse, Streams
-from calib.daemon.web.window import add_window
 
 REFUSALS: dict[int | str, dict[str, Any]] = {
     400: {"model": ApiError, "description": "The request is not HTTP, or its Host header is not a name of this daemon"},

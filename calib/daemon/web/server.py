@@ -15,10 +15,10 @@ import uvicorn
 
 from armlink.content.atomic_file import file_identity
 from armlink.errors import BadInput
+from calib.daemon.environment import CLOSING_SECONDS
 from calib.daemon.view import DaemonView
-from calib.daemon.web.admission import Admission
 from calib.daemon.web.app import make_app
-from calib.daemon.web.connection import protocol_of
+from calib.daemon.web.connection import PATIENCE_SECONDS, protocol_of
 from calib.daemon.web.guard import Access, names_of_host
 
 log = logging.getLogger(__name__)
@@ -26,12 +26,9 @@ SOCKET_MODE = 0o660
 """Access for owner and group only."""
 SHORTEST_TOKEN = 16
 MOST_CONNECTIONS = 1280
-"""More than all that `admission` lets in together."""
-ACCEPTED_AT_ONCE = 32
-"""Connections accepted in one go: those that find no room are closed before the next go."""
+"""Connections at once; a request on a further one is answered with 503."""
 FILES = 4096
 """Open files that the daemon asks the system for, as far as its hard limit allows."""
-CLOSING_SECONDS = 2
 
 
 async def serve(view: DaemonView, *, socket: Path | None, tcp: tuple[str, int] | None, token: str | None) -> None:
@@ -117,13 +114,7 @@ def _allow_files() -> None:
 
 
 class _ApiServer(uvicorn.Server):
-    """uvicorn's server without its signal handlers (the service has its own), and with a queue longer than one go."""
-
-    async def startup(self, sockets: list[sockets.socket] | None = None) -> None:
-        """As uvicorn's, whose backlog is both the kernel's queue and what is accepted in one go."""
-        await super().startup(sockets)
-        for listening in sockets or ():
-            listening.listen(512)  # beyond them connect() on the Unix socket fails
+    """uvicorn's server without its signal handlers: the service has its own."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -135,8 +126,8 @@ async def _run(view: DaemonView, listening: list[sockets.socket], access: Access
     _allow_files()
     config = uvicorn.Config(
         app,
-        http=protocol_of(Admission()),
-        backlog=ACCEPTED_AT_ONCE,
+        http=protocol_of(),
+        timeout_keep_alive=round(PATIENCE_SECONDS),
         ws="none",
         lifespan="off",
         log_config=None,
@@ -144,7 +135,7 @@ async def _run(view: DaemonView, listening: list[sockets.socket], access: Access
         server_header=False,
         proxy_headers=False,
         limit_concurrency=MOST_CONNECTIONS,
-        timeout_graceful_shutdown=CLOSING_SECONDS,
+        timeout_graceful_shutdown=round(CLOSING_SECONDS),
     )
     server = _ApiServer(config)
     running = asyncio.create_task(server.serve(sockets=listening))

@@ -64,8 +64,6 @@ class Streams:
 
     async def run(self, scope: Scope, receive: Receive, send: Send, after: int | None) -> None:
         """Serve one client until it leaves: all events after id `after` (None: only new ones), then new items."""
-        if (connection := peer_of(scope).connection) is not None:
-            connection.never_ends()
         client = asyncio.create_task(self._send_all(send, after))
         self._tasks[client] = peer_of(scope).owner
         if self._closed:
@@ -81,7 +79,7 @@ class Streams:
         if isinstance(results[0], TimeoutError):
             self.cut_off += 1
             _log.warning("stream: %s has read nothing for %.0f s and was cut off", peer_of(scope).name, SEND_SECONDS)
-            if connection is not None:
+            if (connection := peer_of(scope).connection) is not None:
                 connection.cut()
             return
         if isinstance(results[0], Exception):

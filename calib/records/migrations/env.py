@@ -2,7 +2,7 @@
 
 from alembic import context
 
-from calib.records.schema import TABLES
+from calib.records.database import TABLES
 
 context.configure(connection=context.config.attributes["connection"], target_metadata=TABLES, transactional_ddl=True)
 context.run_migrations()

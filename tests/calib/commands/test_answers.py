@@ -7,7 +7,7 @@ import numpy as np
 
 from calib.commands import float as float_command
 from calib.commands.identify import _answer
-from calib.sweep.stalls import give_up
+from calib.sweep.sweep_pass import give_up
 
 
 def test_a_gravity_model_is_told_with_its_record_and_uncertainty() -> None:

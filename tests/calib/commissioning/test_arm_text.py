@@ -13,10 +13,9 @@ from armlink.content.file_content import parse_yaml
 from armlink.content.yaml_text import yaml_comment, yaml_document, yaml_entry, yaml_item
 from armlink.drives.findings import FoundDrive
 from armlink.errors import BadInput
-from calib.commissioning.arm_text import arm_text
-from calib.commissioning.bus_arm import _text as bus_text
-from calib.commissioning.draft import Draft, JointDraft
+from calib.commissioning.draft import Draft, JointDraft, arm_text
 from calib.commissioning.drive_match import Match
+from calib.commissioning.drive_match import _text as bus_text
 
 NAMES = [
     "on", "null", "12", "1e3", "2026-01-01", "a, b", "joint: 1", "#1", "Gelenk_ü", "'", '"', "a: {b: [c", "*a", "&a",

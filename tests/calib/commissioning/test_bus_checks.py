@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from calib.commissioning import bus_checks
+from calib.commissioning import doctor as bus_checks
 
 
 @pytest.mark.parametrize(

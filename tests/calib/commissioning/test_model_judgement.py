@@ -10,12 +10,10 @@ import pytest
 
 from armlink.cli import run
 from armlink.errors import BadInput
-from calib.commissioning.chain import find_chains
+from calib.commissioning.chain import find_chains, model_joints
 from calib.commissioning.doctor import examine
 from calib.commissioning.draft import LOAD_FACTOR, draft_of_model
-from calib.commissioning.model_checks import model_findings
-from calib.commissioning.model_joints import model_joints
-from calib.commissioning.model_judgement import gravity_need, model_errors, refuse_impossible_model
+from calib.commissioning.model_checks import gravity_need, model_errors, model_findings, refuse_impossible_model
 from calib.commissioning.new_arm import NewArm, new_arm
 from gcomp.arm.load import ModelArm, load_model
 from gcomp.gravity.torque import gravity_torque

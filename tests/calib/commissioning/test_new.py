@@ -17,7 +17,7 @@ from armlink.arm_file import bundled_arms, load_arm, parse_arm
 from armlink.drives.canopen.check.scan import FoundNodes
 from armlink.errors import BadInput, BusFault
 from calib.arm.kinematics import gcomp_arm
-from calib.commissioning.bus_arm import arm_of_bus
+from calib.commissioning.drive_match import arm_of_bus
 from calib.commissioning.new_arm import NewArm, new_arm
 from calib.plan.collisions import Geometry
 from gcomp.errors import BadModel

@@ -10,8 +10,7 @@ from judged_creeps import creep_arm
 from armlink.arrays import Array
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.creep_fit import CreepFit, fit_rows
-from calib.fit.pushes import ripple_cycles
-from calib.fit.scatter import Scatter, scatter
+from calib.fit.creep_residuals import Scatter, ripple_cycles, scatter
 from calib.fit.sweep_readings import SweepReadings, steady
 from calib.plan.creep_plan import plan_creep
 

@@ -11,7 +11,7 @@ from calib.arm.kinematics import gcomp_arm
 from calib.arm.sweep_section import sweep_motion
 from calib.commissioning.model_checks import model_findings
 from calib.plan.creep_plan import plan_creep
-from calib.plan.levers import VERTICAL, is_vertical
+from calib.plan.rough_gravity import VERTICAL, is_vertical
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "yam.yaml"
 LINKS = (

@@ -31,7 +31,7 @@ from armlink.loop.messages import Batch, Call, Down, Health, LoopAnswer, Told, U
 from armlink.loop.process import UNREAD_SECONDS
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.view import State
-from calib.motion.random_work import work_targets
+from calib.motion.trajectory import work_targets
 from calib.records.file_lock import locked_directory
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm

@@ -19,7 +19,7 @@ from armlink.errors import BadInput
 from armlink.loop.messages import Down, Up
 from armlink.recording.files import load_recording
 from calib.daemon.logs import JsonFormatter, LineLimit
-from calib.daemon.notify import Notifier, watchdog_seconds
+from calib.daemon.main_loop import Notifier, watchdog_seconds
 from calib.daemon.settings import DaemonSection
 from calib.daemon.state.journal import Journal
 from calib.daemon.state.journal_rows import HistoryReader

@@ -19,8 +19,7 @@ from armlink.loop.kept_arm import KeptMessage
 from armlink.loop.messages import Told
 from calib.daemon import main_loop
 from calib.daemon.environment import Immediate
-from calib.daemon.main_loop import BEGIN_SECONDS, SILENT_SECONDS, Daemon
-from calib.daemon.notify import Notifier
+from calib.daemon.main_loop import BEGIN_SECONDS, SILENT_SECONDS, Daemon, Notifier
 from calib.daemon.settings import Options
 from calib.records.file_lock import locked_directory
 

@@ -6,7 +6,7 @@ from sweep_arms import random_arm, synthetic_pass
 from synthetic_sweeps import passes, plans
 
 from calib.arm.kinematics import gcomp_arm
-from calib.fit.felt_mass import felt_mass
+from calib.fit.sensor_fit import felt_mass
 from calib.fit.sweep_readings import sweep_readings
 from sim_bus.truth import Truth
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.fit import remaining_doubt as module
+from calib.fit import examination as module
 from calib.fit.small_troubles import FAMILIES
 
 

@@ -11,11 +11,9 @@ from realistic_sweeps import RestingArm, both_passes, plans
 
 from calib.arm.kinematics import gcomp_arm
 from calib.dataset import SweepData
-from calib.fit.lags import Lags
-from calib.fit.levels import LEAST, RandomEffects, learn
-from calib.fit.position_field import PositionField, kernel
+from calib.fit.refinement import LEAST, RandomEffects, learn
 from calib.fit.sensor_fit import SensorFit, fit_sensors
-from calib.fit.small_troubles import FAMILIES, UNITS, Setting, troubles
+from calib.fit.small_troubles import FAMILIES, UNITS, Lags, PositionField, Setting, kernel, troubles
 from calib.fit.sweep_readings import SweepReadings
 from calib.plan.types import SweepPlan
 from gcomp.gravity.torque import gravity_regressor, gravity_torque

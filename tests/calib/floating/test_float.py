@@ -13,8 +13,7 @@ from armlink.arm_file import ArmFile, load_arm
 from armlink.link.link import Link
 from armlink.link.types import Command, Sample
 from calib.arm.kinematics import gcomp_arm
-from calib.floating.controller import FloatConfig, FloatControl
-from calib.floating.run import Floating, run_float
+from calib.floating.run import FloatConfig, FloatControl, Floating, run_float
 from gcomp.gravity.torque import gravity_torque
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm

@@ -16,7 +16,7 @@ from calib.arm.kinematics import DriveLimits
 from calib.install.check_motion import CheckMotion, check_poses
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import Admitted, admit, check_bounds, check_change, history_std, past_changes
-from calib.observer.check_at_rests import ROWS, AfterWrite
+from calib.observer.recalibrator import ROWS, AfterWrite
 from calib.records.records import CalibrationRecord, GravityRecord, JointCalibration, matrix, provenance
 from calib.records.store import RecordStore
 from sim_bus.bus.lock_step import LockStepBus

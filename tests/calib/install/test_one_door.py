@@ -14,9 +14,8 @@ from armlink.errors import BusFault, Refused
 from armlink.link.types import Calibration
 from calib.install.journaled_write import install, recover
 from calib.install.plausibility import GateRefused, Refusal, admit, admit_rollback
-from calib.observer.check_at_rests import Checked
 from calib.observer.decision import DriftFinding
-from calib.observer.recalibrator import Recalibrator
+from calib.observer.recalibrator import Checked, Recalibrator
 from calib.records.records import CalibrationRecord
 from calib.records.store import RecordStore
 

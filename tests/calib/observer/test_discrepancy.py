@@ -8,8 +8,7 @@ from rest_arm import RestArm, harmonics
 
 from calib.observer.cause_test import CauseTest
 from calib.observer.config import LONGEST_WINDOW
-from calib.observer.discrepancy.kernel import Kernel
-from calib.observer.discrepancy.level import DiscrepancyLevel
+from calib.observer.discrepancy import DiscrepancyLevel, Kernel
 from calib.observer.evidence import DRIFT
 from calib.observer.gravity_belief import GravityBelief
 from gcomp.identify.readings import StaticReadings

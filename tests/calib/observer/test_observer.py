@@ -10,7 +10,7 @@ from observed_stops import POSE_SECONDS, SIGMA, Bench, kinds
 from calib.motion.static_reading import StaticReading
 from calib.observer.config import ObserverConfig
 from calib.observer.observer import Observer
-from calib.observer.tracking.pose_memory import PLACE_ROWS
+from calib.observer.tracking import PLACE_ROWS
 from gcomp.arm.mass_moments import payload_columns
 from gcomp.gravity.torque import gravity_regressor, gravity_torque
 

@@ -13,9 +13,8 @@ from fake_controllers import ARM, NAMES, Controllers, joint, record
 from armlink.errors import BusFault, Refused
 from armlink.torque_calibration import TorqueCalibration
 from calib.install.journaled_write import recover
-from calib.observer.check_at_rests import Checked
 from calib.observer.decision import DriftFinding
-from calib.observer.recalibrator import Recalibrator, recalibrated_record
+from calib.observer.recalibrator import Checked, Recalibrator, recalibrated_record
 from calib.records.database import StoreFault
 from calib.records.records import CalibrationRecord, GravityRecord, matrix, provenance
 from calib.records.store import RecordStore

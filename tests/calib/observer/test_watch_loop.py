@@ -11,7 +11,7 @@ from armlink.arm_file import ArmFile, parse_arm
 from armlink.link.link import Link
 from armlink.link.types import Calibration, Command, DriveSerial, Sample
 from calib.arm.kinematics import gcomp_arm
-from calib.motion.random_work import WorkMotion, work_targets
+from calib.motion.trajectory import WorkMotion, work_targets
 from calib.observer.config import ObserverConfig
 from calib.observer.observer import Observer
 from calib.observer.recalibrator import Recalibrator

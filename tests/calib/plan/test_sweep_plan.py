@@ -10,7 +10,7 @@ from armlink.errors import BadInput
 from calib.arm.kinematics import DriveLimits
 from calib.plan.sweep_plan import plan_sweep, refuse_unbearable_mass
 from calib.plan.types import SweepPlan
-from calib.sweep.scout import rough_model
+from calib.sweep.step_pass import rough_model
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
 

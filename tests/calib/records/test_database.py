@@ -17,9 +17,8 @@ from armlink.errors import BadInput, Refused
 from calib.install.journaled_write import install
 from calib.install.plausibility import Admitted
 from calib.records import database
-from calib.records.database import StoreFault, open_database
+from calib.records.database import TABLES, StoreFault, open_database
 from calib.records.records import CalibrationRecord, GravityRecord
-from calib.records.schema import TABLES
 from calib.records.store import RecordStore
 
 AS_OF_SESSION_1 = """

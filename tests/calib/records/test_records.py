@@ -186,7 +186,7 @@ def test_a_process_killed_while_it_writes_leaves_whole_records(tmp_path: Path) -
     script = (
         "import os, signal, sys, made_records as t\n"
         "from calib.records.database import transaction\n"
-        "from calib.records.schema import RECORDS\n"
+        "from calib.records.database import RECORDS\n"
         "from calib.records.store import RecordStore\n"
         "store = RecordStore(sys.argv[1])\n"
         "store.put(t.calibration(), t.ARM, by='ann', reason='sweep')\n"

@@ -20,8 +20,7 @@ from calib.arm.sweep_section import SweepSection
 from calib.commands.screen import unsettled_lines
 from calib.dataset import DataWriter, Manifest, PlanLine, encode, load_data
 from calib.motion.mover import STOP_TOLERANCE, Mover
-from calib.motion.settle_rule import SettleRule
-from calib.motion.static_reading import StaticReading
+from calib.motion.static_reading import SettleRule, StaticReading
 from calib.motion.trajectory import trajectory
 from calib.plan.sweep_plan import plan_sweep
 from calib.sweep.preflight import _noise

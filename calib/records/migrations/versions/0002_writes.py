@@ -3,7 +3,7 @@
 import sqlalchemy as sa
 from alembic import op
 
-from calib.records.schema import append_only
+from calib.records.database import append_only
 
 revision, down_revision = "0002", "0001"
 

@@ -16,10 +16,10 @@ from pydantic import TypeAdapter, ValidationError
 from served_page import Served
 
 from calib.daemon.view import HistoryPoint
+from calib.daemon.web import app as page_module
 from calib.daemon.web import history, routes
-from calib.daemon.web import page as page_module
-from calib.daemon.web.page import page_files
-from calib.daemon.web.parameters import LARGEST_ID, Id
+from calib.daemon.web.app import page_files
+from calib.daemon.web.history import LARGEST_ID, Id
 from calib.daemon.web.stream import Streams
 
 

@@ -1,11 +1,9 @@
 """No answer is lost because the client was still sending, and a client that never stops is cut within bounds."""
 
-import asyncio
 import logging
 import select
 import socket
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,12 +11,10 @@ import pytest
 from made_up_view import MadeUpView
 from served_page import TOKEN, Served, served
 
-from calib.daemon.web import connection as connection_module
+from calib.daemon.environment import CLOSING_SECONDS
 from calib.daemon.web import guard as guard_module
 from calib.daemon.web import server as server_module
-from calib.daemon.web.connection import LINGER_BYTES, Connection
-from calib.daemon.web.guard import HEAD_LIMIT, RateLimit
-from calib.daemon.web.server import CLOSING_SECONDS
+from calib.daemon.web.guard import HEAD_LIMIT, LINGER_BYTES, RateLimit
 
 MUCH = 100_000
 """Bytes; more than the server reads of any of these requests before it answers."""
@@ -32,18 +28,19 @@ TO_TCP = HOST + f"Authorization: Bearer {TOKEN}\r\n".encode()
 POST = b"POST /api/proposals/1/approve"
 BODY = b"Content-Length: %d\r\n\r\n" % MUCH + b"x" * MUCH
 
+CHUNK = b"1000\r\n" + b"x" * 4096 + b"\r\n"
+
 REFUSED = {
-    "long request line": (400, b"GET /" + b"a" * MUCH + TO_TCP + b"\r\n"),
-    "long header": (400, b"GET /" + TO_TCP + b"X: " + b"a" * MUCH + b"\r\n\r\n"),
-    "many headers": (400, b"GET /" + TO_TCP + b"X-Y: zzzzzzzzzz\r\n" * (MUCH // 17) + b"\r\n"),
-    "bad length": (400, POST + TO_TCP + b"Content-Length: -1\r\n\r\n" + b"x" * MUCH),
-    "no HTTP": (400, b"\x00\x01\r\n\r\n" * (MUCH // 6)),
     "wrong host": (400, POST + b" HTTP/1.1\r\nHost: evil.example\r\n" + BODY),
     "other origin": (403, POST + TO_TCP + b"Origin: http://evil.example\r\n" + BODY),
     "large body": (413, POST + TO_TCP + BODY),
     "large chunks": (
         413,
-        POST + TO_TCP + b"Transfer-Encoding: chunked\r\n\r\n" + (b"1000\r\n" + b"x" * 4096 + b"\r\n") * 25,
+        POST
+        + TO_TCP
+        + b"Transfer-Encoding: chunked\r\n\r\n"
+        + (b"1000\r\n" + b"x" * 4096 + b"\r\n") * 25
+        + b"0\r\n\r\n",
     ),
 }
 
@@ -57,7 +54,7 @@ def _no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """However slow this machine is, the time of a drain is enough."""
-    monkeypatch.setattr(connection_module, "LINGER_SECONDS", PATIENCE)
+    monkeypatch.setattr(guard_module, "LINGER_SECONDS", PATIENCE)
 
 
 def connect(server: Served, tcp: bool) -> socket.socket:
@@ -96,7 +93,7 @@ def test_a_client_that_is_still_sending_gets_its_refusal(server: Served, name: s
     for _ in range(10):
         answer = send_on_after_the_answer(server, tcp, request)
         assert is_refusal(answer, status), answer[:300]
-        assert b'{"error": ' in answer
+        assert b'{"error":' in answer
 
 
 @pytest.mark.sample(1)
@@ -107,8 +104,7 @@ def test_many_clients_at_once_that_send_all_in_one_go_get_their_refusals(server:
         status, request = REFUSED[name]
         with connect(server, tcp) as raw:
             raw.sendall(request)
-            answer = rest_of(raw)
-        return is_refusal(answer, status) or is_refusal(answer, 431)  # 431: a head that came in one piece
+            return is_refusal(rest_of(raw), status)
 
     with ThreadPoolExecutor(16) as pool:
         assert all(pool.map(is_refused, list(REFUSED) * 20))
@@ -129,22 +125,18 @@ def test_a_body_that_came_too_slowly_may_come_after_the_answer(server: Served, m
         assert is_refusal(send_on_after_the_answer(server, tcp, request, begin=len(request) - 3000), 408)
 
 
-@pytest.mark.usefixtures("patient")
-def test_a_client_too_many_gets_its_503(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(server_module, "MOST_CONNECTIONS", 1)
-    with served(MadeUpView, tmp_path / "api.sock") as server:
-        assert is_refusal(send_on_after_the_answer(server, False, POST + HOST + BODY), 503)
-
-
 @pytest.mark.parametrize("headers", [HOST, TO_TCP], ids=["no token", "token"])
 def test_a_body_that_is_not_http_is_answered_once(server: Served, caplog, headers: bytes) -> None:
     caplog.set_level(logging.ERROR)
     with connect(server, tcp=True) as raw:
         raw.sendall(POST + headers + b"Transfer-Encoding: chunked\r\n\r\nzz\r\n")
         answer = rest_of(raw)
-    assert is_refusal(answer, 400)
+    assert answer.startswith(b"HTTP/1.1 400 ")
     assert answer.count(b"HTTP/1.1") == 1
     assert not caplog.records
+
+
+ENDLESS = POST + TO_TCP + b"Content-Length: %d\r\n\r\n" % 10**12 + b"x" * BEGIN
 
 
 def bytes_until_cut(raw: socket.socket, piece: bytes, pause: float) -> int:
@@ -160,27 +152,25 @@ def bytes_until_cut(raw: socket.socket, piece: bytes, pause: float) -> int:
 
 
 @pytest.mark.parametrize("tcp", [False, True], ids=["unix", "tcp"])
-@pytest.mark.parametrize("name", ["long request line", "large body"])
-def test_a_client_that_never_stops_is_cut_after_its_bytes(server: Served, monkeypatch, name: str, tcp: bool) -> None:
-    monkeypatch.setattr(connection_module, "LINGER_SECONDS", 10 * PATIENCE)
+def test_a_client_that_never_stops_is_cut_after_its_bytes(server: Served, monkeypatch, tcp: bool) -> None:
+    monkeypatch.setattr(guard_module, "LINGER_SECONDS", 10 * PATIENCE)
     with connect(server, tcp) as raw:
-        raw.sendall(REFUSED[name][1][:BEGIN])
+        raw.sendall(ENDLESS[:BEGIN])
         between = 16 * 1024 * 1024  # what the kernel may hold of it
         assert bytes_until_cut(raw, b"x" * 65536, 0.0) < LINGER_BYTES + between
 
 
 @pytest.mark.parametrize("tcp", [False, True], ids=["unix", "tcp"])
-@pytest.mark.parametrize("name", ["long request line", "large body"])
-def test_a_client_that_never_stops_is_cut_after_its_time(server: Served, monkeypatch, name: str, tcp: bool) -> None:
-    monkeypatch.setattr(connection_module, "LINGER_SECONDS", 0.2)
+def test_a_client_that_never_stops_is_cut_after_its_time(server: Served, monkeypatch, tcp: bool) -> None:
+    monkeypatch.setattr(guard_module, "LINGER_SECONDS", 0.2)
     with connect(server, tcp) as raw:
-        raw.sendall(REFUSED[name][1][:BEGIN])
+        raw.sendall(ENDLESS[:BEGIN])
         bytes_until_cut(raw, b"x", 0.01)
 
 
 def test_clients_that_stay_after_their_answer_hold_no_place_for_long(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(server_module, "MOST_CONNECTIONS", 5)
-    monkeypatch.setattr(connection_module, "LINGER_SECONDS", 0.2)
+    monkeypatch.setattr(guard_module, "LINGER_SECONDS", 0.2)
     with served(MadeUpView, tmp_path / "api.sock") as server:
         staying = [connect(server, False) for _ in range(4)]
         for raw in staying:
@@ -194,7 +184,7 @@ def test_clients_that_stay_after_their_answer_hold_no_place_for_long(tmp_path: P
 
 
 def test_the_server_ends_before_a_client_that_stays_has_to(tmp_path: Path) -> None:
-    assert connection_module.LINGER_SECONDS < CLOSING_SECONDS
+    assert guard_module.LINGER_SECONDS < CLOSING_SECONDS
     with served(MadeUpView, tmp_path / "api.sock") as server:
         idle, staying = connect(server, False), connect(server, False)
         staying.sendall(REFUSED["large body"][1])
@@ -203,84 +193,3 @@ def test_the_server_ends_before_a_client_that_stays_has_to(tmp_path: Path) -> No
     for raw in (idle, staying):
         with raw, pytest.raises(BrokenPipeError):
             raw.sendall(b"x")
-
-
-class Noting(asyncio.Protocol):
-    """Where a connection's end is seen."""
-
-    def __init__(self) -> None:
-        self.ends: list[Exception | None] = []
-        self.ended = asyncio.Event()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self.ends.append(exc)
-        self.ended.set()
-
-
-async def closed_after(answer: bytes, ours: socket.socket) -> tuple[Noting, Connection]:
-    """A connection with a long answer, just closed."""
-    protocol = Noting()
-    transport = Connection(lambda **_: protocol)
-    await asyncio.get_running_loop().connect_accepted_socket(lambda: transport, ours)
-    transport.data_received(b"request")
-    transport.write(answer)
-    transport.close()
-    assert transport.is_closing()
-    transport.write(b"too late")
-    transport.close()
-    return protocol, transport
-
-
-@pytest.fixture
-def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        theirs.settimeout(PATIENCE)
-        yield ours, theirs
-
-
-def test_a_slow_reader_gets_the_whole_answer(pair, monkeypatch) -> None:
-    monkeypatch.setattr(connection_module, "LINGER_SECONDS", 0.05)
-    ours, theirs = pair
-    answer = b"0123456789" * 500_000
-
-    async def run() -> tuple[Noting, bytes]:
-        protocol, transport = await closed_after(answer, ours)
-        await asyncio.sleep(0.2)  # longer than the time of a drain, which has not begun
-        assert transport.get_write_buffer_size() > 0
-        got = await asyncio.to_thread(rest_of, theirs)
-        await asyncio.wait_for(protocol.ended.wait(), PATIENCE)  # though the client has not closed
-        return protocol, got
-
-    protocol, got = asyncio.run(run())
-    assert got == answer
-    assert protocol.ends == [None]
-
-
-def test_a_client_that_never_reads_is_cut(pair, monkeypatch) -> None:
-    monkeypatch.setattr(connection_module, "FLUSH_SECONDS", 0.1)
-    ours, theirs = pair
-    answer = b"0123456789" * 500_000
-
-    async def run() -> Noting:
-        protocol, _ = await closed_after(answer, ours)
-        await asyncio.wait_for(protocol.ended.wait(), PATIENCE)
-        return protocol
-
-    assert asyncio.run(run()).ends == [None]
-    assert len(rest_of(theirs)) < len(answer)
-
-
-@pytest.mark.usefixtures("patient")
-def test_a_client_that_closes_ends_the_drain_at_once(pair) -> None:
-    ours, theirs = pair
-
-    async def run() -> Noting:
-        protocol, _ = await closed_after(b"answer", ours)
-        assert await asyncio.to_thread(rest_of, theirs) == b"answer"
-        assert not protocol.ended.is_set()
-        theirs.close()
-        await asyncio.wait_for(protocol.ended.wait(), PATIENCE / 2)
-        return protocol
-
-    assert asyncio.run(run()).ends == [None]

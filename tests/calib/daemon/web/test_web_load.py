@@ -19,7 +19,7 @@ from made_up_view import MadeUpView
 from served_page import Served, served
 
 from calib.daemon import service_view
-from calib.daemon.web import admission, connection, stream
+from calib.daemon.web import connection, stream
 from calib.daemon.web.stream import Streams
 
 ROWS = 3000
@@ -81,49 +81,6 @@ def test_idle_strangers_on_tcp_lock_nobody_out(
     assert len(caplog.records) < 100
 
 
-class Connection:
-    def __init__(self, room: admission.Admission, address: str, owner: str = "") -> None:
-        self.room, self.address, self.owner = room, address, owner or address
-        self.is_cut = self.begun = self.gave_way = False
-
-    def begin(self) -> None:
-        self.begun = True
-
-    def give_way(self) -> None:
-        self.gave_way = True
-
-    def cut(self) -> None:
-        self.is_cut = True
-        self.room.leave(self)
-
-    def unsent(self) -> int:
-        return 1 << 20
-
-
-def test_of_one_address_only_the_newest_strangers_stay() -> None:
-    room = admission.Admission()
-    first = [Connection(room, "192.0.2.1") for _ in range(admission.MOST_OF_AN_ADDRESS + 3)]
-    others = [Connection(room, f"192.0.2.{number}") for number in range(2, 40)]
-    for each in first + others:
-        room.enter(each)
-    assert [each.is_cut for each in first[:3]] == [True] * 3
-    kept = [each for each in first + others if not each.is_cut]
-    assert len(kept) == admission.MOST_STRANGERS
-    assert others[-1] in kept
-    trusted = kept[0]
-    assert room.trust(trusted)
-    for number in range(200):
-        room.enter(Connection(room, f"198.51.100.{number}"))
-    assert not trusted.is_cut
-    stuck = [Connection(room, "") for _ in range(20)]
-    for each in stuck:
-        room.stuck(each)
-    assert [each.is_cut for each in stuck] == [True] * 4 + [False] * 16  # 16 MB of answers nobody takes
-    stuck[-1].unsent = lambda: (1 << 20) + 1  # type: ignore[method-assign]
-    room.stuck(stuck[-1])
-    assert [each.is_cut for each in stuck] == [True] * 5 + [False] * 15
-
-
 @pytest.mark.long
 def test_a_long_history_nobody_reads_is_neither_made_nor_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "PATIENCE_SECONDS", 1.0)
@@ -169,53 +126,6 @@ def test_a_reader_that_does_not_read_is_cut_on_every_route(
         assert answer.status_code == 200
     wait_until_cut([reader])
     assert len(rest_of(reader)) < 20_000_000
-
-
-def test_on_the_socket_the_process_that_holds_most_makes_room_and_nobody_is_cut_off_from_an_answer() -> None:
-    now = [0.0]
-    room = admission.Admission(lambda: now[0])
-    crowd = [Connection(room, "", "process 1") for _ in range(admission.MOST_LOCAL + 10)]
-    for each in crowd:
-        room.enter(each)
-    assert [each.begun for each in crowd].count(True) == admission.MOST_LOCAL
-    new = Connection(room, "", "process 2")
-    room.enter(new)
-    assert not new.begun  # all others may still send their first request
-    for each in crowd[:5]:
-        room.asked(each)
-    now[0] = admission.FIRST_SECONDS
-    room.admit()
-    assert new.begun
-    assert crowd[5].gave_way  # the oldest that has asked for nothing
-    assert all(each.begun for each in crowd)
-    assert not any(each.is_cut or each.gave_way for each in crowd[:5])
-    for each in crowd[16:]:
-        room.asked(each)
-    busy = Connection(room, "", "process 3")
-    room.asked(new)
-    room.enter(busy)
-    assert not busy.begun
-    room.answered(crowd[0])
-    assert busy.begun
-    assert crowd[0].gave_way
-    assert not any(each.is_cut for each in (*crowd, new, busy))
-
-
-def test_a_full_queue_of_one_process_does_not_keep_others_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(admission, "MOST_LOCAL", 4)
-    monkeypatch.setattr(admission, "MOST_QUEUED", 8)
-    room = admission.Admission(lambda: 0.0)
-    crowd = [Connection(room, "", "process 1") for _ in range(12)]
-    for each in crowd:
-        room.enter(each)
-        room.asked(each)
-    new = Connection(room, "", "process 2")
-    room.enter(new)
-    assert [each.is_cut for each in crowd] == [False] * 4 + [True] + [False] * 7
-    assert not new.is_cut
-    room.answered(crowd[0])
-    assert new.begun
-    assert not crowd[5].begun
 
 
 CROWD = 600

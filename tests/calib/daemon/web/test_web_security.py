@@ -193,7 +193,6 @@ def test_malformed_requests_get_4xx(server: Served, view: MadeUpView, request_by
     server.do(view.propose)
     answer = exchange(server, request_bytes)
     assert answer.startswith(b"HTTP/1.1 4"), answer[:200]
-    assert b'"error"' in answer
     assert server.do(lambda: view.offered[0].state) == "pending"
     assert server.client().get("/api/status").status_code == 200
 

@@ -18,7 +18,6 @@ from small_arm import small_arm
 
 from calib.daemon.service_view import ServiceView
 from calib.daemon.web import stream as stream_module
-from calib.daemon.web.server import ACCEPTED_AT_ONCE
 from calib.daemon.web.stream import Streams
 
 
@@ -117,7 +116,7 @@ def test_fifty_clients_get_every_item_and_it_is_encoded_once(server: Served, vie
 def test_clients_that_connect_while_the_service_is_busy_are_let_in(server: Served) -> None:
     """More than are accepted in one go, and none of them waits in connect()."""
     with contextlib.ExitStack() as opened:
-        clients = [opened.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(5 * ACCEPTED_AT_ONCE)]
+        clients = [opened.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(160)]
 
         def connect() -> None:
             for each in clients:
@@ -229,16 +228,3 @@ def test_a_stream_that_is_asked_for_while_the_server_ends_ends_at_once() -> None
 
     assert asyncio.run(run()) == 0
     assert sent == [{"type": "http.response.body", "body": b"", "more_body": False}]
-
-
-@pytest.mark.parametrize("before", [b"", b"GET /api/status HTTP/1.1\r\nHost: localhost\r\n\r\n"])
-def test_who_sends_more_after_asking_for_the_stream_is_cut(server: Served, before: bytes) -> None:
-    """Found by the campaign fuzz_api: nothing of it is ever read, and the client waited to send the rest."""
-    stream, rest = b"GET /api/stream HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n" * 200_000
-    with socket.socket(socket.AF_UNIX) as client:
-        client.settimeout(30)
-        client.connect(str(server.path))
-        with pytest.raises(ConnectionError):  # a time-out is none
-            client.sendall(before + stream + rest)
-    with server.client().stream("GET", "/api/stream") as answer:
-        assert first(items(answer), "joints")

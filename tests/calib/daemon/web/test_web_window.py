@@ -13,7 +13,7 @@ from small_arm import small_arm
 
 from armlink.recording.files import load_recording
 from armlink.recording.ros_joint_state import JointStateDecoder
-from calib.daemon.web.window import PIECE, csv_lines, mcap_pieces
+from calib.daemon.web.history import PIECE, csv_lines, mcap_pieces
 
 
 def test_json_csv_and_mcap_are_the_same_rows(server: Served, view: MadeUpView, tmp_path: Path) -> None:

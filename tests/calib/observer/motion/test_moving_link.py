@@ -11,7 +11,7 @@ from armlink.link.types import Command
 from calib.arm.kinematics import gcomp_arm
 from calib.fit.creep_fit import fit_creep
 from calib.motion.trajectory import trajectory
-from calib.observer.events import Event
+from calib.observer.decision import Event
 from calib.observer.observer import observer_of
 from calib.plan.creep_plan import plan_creep
 from calib.sweep.run import run_sweep

@@ -14,10 +14,9 @@ from judged_creeps import creep_arm
 from calib.arm.kinematics import gcomp_arm
 from calib.daemon.state.events import describe
 from calib.fit.creep_fit import fit_rows
-from calib.observer.events import Event
+from calib.observer.decision import Event
 from calib.observer.evidence import ChangeHypothesis, ResidualTest
-from calib.observer.motion.change_test import ChangeTest
-from calib.observer.motion.observer import MovingObserver
+from calib.observer.moving_observer import ChangeTest, MovingObserver
 from calib.observer.observer import Observer, observer_of
 from calib.plan.creep_plan import plan_creep
 from calib.records.records import CalibrationRecord, GravityRecord

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from calib.observer.motion.passages import WIDTH, Passage, PassageDetector
+from calib.observer.motor_belief import WIDTH, Passage, PassageDetector
 
 PERIOD = 0.02
 

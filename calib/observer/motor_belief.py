@@ -1,4 +1,8 @@
-"""Belief about drives whose torque is a motor current: friction, gravity and their doubts.
+"""Rows of motion of drives whose torque is a motor current, and the belief about these: friction, gravity, doubts.
+
+Where torque is a motor current, friction hides gravity at rest; while a joint moves, friction has a known sign. A row
+is a passage: the averages over a stretch of ordinary motion in which a joint moves at constant speed. A stretch counts
+only if no joint of the arm speeds up or slows down in it, so that inertia takes no torque.
 
 The unknowns are those of `gcomp.identify.motor_model`, against readings that are corrected by the record in force:
 gains are 1 and offsets 0 while nothing has changed. Records say how sure each value is, though not how gains and
@@ -7,18 +11,124 @@ mass moments go together, nor how friction changes over position: that is learne
 
 from collections.abc import Sequence
 from copy import copy
-from typing import Self
+from dataclasses import dataclass, field
+from typing import Any, Self
 
 import numpy as np
 
-from calib.observer.config import NOISE_ROWS
-from calib.observer.motion.passages import Passage
+from calib.fit.calibration import NOISE_ROUNDS, USUAL_ROWS
+from calib.motion.static_reading import LEAST_SAMPLES
+from calib.observer.config import LONGEST_GAP
+from calib.observer.saved_values import known
 from calib.records.records import CalibrationRecord, GravityRecord, MotorTorque
 from gcomp.arm.arm import Arm
-from gcomp.arrays import Array
+from gcomp.arrays import Array, as_array
 from gcomp.gravity.torque import gravity_regressor
 from gcomp.identify.motor_model import LAST_ZERO, MotorDoubt, MotorModel, family_slices
 from gcomp.identify.readings import StaticReadings
+
+WIDTH = 0.1
+"""A stretch is complete when some joint has moved this far [rad]: two or three periods of a motor's cogging."""
+LEAST_SECONDS, MOST_SECONDS = 0.2, 3.0
+"""Shortest and longest stretch [s]: a slower joint creeps below the speeds at which its friction is known."""
+SLOWEST = 0.03
+"""Below this speed friction depends on the time at rest [rad/s]: such a joint gives no row."""
+STEADY = 0.15
+"""Largest acceleration in a stretch [rad/s²]: 1 kg·m² then takes 0.15 N·m."""
+TURNED = 0.03
+"""After a reversal friction has turned round once the joint has moved so far [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """One joint's averages over a stretch of motion."""
+
+    t: float
+    """Middle of the stretch [s]."""
+    joint: int
+    position: Array
+    """Of all joints (n,) [rad]."""
+    torque: float
+    """Of this joint's motor [N·m]."""
+    velocity: float
+    """Of this joint, with sign [rad/s]."""
+    temperature: float
+    """Of its drive [°C]; NaN if it is not known."""
+
+    def to_json(self) -> list[Any]:
+        """As JSON values, without the time, since clocks restart with the machine."""
+        warm = known(np.array([self.temperature]))[0]
+        return [self.joint, self.position.tolist(), self.torque, self.velocity, warm]
+
+    @classmethod
+    def from_json(cls, values: Any, n: int) -> "Passage":
+        """Read back; raises TypeError, ValueError or LookupError where the values do not fit n joints."""
+        joint, position, torque, velocity, warm = values
+        if not 0 <= int(joint) < n:
+            raise ValueError(f"joint {joint} of {n}")
+        temperature = np.nan if warm is None else float(warm)
+        where = as_array("position", position, (n,))
+        return cls(0.0, int(joint), where, float(torque), float(velocity), temperature)
+
+
+@dataclass
+class PassageDetector:
+    """Cuts samples of an arm of n joints into stretches, and averages the steady ones."""
+
+    n: int
+    _samples: list[tuple[float, Array, Array]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._side = np.zeros(self.n)
+        self._turned_at = np.full(self.n, np.nan)
+
+    def handle(self, t: float, position: Array, torque: Array, temperature: Array | None = None) -> list[Passage]:
+        """Take one sample ((n,) each, SI, temperatures in °C); the rows of the stretch that it completes."""
+        if not (np.isfinite(position).all() and np.isfinite(torque).all()):
+            self._samples.clear()
+            return []
+        if self._samples and not 0 < t - self._samples[-1][0] <= LONGEST_GAP:
+            self._samples.clear()
+        self._samples.append((t, position.copy(), torque.copy()))
+        first = self._samples[0]
+        if np.abs(position - first[1]).max() < WIDTH or t - first[0] < LEAST_SECONDS:
+            if t - first[0] > MOST_SECONDS:
+                self._samples = [self._samples[-1]]
+            return []
+        rows = self._rows(np.full(self.n, np.nan) if temperature is None else temperature)
+        self._samples = [self._samples[-1]]
+        return rows
+
+    def _rows(self, temperature: Array) -> list[Passage]:
+        times, positions, torques = (np.array(column) for column in zip(*self._samples, strict=True))
+        if len(times) < LEAST_SAMPLES:
+            return []
+        half = len(times) // 2
+        early, late = _speed(times[: half + 1], positions[: half + 1]), _speed(times[half:], positions[half:])
+        velocity = (positions[-1] - positions[0]) / (times[-1] - times[0])
+        side = np.where(np.abs(velocity) >= SLOWEST, np.sign(velocity), 0.0)
+        turned = (side != 0) & (side != self._side)
+        self._turned_at = np.where(turned, positions[0], self._turned_at)
+        self._side = np.where(side != 0, side, self._side)
+        if (np.abs(late - early) > STEADY * (times[-1] - times[0]) / 2).any():
+            return []
+        onward = (np.sign(early) == side) & (np.sign(late) == side)
+        settled = np.abs(positions[0] - self._turned_at) >= TURNED
+        weight = np.hanning(len(times) + 2)[1:-1]  # suppresses ripple with the position
+        weight /= weight.sum()
+        here, pull, when = weight @ positions, weight @ torques, float(weight @ times)
+        return [
+            Passage(when, int(j), here, float(pull[j]), float(velocity[j]), float(temperature[j]))
+            for j in np.flatnonzero((side != 0) & onward & settled)
+        ]
+
+
+def _speed(t: Array, position: Array) -> Array:
+    """Least-squares slope (n,) [rad/s]."""
+    centred = t - t.mean()
+    slope: Array = centred @ position / (centred @ centred)
+    return slope
+
 
 ZERO_STD = 2e-3
 """Least standard deviation of a position zero [rad]: links give way."""
@@ -31,8 +141,6 @@ FITTED = 5
 """Rows of a joint that its own parameters take up."""
 NEIGHBOUR_DISTANCE = 0.2
 """Rows of a joint are neighbours if it moved less between them [rad]."""
-LEARNING_ROUNDS = 3
-"""Linearisations of learning, each with the scatter found by the one before."""
 UNKNOWN_WARMTH_STD = 0.01
 """Doubt of a gain where no temperature is known: a drive that warms by 10 K loses a hundredth."""
 KNOWN_WARMTH_STD = 5e-4
@@ -111,7 +219,7 @@ class MotorBelief:
         first_mean, first_covariance, belief.sigma = self._first
         model = MotorModel(self.arm, self.rows(belief.learnt))
         belief.mean = first_mean
-        for _ in range(LEARNING_ROUNDS):
+        for _ in range(NOISE_ROUNDS):
             predicted, jacobian = model.linearised(belief.mean)
             noise = belief.sigma[model.joint] ** 2
             target = model.reading - predicted + jacobian @ (belief.mean - first_mean)
@@ -125,13 +233,13 @@ class MotorBelief:
     def _scatter(self, model: MotorModel, residual: Array) -> Array:
         """Standard deviation of a row (n,) [N·m]: as measured, drawn towards what was assumed.
 
-        Neighbouring rows whose residuals are alike count for less than one each, as in `calib.fit.scatter`.
+        Neighbouring rows whose residuals are alike count for less than one each, as in `calib.fit.creep_residuals`.
         """
         usual, found = self._first[2], np.empty(self.arm.n)
         for j in range(self.arm.n):
             own = np.flatnonzero(model.joint == j)
             square = residual[own] ** 2
-            variance = (square.sum() + NOISE_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + NOISE_ROWS)
+            variance = (square.sum() + USUAL_ROWS * usual[j] ** 2) / (max(len(own) - FITTED, 0) + USUAL_ROWS)
             near = np.abs(np.diff(model.readings.position[own, j])) < NEIGHBOUR_DISTANCE
             common = float((residual[own][1:] * residual[own][:-1])[near].sum() / max(square[1:][near].sum(), 1e-12))
             found[j] = np.sqrt(variance * (1 + 2 * min(max(common, 0.0), 1.0)))
