@@ -32,9 +32,8 @@ def drafted(name: str, other: str, note: str = "") -> Draft:
     ]
     joints[0].notes = [note] if note else []
     aside = ((other, "is a gripper"),)
-    bus: dict[str, str | int] = {"interface": other, "channel": name, "bitrate": 1}
     notes = [note] if note else []
-    return Draft(name, Path("arm.urdf"), other, (0.0, 0.0, -9.81), joints, aside, notes, bus, name, other, note or None)
+    return Draft(name, Path("arm.urdf"), other, (0.0, 0.0, -9.81), joints, aside, notes, name, other, note or None)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -53,14 +52,14 @@ def test_a_name_is_read_back_as_it_is(name, tmp_path):
 @settings(deadline=None, max_examples=50, derandomize=True)
 @given(TEXTS.filter(lambda name: name != "j-2.a"), TEXTS, TEXTS)
 def test_no_text_from_outside_adds_to_the_file(name, other, note):
-    """Whatever stands in names of joints, bodies, files, buses, and in remarks."""
+    """Whatever stands in names of joints, bodies, files, and in remarks."""
     content = yaml.safe_load(arm_text(drafted(name, other, note), Path("/nowhere/arm.yaml")))
     assert set(content) - {"sweep"} == {"name", "serial", "kinematics", "link", "sim"}
     assert set(content["kinematics"]) == {"model", "base", "tip", "gravity", "stops"}
     assert content["kinematics"]["stops"] == {name: [-1.0, 1.0], "j-2.a": [-1.0, 1.0]}
     assert (content["kinematics"]["base"], content["kinematics"]["tip"]) == (other, other)
     assert set(content["link"]) == {"bus", "rate", "joints"}
-    assert content["link"]["bus"] == {"interface": other, "channel": name, "bitrate": 1}
+    assert content["link"]["bus"] == {"interface": "armlink_sim", "channel": "arm.yaml", "bitrate": 1000000}
     assert (content["name"], content["serial"]) == (name, name)
     assert content.get("sweep", {"hold": "servo"}) == {"hold": "servo"}
 
