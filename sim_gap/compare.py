@@ -15,8 +15,8 @@ from armlink.recording.corrections import AS_IT_IS, Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnose import checked_recordings
+from sim_gap.checks.check import is_position_only
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.position_command import is_position_only
 from sim_gap.model.known_gains import KnownGains
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.fit import LoopFit, evaluate

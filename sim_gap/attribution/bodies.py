@@ -1,7 +1,7 @@
 """Bodies that only some recordings have: which of them were made with one, and how it was mounted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -70,7 +70,7 @@ def numbered_by_body(estimate: EffectEstimate, heldout: ResidualSet) -> Residual
         best = tried[int(np.argmin(left))]
         if tried[0].number != ABSENT:
             alone = ResidualSet((tried[0],), heldout.layout)
-            own = _own(estimate, estimate.on(alone), body, 0).values
+            own, _ = _own(estimate, estimate.on(alone), body, 0)
             turned = replace(tried[0], mount=_turn(s, estimate.of(body), own))
             best = turned if _left(estimate, replace(alone, signals=(turned,))) < min(left) - CLEARLY else best
         out.append(best)
@@ -86,48 +86,23 @@ ALIKE = 0.5
 OF_A_BODY, NEAR = 0.1, 2.0
 """Largest share of the squares that a body leaves of a gap that is one; multiple of its margin from which a row has a
 gap."""
-OPPOSITE = 0.9
-"""Cosine from which two moments are opposite."""
 
 
 def mounts(estimate: EffectEstimate) -> tuple[float, ...]:
-    """Angle by which the body is turned in each training recording against the first that has it [rad].
-
-    Without a body found, one that is turned by half a turn between recordings may have been missed, as its moment
-    cancels: then of what is left, the recordings want opposite moments.
-    """
+    """Angle by which the body is turned in each training recording against the first that has it [rad]."""
     body, data = body_of(estimate), estimate.store.data
-    term = body or Term("link.payload", 0)
-    have = [k for k, s in enumerate(data.signals) if term.form.signature.present(term.shape, s.number)]
     angles = [s.mount for s in data.signals]
-    if len(have) < 2:
-        return tuple(angles)
-    owns = {k: _own(estimate, estimate.store, term, k) for k in have}
-    one = owns[have[0]]
-    for k in have[1:]:
-        if body is not None:
-            angle = _turn(data.signals[k], one.values, owns[k].values)
-        else:
-            clear = min(one.fall, owns[k].fall) > CLEARLY
-            angle = np.pi if clear and _opposite(data.signals[k], one.values, owns[k].values) else 0.0
-        if abs(angle) > TURNED:
-            angles[k] += angle
+    have = [k for k, s in enumerate(data.signals) if body and body.form.signature.present(body.shape, s.number)]
+    owns = [_own(estimate, estimate.store, body, k)[0] for k in have] if body and len(have) > 1 else []
+    for k, own in zip(have, owns, strict=False):
+        angle = _turn(data.signals[k], owns[0], own)
+        angles[k] += angle if abs(angle) > TURNED else 0.0
     return tuple(angles)
 
 
-@dataclass(frozen=True)
-class _Own:
-    """Mass and first moment of the body from one recording alone, (4,)."""
-
-    values: Array
-    fall: float
-    """Fall of Σ ½ log(R² + floor²) over the rows by it."""
-    left: float
-    """Share of the squares of the rows with a gap that it leaves; one without a gap."""
-
-
-def _own(estimate: EffectEstimate, store: ColumnStore, body: Term, recording: int) -> _Own:
-    """The body in one recording of a set, all else as in the estimate."""
+def _own(estimate: EffectEstimate, store: ColumnStore, body: Term, recording: int) -> tuple[Array, float]:
+    """Mass and first moment (4,) of the body in one recording of a set, all else as in the estimate, and the share of
+    the squares of the rows with a gap that it leaves; one without a gap."""
     data = store.data
     explained = estimate.predict(data, store)
     start = sum(data.lengths[:recording])
@@ -137,30 +112,14 @@ def _own(estimate: EffectEstimate, store: ColumnStore, body: Term, recording: in
         valid = data.valid[row][part]
         x, y = columns[part][valid], (data.values[row] - explained[row])[part][valid]
         if len(y):
-            floor = data.relevance_floor[row] ** 2
-            rows.append((x, y, floor, data.margin[row] ** 2))
-            gram += x.T @ x / (np.mean(y**2) + floor)
-            side += x.T @ y / (np.mean(y**2) + floor)
+            weight = 1.0 / (np.mean(y**2) + data.relevance_floor[row] ** 2)
+            rows.append((x, y, data.margin[row] ** 2))
+            gram, side = gram + weight * x.T @ x, side + weight * x.T @ y
     scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-12))
     change = scale * np.linalg.lstsq(gram * scale * scale[:, None], scale * side, 1e-8)[0]
-    squares = [(np.mean(y**2), np.mean((y - x @ change) ** 2), floor, margin) for x, y, floor, margin in rows]
-    fall = sum(0.5 * np.log((before + floor) / (after + floor)) for before, after, floor, _ in squares)
-    gaps = [after / before for before, after, _, margin in squares if before > NEAR**2 * margin]
+    gaps = [np.sum((y - x @ change) ** 2) / (y @ y) for x, y, margin in rows if np.mean(y**2) > NEAR**2 * margin]
     found = estimate.of(body) if body in estimate.terms else np.zeros(4)
-    return _Own(found + change, float(fall), float(np.mean(gaps)) if gaps else 1.0)
-
-
-def _across(s: PreparedSignals, body: Array) -> Array:
-    """Moment of a body across the last joint's axis, (3,)."""
-    axis = s.arm.axis[-1]
-    return np.asarray(body[1:] - (body[1:] @ axis) * axis)
-
-
-def _opposite(s: PreparedSignals, one: Array, other: Array) -> bool:
-    """Whether two moments across the last joint's axis are opposite."""
-    first, second = _across(s, one), _across(s, other)
-    sizes = sorted((float(np.linalg.norm(first)), float(np.linalg.norm(second))))
-    return sizes[0] > ALIKE * sizes[1] and float(first @ second) < -OPPOSITE * sizes[0] * sizes[1]
+    return found + change, float(np.mean(gaps)) if gaps else 1.0
 
 
 def _turn(s: PreparedSignals, one: Array, other: Array) -> float:
@@ -168,12 +127,13 @@ def _turn(s: PreparedSignals, one: Array, other: Array) -> float:
 
     They are alike if their masses are, and the sizes of their moments across the axis.
     """
-    across = [_across(s, body) for body in (one, other)]
+    axis = s.arm.axis[-1]
+    across = [body[1:] - (body[1:] @ axis) * axis for body in (one, other)]
     sizes = [np.array([abs(b[0]), np.linalg.norm(r)]) for b, r in zip((one, other), across, strict=True)]
     most = np.maximum(*sizes)
     if one[0] * other[0] <= 0.0 or np.any(np.abs(sizes[0] - sizes[1]) > ALIKE * most):
         return 0.0
-    return float(np.arctan2(np.cross(across[0], across[1]) @ s.arm.axis[-1], across[0] @ across[1]))
+    return float(np.arctan2(np.cross(across[0], across[1]) @ axis, across[0] @ across[1]))
 
 
 def recordings_with_another_body(estimate: EffectEstimate, heldout: ResidualSet) -> list[int]:
@@ -187,7 +147,7 @@ def recordings_with_another_body(estimate: EffectEstimate, heldout: ResidualSet)
         trial = Term("link.payload", 0)
         others = [(k, s) for k, s in enumerate(heldout.signals) if s.number not in known]
         owns = {k: _own(estimate, estimate.on(ResidualSet((s,), heldout.layout)), trial, 0) for k, s in others}
-        return [k for k, own in owns.items() if own.left < OF_A_BODY]
+        return [k for k, (_, left) in owns.items() if left < OF_A_BODY]
     if not all(body.form.signature.present(body.shape, number) for number in known):
         return []
     return [k for k, s in enumerate(heldout.signals) if s.number == ABSENT]

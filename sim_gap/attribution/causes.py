@@ -9,8 +9,7 @@ import numpy as np
 
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import HINT, Cause, Signs
-from sim_gap.attribution.law_test import LawTest
-from sim_gap.attribution.rivals import Rivals
+from sim_gap.attribution.rivals import LawTest, Rivals
 from sim_gap.attribution.verdict import FOUNDED, confidence
 from sim_gap.effects.registry import effects
 from sim_gap.residuals.layout import ChannelLayout, Row

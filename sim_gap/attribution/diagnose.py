@@ -31,10 +31,15 @@ from sim_gap.attribution.friction_compensation import find_compensations, held_i
 from sim_gap.attribution.position_answer import diagnose_positions
 from sim_gap.attribution.rivals import Rivals
 from sim_gap.attribution.verdict import is_within
-from sim_gap.checks.check import check_recordings, times_in_motion, unchecked_note
+from sim_gap.checks.check import (
+    check_position_only,
+    check_recordings,
+    is_position_only,
+    times_in_motion,
+    unchecked_note,
+)
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.joints import match_joints
-from sim_gap.checks.position_command import check_position_only, is_position_only
 from sim_gap.effects.registry import library_without
 from sim_gap.model.known_gains import KnownGains
 from sim_gap.model.load import SimModel, ends_of, hinges_between, load_compiled, load_model, with_gains

@@ -1,28 +1,29 @@
 """Entry point of the check: recordings and a model in, corrected recordings and findings out.
 
 Run before anything is fitted. A finding that is certain is corrected; one that is not names the options that settle it,
-and the recording is diagnosed as it is. Times, counts, jumps and ranges that no arm can have end the diagnosis.
+and the recording is diagnosed as it is. Times, counts, jumps and ranges that no arm can have end the diagnosis, and
+without a torque channel commands that do not belong to the positions do.
 """
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
 from armlink.errors import BadInput
 from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections, parse_corrections
-from armlink.recording.recording import Recording
+from armlink.recording.recording import TORQUE_CHANNELS, Recording
 from gcomp.arrays import Array
-from sim_gap.checks.channel_motion import motion_of
-from sim_gap.checks.column_pairs import follows_position, sound_velocity
+from sim_gap.checks.column_pairs import follows_position, require_commands, sound_velocity
 from sim_gap.checks.columns import find_wrong_columns
 from sim_gap.checks.finding import RecordingFinding
-from sim_gap.checks.joint_range import find_beyond_range, find_counts
+from sim_gap.checks.joint_range import find_beyond_range, find_counts, find_far
 from sim_gap.checks.jumps import find_jumps, find_seam, unwrap
 from sim_gap.checks.sampling import drop_held, drop_repeats, even_times, find_dropped, find_time_unit
-from sim_gap.checks.torque_source import find_gain_command, find_same, with_gravity
+from sim_gap.checks.sound_arm import motion_of
 from sim_gap.model.rigid_body import RigidArm
-from sim_gap.residuals.preprocess import CHANNELS, PreparedSignals, prepare
+from sim_gap.residuals.preprocess import CHANNELS, SHORTEST_S, PreparedSignals, prepare
 
 LEAST_WAY = 1.5
 """Way of the joints that move over their range (median) from which they turn back: a single stroke has 1."""
@@ -173,3 +174,96 @@ def _corrected(recording: Recording, finding: RecordingFinding, label: str, arm:
         return parse_corrections(effort_is=value).apply(recording, label)
     made = parse_corrections(**{keys[name]: [value]})  # type: ignore[arg-type]
     return replace(made.apply(recording, label), warning=recording.warning)
+
+
+LAWFUL, STEPS = 0.3, 50
+"""Least share of the variance of a command's steps that a law of gains explains (half on OpenArm, where positions,
+velocities and targets are rounded on the bus); least number of such steps."""
+
+
+def with_gravity(arm: RigidArm, recording: Recording, channels: Sequence[str]) -> Recording:
+    """The recording with the model's gravity added to these torque channels."""
+    still = np.zeros_like(recording.position)
+    gravity = arm.torque(recording.position, still, still)
+    made = {CHANNELS[channel]: getattr(recording, CHANNELS[channel]) for channel in channels}
+    return replace(recording, **{name: values + gravity for name, values in made.items() if values is not None})
+
+
+def find_same(recording: Recording, stated: Corrections) -> list[RecordingFinding]:
+    """A channel taken for a link sensor's that repeats the motors': arms without sensors have one reading of torque."""
+    link, motor = recording.torque, recording.motor_torque
+    if stated.effort or link is None or motor is None or not np.array_equal(link, motor, equal_nan=True):
+        return []
+    evidence = (
+        "the channel equals tau_motor in every sample, so these drives have only one torque reading, the torque "
+        "of their motors"
+    )
+    return [RecordingFinding("effort_source", "tau", "all", evidence, "--effort-is motor", True)]
+
+
+def find_gain_command(recording: Recording, stated: Corrections) -> list[RecordingFinding]:
+    """Commanded torque that is the law of drives with gains at the row's readings: kp (q_cmd − q) + kd (…) + τ.
+
+    The drive follows the position within its cycle, and the command may be another one already: the law then differs
+    from the torque made by kp times the way of half a cycle or more, which is far more than friction's uncertainty.
+    """
+    command, target, velocity = recording.torque_command, recording.position_command, recording.velocity
+    if "tau_cmd" in stated.clock or command is None or target is None or velocity is None:
+        return []
+    lawful = 0
+    for own, error, speed in zip(command.T, (target - recording.position).T, velocity.T, strict=True):
+        steps = np.diff(np.stack([own, error, speed]), axis=1)
+        steps = steps[:, np.isfinite(steps).all(axis=0)]
+        if steps.shape[1] < STEPS or np.ptp(steps[0]) == 0.0 or np.ptp(steps[1]) == 0.0:
+            continue
+        law = np.linalg.lstsq(steps[1:].T, steps[0], rcond=None)[0]
+        lawful += bool(np.var(law @ steps[1:]) > LAWFUL * np.var(steps[0]) and law[0] > 0.0)
+    if 2 * lawful <= recording.position.shape[1]:
+        return []
+    evidence = (
+        "the torque was computed as kp (q_cmd − q) from the values of the same row, but the drive computes it "
+        "at another time in the cycle, so the channel is left out"
+    )
+    return [RecordingFinding("clock", "tau_cmd", "all", evidence, "--clock tau_cmd=0 (to keep the channel)", True)]
+
+
+def is_position_only(recording: Recording) -> bool:
+    """Whether no torque channel of a recording holds a number."""
+    channels = [getattr(recording, name) for name in TORQUE_CHANNELS]
+    return all(values is None or not np.isfinite(values).any() for values in channels)
+
+
+def check_position_only(
+    arm: RigidArm, recordings: Sequence[Recording], labels: Sequence[str], stated: Corrections
+) -> tuple[list[Recording], list[RecordingFinding]]:
+    """Recordings on their sample times, without repeated rows, and the findings.
+
+    Raises BadInput where commands and positions do not belong together, with the option that settles it.
+    """
+    checked, found = [], []
+    short = [k for k, r in enumerate(recordings) if r.t[-1] - r.t[0] < SHORTEST_S]
+    for k in range(len(recordings)):
+        if k not in short:
+            require_commands([recordings[k]], labels[k], stated)
+    if short:  # together, since a lag turns what a single step seems to follow
+        more = f" and {len(short) - 1} more" if len(short) > 1 else ""
+        require_commands([recordings[k] for k in short], labels[short[0]] + more, stated)
+    for recording, label in zip(recordings, labels, strict=True):
+        if recording.position_command is None or not np.isfinite(recording.position_command).any():
+            raise BadInput(
+                f"{label}: no torque channel and no commanded position holds a number: record tau_1 …, "
+                "tau_motor_1 … or tau_cmd_1 …, or q_cmd_1 …"
+            )
+        looks = (
+            find_counts(recording, stated),
+            find_beyond_range(arm, recording, stated),
+            find_far(arm, recording, stated),
+        )
+        for finding in chain(*looks):
+            raise BadInput(f"{label}: {finding.refusal()}")
+        recording, repeated = drop_repeats(recording)
+        recording, jitter = even_times(recording, stated)
+        dropped = [] if repeated else find_dropped(recording)
+        checked.append(recording)
+        found += [finding for finding in (*repeated, *jitter, *dropped) if finding not in found]
+    return checked, found

@@ -13,10 +13,9 @@ import numpy as np
 from armlink.recording.corrections import Corrections
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, SIGNIFICANT
-from sim_gap.checks.channel_motion import ChannelMotion
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, exchangeable, exchanged, hypotheses, put_in_order
-from sim_gap.checks.sound_arm import likelihood, quick_costs
+from sim_gap.checks.sound_arm import ChannelMotion, likelihood, quick_costs
 from sim_gap.model.rigid_body import RigidArm
 
 CERTAIN_FALL = 5.0 * PRICE

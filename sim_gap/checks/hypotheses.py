@@ -10,9 +10,8 @@ import numpy as np
 
 from armlink.recording.corrections import WITHOUT_GRAVITY, Corrections
 from gcomp.arrays import Array
-from sim_gap.checks.channel_motion import ChannelMotion
 from sim_gap.checks.finding import Kind
-from sim_gap.checks.sound_arm import measurements
+from sim_gap.checks.sound_arm import ChannelMotion, measurements
 from sim_gap.model.rigid_body import RigidArm
 
 DEGREE = math.pi / 180.0

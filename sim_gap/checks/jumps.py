@@ -8,9 +8,9 @@ from scipy.signal import medfilt
 from armlink.recording.corrections import Corrections
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array
-from sim_gap.checks.channel_motion import TURNING
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.sampling import fill
+from sim_gap.checks.sound_arm import TURNING
 
 JUMP, TIMES = 0.05, 8.0
 """Step from row to row from which a position jumps [rad], and its speed over what is usual at the joint."""

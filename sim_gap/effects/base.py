@@ -90,7 +90,7 @@ EFFECTS = (
     InverseEffect(
         "base.tilt",
         Signature(_tilt, whole_arm=True, offset=_beside),
-        Plausibility(prior_std=lambda _signals, _place: np.full(2, TILT_DEVIATION)),
+        Plausibility(prior_std=TILT_DEVIATION),
         SearchHints(shapes_for=_starts, linearised_at=0, relinearise=lambda c, _shape: (float(c[0]), float(c[1]))),
     ),
 )

@@ -13,15 +13,11 @@ from gcomp.arrays import Array
 from sim_gap.effects.effect import (
     CLIPPED,
     NEAR_ONE,
-    Beneath,
     InverseEffect,
     Plausibility,
-    Ratings,
     SearchHints,
     Shape,
     Signature,
-    as_shape,
-    between,
     delay_effect,
 )
 from sim_gap.residuals.preprocess import PreparedSignals
@@ -31,16 +27,6 @@ ROTOR = 1.0
 matched to their load within a factor of some."""
 LONGEST = 0.2
 """Longest time that counts as a lag or delay [s]."""
-
-
-def _gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
-    """Torque produced per torque reported: the error of the torque constant."""
-    return 1.0 / (1.0 + coefficients)
-
-
-def _above_nominal(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
-    """The rotor may have less inertia than the model's armature."""
-    return -ratings.armature, np.inf
 
 
 def _missing(lost: Callable[[Array, float, float], Array]) -> Signature:
@@ -76,18 +62,16 @@ EFFECTS = (
     InverseEffect(  # the whole nominal motor torque: known rotor inertia and friction are scaled too
         "actuator.gain",
         Signature.at_motor(lambda s, j, _: s.motor_model[:, j], "motor", "drive"),
-        Plausibility(
-            background_std=0.002, prior_std=lambda _signals, _place: np.full(1, 0.5), bounds=between(-0.5, 1.0)
-        ),
-        parameters_of=_gain,
+        Plausibility(background_std=0.002, prior_std=0.5, bounds=(-0.5, 1.0)),
+        parameters_of=lambda c, _shape, _: 1.0 / (1.0 + c),  # torque produced per torque reported
     ),
-    InverseEffect(
+    InverseEffect(  # the rotor may have less inertia than the model's armature
         "actuator.rotor_inertia",
         Signature.at_motor(lambda s, j, _: s.a[:, j], "motor"),
         Plausibility(
             every_joint=True,
-            prior_std=lambda signals, _place: np.full(1, ROTOR * signals.arm.stretched_inertia),
-            bounds=_above_nominal,
+            prior_std=lambda signals, _place: ROTOR * signals.arm.stretched_inertia,
+            bounds=lambda ratings, _shape: (-ratings.armature, np.inf),
         ),
     ),
     delay_effect("actuator.lag", _missing(_lag), 0.01, LONGEST),
@@ -95,8 +79,8 @@ EFFECTS = (
     InverseEffect(
         "actuator.saturation",
         _missing(_clipped),
-        Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), bounds=NEAR_ONE),
+        Plausibility(prior_mean=1.0, prior_std=CLIPPED, bounds=NEAR_ONE),
         SearchHints(shapes_for=_levels),
-        parameters_of=as_shape,
+        parameters_of=lambda _, shape, _beneath: [shape[0]],
     ),
 )

@@ -50,7 +50,7 @@ class Ratings:
     """Coefficients of the effect itself as estimated."""
 
 
-Bounds = Callable[[Ratings, Shape], tuple[Array | float, Array | float]]
+Bounds = tuple[Array | float, Array | float]
 """Least and largest coefficients of an effect that can exist."""
 
 Channel = Literal["any", "sensor", "motor", "command"]
@@ -126,18 +126,6 @@ def _2d(columns: Array) -> Array:
     return columns[:, None] if columns.ndim == 1 else columns
 
 
-def unbounded(_ratings: Ratings, _shape: Shape) -> tuple[float, float]:
-    return -np.inf, np.inf
-
-
-def not_negative(_ratings: Ratings, _shape: Shape) -> tuple[float, float]:
-    return 0.0, np.inf
-
-
-def between(low: float, high: float) -> Bounds:
-    return lambda _ratings, _shape: (low, high)
-
-
 @dataclass(frozen=True)
 class Plausibility:
     """Priors of an effect, and the values that can exist."""
@@ -148,14 +136,21 @@ class Plausibility:
     """Number of extra coefficients that the effect is charged for: 0 if many arms have it, more if few have."""
     prior_mean: float = 0.0
     """Prior mean of the coefficients: 1 if the shape alone determines the effect."""
-    prior_std: Callable[[PreparedSignals, int], Array] = lambda _signals, _place: np.full(1, np.inf)
-    """Prior standard deviation of each coefficient (p,), its largest plausible size; infinite for none."""
+    prior_std: float | Array | Callable[[PreparedSignals, int], float | Array] = np.inf
+    """Prior standard deviation of each coefficient, its largest plausible size, of signals and place; infinite for
+    none."""
     background_std: float = 0.0
     """Standard deviation of each coefficient over sound arms; confidence intervals include it."""
     background_nm: bool = False
     """Whether it is a torque, and so smaller on arms of little strength."""
-    bounds: Bounds = unbounded
-    """Least and largest coefficients that can exist."""
+    bounds: Bounds | Callable[[Ratings, Shape], Bounds] = (-np.inf, np.inf)
+    """Least and largest coefficients that can exist, of ratings and shape."""
+
+    def spread(self, signals: PreparedSignals, place: int) -> float | Array:
+        return self.prior_std(signals, place) if callable(self.prior_std) else self.prior_std
+
+    def limits(self, ratings: Ratings, shape: Shape) -> Bounds:
+        return self.bounds(ratings, shape) if callable(self.bounds) else self.bounds
 
 
 @dataclass(frozen=True)
@@ -185,31 +180,6 @@ class SearchHints:
         return self.shapes if self.shapes_for is None else self.shapes_for(signals, place)
 
 
-def as_fitted(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
-    """The coefficients are the reported parameters."""
-    return coefficients
-
-
-def as_gain(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
-    """The coefficient is a gain's distance from one."""
-    return 1.0 + coefficients
-
-
-def as_shape(_coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
-    """The shape is the reported parameter."""
-    return np.array([shape[0]])
-
-
-def as_fitted_and_shape(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
-    """The coefficient and the shape are the reported parameters."""
-    return np.array([coefficients[0], shape[0]])
-
-
-def as_share_of_shape(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
-    """The coefficient is a factor on the shape."""
-    return coefficients * shape[0]
-
-
 @dataclass(frozen=True)
 class InverseEffect:
     """The inverse form of one effect."""
@@ -220,7 +190,7 @@ class InverseEffect:
     hints: SearchHints = SearchHints()
     needs: tuple[str, ...] = ()
     """Effects at the same place that it builds on: the simpler model."""
-    parameters_of: Callable[[Array, Shape, Beneath], Array] = as_fitted
+    parameters_of: Callable[[Array, Shape, Beneath], Array | list[float]] = lambda c, _shape, _beneath: c
     """Reported parameters from coefficients, shape and the coefficients of `needs`, in the catalogue's order."""
 
     @property
@@ -232,14 +202,12 @@ SHORTEST_DELAY = 1e-3
 """Shortest time that counts as a delay or a lag [s]."""
 CLIPPED = 0.2
 """Prior standard deviation of a clipped signal's coefficient about one: all above the level is cut off."""
-NEAR_ONE = between(0.6, 1.6)
+NEAR_ONE = (0.6, 1.6)
+"""Bounds of such a coefficient."""
 
 
 def delay_effect(effect_id: str, signature: Signature, start: float, longest: float) -> InverseEffect:
     """An effect whose shape is a time: the search starts at `start` and goes up to `longest` [s]."""
-
-    def bounds(_ratings: Ratings, shape: Shape) -> tuple[float, float]:
-        return SHORTEST_DELAY / shape[0], longest / shape[0]
 
     def relinearise(coefficients: Array, shape: Shape) -> Shape:
         return (float(np.clip(coefficients[0] * shape[0], SHORTEST_DELAY, longest)),)
@@ -247,7 +215,7 @@ def delay_effect(effect_id: str, signature: Signature, start: float, longest: fl
     return InverseEffect(
         effect_id,
         signature,
-        Plausibility(bounds=bounds),
+        Plausibility(bounds=lambda _ratings, shape: (SHORTEST_DELAY / shape[0], longest / shape[0])),
         SearchHints(shapes=((start,),), linearised_at=0, relinearise=relinearise),
-        parameters_of=as_share_of_shape,
+        parameters_of=lambda c, shape, _: c * shape[0],
     )

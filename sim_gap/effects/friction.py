@@ -19,8 +19,6 @@ from sim_gap.effects.effect import (
     SearchHints,
     Shape,
     Signature,
-    as_fitted_and_shape,
-    between,
 )
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
@@ -37,11 +35,6 @@ WITHIN = 0.5
 """A Stribeck velocity is below this share of the fastest usual speed."""
 
 
-def dry(beneath: Beneath) -> float:
-    """Total Coulomb friction [N·m]: the nominal model's and what was found in addition."""
-    return float(beneath["friction.coulomb"][0] + beneath["nominal"][0])
-
-
 def _dry_above_nominal(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
     """The arm may have less friction than the model, of both kinds: one alone stands for both at the usual speed."""
     return -ratings.friction - ratings.damping * ratings.speed, ratings.torque
@@ -50,14 +43,6 @@ def _dry_above_nominal(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
 def _viscous_above_nominal(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
     speed = max(ratings.speed, SLOWEST)
     return -ratings.damping - ratings.friction / speed, ratings.torque / speed
-
-
-def _up_to_rated(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
-    return 0.0, ratings.torque
-
-
-def _below_dry(ratings: Ratings, _shape: Shape) -> tuple[float, float]:
-    return -ratings.dry, ratings.dry
 
 
 def _stribeck(s: PreparedSignals, joint: int, shape: Shape) -> Array:
@@ -88,7 +73,10 @@ def _viscous_or_load(_layout: ChannelLayout, place: int, _shape: Shape) -> tuple
 
 def _ratio(coefficients: Array, _shape: Shape, beneath: Beneath) -> Array:
     """Friction is (1 + ratio) times as large in one direction and (1 − ratio) in the other; of its Coulomb part."""
-    return coefficients / max(abs(dry(beneath)), 1e-9)
+    dry = float(
+        beneath["friction.coulomb"][0] + beneath["nominal"][0]
+    )  # the nominal model's, and what was found beside
+    return coefficients / max(abs(dry), 1e-9)
 
 
 EFFECTS = (
@@ -105,15 +93,15 @@ EFFECTS = (
     InverseEffect(
         "friction.stribeck",
         Signature.at_motor(_stribeck),
-        Plausibility(bounds=_up_to_rated),
+        Plausibility(bounds=lambda ratings, _shape: (0.0, ratings.torque)),
         SearchHints(shapes_for=_velocities, alternatives=_viscous_or_load),
         needs=COULOMB,
-        parameters_of=as_fitted_and_shape,
+        parameters_of=lambda c, shape, _: [c[0], shape[0]],
     ),
     InverseEffect(
         "friction.asymmetric",
         Signature.at_motor(lambda s, joint, _: np.abs(s.direction[:, joint])),
-        Plausibility(bounds=_below_dry),
+        Plausibility(bounds=lambda ratings, _shape: (-ratings.dry, ratings.dry)),
         needs=COULOMB,
         parameters_of=_ratio,
     ),
@@ -125,6 +113,6 @@ EFFECTS = (
     InverseEffect(
         "friction.load",
         Signature.at_motor(lambda s, joint, _: s.direction[:, joint] * np.abs(s.model[:, joint])),
-        Plausibility(bounds=between(0.0, SELF_LOCKING)),
+        Plausibility(bounds=(0.0, SELF_LOCKING)),
     ),
 )

@@ -187,19 +187,17 @@ EFFECTS = (
     InverseEffect(
         "link.mass_moment",
         Signature(_mass_moment),
-        Plausibility(prior_penalty=0, prior_std=lambda signals, link: np.full(3, LEVER * _mass(signals, link))),
+        Plausibility(prior_penalty=0, prior_std=lambda signals, link: LEVER * _mass(signals, link)),
     ),
     InverseEffect(
         "link.inertia",
         Signature(_inertia),
-        Plausibility(prior_std=lambda signals, link: np.full(6, LEVER**2 * _mass(signals, link))),
+        Plausibility(prior_std=lambda signals, link: LEVER**2 * _mass(signals, link)),
     ),
     InverseEffect(
         "link.payload",
         Signature(_payload, whole_arm=True, recordings=recording_numbers, body=True, slopes=_payload_slopes),
-        Plausibility(
-            prior_penalty=0, prior_std=lambda _signals, _place: np.array([20.0, 4.0, 4.0, 4.0]), bounds=_near_the_tip
-        ),
+        Plausibility(prior_penalty=0, prior_std=np.array([20.0, 4.0, 4.0, 4.0]), bounds=_near_the_tip),
         SearchHints(
             shapes_for=_recordings, discrete=frozenset({0}), covers=_tip_mass_moment, alternatives=_all_mass_moments
         ),

@@ -17,8 +17,6 @@ from sim_gap.effects.effect import (
     SearchHints,
     Shape,
     Signature,
-    as_gain,
-    between,
 )
 from sim_gap.residuals.layout import ChannelLayout, Columns
 from sim_gap.residuals.preprocess import PreparedSignals
@@ -84,32 +82,27 @@ def _amplitude_and_phase(coefficients: Array, _shape: Shape, _beneath: Beneath) 
     return np.array([np.hypot(*coefficients), np.arctan2(coefficients[1], coefficients[0])])
 
 
-def _small(_signals: PreparedSignals, _place: int) -> Array:
-    return np.full(1, 0.2)
-
-
+SMALL = 0.2
+"""Usual error of a position sensor [rad; 1]."""
 FROM_ZERO = SearchHints(shapes=((0.0,),), linearised_at=0)
 EFFECTS = (
     InverseEffect(
         "position.offset",
         position_effect(reading_moves(lambda q: (np.ones_like(q), 0 * q, 0 * q)), shaped=True),
-        Plausibility(prior_std=_small),
+        Plausibility(prior_std=SMALL),
         FROM_ZERO,
     ),
     InverseEffect(
         "position.gain",
         position_effect(reading_moves(lambda q: (q, np.ones_like(q), 0 * q)), shaped=True),
-        Plausibility(prior_std=_small, bounds=between(-WORST_GAIN, WORST_GAIN)),
+        Plausibility(prior_std=SMALL, bounds=(-WORST_GAIN, WORST_GAIN)),
         FROM_ZERO,
-        parameters_of=as_gain,
+        parameters_of=lambda c, _shape, _: 1.0 + c,
     ),
     InverseEffect(
         "position.eccentricity",
         position_effect(reading_moves(lambda q: (np.sin(q), np.cos(q), np.cos(q), -np.sin(q), -np.sin(q), -np.cos(q)))),
-        Plausibility(
-            prior_std=lambda _signals, _place: np.full(2, 0.1),
-            bounds=between(-WORST_ECCENTRICITY, WORST_ECCENTRICITY),
-        ),
+        Plausibility(prior_std=0.5 * SMALL, bounds=(-WORST_ECCENTRICITY, WORST_ECCENTRICITY)),
         SearchHints(shapes_for=_far_enough),
         parameters_of=_amplitude_and_phase,
     ),

@@ -16,11 +16,6 @@ from sim_gap.effects.effect import (
     SearchHints,
     Shape,
     Signature,
-    as_fitted_and_shape,
-    as_gain,
-    as_shape,
-    as_share_of_shape,
-    between,
     delay_effect,
 )
 from sim_gap.residuals.preprocess import PreparedSignals
@@ -91,7 +86,7 @@ def _delayed(signals: PreparedSignals, joint: int, shape: Shape) -> Array:
     return np.asarray(np.interp(signals.t - shape[0], signals.t, torque) - torque)
 
 
-CUT_OFF = Plausibility(prior_mean=1.0, prior_std=lambda _signals, _place: np.full(1, CLIPPED), bounds=NEAR_ONE)
+CUT_OFF = Plausibility(prior_mean=1.0, prior_std=CLIPPED, bounds=NEAR_ONE)
 """Of a level, beyond which all is cut off."""
 EFFECTS = (
     InverseEffect(  # without a sensor, an offset of the motor's torque
@@ -103,16 +98,16 @@ EFFECTS = (
     InverseEffect(
         "torque.gain",
         Signature.at_sensor(lambda s, joint, _shape: s.sensed[:, joint]),
-        Plausibility(prior_penalty=0, background_std=0.002, bounds=between(-0.5, 1.0)),
-        parameters_of=as_gain,
+        Plausibility(prior_penalty=0, background_std=0.002, bounds=(-0.5, 1.0)),
+        parameters_of=lambda c, _shape, _: 1.0 + c,
     ),
     InverseEffect("torque.drift", Signature.at_sensor(lambda s, _joint, _shape: s.t), needs=("torque.offset",)),
     InverseEffect(
         "torque.crosstalk",
         Signature.at_sensor(lambda s, _joint, shape: s.model[:, int(shape[0]) - 1], side="distortion"),
-        Plausibility(bounds=between(-0.5, 0.5)),
+        Plausibility(bounds=(-0.5, 0.5)),
         SearchHints(shapes_for=_other_joints, discrete=frozenset({0})),
-        parameters_of=as_fitted_and_shape,
+        parameters_of=lambda c, shape, _: [c[0], shape[0]],
     ),
     InverseEffect(  # the width is the deviation after a long way
         "torque.hysteresis",
@@ -121,21 +116,21 @@ EFFECTS = (
         SearchHints(
             shapes_for=_shares(0.01, 0.03, 0.06, 0.12, 0.25), discrete=frozenset({1}), forms=_abrupt_and_gradual
         ),
-        parameters_of=as_share_of_shape,
+        parameters_of=lambda c, shape, _: c * shape[0],
     ),
     InverseEffect(  # the width is what is lost beyond the band
         "torque.deadband",
         _distorted(lambda torque, shape, _rate: -np.clip(torque, -shape[0], shape[0])),
         CUT_OFF,
         SearchHints(shapes_for=_shares(0.02, 0.05, 0.1, 0.2, 0.4, 0.8)),
-        parameters_of=as_share_of_shape,
+        parameters_of=lambda c, shape, _: c * shape[0],
     ),
     InverseEffect(
         "torque.saturation",
         _distorted(lambda torque, shape, _rate: np.clip(torque, -shape[0], shape[0]) - torque),
         CUT_OFF,
         SearchHints(shapes_for=_exceeded),
-        parameters_of=as_shape,
+        parameters_of=lambda _, shape, _beneath: [shape[0]],
     ),
     delay_effect("timing.delay", Signature.at_sensor(_delayed, "any", "distortion"), 0.005, 0.1),
 )

@@ -15,12 +15,9 @@ from sim_gap.effects.effect import (
     InverseEffect,
     Key,
     Plausibility,
-    Ratings,
     SearchHints,
     Shape,
     Signature,
-    between,
-    not_negative,
 )
 from sim_gap.effects.position import position_effect
 from sim_gap.model.rigid_body import CREEP
@@ -53,18 +50,10 @@ def _cycles(signals: Sequence[PreparedSignals], place: int) -> tuple[Shape, ...]
     return tuple((float(cycles),) for cycles in range(4, int(min(max(shown, ALWAYS), MOST)) + 1, 2))
 
 
-def _wave(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
-    return np.array([np.hypot(*coefficients), shape[0], np.arctan2(coefficients[1], coefficients[0])])
-
-
 def _spring(s: PreparedSignals, joint: int, _shape: Shape) -> Array:
     """A spring across the joint, such as a cable bundle: torque linear in position on the link side."""
     q = s.q[:, joint]
     return np.column_stack([q, np.ones_like(q)])
-
-
-def _stiff(_ratings: Ratings, _shape: Shape) -> tuple[Array, float]:
-    return np.array([0.0, -np.inf]), np.inf
 
 
 def _stiffness_and_rest(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
@@ -101,10 +90,6 @@ def _own_rotors(_layout: ChannelLayout, place: int, shape: Shape) -> tuple[Key, 
     return tuple((effect, joint) for joint in (place, int(shape[0]) - 1) for effect in own)
 
 
-def _coupled(coefficients: Array, shape: Shape, _beneath: Beneath) -> Array:
-    return np.array([shape[1], shape[0], *coefficients])
-
-
 def transmitted(signals: PreparedSignals, layout: ChannelLayout, joint: int) -> Array:
     """Torque through the transmission, smooth, (K,): the sensor's; the model's if there is none or it is noisy.
 
@@ -131,29 +116,31 @@ def _play(signals: PreparedSignals, layout: ChannelLayout, place: int) -> Array:
     return -0.5 * np.stack([side, 0.0 * side, 0.0 * side], axis=-1)[:, None]
 
 
-def _stiffness(coefficients: Array, _shape: Shape, _beneath: Beneath) -> Array:
-    return 1.0 / np.maximum(coefficients, 1e-12)
-
-
 EFFECTS = (
     InverseEffect(
-        "transmission.ripple", Signature.at_motor(_ripple), hints=SearchHints(shapes_for=_cycles), parameters_of=_wave
+        "transmission.ripple",
+        Signature.at_motor(_ripple),
+        hints=SearchHints(shapes_for=_cycles),
+        parameters_of=lambda c, shape, _: [np.hypot(*c), shape[0], np.arctan2(c[1], c[0])],
     ),
     InverseEffect(
         "transmission.spring",
         Signature.at_link(_spring),
-        Plausibility(bounds=_stiff),
+        Plausibility(bounds=(np.array([0.0, -np.inf]), np.inf)),
         parameters_of=_stiffness_and_rest,
     ),
     InverseEffect(
         "transmission.coupling",
         Signature(_coupling, side="motor"),
-        Plausibility(bounds=not_negative),
+        Plausibility(bounds=(0.0, np.inf)),
         SearchHints(shapes_for=_neighbours, discrete=frozenset({0}), alternatives=_own_rotors, canonical=_outer_joint),
-        parameters_of=_coupled,
+        parameters_of=lambda c, shape, _: [shape[1], shape[0], *c],
     ),
     InverseEffect(
-        "transmission.elasticity", position_effect(_bend), Plausibility(bounds=not_negative), parameters_of=_stiffness
+        "transmission.elasticity",
+        position_effect(_bend),
+        Plausibility(bounds=(0.0, np.inf)),
+        parameters_of=lambda compliance, _shape, _: 1.0 / np.maximum(compliance, 1e-12),
     ),
-    InverseEffect("transmission.backlash", position_effect(_play), Plausibility(bounds=between(0.0, 0.3))),
+    InverseEffect("transmission.backlash", position_effect(_play), Plausibility(bounds=(0.0, 0.3))),
 )

@@ -18,7 +18,7 @@ from gcomp.arrays import Array
 from sim_gap.model.load import SimModel
 from sim_gap.position_gap.pieces import Piece
 from sim_gap.position_gap.plant import MovedModel
-from sim_gap.residuals.resampling import low_pass
+from sim_gap.residuals.preprocess import low_pass
 
 WINDOW_S, WARM_S = 3.0, 1.0
 """Judged length of a window, and the simulated time before it that is not judged [s]."""

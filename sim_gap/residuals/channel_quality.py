@@ -165,3 +165,13 @@ def stuck_intervals(time: Array, model: Array, held: Mask, t: Array, reading: Ar
         if not natural and meanwhile.any() and np.ptp(model[meanwhile]) > least:
             out.append((float(t[a]), float(t[b])))
     return out
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """One disturbance: its time since the start of the recording [s], the largest residual [N·m] and its joint."""
+
+    start: float
+    end: float
+    joint: int
+    torque: float

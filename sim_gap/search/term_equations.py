@@ -72,8 +72,8 @@ class TermEquations:
         spread, expected, low, high = (np.zeros(self.size) for _ in range(4))
         for term, at in self.at.items():
             likely = term.form.plausibility
-            spread[at], expected[at] = likely.prior_std(data.signals[0], term.place), likely.prior_mean
-            low[at], high[at] = likely.bounds(self.ratings.of(term), term.shape)
+            spread[at], expected[at] = likely.spread(data.signals[0], term.place), likely.prior_mean
+            low[at], high[at] = likely.limits(self.ratings.of(term), term.shape)
         beside = list(self.fixed.values())
         spread[beside], expected[beside], low[beside], high[beside] = np.inf, 1.0, 1.0, 1.0
         for term, values in self.store.pins.items():
@@ -153,7 +153,7 @@ class TermChoice(EffectChoice[Term]):
                 change = self.terms.fit(self.free(names)) if change is None else change
                 c = change[self.equations.at[term]]
                 rated = replace(self.equations.ratings.of(term), own=c)
-                low, high = term.form.plausibility.bounds(rated, term.shape)
+                low, high = term.form.plausibility.limits(rated, term.shape)
                 if np.any(c < low) or np.any(c > high):
                     return float("inf")
         return super().judge(names)

@@ -5,7 +5,7 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.attribution.law_test import LawTest
+from sim_gap.attribution.rivals import LawTest
 from sim_gap.effects.laws import LAWS
 from sim_gap.effects.registry import effects, library_without
 from sim_gap.model.load import load_model

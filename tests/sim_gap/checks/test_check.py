@@ -13,9 +13,9 @@ from armlink.recording.corrections import AS_IT_IS, TIME_UNITS, parse_correction
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording, take_joints
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.checks.channel_motion import ChannelMotion
 from sim_gap.checks.check import check_recording
 from sim_gap.checks.columns import find_wrong_columns
+from sim_gap.checks.sound_arm import ChannelMotion
 from sim_gap.model.load import load_model
 
 REAL = Wrong(

@@ -8,11 +8,10 @@ import pytest
 from wrong_arms import THREE, motion
 
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
-from sim_gap.checks.channel_motion import ChannelMotion
 from sim_gap.checks.columns import find_wrong_columns
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.checks.hypotheses import Hypothesis, hypotheses
-from sim_gap.checks.sound_arm import LEAST_RESIDUAL, likelihood, measurements
+from sim_gap.checks.sound_arm import LEAST_RESIDUAL, ChannelMotion, likelihood, measurements
 from sim_gap.model.load import load_model
 
 ARM = load_model(mujoco.MjModel.from_xml_string(THREE)).arm

@@ -11,7 +11,7 @@ from armlink.errors import BadInput
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.files import load_recording
 from armlink.recording.recording import Recording
-from sim_gap.checks.position_command import check_position_only
+from sim_gap.checks.check import check_position_only
 from sim_gap.model.load import load_model
 
 

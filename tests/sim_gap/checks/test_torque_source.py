@@ -8,8 +8,7 @@ from wrong_arms import THREE, motion
 
 from armlink.recording.corrections import AS_IT_IS, parse_corrections
 from armlink.recording.recording import Recording
-from sim_gap.checks.check import check_recording
-from sim_gap.checks.torque_source import find_gain_command, find_same
+from sim_gap.checks.check import check_recording, find_gain_command, find_same
 from sim_gap.model.load import load_model
 
 RATE = 25.0

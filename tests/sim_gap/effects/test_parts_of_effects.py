@@ -26,7 +26,7 @@ RATINGS = Ratings(
 
 
 def bounds(effect: str, ratings: Ratings = RATINGS) -> tuple[np.ndarray, np.ndarray]:
-    low, high = effects()[effect].plausibility.bounds(ratings, ())
+    low, high = effects()[effect].plausibility.limits(ratings, ())
     return np.atleast_1d(low), np.atleast_1d(high)
 
 

@@ -7,7 +7,7 @@ import pytest
 from wrong_arms import Wrong, model, record
 
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.residuals.disturbances import are_far_off, disturbances
+from sim_gap.residuals.disregarded_rows import are_far_off, disturbances
 
 RATE = 25.0
 TIME = np.arange(0.0, 40.0, 1.0 / RATE)

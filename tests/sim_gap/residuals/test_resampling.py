@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim_gap.residuals.resampling import coverage, decimation
+from sim_gap.residuals.preprocess import coverage, decimation
 from sim_gap.residuals.residual_set import SHARP, near_impacts
 
 
