@@ -50,8 +50,8 @@ from sim_gap.demo.account import Account
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
 from sim_gap.model.load import compile_model
 from sim_gap.report.effect_text import sentence
+from sim_gap.report.figures import watch_figure
 from sim_gap.report.page import sections as gap_sections
-from sim_gap.report.time_figures import watch_figure
 
 Made = TypeVar("Made")
 BY = "armlink demo"

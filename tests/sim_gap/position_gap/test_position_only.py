@@ -28,7 +28,7 @@ from sim_gap.position_gap.training.position_files import (
 )
 from sim_gap.position_gap.training.replay import Simulated, replay_rms
 from sim_gap.position_gap.training.spread import known_before
-from sim_gap.report.motion_figure import motion_figure
+from sim_gap.report.figures import motion_figure
 from sim_gap.report.page import write_report
 
 REAL = model_text(kp=15.0, friction=0.25)
