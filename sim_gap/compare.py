@@ -24,12 +24,11 @@ from sim_gap.position_gap.parameters import PARAMETERS
 from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.training.export import widen_ranges
 from sim_gap.position_gap.training.replay import nominal, replay_rms
+from sim_gap.position_gap.training.spread import INSIDE
 from sim_gap.position_gap.windows import windows_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import residual_sets
 
-INSIDE = 0.95
-"""Probability of an interval."""
 RESAMPLED = 2000
 """Samples of a bootstrap over windows (Efron and Tibshirani 1993: a thousand and more for the ends of an interval)."""
 ALIKE = 0.01
@@ -144,7 +143,7 @@ def _moved(
         )
     data = windows_of(plant, recordings, labels)
     point = nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()})
-    rms = evaluate(data, LoopFit(point, ((),) * sim.n)).rms
+    rms = evaluate(data, LoopFit(point)).rms
     assert rms is not None
     weight = data.weight.sum(0)
     return rms**2 * weight, weight, replay_rms(nominal(sim), recordings)

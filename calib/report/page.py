@@ -14,7 +14,7 @@ from armlink.content.printable_text import printable_text
 from calib.report.tables import ReportTable
 
 SCRIPT = Path(__file__).with_name("plotly-basic.min.js")
-"""plotly.js with lines, points and bars alone: plotly.js-basic-dist-min of npm, in the version of the Python package."""
+"""plotly.js with lines, points and bars alone: plotly.js-basic-dist-min of npm, in the version of plotly's own."""
 SCREEN = {"responsive": True, "displayModeBar": False}
 FONT = {"family": "system-ui, sans-serif", "size": 13, "color": "#1c2733"}
 COLOURS = ["#1f5fa8", "#d9622b", "#3c8d5a", "#8a4fa3", "#b8912b", "#4f7f95", "#a83248"]
@@ -116,7 +116,7 @@ def _escaped(part: Any, key: str = "") -> Any:
     if isinstance(part, dict):
         if part.get("dtype") == "f8":
             single = np.frombuffer(b64decode(part["bdata"])).astype("<f4")
-            part = {**part, "dtype": "f4", "bdata": b64encode(single).decode()}
+            part = {**part, "dtype": "f4", "bdata": b64encode(single.tobytes()).decode()}
         return {each: _escaped(value, each) for each, value in part.items()}
     if isinstance(part, np.ndarray) and part.dtype.kind in "OU":
         part = part.tolist()

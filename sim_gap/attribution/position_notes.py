@@ -35,7 +35,7 @@ def notes(found: Identified) -> list[str]:
             f"{listed}: positions show only the ratios of gain, friction and inertia of these joints; the scale is "
             "taken from the inertia of the model: to measure the scale, hold a known load or record the current"
         )
-    if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
+    if any("viscous" in (own := found.fit.at(j)) and "back_emf" not in own for j in range(found.sim.n)):
         out.append(
             "viscous friction, back-EMF and velocity feedback have the same effect on positions, so only their sum is "
             "given" + (", as part of the controller" if found.search.open_controller else "")
@@ -88,7 +88,7 @@ def _early(found: Identified) -> list[str]:
     """A note of commands that act before their time, as those of rows with the position of a later row do."""
     early = {}
     for j in range(found.sim.n):
-        if "delay" not in found.fit.active[j]:
+        if "delay" not in found.fit.at(j):
             continue
         value, _, high, _ = interval(found.search, found.fit, found.within, j, "delay")
         if high < 0.0:

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from gcomp.estimate.problem import FREEDOM, EstimationProblem, FittedParameter, linearise
@@ -29,6 +30,8 @@ PRIOR_RELATIVE = 3.0
 """Standard deviation of the logarithm of a gain before any recording."""
 Point = Mapping[str, Array]
 """Parameter → (J,)."""
+Place = tuple[int, str]
+"""Joint, or −1 for the whole arm, and name of a parameter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +39,19 @@ class LoopFit:
     """Parameters of all joints, those that were fitted, and what they leave."""
 
     point: dict[str, Array]
-    active: tuple[tuple[str, ...], ...]
-    """Names fitted at each joint."""
-    shared: tuple[str, ...] = ()
-    """Names of parameters with one value for the whole arm."""
+    free: tuple[Place, ...] = ()
+    """The fitted ones: those of the first joint first, those of the whole arm last."""
     rms: Array | None = None
     """RMS of the residual per joint and window [rad], (J, W)."""
+
+    def at(self, joint: int) -> tuple[str, ...]:
+        """Names that were fitted at a joint, or with −1 of the whole arm."""
+        return tuple(name for j, name in self.free if j == joint)
+
+    def freed(self, places: Iterable[Place]) -> "LoopFit":
+        """The same with these places fitted and no others."""
+        free = sorted(dict.fromkeys(places), key=lambda place: (place[0] < 0, place[0]))
+        return replace(self, free=tuple(free), rms=None)
 
     def with_values(self, **values: Array) -> "LoopFit":
         return replace(self, point={**self.point, **values})
@@ -76,7 +86,7 @@ def evaluate(data: Windows, fit: LoopFit) -> LoopFit:
 class Layout:
     """Parameters of joints (joint, name) and of the whole arm (−1, name) in the order of an `EstimationProblem`."""
 
-    def __init__(self, data: Windows, scales: Scales, point: Point, names: Iterable[tuple[int, str]]) -> None:
+    def __init__(self, data: Windows, scales: Scales, point: Point, names: Iterable[Place]) -> None:
         self.data, self.scales, self.point = data, scales, dict(point)
         self.names = list(names)
         for j, name in self.names:
@@ -105,7 +115,7 @@ class Layout:
                 point[name][j] = from_coordinate(name, np.array(x), np.array(self.size(j, name)))
         return point
 
-    def problem(self, nominal: Point, steps: Mapping[tuple[int, str], float], floor: Array) -> EstimationProblem:
+    def problem(self, nominal: Point, steps: Mapping[Place, float], floor: Array) -> EstimationProblem:
         parameters = tuple(self._parameter(j, name, nominal, steps.get((j, name))) for j, name in self.names)
         shape = (self.data.joints, -1)
 
@@ -135,28 +145,26 @@ class Layout:
         )
 
 
-def names_of(fit: LoopFit) -> list[tuple[int, str]]:
-    """Fitted parameters: joint and name, then the whole arm's."""
-    return [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
-
-
-def jacobian(
-    data: Windows, fit: LoopFit, scales: Scales, names: Sequence[Sequence[str]], shared: Sequence[str] = ()
-) -> tuple[Array, list[Array]]:
-    """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the parameters' own coordinates."""
-    listed = [(j, name) for j, own in enumerate(names) for name in own] + [(-1, name) for name in shared]
-    layout = Layout(data, scales, fit.point, listed)
-    problem, theta = layout.problem(fit.point, {}, np.zeros(data.joints)), layout.theta(layout.point)
-    at = {place: k for k, place in enumerate(listed)}
+def jacobian(data: Windows, point: Point, scales: Scales, places: Sequence[Place]) -> tuple[Array, list[Array]]:
+    """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) by its own parameters at these places and
+    by those of the whole arm, in their own coordinates."""
+    layout = Layout(data, scales, point, places)
+    problem, theta = layout.problem(point, {}, np.zeros(data.joints)), layout.theta(layout.point)
+    at = {place: k for k, place in enumerate(places)}
     parameters = list(problem.parameters)
     for (j, name), k in at.items():
         if name == "kp":
             others = tuple((at[j, each], float(theta[at[j, each]])) for each in WITH_TORQUE if (j, each) in at)
             parameters[k] = replace(parameters[k], along=others)
-    about = linearise(replace(problem, parameters=tuple(parameters)), theta, range(len(listed)))
+    about = linearise(replace(problem, parameters=tuple(parameters)), theta, range(len(places)))
     shape = (len(data.measured), data.count)
     now = about.residual.reshape(data.joints, *shape).transpose(1, 0, 2)
     return now, [x.reshape(len(x), *shape) for x in about.slopes]
+
+
+def acting(places: Sequence[Place], joint: int) -> NDArray[np.intp]:
+    """Numbers of the parameters that act on a joint: its own and those of the whole arm."""
+    return np.array([k for k, (j, _) in enumerate(places) if j in (joint, -1)], np.intp)
 
 
 def improve(
@@ -169,12 +177,11 @@ def improve(
     freedom: float = FREEDOM,
 ) -> LoopFit:
     """The most probable values of what is active, from a fit on; `freedom` is that of the residuals' distribution."""
-    names = names_of(fit)
-    if not names:
+    if not fit.free:
         return evaluate(data, fit)
-    layout = Layout(data, scales, fit.point, names)
+    layout = Layout(data, scales, fit.point, fit.free)
     problem = replace(layout.problem(nominal, {}, floor), freedom=freedom)
-    found = solve(problem, layout.theta(layout.point), range(len(names)), iterations)
+    found = solve(problem, layout.theta(layout.point), range(len(fit.free)), iterations)
     shape = (data.joints, len(data.measured), data.count)
     left = found.residual.reshape(shape).transpose(1, 0, 2)
     return replace(fit, point=layout.at(found.theta), rms=root_mean_squares(data, left))

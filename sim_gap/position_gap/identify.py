@@ -31,9 +31,15 @@ from sim_gap.position_gap.sound_arm import SoundGap, split_gap
 from sim_gap.position_gap.start import controller_name, limited_servo_starts, noise_floor, scales_of, starting_fit
 from sim_gap.position_gap.training.bands import Band, band
 from sim_gap.position_gap.training.export import Exported, export_fit, export_with_module, native_fit, widen_ranges
-from sim_gap.position_gap.training.jackknife import gaps_left_out, terms_of
 from sim_gap.position_gap.training.replay import nominal, replay_rms
-from sim_gap.position_gap.training.spread import Covariance, covariance, covariance_within, known_before
+from sim_gap.position_gap.training.spread import (
+    Covariance,
+    covariance,
+    covariance_within,
+    gaps_left_out,
+    known_before,
+    terms_of,
+)
 from sim_gap.position_gap.training.unreached_limits import find_unreached
 from sim_gap.position_gap.windows import Windows, thin, thin_moving, windows_of
 from sim_gap.residuals.residual_set import EXPLAINED
@@ -139,7 +145,7 @@ def identify(
     before = _bare(search, fit, about, own.complete)
     terms = terms_of(search, fit)
     spread = replace(covariance(search, fit), limits=find_unreached(search, fit))
-    left = gaps_left_out(data, terms, known_before(search, fit, terms.names))
+    left = gaps_left_out(data, terms, known_before(search, fit))
     return Identified(
         sim=sim,
         search=search,
@@ -167,7 +173,7 @@ def identify(
 
 def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None]) -> tuple[LoopSearch, LoopFit, About]:
     """The fit, with the effects that it takes; the nominal model as it is where it leaves nothing."""
-    bare = evaluate(search.data, LoopFit(search.nominal, ((),) * search.data.joints))
+    bare = evaluate(search.data, LoopFit(search.nominal))
     if complete and bool(np.all(rms_on(search.data, bare) < QUIET * search.floor)):
         return search, bare, look_about(search, bare, [])
     search, fit = starting_fit(search, search.data.plant.servos, progress)
@@ -213,7 +219,7 @@ def _bare(search: LoopSearch, fit: LoopFit, about: About, complete: bool) -> Loo
     """The nominal model with its own controller, or with that of the fit, fitted again without any effect."""
     if complete:
         own = {name: values.copy() for name, values in search.nominal.items()}
-        return LoopFit(own | {"creep": search.data.plant.creep}, ((),) * search.data.joints)
+        return LoopFit(own | {"creep": search.data.plant.creep})
     for group in groups_of(fit, search):
         fit = without_group(search, fit, group)
     return search.improve(replace(fit, rms=None), 4)
@@ -236,4 +242,4 @@ def _margin(search: LoopSearch, fit: LoopFit) -> Array:
 
 def columns_of_effect(found: Identified, effect: str) -> tuple[str, ...]:
     """Names of the fitted columns of an effect of the whole arm."""
-    return tuple(n for n in shared_effects(found.sim.arm)[effect] if n in found.fit.shared)
+    return tuple(n for n in shared_effects(found.sim.arm)[effect] if n in found.fit.at(-1))

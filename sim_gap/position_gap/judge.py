@@ -7,9 +7,8 @@ import numpy as np
 
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE
-from sim_gap.position_gap.choice import About, Group, LoopSearch, groups_of, names_in, without_group
+from sim_gap.position_gap.choice import About, Group, LoopSearch, groups_of, id_of, parts_of, without_group
 from sim_gap.position_gap.fit import LoopFit, evaluate
-from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.windows import Windows
 
 LEAST_SHRINK = 0.05
@@ -85,41 +84,38 @@ def _rivals(search: LoopSearch, fit: LoopFit, about: About, group: Group) -> tup
     """Loss of the held-out cost with the best other effect in a group's place, and those that lose next to nothing."""
     effect, joints = group
     terms, every = about.terms, about.effects
-    chosen = [name for each in groups_of(fit, search) for name in names_in(each) if name in every]
-    chosen += [name for name in every if name.partition("#")[0] in search.kept and name not in chosen]
-    rest = [name for name in chosen if name not in names_in(group)]
+    chosen = [part for each in groups_of(fit, search) for part in parts_of(each) if part in every]
+    chosen += [part for part in every if part[0] in search.kept and part not in chosen]
+    rest = [part for part in chosen if part not in parts_of(group)]
     base = float(terms.cost(about.parameters(chosen)).sum())
 
-    def lost(names: Sequence[str]) -> float:
-        return float(terms.cost(about.parameters(names)).sum()) - base
+    def lost(parts: Sequence[Group]) -> float:
+        return float(terms.cost(about.parameters(parts)).sum()) - base
 
     whole = lost(rest)
     if effect == "controller.stiffness":
         return whole, _scale_rivals(search, fit, about, chosen)
     least, close = whole, list(ALWAYS.get(effect, ()))
-    others = {name.partition("#")[0].partition("@")[0] for name in every} - {effect.partition("@")[0]}
-    for other in sorted(others):
-        places = [f"{other}#{j}" for j in joints if f"{other}#{j}" in every]
-        if not joints or not places:
-            places = max(
-                ([name] for name in every if name.partition("@")[0] == other and "#" not in name),
-                key=lambda names: -lost([*rest, *names]),
-                default=[],
-            )
-        places = [name for name in places if name not in chosen]
-        if places:
-            left = lost([*rest, *places])
+    for other in sorted({id_of(part) for part in every} - {id_of(group)}):
+        parts = [part for part in parts_of((other, joints)) if joints and part in every]
+        if not parts:
+            whole_arm = [part for part in every if id_of(part) == other and not part[1]]
+            parts = [min(whole_arm, key=lambda part: lost([*rest, part]))] if whole_arm else []
+        parts = [part for part in parts if part not in chosen]
+        if parts:
+            left = lost([*rest, *parts])
             least = min(least, left)
             if left < max(PRICE, AS_WELL * whole):
                 close.append(other)
     return max(least, 0.0), tuple(dict.fromkeys(close))
 
 
-def _scale_rivals(search: LoopSearch, fit: LoopFit, about: About, chosen: Sequence[str]) -> tuple[str, ...]:
+def _scale_rivals(search: LoopSearch, fit: LoopFit, about: About, chosen: Sequence[Group]) -> tuple[str, ...]:
     """`actuator.rotor_inertia` if beside a free rotor some joint's gain is loose: positions show ratios."""
     terms, places = about.terms, about.layout.names
-    for j, own in enumerate(fit.active):
-        if "kp" not in own or (j, "armature") not in places or EFFECTS["actuator.rotor_inertia"].id in search.excluded:
+    for j in range(search.data.joints):
+        rotor = (j, "armature") in places and "actuator.rotor_inertia" not in search.excluded
+        if "kp" not in fit.at(j) or not rotor:
             continue
         free = sorted({k for k in about.parameters(chosen) if places[k][0] == j} | {places.index((j, "armature"))})
         index = terms.acting[j].tolist()

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from gcomp.arrays import Array
 from sim_gap.model.rigid_body import RigidArm
 
 UNIT = {"mass": "kg", "x": "kg·m", "y": "kg·m", "z": "kg·m", "angle": "rad", "angle_1": "rad", "angle_2": "rad"}
@@ -22,10 +21,6 @@ def shared_effects(arm: RigidArm) -> dict[str, tuple[str, ...]]:
         effects[f"position.offset@{name}"] = (f"zero{link}.angle",)
     effects["base.tilt"] = ("tilt.angle_1", "tilt.angle_2")
     return effects
-
-
-def shared_names(arm: RigidArm) -> tuple[str, ...]:
-    return tuple(name for names in shared_effects(arm).values() for name in names)
 
 
 def range_of(arm: RigidArm, name: str) -> tuple[float, float]:
@@ -50,7 +45,3 @@ def size_of(arm: RigidArm, name: str) -> float:
     """Size at which a parameter is tried."""
     low, high = range_of(arm, name)
     return 0.1 * min(-low, high) if -low > 1e-9 else 0.1 * high
-
-
-def along(values: dict[str, Array], name: str) -> float:
-    return float(values[name][0]) if name in values else 0.0

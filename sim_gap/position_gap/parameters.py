@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
+from gcomp.estimate.solve import LONGEST_STEP
 
 
 @dataclass(frozen=True)
@@ -118,8 +119,6 @@ INVERSE = "limit", "slew"
 """Limits: their inverse is fitted, which is 0 where there is none."""
 LEAST_INVERSE = 1e-3
 """Inverse of a limit, over that of its usual size, below which there is none."""
-FARTHEST = 1.5
-"""Logarithm of the largest factor of one step of a fit."""
 
 
 def to_coordinate(name: str, value: float, size: float) -> float:
@@ -141,7 +140,7 @@ def from_coordinate(name: str, x: Array, size: Array) -> Array:
 
 
 def step_parameter(
-    name: str, value: float, step: float, scales: Scales, joint: int, farthest: float = FARTHEST
+    name: str, value: float, step: float, scales: Scales, joint: int, farthest: float = LONGEST_STEP
 ) -> float:
     """A parameter's value after a step in its own coordinate, within its bounds.
 

@@ -93,15 +93,14 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
     names = ("kp", "viscous", "coulomb")
     # a joint that swings with its servo off shows friction and inertia against gravity, and only both together
-    free = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2)).tolist()
-    active = tuple(
-        () if rest else (*names, "armature") if swings else names for rest, swings in zip(at_rest, free, strict=True)
-    )
+    swings = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2))
+    moving = np.flatnonzero(~at_rest).tolist()
+    free = [(j, name) for j in moving for name in (*names, *(("armature",) if swings[j] else ()))]
     kept = {"controller.stiffness"} if not own.complete else set()
     search = replace(search, kept=frozenset(kept))
     few = replace(few, nominal=search.nominal)
     # all rows count at first: far from the arm's motion a robust fit would take the motion for outliers
-    fit = few.improve(LoopFit(point, active), 5, NORMAL)
+    fit = few.improve(LoopFit(point, tuple(free)), 5, NORMAL)
     if np.any(search.nominal["creep"] > 0.0):
         rest = {"creep": np.zeros(search.data.joints)}
         at_rest_fit = few.improve(fit.with_values(**rest), 4, NORMAL)
@@ -119,13 +118,11 @@ def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[
     few = replace(search, data=thin_moving(search.data, FEW))
     drawn = _drawn_servos(few, fit, where)
     names = [name for name in SERVO_RANGES if name != "lag" or search.nominal["lag"].any()]
-    active = tuple(
-        tuple(dict.fromkeys((*own, *names))) if tried else own for own, tried in zip(fit.active, where, strict=True)
-    )
+    free = [*fit.free, *((j, name) for j in np.flatnonzero(where).tolist() for name in names)]
     starts = []
     for best in costs_of(few, drawn).argsort(axis=0)[:BEST_SERVOS]:
         point = {name: np.array([drawn[b][name][j] for j, b in enumerate(best)]) for name in fit.point}
-        starts.append(replace(few.improve(LoopFit(point, active, fit.shared), 5), rms=None))
+        starts.append(replace(few.improve(LoopFit(point).freed(free), 5), rms=None))
     return starts
 
 
@@ -210,6 +207,6 @@ def _holding(search: LoopSearch, own: Servos) -> dict[str, Array]:
 
 def controller_name(fit: LoopFit) -> str:
     """The controller that was found: P, PD, PI, PID, with feed-forward or without."""
-    names = {name for own in fit.active for name in own}
+    names = {name for _, name in fit.free}
     kind = "P" + "I" * ("ki" in names) + "D" * ("kd" in names)
     return kind + " with feed-forward" * ("feed" in names)

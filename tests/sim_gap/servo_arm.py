@@ -117,7 +117,12 @@ def fitted(*friction: float, weightless: bool = False) -> tuple[LoopSearch, Loop
     made = [record(text(x), seed, 21.0) for seed, x in enumerate(friction, start=1)]
     search = search_on(text(0.2), made)
     names = ("kp", "coulomb", "viscous")
-    return search, search.improve(LoopFit(search.nominal, (names, names)))
+    return search, search.improve(LoopFit(search.nominal).freed(at_both(*names)))
+
+
+def at_both(*names: str) -> list[tuple[int, str]]:
+    """Places of these parameters at both joints."""
+    return [(j, name) for j in (0, 1) for name in names]
 
 
 def search_on(text: str, recordings: Sequence[Recording], floor: float = 3e-4) -> LoopSearch:

@@ -17,8 +17,7 @@ from sim_gap.position_gap.choice import LoopSearch
 from sim_gap.position_gap.fit import LoopFit, batch, jacobian, root_mean_squares
 from sim_gap.position_gap.judge import joint_rms
 from sim_gap.position_gap.simulation import simulate
-from sim_gap.position_gap.training.jackknife import recordings_or_thirds
-from sim_gap.position_gap.training.spread import Covariance
+from sim_gap.position_gap.training.spread import Covariance, recordings_or_thirds
 from sim_gap.position_gap.training.unreached_limits import LIMITS, Unreached
 from sim_gap.position_gap.windows import Windows
 
@@ -126,8 +125,7 @@ def _variance(search: LoopSearch, fit: LoopFit, spread: Covariance, data: Window
 
     It is linear, so that parameters of which only ratios are known leave nothing open where they move nothing.
     """
-    active = tuple(tuple(name for j, name in spread.names if j == joint) for joint in range(data.joints))
-    _, slopes = jacobian(data, fit, search.scales, active, fit.shared)
+    _, slopes = jacobian(data, fit.point, search.scales, spread.names)
     each = [np.einsum("atw,ab,btw->tw", x, spread.of_joint(j), x) for j, x in enumerate(slopes)]
     return np.stack(each, axis=1)
 

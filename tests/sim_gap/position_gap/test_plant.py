@@ -23,7 +23,7 @@ TEXT = model_text(kp=15.0, friction=0.2)
 def left(search: LoopSearch, **values: object) -> np.ndarray:
     """RMS that the nominal model leaves with other values, (J,) [rad]."""
     point = {**search.nominal, **{name: np.broadcast_to(x, 2).astype(float) for name, x in values.items()}}
-    return rms_on(search.data, evaluate(search.data, LoopFit(point, ((), ()))))
+    return rms_on(search.data, evaluate(search.data, LoopFit(point)))
 
 
 def pid(text: str) -> str:

@@ -37,7 +37,7 @@ def test_a_models_own_steps_leave_nothing(lag: float) -> None:
     )
     search = search_on(text, [roll_out(text, size, 1.0) for size in (0.4, -0.7, 1.1)])
     held_by_friction = 0.3 / 25.0
-    assert rms_on(search.data, LoopFit(search.nominal, ((),))) == pytest.approx(0.0, abs=held_by_friction)
+    assert rms_on(search.data, LoopFit(search.nominal)) == pytest.approx(0.0, abs=held_by_friction)
 
 
 def test_a_command_within_the_limit_of_its_change_is_followed_and_another_at_the_limit() -> None:

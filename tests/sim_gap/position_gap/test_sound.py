@@ -17,7 +17,7 @@ def split(real: str):
     """The gap of the nominal model against an arm, split, with its margin and the RMS that it has [rad]."""
     search, other = (search_on(NOMINAL, [record(real, seed, 26.0)]) for seed in (1, 2))
     search = replace(search, floor=noise_floor(search.data))
-    fit = evaluate(search.data, LoopFit(search.nominal, ((),) * 2))
+    fit = evaluate(search.data, LoopFit(search.nominal))
     margin = _margin(search, fit)
     return split_gap(search, other.data, margin), margin, rms_on(search.data, fit)
 
