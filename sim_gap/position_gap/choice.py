@@ -8,22 +8,11 @@ from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, Effect, LinearTerms, choose, price_of, terms_of
-from gcomp.estimate.problem import FREEDOM, linearise
+from gcomp.estimate.problem import linearise
 from gcomp.estimate.solve import cost_of, prior_cost, scale_of
-from sim_gap.model.rigid_body import RigidArm
-from sim_gap.position_gap.fit import (
-    INDEPENDENT_S,
-    Layout,
-    LoopFit,
-    Place,
-    Point,
-    batch,
-    evaluate,
-    improve,
-    residuals,
-)
-from sim_gap.position_gap.links import shared_effects, size_of
-from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, Scales
+from sim_gap.position_gap.fit import Group, Layout, LoopFit, LoopSearch, Place, residuals, rms_on
+from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, shared_effects, size_of
+from sim_gap.position_gap.plant import Point
 from sim_gap.position_gap.windows import Windows, thin_moving
 
 FOLDS = 6
@@ -45,59 +34,6 @@ LEVELS = {
 }
 """Levels at which a limit is tried: in units of the command's highest speed, of the joint's own torque."""
 Progress = Callable[[str], None]
-Group = tuple[str, tuple[int, ...]]
-"""An effect with the joints that have it; no joints for one of the whole arm."""
-
-
-@dataclass(frozen=True, eq=False)
-class LoopSearch:
-    """Data and nominal parameters of a choice of effects."""
-
-    data: Windows
-    scales: Scales
-    nominal: dict[str, Array]
-    """Parameters of the nominal model, to which one returns that is taken out, (J,) each."""
-    floor: Array
-    """RMS below which nothing can be seen, per joint (J,) [rad]."""
-    excluded: frozenset[str] = frozenset()
-    """Effects that do not take part."""
-    kept: frozenset[str] = frozenset()
-    """Effects that are not taken out."""
-    resting: frozenset[int] = frozenset()
-    """Joints of which nothing is fitted."""
-    open_controller: bool = False
-    """Whether the nominal model has no controller, so that the fitted one is no cause of a gap."""
-
-    @property
-    def arm(self) -> RigidArm:
-        return self.data.plant.sim.arm
-
-    def places_of(self, group: Group) -> list[Place]:
-        effect, joints = group
-        if joints:
-            return [(j, name) for j in joints for name in EFFECTS[effect].parameters]
-        return [(-1, name) for name in shared_effects(self.arm)[effect]]
-
-    def score(self, fit: LoopFit) -> Array:
-        """Half the logarithm of the mean square, times independent samples, per joint (J,); less is better."""
-        assert fit.rms is not None
-        count = self.data.weight.sum(0)
-        mean = (fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0)
-        return np.asarray(0.5 * self.samples * np.log(mean + self.floor**2))
-
-    @property
-    def samples(self) -> Array:
-        """Independent samples of each joint, (J,)."""
-        return np.asarray(self.data.weight.sum((0, 2)) * min(self.data.judged_s / INDEPENDENT_S, 1.0))
-
-    def size_of(self, name: str) -> Array:
-        """Unit of the levels of a limit, (J,): the highest speed, if a joint moves at all, or the usual size."""
-        if name != "slew":
-            return self.scales.of(name)
-        return np.asarray(np.maximum(np.abs(self.data.v).max(axis=(0, 2)), PARAMETERS["slew"].low))
-
-    def improve(self, fit: LoopFit, iterations: int = 5, freedom: float = FREEDOM) -> LoopFit:
-        return improve(self.data, fit, self.scales, self.floor, self.nominal, iterations, freedom)
 
 
 def folds_of(data: Windows) -> NDArray[np.intp]:
@@ -198,8 +134,8 @@ def look_about(
             steps[j, name] = 0.5 if point[name][j] == PARAMETERS[name].neutral else 0.1
     # a Stribeck velocity says nothing without the friction that it is of
     places = [(j, name) for j, name in places if name != "stribeck_velocity" or (j, "stribeck") in fit.free]
-    layout = Layout(search.data, search.scales, point, places)
-    problem = layout.problem(search.nominal, steps, search.floor)
+    layout = Layout(search, point, places)
+    problem = layout.problem(steps)
     about = linearise(problem, layout.theta(layout.point), range(len(places)))
     at = {place: k for k, place in enumerate(places)}
     samples = search.samples
@@ -229,7 +165,7 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
     one that is always reached leads nowhere."""
     levels = np.minimum(np.array(LEVELS[name])[:, None] * search.size_of(name), fit.point[name])
     few = thin_moving(search.data, FEW)
-    gaps = residuals(few, batch([{**fit.point, name: level} for level in levels]))
+    gaps = residuals(few, [{**fit.point, name: level} for level in levels])
     squares = np.einsum("ptjw,tjw->pj", gaps**2, few.weight)
     return np.asarray(levels[squares.argmin(axis=0), np.arange(search.data.joints)])
 
@@ -275,27 +211,22 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
 
 def worth(search: LoopSearch, fit: LoopFit) -> float:
     """Logarithm of the probability of a fit less the price of its parameters, but for a constant."""
-    layout = Layout(search.data, search.scales, fit.point, fit.free)
-    problem = layout.problem(search.nominal, {}, search.floor)
-    unlikely = prior_cost(problem, layout.theta(layout.point), search.data.joints).sum()
-    paid = sum(not any(name in EFFECTS[e].parameters for e in OF_EVERY_JOINT) for _, name in layout.names)
+    layout = Layout(search, fit.point, fit.free)
+    unlikely = prior_cost(layout.problem(), layout.theta(layout.point), search.data.joints).sum()
+    paid = sum(not any(name in EFFECTS[e].parameters for e in OF_EVERY_JOINT) for _, name in fit.free)
     return -float(costs_of(search, [fit.point])[0].sum() + unlikely) - PRICE * paid
 
 
 def costs_of(search: LoopSearch, points: Sequence[Point]) -> Array:
     """Negative logarithm of the likelihood of each joint at P points, (P, J), but for a constant."""
-    problem = Layout(search.data, search.scales, points[0], ()).problem(search.nominal, {}, search.floor)
-    left = residuals(search.data, batch(points)).transpose(0, 2, 1, 3).reshape(len(points), search.data.joints, -1)
+    problem = Layout(search, points[0], ()).problem()
+    left = residuals(search.data, points).transpose(0, 2, 1, 3).reshape(len(points), search.data.joints, -1)
     return np.stack([cost_of(problem, each, scale_of(problem, each)) for each in left])
 
 
 def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[Group]:
     """Effects of the joints at which a fit leaves more than noise, and of the whole arm if it does anywhere."""
-    fit = fit if fit.rms is not None else evaluate(search.data, fit)
-    assert fit.rms is not None
-    count = search.data.weight.sum(0)
-    rms = np.sqrt((fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0))
-    left = set(np.flatnonzero(rms > QUIET * search.floor).tolist())
+    left = set(np.flatnonzero(rms_on(search.data, fit.point) > QUIET * search.floor).tolist())
     return [(effect, joints) for effect, joints in candidates_of(search) if left and left >= {*joints}]
 
 

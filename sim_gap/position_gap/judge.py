@@ -7,8 +7,8 @@ import numpy as np
 
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE
-from sim_gap.position_gap.choice import About, Group, LoopSearch, groups_of, id_of, parts_of, without_group
-from sim_gap.position_gap.fit import LoopFit, evaluate
+from sim_gap.position_gap.choice import About, groups_of, id_of, parts_of, without_group
+from sim_gap.position_gap.fit import Group, LoopFit, LoopSearch, rms_on
 from sim_gap.position_gap.windows import Windows
 
 LEAST_SHRINK = 0.05
@@ -17,17 +17,6 @@ AS_WELL = 0.1
 """Share of an effect's worth that may be lost with another one that would do as well."""
 LOOSE = 0.35
 """Relative standard deviation of a gain beside a free rotor from which its scale is not decided."""
-
-
-def rms_on(data: Windows, fit: LoopFit) -> Array:
-    """RMS of the position gap of each joint [rad], (J,)."""
-    return joint_rms(data, _rms(data, fit))
-
-
-def joint_rms(data: Windows, rms: Array) -> Array:
-    """RMS over all windows of each joint, (J,)."""
-    count = data.weight.sum(0)
-    return np.asarray(np.sqrt((rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +41,14 @@ def stages(search: LoopSearch, fit: LoopFit, about: About, heldout: Windows, mat
     `matters` is the gap that counts as one at each joint, (J,) [rad].
     """
     groups = groups_of(fit, search)
-    final, floor = rms_on(heldout, fit), search.floor
-    alone = {group: rms_on(heldout, without_group(search, fit, group)) for group in groups}
+    final, floor = rms_on(heldout, fit.point), search.floor
+    alone = {group: rms_on(heldout, without_group(search, fit, group).point) for group in groups}
     order = sorted(groups, key=lambda group: -float(((alone[group] - final) / matters).max()))
     fits = [fit]
     for group in reversed(order):
         fits.append(without_group(search, fits[-1], group))
     known = [final, *(alone[group] for group in order[-1:])]
-    courses = [*known, *(rms_on(heldout, each) for each in fits[len(known) :])][::-1]
+    courses = [*known, *(rms_on(heldout, each.point) for each in fits[len(known) :])][::-1]
     out = []
     for group, before, after in zip(order, courses[:-1], courses[1:], strict=True):
         falls = [1.0 - np.hypot(b, floor) / np.hypot(a, floor) for a, b in ((before, after), (alone[group], final))]
@@ -67,13 +56,6 @@ def stages(search: LoopSearch, fit: LoopFit, about: About, heldout: Windows, mat
         loss, rivals = _rivals(search, fit, about, group)
         out.append(Stage(group, before, after, share, loss, rivals if (share > LEAST_SHRINK).any() else ()))
     return out
-
-
-def _rms(data: Windows, fit: LoopFit) -> Array:
-    """RMS of every joint and window, (J, W) [rad]."""
-    found = evaluate(data, fit).rms
-    assert found is not None
-    return found
 
 
 ALWAYS = {"controller.dead_zone": ("transmission.backlash",)}
@@ -112,7 +94,7 @@ def _rivals(search: LoopSearch, fit: LoopFit, about: About, group: Group) -> tup
 
 def _scale_rivals(search: LoopSearch, fit: LoopFit, about: About, chosen: Sequence[Group]) -> tuple[str, ...]:
     """`actuator.rotor_inertia` if beside a free rotor some joint's gain is loose: positions show ratios."""
-    terms, places = about.terms, about.layout.names
+    terms, places = about.terms, about.layout.places
     for j in range(search.data.joints):
         rotor = (j, "armature") in places and "actuator.rotor_inertia" not in search.excluded
         if "kp" not in fit.at(j) or not rotor:

@@ -12,10 +12,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, Place, acting, jacobian
-from sim_gap.position_gap.judge import rms_on
+from sim_gap.position_gap.fit import LoopSearch, Place, acting, jacobian, rms_on
 from sim_gap.position_gap.parameters import step_parameter
+from sim_gap.position_gap.plant import Point
 from sim_gap.position_gap.windows import Windows
 
 ERROR = 0.01
@@ -107,7 +106,7 @@ def _correlation(sizes: Mapping[Place, float]) -> Array:
     return np.asarray(np.diag(1.0 - share * late) + share * np.outer(late, late))
 
 
-def _fit(search: LoopSearch, sizes: Mapping[Place, float], errors: Array) -> LoopFit:
+def _fit(search: LoopSearch, sizes: Mapping[Place, float], errors: Array) -> Point:
     """The nominal model with errors, in standard deviations."""
     point = {name: values.copy() for name, values in search.nominal.items()}
     for ((j, name), size), error in zip(sizes.items(), errors.tolist(), strict=True):
@@ -115,14 +114,14 @@ def _fit(search: LoopSearch, sizes: Mapping[Place, float], errors: Array) -> Loo
             point[name][j] = step_parameter(name, point[name][j], size * error, search.scales, j)
         else:
             point[name] = np.full(search.data.joints, size * error)
-    return LoopFit(point)
+    return point
 
 
 def _weighed(search: LoopSearch, sizes: Mapping[Place, float]) -> tuple[list[Array], list[Array]]:
     """The nominal model's gap at each joint (N,) and its changes by a standard deviation of each parameter (K, N), such
     that their norms are RMS values [rad]."""
     data, places, deviations = search.data, [*sizes], np.array([*sizes.values()])
-    now, slopes = jacobian(data, search.nominal, search.scales, places)
+    now, slopes = jacobian(search, search.nominal, places)
     gaps, changes = [], []
     for j, slope in enumerate(slopes):
         count = np.sqrt(max(float(data.weight[:, j].sum()), 1.0))

@@ -9,10 +9,9 @@ from scipy.stats import qmc
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
 from gcomp.estimate.problem import NORMAL
-from sim_gap.position_gap.choice import FEW, LoopSearch, Progress, costs_of
-from sim_gap.position_gap.fit import LoopFit, batch, residuals
+from sim_gap.position_gap.choice import FEW, Progress, costs_of
+from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 from sim_gap.position_gap.parameters import Scales
-from sim_gap.position_gap.plant import Servos
 from sim_gap.position_gap.windows import Windows, thin_moving
 
 GAINS = 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0
@@ -74,20 +73,20 @@ def noise_floor(data: Windows) -> Array:
     return np.asarray(np.maximum(np.sqrt(np.mean(data.noise**2, axis=1)), LEAST_FLOOR))
 
 
-def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[LoopSearch, LoopFit]:
+def starting_fit(search: LoopSearch, progress: Progress) -> tuple[LoopSearch, LoopFit]:
     """The search with what rests left out, and a fit of gain, Coulomb and viscous friction at every other joint.
 
     Where the model has position actuators and moves as the arm does, the fit begins there.
     """
     progress("fitting gains and friction as a start")
-    at_rest = rests(search.data)
+    at_rest, complete = rests(search.data), bool(search.data.plant.driven.all())
     search = replace(search, resting=frozenset(np.flatnonzero(at_rest).tolist()))
-    if not own.complete:
-        search = replace(search, nominal=_holding(search, own), open_controller=True)
+    if not complete:
+        search = replace(search, nominal=_holding(search), open_controller=True)
         search = replace(search, excluded=search.excluded | {"actuator.gain"})
     few = replace(search, data=thin_moving(search.data, FEW))
-    points = _points(few, own)
-    gaps = residuals(few.data, batch(points))
+    points = _points(few)
+    gaps = residuals(few.data, points)
     costs = np.einsum("ptjw,tjw->pj", np.minimum(np.abs(gaps), 1.0) ** 2, few.data.weight)
     best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
@@ -96,8 +95,7 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
     swings = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2))
     moving = np.flatnonzero(~at_rest).tolist()
     free = [(j, name) for j in moving for name in (*names, *(("armature",) if swings[j] else ()))]
-    kept = {"controller.stiffness"} if not own.complete else set()
-    search = replace(search, kept=frozenset(kept))
+    search = replace(search, kept=frozenset(() if complete else ("controller.stiffness",)))
     few = replace(few, nominal=search.nominal)
     # all rows count at first: far from the arm's motion a robust fit would take the motion for outliers
     fit = few.improve(LoopFit(point, tuple(free)), 5, NORMAL)
@@ -105,9 +103,9 @@ def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[L
         rest = {"creep": np.zeros(search.data.joints)}
         at_rest_fit = few.improve(fit.with_values(**rest), 4, NORMAL)
         # gears hold what rests: a model's solver that lets it creep is no statement about the arm
-        if float((few.score(at_rest_fit) - few.score(fit)).sum()) < PRICE:
+        if float((few.score(at_rest_fit.point) - few.score(fit.point)).sum()) < PRICE:
             search, fit = replace(search, nominal={**search.nominal, **rest}), at_rest_fit
-    return search, replace(fit, rms=None)
+    return search, fit
 
 
 def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[LoopFit]:
@@ -122,7 +120,7 @@ def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[
     starts = []
     for best in costs_of(few, drawn).argsort(axis=0)[:BEST_SERVOS]:
         point = {name: np.array([drawn[b][name][j] for j, b in enumerate(best)]) for name in fit.point}
-        starts.append(replace(few.improve(LoopFit(point).freed(free), 5), rms=None))
+        starts.append(few.improve(LoopFit(point).freed(free), 5))
     return starts
 
 
@@ -147,16 +145,16 @@ def _drawn_servos(search: LoopSearch, fit: LoopFit, where: Mask) -> list[dict[st
     return points
 
 
-def _points(search: LoopSearch, own: Servos) -> list[dict[str, Array]]:
+def _points(search: LoopSearch) -> list[dict[str, Array]]:
     """Points that are tried: the nominal model, and gains with least frictions."""
-    nominal, scales = search.nominal, search.scales
-    centre = np.where(np.isfinite(own.kp), nominal["kp"], scales.inertia)
+    nominal, driven = search.nominal, search.data.plant.driven
+    centre = np.where(driven, nominal["kp"], search.scales.inertia)
     tries = np.where(
-        np.isfinite(own.kp),
+        driven,
         np.array(GAINS)[:, None],
         (2.0 * np.pi * np.array(FREQUENCIES_HZ)[:, None]) ** 2,
     )
-    points = [nominal] if own.complete else []
+    points = [nominal] if driven.all() else []
     for factor, stuck in product(tries, FRICTIONS):
         kp = np.maximum(centre * factor, 1e-3)
         point = {name: values.copy() for name, values in nominal.items()}
@@ -195,9 +193,9 @@ def rests(data: Windows) -> Mask:
     return np.asarray((on & told).any(axis=(0, 2)) & (commanded < RESTS_RAD) & ~(free >= RESTS_RAD))
 
 
-def _holding(search: LoopSearch, own: Servos) -> dict[str, Array]:
+def _holding(search: LoopSearch) -> dict[str, Array]:
     """The nominal values, with a controller at joints (J,) that have none: critically damped, and stiff."""
-    held, missing = dict(search.nominal), ~np.isfinite(own.kp)
+    held, missing = dict(search.nominal), ~search.data.plant.driven
     frequency = 2.0 * np.pi * HOLDS_HZ
     held["kp"] = np.where(missing, search.scales.inertia * frequency**2, held["kp"])
     held["viscous"] = np.where(missing, 2.0 * search.scales.inertia * frequency, held["viscous"])

@@ -16,8 +16,7 @@ from armlink.errors import BadInput
 from armlink.recording.recording import Recording, slice_rows
 from gcomp.arrays import Array
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.pieces import Piece
-from sim_gap.position_gap.plant import MovedModel
+from sim_gap.position_gap.plant import MovedModel, Piece
 from sim_gap.residuals.resampling import low_pass
 
 WINDOW_S, WARM_S = 3.0, 1.0

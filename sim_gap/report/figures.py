@@ -266,7 +266,7 @@ def motion_figure(found: Identified, causes: Sequence[Cause] = ()) -> Any:
     assert recording.position_command is not None
     command = np.concatenate([recording.position_command[rows] for rows in commanded_rows(recording, SHOWN_S)])
     lines: list[Line] = [("command", command, GREY, True), ("measured", measured, "black", True)]
-    if found.nominal_has_controller:
+    if not found.search.open_controller:
         lines.append(("nominal model", moved(nominal(found.sim))[1], ORANGE, True))
     lines.append(("corrected model", after, BLUE, True))
     without = {}

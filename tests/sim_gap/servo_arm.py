@@ -8,9 +8,7 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit
-from sim_gap.position_gap.parameters import PARAMETERS
+from sim_gap.position_gap.fit import LoopFit, LoopSearch
 from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.start import scales_of
 from sim_gap.position_gap.windows import windows_of
@@ -129,7 +127,7 @@ def search_on(text: str, recordings: Sequence[Recording], floor: float = 3e-4) -
     """Recordings beside a model, of which effects may be chosen; with a noise `floor` [rad]."""
     plant = MovedModel(load_model(mujoco.MjModel.from_xml_string(text)))
     data = windows_of(plant, recordings, [f"run {k}" for k in range(len(recordings))])
-    point = nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()})
+    point = nominal_point(plant)
     return LoopSearch(data, scales_of(data), point, np.full(data.joints, floor))
 
 

@@ -17,8 +17,8 @@ from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.urdf import xml_comment
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.choice import Group, LoopSearch, id_of, present, without_group
-from sim_gap.position_gap.fit import LoopFit
+from sim_gap.position_gap.choice import id_of, present, without_group
+from sim_gap.position_gap.fit import Group, LoopFit, LoopSearch
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.plant import MovedModel
 
@@ -97,7 +97,7 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
     dry = fit.point["stribeck"] * ("friction.stribeck" not in held) + loaded * ("friction.load" not in held)
     bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
     # a PID actuator, which holds slew limit and integral part, has no filter: a delay takes its place
-    unfiltered = (search.data.plant.servos.lag > 0.0) & needs_pid(bare, held)
+    unfiltered = (search.data.plant.servo["lag"] > 0.0) & needs_pid(bare, held)
     late = bare.point["delay"] + np.where(unfiltered, bare.point["lag"], 0.0)
     bare = bare.with_values(lag=np.where(unfiltered, 0.0, bare.point["lag"]), delay=late)
     changed = bare.free != fit.free or bool(unfiltered.any())
@@ -187,7 +187,7 @@ def _set_actuator(spec: Any, plant: MovedModel, model: Any, fit: LoopFit, j: int
     or where only a PID one holds what was found."""
     import mujoco
 
-    joint, i = spec.joints[plant.joints[j]].name, int(plant.servos.actuator[j])
+    joint, i = spec.joints[plant.joints[j]].name, int(plant.actuator[j])
     old = [a for a in spec.actuators if a.target == joint and a.trntype == mujoco.mjtTrn.mjTRN_JOINT]
     point = {name: float(value[j]) for name, value in fit.point.items() if len(value) == plant.n}
     optional = {"ki": point["ki"] * point["gain"], "slewmax": point["slew"]}
@@ -215,5 +215,5 @@ def _set_actuator(spec: Any, plant: MovedModel, model: Any, fit: LoopFit, j: int
             made.forcelimited, made.forcerange = 1, [-limit, limit]
     if i >= 0 and model.actuator_ctrllimited[i]:
         made.ctrllimited, made.ctrlrange = 1, model.actuator_ctrlrange[i]
-    if not kept or point["delay"] != plant.servos.delay[j]:
+    if not kept or point["delay"] != plant.servo["delay"][j]:
         put_delay(made, point["delay"])

@@ -18,11 +18,9 @@ from scipy.stats import norm, t
 
 from gcomp.arrays import Array
 from gcomp.estimate.solve import LONGEST_STEP, precision
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import Layout, LoopFit, Place, acting, coordinate, jacobian
-from sim_gap.position_gap.judge import LOOSE, rms_on
-from sim_gap.position_gap.links import UNIT, range_of
-from sim_gap.position_gap.parameters import PARAMETERS, WITH_TORQUE, relative_step, step_parameter
+from sim_gap.position_gap.fit import Layout, LoopFit, LoopSearch, Place, acting, jacobian, rms_on
+from sim_gap.position_gap.judge import LOOSE
+from sim_gap.position_gap.parameters import PARAMETERS, UNIT, WITH_TORQUE, range_of, relative_step, step_parameter
 from sim_gap.position_gap.sound_arm import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
 from sim_gap.position_gap.training.unreached_limits import Unreached, draw_limits
 from sim_gap.position_gap.windows import Windows
@@ -89,7 +87,7 @@ class WindowTerms:
 
 def terms_of(search: LoopSearch, fit: LoopFit) -> WindowTerms:
     """Normal equations of each window of the search about a fit."""
-    now, slopes = jacobian(search.data, fit.point, search.scales, fit.free)
+    now, slopes = jacobian(search, fit.point, fit.free)
     size, count, weight = len(fit.free), search.data.count, search.data.weight
     squares, scores = np.zeros((count, size, size)), np.zeros((count, size))
     weights = search.samples / np.maximum((now**2 * weight).sum((0, 2)), 1e-300)
@@ -175,8 +173,7 @@ def _sets_scale(fit: LoopFit, joint: int, name: str) -> bool:
 
 def known_before(search: LoopSearch, fit: LoopFit) -> Array:
     """Inverse variance of each fitted parameter before any recording, (K, K)."""
-    layout = Layout(search.data, search.scales, fit.point, fit.free)
-    return np.diag(precision(layout.problem(search.nominal, {}, search.floor)))
+    return np.diag(precision(Layout(search, fit.point, fit.free).problem()))
 
 
 def covariance_within(search: LoopSearch, fit: LoopFit, terms: WindowTerms) -> Covariance:
@@ -235,7 +232,7 @@ def _of_one_motion(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> 
     """
     if not search.data.of_one_recording:
         return np.zeros((len(names), len(names)))
-    left = np.minimum(OTHERWISE * rms_on(search.data, fit) / search.scales.angle, STATED)
+    left = np.minimum(OTHERWISE * rms_on(search.data, fit.point) / search.scales.angle, STATED)
     share = np.array([left[j] if j >= 0 else left.max() for j, _ in names])
     return np.diag((share * _values(search, fit, names)) ** 2)
 
@@ -244,9 +241,7 @@ def _values(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
     """Change of a parameter's own coordinate per relative change of it, (K,)."""
     return np.array(
         [
-            coordinate(fit, search.scales, j, name)
-            if j < 0
-            else relative_step(name, fit.point[name][j], search.scales, j)
+            float(fit.point[name][0]) if j < 0 else relative_step(name, fit.point[name][j], search.scales, j)
             for j, name in names
         ]
     )
@@ -315,9 +310,8 @@ def draw(
     steps = random.standard_normal((count, len(values))) @ root.T
     if reach is not None:
         steps = _within(search, fit, spread, steps, reach)
-    layout = Layout(search.data, search.scales, fit.point, spread.names)
-    problem = layout.problem(search.nominal, {}, search.floor)
-    about = layout.theta(layout.point)
+    layout = Layout(search, fit.point, spread.names)
+    problem, about = layout.problem(), layout.theta(layout.point)
     points = [layout.at(problem.within(about + step)) for step in _with_gains(spread.names, about, steps)]
     rows = [{_label(search, j, name): float(point[name][max(j, 0)]) for j, name in spread.names} for point in points]
     for each, drawn in zip(spread.limits, draw_limits(spread.limits, count, random), strict=True):
@@ -341,7 +335,7 @@ def _with_gains(names: Sequence[Place], about: Array, steps: Array) -> Array:
 def _within(search: LoopSearch, fit: LoopFit, spread: Covariance, steps: Array, reach: Array) -> Array:
     """The steps (P, K), shorter for each joint that goes further than `reach`; for all, where they share some."""
     data, names = search.data, spread.names
-    _, slopes = jacobian(data, fit.point, search.scales, names)
+    _, slopes = jacobian(search, fit.point, names)
     count = np.maximum(data.weight.sum((0, 2)), 1.0)
     share = np.ones((len(steps), data.joints))
     for j, x in enumerate(slopes):

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, Point, batch, residuals, root_mean_squares
+from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 
 HEADROOM = 10.0
 """Ratio of the highest level of the prior to the least that the training motion admits: recordings use between a tenth
@@ -59,15 +58,11 @@ def _least_admitted(search: LoopSearch, fit: LoopFit, name: str, asked: Array) -
     levels = np.array(ABOVE)[:, None] * np.maximum(asked, 1e-9)
     joints = np.arange(len(asked))
 
-    def score(point: Point) -> Array:
-        left = residuals(search.data, batch([point]))
-        return search.score(LoopFit(dict(point), rms=root_mean_squares(search.data, left)[0]))
-
-    bare = score(fit.point)
+    bare = search.score(fit.point)
     low, high = np.zeros(len(asked), int), np.full(len(asked), len(ABOVE) - 1)  # the highest is admitted in any case
     while np.any(low < high):
         middle = (low + high) // 2
-        costly = score({**fit.point, name: levels[middle, joints]}) - bare >= COSTS
+        costly = search.score({**fit.point, name: levels[middle, joints]}) - bare >= COSTS
         low, high = np.where(costly & (low < high), middle + 1, low), np.where(costly, high, middle)
     return np.where(asked > 0.0, levels[low, joints], 0.0)
 
@@ -75,7 +70,7 @@ def _least_admitted(search: LoopSearch, fit: LoopFit, name: str, asked: Array) -
 def _torques(search: LoopSearch, fit: LoopFit) -> Array:
     """Torque that each servo is asked for along the training motion, (J,) [N·m]."""
     data, point = search.data, fit.point
-    error = data.error - residuals(data, batch([point]))[0]
+    error = data.error - residuals(data, [point])[0]
     kp, inner = (point[name][:, None] for name in ("kp", "kv"))
     damping = np.minimum(inner, point["viscous"][:, None]) + point["kd"][:, None]
     return _highest(search, np.abs(kp * error * data.scale - damping * data.v))

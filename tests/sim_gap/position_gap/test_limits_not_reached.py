@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from servo_arm import at_both, model_text, record, search_on
 
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit
+from sim_gap.position_gap.fit import LoopFit, LoopSearch
 from sim_gap.position_gap.training import bands, unreached_limits
 from sim_gap.position_gap.training.bands import band
 from sim_gap.position_gap.training.spread import covariance, draw, gaps_left_out, known_before, terms_of

@@ -84,7 +84,7 @@ def test_a_model_without_servos_gets_one_that_holds_the_resting_joint_and_moves_
     bare = text[: text.index("<actuator>")] + "</mujoco>"
     search = search_on(bare.replace('frictionloss="0.15"', ""), [still(record(text, 1, 18.0))])
     search = replace(search, excluded=frozenset({"actuator.back_emf"}))
-    search, fit = starting_fit(search, search.data.plant.servos, lambda text: None)
+    search, fit = starting_fit(search, lambda text: None)
     assert search.resting == {1}
     assert search.open_controller
     assert fit.at(1) == ()

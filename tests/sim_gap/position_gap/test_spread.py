@@ -7,8 +7,7 @@ import pytest
 from servo_arm import JOINTS, at_both, fitted
 
 from sim_gap.position_gap import sound_arm
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, batch, residuals
+from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 from sim_gap.position_gap.training import spread
 from sim_gap.position_gap.training.spread import (
     Covariance,
@@ -106,7 +105,7 @@ def test_draws_of_an_undecided_scale_move_the_arm_as_the_fit_does(weightless) ->
             for name in ("kp", "coulomb", "viscous", "armature")
         }
         points.append({**fit.point, **own})
-    gaps = residuals(search.data, batch([fit.point, *points]))
+    gaps = residuals(search.data, [fit.point, *points])
     moved = np.sqrt(np.mean((gaps[1:] - gaps[0]) ** 2, axis=(1, 2, 3)))
     assert np.median(moved) < 0.001
 
@@ -119,7 +118,7 @@ def test_no_draw_moves_the_arm_further_than_it_may(several) -> None:
 
     def moved(rows: list[dict[str, float]]) -> np.ndarray:
         points = [{**fit.point, "delay": np.array([row["shoulder.delay"], fit.point["delay"][1]])} for row in rows]
-        gaps = residuals(search.data, batch([fit.point, *points]))[:, :, 0]
+        gaps = residuals(search.data, [fit.point, *points])[:, :, 0]
         return np.sqrt(np.mean((gaps[1:] - gaps[0]) ** 2, axis=(1, 2)))
 
     assert np.median(moved(free)) > 0.02

@@ -13,8 +13,7 @@ from armlink.recording.recording import Recording
 from sim_gap.attribution.position_notes import _ranges
 from sim_gap.better_model.export import module_text
 from sim_gap.model.load import SimModel, load_model
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit
+from sim_gap.position_gap.fit import LoopFit, LoopSearch
 from sim_gap.position_gap.training.export import (
     IN_MODULE,
     Exported,
