@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.content.atomic_file import open_whole
+from armlink.content.atomic_file import open_whole, writing
 from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
 from armlink.extras import require_extra
@@ -156,11 +156,8 @@ def save_motion(motion: PlannedMotion, path: Path) -> None:
         raise BadInput(f"{path}: a motion is written as .csv")
     columns = {"t": np.arange(len(motion.target)) / motion.rate}
     columns |= {f"q_cmd_{i + 1}": column for i, column in enumerate(motion.target.T)}
-    try:
-        with open_whole(path) as stream:
-            write_numbers(stream, columns)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error}") from None
+    with writing(path), open_whole(path) as stream:
+        write_numbers(stream, columns)
 
 
 def load_motion(path: Path, arm: ArmFile) -> Array:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from armlink.content.atomic_file import write_whole
-from armlink.errors import BadInput
+from armlink.content.atomic_file import write_whole, writing
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import (
     add_motors,
@@ -111,14 +110,12 @@ def write_files(
     earlier model. Returns a line for all that the file cannot hold, `lines` first. Raises BadInput."""
     if path.suffix == URDF:
         xml, lines = urdf_of(compiled(), urdf_behind(sim.path), lines)
-    try:
+    with writing(path):
         for file, text in {path: xml, **beside}.items():
             if text is None:
                 file.unlink(missing_ok=True)
             else:
                 write_whole(file, text)
-    except OSError as error:
-        raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
     return list(lines)
 
 

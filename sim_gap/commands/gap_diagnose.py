@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from armlink.commands.options import reads_recordings
+from armlink.commands.options import Json, reads_recordings
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 def _about(help_text: str, **more: Any) -> Any:
     return typer.Option(help=help_text, rich_help_panel="About the arm and the recordings", **more)
+
+
+def _training(help_text: str, **more: Any) -> Any:
+    return typer.Option(help=help_text, rich_help_panel="For training in simulation", **more)
 
 
 Base = Annotated[str | None, _about("Body of the model that carries the recorded arm; by default the world.")]
@@ -49,54 +53,34 @@ def diagnose(
     gains: KnownGain = "",
     group: Annotated[
         list[str] | None,
-        typer.Option(
+        _about(
+            "Recordings, also held-out ones, in which the arm carries the same body, such as a payload; may be "
+            "repeated. By default the diagnosis finds these groups.",
             metavar="NAME=REC[,REC…]",
-            help="Recordings, also held-out ones, in which the arm carries the same body, such as a payload; may "
-            "be repeated. By default the diagnosis finds these groups.",
-            rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
-    json: Annotated[
-        Path | None, typer.Option(help="Write the result as JSON to this file; for standard output give `-`.")
-    ] = None,
+    json: Json = None,
     report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report to this file.")] = None,
     gain: Annotated[
         list[str] | None,
-        typer.Option(
+        _about(
+            "Gain of the position controller in a recording (patterns allowed), in any unit; only needed if there is "
+            "no torque channel and the gain differs between recordings.",
             metavar="REC=VALUE",
-            help="Gain of the position controller in a recording (patterns allowed), in any unit; only needed if "
-            "there is no torque channel and the gain differs between recordings.",
-            rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
     samples: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Write this number of random draws of all parameters, for domain randomisation.",
-            rich_help_panel="For training in simulation",
-        ),
+        int, _training("Write this number of random draws of all parameters, for domain randomisation.", min=0)
     ] = 0,
     out_samples: Annotated[
-        Path | None,
-        typer.Option(
-            help="File for the draws: .csv, .json or .parquet; by default samples.csv.",
-            rich_help_panel="For training in simulation",
-        ),
+        Path | None, _training("File for the draws: .csv, .json or .parquet; by default samples.csv.")
     ] = None,
     out_actuators: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write actuator entries for Isaac Lab and mjlab to this file (.py).",
-            rich_help_panel="For training in simulation",
-        ),
+        Path | None, _training("Write actuator entries for Isaac Lab and mjlab to this file (.py).")
     ] = None,
     physics_step: Annotated[
         float,
-        typer.Option(
-            help="Physics step of the training simulation [s]; the actuator entries count delays in these steps.",
-            rich_help_panel="For training in simulation",
-        ),
+        _training("Physics step of the training simulation [s]; the actuator entries count delays in these steps."),
     ] = 0.005,
     out_model: Annotated[
         Path | None,
