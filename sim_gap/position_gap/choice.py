@@ -13,7 +13,7 @@ from gcomp.estimate.solve import cost_of, prior_cost, scale_of
 from sim_gap.position_gap.fit import Group, Layout, LoopFit, LoopSearch, Place, residuals, rms_on
 from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, shared_effects, size_of
 from sim_gap.position_gap.plant import Point
-from sim_gap.position_gap.windows import Windows, thin_moving
+from sim_gap.position_gap.windows import Windows, thin
 
 FOLDS = 6
 """Parts of the windows of which each is held out once."""
@@ -164,7 +164,7 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
     """The best of some levels of a limit at every joint, (J,): one that is never reached has no slope to follow, and
     one that is always reached leads nowhere."""
     levels = np.minimum(np.array(LEVELS[name])[:, None] * search.size_of(name), fit.point[name])
-    few = thin_moving(search.data, FEW)
+    few = thin(search.data, FEW, moving=True)
     gaps = residuals(few, [{**fit.point, name: level} for level in levels])
     squares = np.einsum("ptjw,tjw->pj", gaps**2, few.weight)
     return np.asarray(levels[squares.argmin(axis=0), np.arange(search.data.joints)])

@@ -39,7 +39,7 @@ from sim_gap.position_gap.training.spread import (
     terms_of,
 )
 from sim_gap.position_gap.training.unreached_limits import find_unreached
-from sim_gap.position_gap.windows import Windows, thin, thin_moving, windows_of
+from sim_gap.position_gap.windows import Windows, thin, windows_of
 from sim_gap.residuals.residual_set import EXPLAINED
 
 FITTED, JUDGED = 12, 24
@@ -114,7 +114,7 @@ def identify(
     progress("reading the motion")
     plant = MovedModel(sim)
     complete = bool(plant.driven.all())
-    data = thin_moving(windows_of(plant, train, labels[: len(train)], scale[: len(train)]), FITTED)
+    data = thin(windows_of(plant, train, labels[: len(train)], scale[: len(train)]), FITTED, moving=True)
     judged = thin(windows_of(plant, heldout, labels[len(train) :], scale[len(train) :]), JUDGED)
     never = frozenset(withhold) | _frozen(sim, data)
     search = LoopSearch(

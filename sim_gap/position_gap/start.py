@@ -12,7 +12,7 @@ from gcomp.estimate.problem import NORMAL
 from sim_gap.position_gap.choice import FEW, Progress, costs_of
 from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 from sim_gap.position_gap.parameters import Scales
-from sim_gap.position_gap.windows import Windows, thin_moving
+from sim_gap.position_gap.windows import Windows, thin
 
 GAINS = 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0
 """Gains that are tried, over that of the model."""
@@ -84,7 +84,7 @@ def starting_fit(search: LoopSearch, progress: Progress) -> tuple[LoopSearch, Lo
     if not complete:
         search = replace(search, nominal=_holding(search), open_controller=True)
         search = replace(search, excluded=search.excluded | {"actuator.gain"})
-    few = replace(search, data=thin_moving(search.data, FEW))
+    few = replace(search, data=thin(search.data, FEW, moving=True))
     points = _points(few)
     gaps = residuals(few.data, points)
     costs = np.einsum("ptjw,tjw->pj", np.minimum(np.abs(gaps), 1.0) ** 2, few.data.weight)
@@ -113,7 +113,7 @@ def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[
 
     A saturated servo hides its gain and its lag, so that no step from one without limits leads there.
     """
-    few = replace(search, data=thin_moving(search.data, FEW))
+    few = replace(search, data=thin(search.data, FEW, moving=True))
     drawn = _drawn_servos(few, fit, where)
     names = [name for name in SERVO_RANGES if name != "lag" or search.nominal["lag"].any()]
     free = [*fit.free, *((j, name) for j in np.flatnonzero(where).tolist() for name in names)]

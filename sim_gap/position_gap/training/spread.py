@@ -161,9 +161,8 @@ def covariance(search: LoopSearch, fit: LoopFit) -> Covariance:
         matrix += few**2 * jackknifed(terms, known, groups)
     told = [k for k, place in enumerate(terms.names) if place in fit.free or _sets_scale(fit, *place)]
     names = [terms.names[k] for k in told]
-    matrix = matrix[np.ix_(told, told)]
-    matrix += _systematic(search, free, names) + _besides(search, names) + _of_one_motion(search, free, names)
-    return Covariance(names, matrix)
+    besides = _systematic(search, free, names) + _besides(search, names) + _of_one_motion(search, free, names)
+    return Covariance(names, matrix[np.ix_(told, told)] + np.diag(besides))
 
 
 def _sets_scale(fit: LoopFit, joint: int, name: str) -> bool:
@@ -187,7 +186,7 @@ def covariance_within(search: LoopSearch, fit: LoopFit, terms: WindowTerms) -> C
     inverse = np.linalg.inv(bread * scale * scale[:, None] + held) * scale * scale[:, None]
     meat = terms.scores.T @ terms.scores
     matrix = inverse @ meat @ inverse * count / max(count - size / max(search.data.joints, 1), 1.0)
-    return Covariance(terms.names, matrix + _systematic(search, fit, terms.names))
+    return Covariance(terms.names, matrix + np.diag(_systematic(search, fit, terms.names)))
 
 
 def free_all(search: LoopSearch, fit: LoopFit) -> LoopFit:
@@ -222,19 +221,19 @@ def _stated(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
 
 
 def _systematic(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
-    return np.diag((SYSTEMATIC * _values(search, fit, names)) ** 2)
+    return np.asarray((SYSTEMATIC * _values(search, fit, names)) ** 2)
 
 
 def _of_one_motion(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
-    """Variances by what another motion would show where a single one was recorded, (K, K).
+    """Variances by what another motion would show where a single one was recorded, (K,).
 
     Other motion turns what the fit leaves of the way to the command into other parameters.
     """
     if not search.data.of_one_recording:
-        return np.zeros((len(names), len(names)))
+        return np.zeros(len(names))
     left = np.minimum(OTHERWISE * rms_on(search.data, fit.point) / search.scales.angle, STATED)
     share = np.array([left[j] if j >= 0 else left.max() for j, _ in names])
-    return np.diag((share * _values(search, fit, names)) ** 2)
+    return np.asarray((share * _values(search, fit, names)) ** 2)
 
 
 def _values(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
@@ -248,11 +247,10 @@ def _values(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
 
 
 def _besides(search: LoopSearch, names: Sequence[Place]) -> Array:
-    """Variances by what sound arms have besides of friction and of lateness, (K, K)."""
+    """Variances by what sound arms have besides of friction and of lateness, (K,)."""
     friction = np.minimum(FRICTION_NM, FRICTION_SHARE * search.scales.torque)
     sizes = {"coulomb": friction, "delay": np.full_like(friction, np.hypot(LATE_S, APART_S))}
-    own = [sizes[name][j] / search.scales.of(name)[j] if name in sizes else 0.0 for j, name in names]
-    return np.diag(np.square(own))
+    return np.square([sizes[name][j] / search.scales.of(name)[j] if name in sizes else 0.0 for j, name in names])
 
 
 # ---- intervals and draws

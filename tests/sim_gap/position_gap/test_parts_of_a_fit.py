@@ -18,7 +18,7 @@ from sim_gap.position_gap.identify import _frozen
 from sim_gap.position_gap.parameters import PARAMETERS, Scales, step_parameter
 from sim_gap.position_gap.training import export, position_files, spread
 from sim_gap.position_gap.training import replay as replays
-from sim_gap.position_gap.windows import choose_windows, thin_moving
+from sim_gap.position_gap.windows import choose_windows, thin
 
 TEXT = model_text(kp=15.0, friction=0.2)
 
@@ -58,7 +58,7 @@ def test_of_one_motion_what_is_left_of_the_way_to_the_command_is_what_another_ma
     scales = Scales(torque, one, one, np.full(3, 0.02))
     search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True), scales=scales)
     share = 0.05 * spread.OTHERWISE
-    found = np.diag(spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp"), (2, "kp")]))
+    found = spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp"), (2, "kp")])
     coulomb = share * 0.3 / scales.of("coulomb")[0]
     np.testing.assert_allclose(found, [share**2, coulomb**2, 0.0, spread.STATED**2])
     two = SimpleNamespace(data=SimpleNamespace(of_one_recording=False), scales=scales)
@@ -148,9 +148,9 @@ def test_a_joint_that_moves_in_few_windows_moves_in_one_that_is_fitted() -> None
     still[7] = 0.0
     speed = many.v.copy()
     speed[:, 1] *= 0.1 * still + (1.0 - still)
-    assert thin_moving(replace(many, v=speed), 4).recording.tolist() == [0, 7, 13, 26, 39]
-    assert thin_moving(many, 4).recording.tolist() == [0, 13, 26, 39]
-    assert thin_moving(many, count) is many
+    assert thin(replace(many, v=speed), 4, moving=True).recording.tolist() == [0, 7, 13, 26, 39]
+    assert thin(many, 4, moving=True).recording.tolist() == [0, 13, 26, 39]
+    assert thin(many, count, moving=True) is many
 
 
 def test_a_limit_is_tried_at_the_level_that_fits() -> None:
