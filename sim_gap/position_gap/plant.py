@@ -31,8 +31,6 @@ LOCKED_TOLERANCE = 1e-16
 the arm of two joints in `tests/sim_gap/position_gap/test_plant.py` rests 4 mrad off, with this 0.3 µrad."""
 Point = Mapping[str, Array]
 """Parameter → (J,); one of the whole arm has the same value at each joint."""
-FILTERS = 2, 3
-"""MuJoCo's codes of actuators that filter their input (`mjDYN_FILTER`, `mjDYN_FILTEREXACT`)."""
 SPEED_S = 0.01
 """Time over which the derivative of a command is taken [s]."""
 
@@ -105,7 +103,7 @@ def servos_of(sim: SimModel) -> tuple[NDArray[np.intp], dict[str, Array]]:
             own["ki"][j], slew = model.actuator_gainprm[i, 0] * gear**2, float(model.actuator_dynprm[i, 1])
             own["slew"][j] = slew / abs(gear) if slew > 0.0 else np.inf
         own["delay"][j] = model.actuator_delay[i]
-        if model.actuator_dyntype[i] in FILTERS:
+        if model.actuator_dyntype[i] in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
             own["lag"][j] = model.actuator_dynprm[i, 0]
     return actuator, own
 
