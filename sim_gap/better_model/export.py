@@ -26,18 +26,16 @@ from sim_gap.search.term import Term
 
 
 @dataclass(frozen=True)
-class Written:
-    """The text of a corrected model and of the module beside it."""
+class CorrectedText:
+    """A corrected model as MJCF."""
 
     xml: str
-    module: str
-    """Empty if MJCF holds every effect."""
-    spec: Any
-    """`mujoco.MjSpec` of the model."""
-    lines: list[str]
-    """A line per effect that MJCF cannot hold, and per link that is not as fitted."""
-    effects: list[JointEffect]
-    """Effects that the module holds."""
+    lines: tuple[str, ...]
+    """A line per effect that it cannot hold, and per link that is not as fitted."""
+    effects: tuple[JointEffect, ...] = ()
+    """Those that a module applies beside it."""
+    spec: Any = None
+    """`mujoco.MjSpec` of the model, if it may refer to files beside it."""
 
 
 def model_files(
@@ -49,8 +47,8 @@ def model_files(
     laws: Sequence[JointEffect] = (),
     spec: Any = None,
     mount: float = 0.0,
-) -> Written:
-    """The files of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
+) -> CorrectedText:
+    """The text of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
 
     A body that only some recordings have is left out, except for the one with this `number`, in which it is turned by
     `mount` [rad]. `laws` are torques without a known cause. `spec` is the nominal model's if it has been read before;
@@ -79,9 +77,7 @@ def model_files(
     module = module_path(Path(name)).name
     comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""
     effects = [] if estimate is None else joint_effects(sim, estimate, corrected.not_held, corrected.held)
-    effects += laws
-    source = module_text(sim, effects, name) if effects else ""
-    return Written(comment + spec.to_xml(), source, spec, lines, effects)
+    return CorrectedText(comment + spec.to_xml(), tuple(lines), (*effects, *laws), spec)
 
 
 def write_model(
@@ -94,7 +90,7 @@ def write_model(
     if the nominal model did not come from a file or a file cannot be written.
     """
     files = model_files(sim, estimate, path.name, laws=laws)
-    beside = {module_path(path): files.module or None}
+    beside = {module_path(path): module_text(sim, files.effects, path.name) if files.effects else None}
     return write_files(path, sim, files.xml, files.spec.compile, files.lines, beside)
 
 

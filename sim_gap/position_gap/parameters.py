@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from gcomp.estimate.solve import LONGEST_STEP
 from sim_gap.model.rigid_body import RigidArm
 
 
@@ -118,6 +117,8 @@ class Scales:
 LOGARITHMIC = ("kp", "stribeck_velocity", "gain")
 INVERSE = "limit", "slew"
 """Limits: their inverse is fitted, which is 0 where there is none."""
+ANYTHING = float(np.log(1e3))
+"""Logarithm of the factor to either side of a gain of which nothing is known."""
 LEAST_INVERSE = 1e-3
 """Inverse of a limit, over that of its usual size, below which there is none."""
 
@@ -140,22 +141,12 @@ def from_coordinate(name: str, x: Array, size: Array) -> Array:
     return np.clip(value, PARAMETERS[name].low, PARAMETERS[name].high)
 
 
-def step_parameter(
-    name: str, value: float, step: float, scales: Scales, joint: int, farthest: float = LONGEST_STEP
-) -> float:
-    """A parameter's value after a step in its own coordinate, within its bounds.
-
-    `farthest` is the logarithm of the largest factor on a gain.
-    """
+def step_parameter(name: str, value: float, step: float, scales: Scales, joint: int) -> float:
+    """A parameter's value after a step in its own coordinate, within its bounds."""
     size = float(scales.of(name)[joint])
     if name in LOGARITHMIC:
-        step = float(np.clip(step, -farthest, farthest))
+        step = float(np.clip(step, -ANYTHING, ANYTHING))
     return float(from_coordinate(name, np.array(to_coordinate(name, value, size) + step), np.array(size)))
-
-
-def relative_step(name: str, value: float, scales: Scales, joint: int) -> float:
-    """Step in a parameter's own coordinate per relative change of its value."""
-    return 1.0 if name in LOGARITHMIC else to_coordinate(name, value, float(scales.of(name)[joint]))
 
 
 # ---- links and base

@@ -12,9 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.fit import LoopSearch, Place, acting, jacobian, rms_on
-from sim_gap.position_gap.parameters import step_parameter
-from sim_gap.position_gap.plant import Point
+from sim_gap.position_gap.fit import Layout, LoopSearch, Place, acting, jacobian, rms_on
 from sim_gap.position_gap.windows import Windows
 
 ERROR = 0.01
@@ -75,7 +73,8 @@ def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
         right -= samples / least**2 * x @ gap
     spread = np.asarray(np.linalg.inv(normal))
     errors = spread @ right
-    found, other = _fit(search, sizes, errors), replace(search, data=heldout)
+    layout, other = Layout(search, search.nominal, [*sizes]), replace(search, data=heldout)
+    found = layout.at(layout.theta(layout.point) + np.array([*sizes.values()]) * errors)
     pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
     small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
     explained = all(small) and probable(errors, usually, spread)
@@ -104,17 +103,6 @@ def _correlation(sizes: Mapping[Place, float]) -> Array:
     late = np.array([name == "delay" for _, name in sizes], float)
     share = LATE_S**2 / (LATE_S**2 + APART_S**2)
     return np.asarray(np.diag(1.0 - share * late) + share * np.outer(late, late))
-
-
-def _fit(search: LoopSearch, sizes: Mapping[Place, float], errors: Array) -> Point:
-    """The nominal model with errors, in standard deviations."""
-    point = {name: values.copy() for name, values in search.nominal.items()}
-    for ((j, name), size), error in zip(sizes.items(), errors.tolist(), strict=True):
-        if j >= 0:
-            point[name][j] = step_parameter(name, point[name][j], size * error, search.scales, j)
-        else:
-            point[name] = np.full(search.data.joints, size * error)
-    return point
 
 
 def _weighed(search: LoopSearch, sizes: Mapping[Place, float]) -> tuple[list[Array], list[Array]]:

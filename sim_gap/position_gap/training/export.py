@@ -5,7 +5,7 @@ applies it. A model that stops where the arm was seen to go on cannot follow it:
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.corrected_model import spec_of, write_changes
+from sim_gap.better_model.export import CorrectedText
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.urdf import xml_comment
@@ -73,15 +74,9 @@ WRITTEN = frozenset({*NATIVE, *IN_MODULE})
 
 
 @dataclass(frozen=True)
-class Exported:
-    """A corrected model: its text, and a line per effect that it cannot hold."""
-
-    xml: str
-    lines: tuple[str, ...]
-    fit: LoopFit
+class Exported(CorrectedText):
+    fit: LoopFit = field(kw_only=True)
     """Parameters that it was written with."""
-    effects: tuple[JointEffect, ...] = ()
-    """Those that a module applies beside it."""
 
 
 def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE) -> LoopFit:
@@ -157,7 +152,7 @@ def export_fit(
     spec.compile()
     head = "These effects are left out, since MJCF has no field for them (the other effects were fitted without them):"
     comment = xml_comment([head, *left]) if left else ""
-    return Exported(comment + spec.to_xml(), tuple(left), native)
+    return Exported(comment + spec.to_xml(), tuple(left), fit=native)
 
 
 def export_with_module(sim: SimModel, search: LoopSearch, fit: LoopFit) -> Exported | None:

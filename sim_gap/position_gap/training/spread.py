@@ -20,7 +20,7 @@ from gcomp.arrays import Array
 from gcomp.estimate.solve import LONGEST_STEP, precision
 from sim_gap.position_gap.fit import Layout, LoopFit, LoopSearch, Place, acting, jacobian, rms_on
 from sim_gap.position_gap.judge import LOOSE
-from sim_gap.position_gap.parameters import PARAMETERS, UNIT, WITH_TORQUE, range_of, relative_step, step_parameter
+from sim_gap.position_gap.parameters import LOGARITHMIC, PARAMETERS, UNIT, WITH_TORQUE, range_of, step_parameter
 from sim_gap.position_gap.sound_arm import APART_S, FRICTION_NM, FRICTION_SHARE, LATE_S, errors_of
 from sim_gap.position_gap.training.unreached_limits import Unreached, draw_limits
 from sim_gap.position_gap.windows import Windows
@@ -43,8 +43,6 @@ ALIKE = 0.9
 """Correlation of the errors of a value of SCALED that the model states for several joints."""
 WIDEST = 100.0
 """Standard deviation of a parameter that nothing shows, in its own coordinate."""
-ANYTHING = float(np.log(1e3))
-"""Logarithm of the factor to either side of a gain of which nothing is known."""
 LEAST_MOMENT = 1e-8
 """Standard deviation of a mass moment of a link without mass [kg·m]."""
 LIGHTEST = 1e-3
@@ -238,12 +236,8 @@ def _of_one_motion(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> 
 
 def _values(search: LoopSearch, fit: LoopFit, names: Sequence[Place]) -> Array:
     """Change of a parameter's own coordinate per relative change of it, (K,)."""
-    return np.array(
-        [
-            float(fit.point[name][0]) if j < 0 else relative_step(name, fit.point[name][j], search.scales, j)
-            for j, name in names
-        ]
-    )
+    own = Layout(search, fit.point, names).theta(fit.point)
+    return np.where([name in LOGARITHMIC for _, name in names], 1.0, own)
 
 
 def _besides(search: LoopSearch, names: Sequence[Place]) -> Array:
@@ -277,7 +271,7 @@ def interval(
         value, (least, most) = float(fit.point[name][0]), range_of(search.arm, name)
         return value, max(value + below, least), min(value + above, most), UNIT[name.partition(".")[2]]
     value = float(fit.point[name][joint])
-    ends = (step_parameter(name, value, step, search.scales, joint, ANYTHING) for step in (below, above))
+    ends = (step_parameter(name, value, step, search.scales, joint) for step in (below, above))
     low, high = sorted(ends)
     return value, low, high, PARAMETERS[name].unit
 

@@ -56,7 +56,7 @@ def test_of_one_motion_what_is_left_of_the_way_to_the_command_is_what_another_ma
     fit = LoopFit({"kp": np.array([15.0, 10.0, 5.0]), "coulomb": np.array([0.3, 0.2, 0.1])})
     torque, one = np.full(3, 0.5), np.ones(3)
     scales = Scales(torque, one, one, np.full(3, 0.02))
-    search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True), scales=scales)
+    search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True, joints=3), scales=scales)
     share = 0.05 * spread.OTHERWISE
     found = spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp"), (2, "kp")])
     coulomb = share * 0.3 / scales.of("coulomb")[0]
