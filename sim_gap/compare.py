@@ -19,17 +19,15 @@ from sim_gap.checks.check import is_position_only
 from sim_gap.checks.finding import RecordingFinding
 from sim_gap.model.known_gains import KnownGains
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.fit import LoopFit, evaluate
-from sim_gap.position_gap.parameters import PARAMETERS
+from sim_gap.position_gap.fit import residuals, root_mean_squares
 from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.training.export import widen_ranges
 from sim_gap.position_gap.training.replay import nominal, replay_rms
+from sim_gap.position_gap.training.spread import INSIDE
 from sim_gap.position_gap.windows import windows_of
 from sim_gap.residuals.preprocess import prepare
 from sim_gap.residuals.residual_set import residual_sets
 
-INSIDE = 0.95
-"""Probability of an interval."""
 RESAMPLED = 2000
 """Samples of a bootstrap over windows (Efron and Tibshirani 1993: a thousand and more for the ends of an interval)."""
 ALIKE = 0.01
@@ -136,16 +134,13 @@ def _moved(
     """Squares of the gap of positions and samples by joint and window (n, W), and the RMS running free (n,)."""
     sim = widen_ranges(sim, recordings)
     plant = MovedModel(sim)
-    if not plant.servos.complete:
-        missing = [name for name, kp in zip(sim.arm.names, plant.servos.kp, strict=True) if not np.isfinite(kp)]
+    if missing := [name for name, driven in zip(sim.arm.names, plant.driven, strict=True) if not driven]:
         raise BadInput(
             f"--sim {model}: no position actuator at {', '.join(missing)}: give the gains with --gains "
             "kp=VALUE,kd=VALUE"
         )
     data = windows_of(plant, recordings, labels)
-    point = nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()})
-    rms = evaluate(data, LoopFit(point, ((),) * sim.n)).rms
-    assert rms is not None
+    rms = root_mean_squares(data, residuals(data, [nominal_point(plant)]))[0]
     weight = data.weight.sum(0)
     return rms**2 * weight, weight, replay_rms(nominal(sim), recordings)
 

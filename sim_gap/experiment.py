@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from armlink.arm_file import ArmFile
-from armlink.content.atomic_file import open_whole
+from armlink.content.atomic_file import open_whole, writing
 from armlink.content.memory_budget import memory_budget
 from armlink.errors import BadInput
 from armlink.extras import require_extra
@@ -38,8 +38,9 @@ REST_S = 1.0
 """Rest between moves [s]."""
 SPEED_TOLERANCE = 1.05
 """Factor by which the speed between two rows may exceed max_velocity, for the rounding in a file."""
-TONES, BAND = 4, (0.08, 0.6)
-"""Number of sines per joint in the motion of all joints, and their frequency band [Hz]."""
+TONES, BAND, FADE_S = 4, (0.08, 0.6), 2.0
+"""Number of sines per joint in the motion of all joints, their frequency band [Hz], and time of their rise and fall
+[s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,21 +119,26 @@ class _Shape:
     def sines(self, joints: list[int], random: np.random.Generator, seconds: float = 60.0) -> None:
         """Move the joints together, each by its own sum of sines about the middle of its range."""
         self.go((self.low + self.high) / 2, PACE * self.fastest)
+        reach, speed = (x[joints] for x in (0.45 * (self.high - self.low), PACE * self.fastest))
         t = np.arange(round(seconds * self.rate)) / self.rate
-        fade = np.clip(np.minimum(t, seconds - t) / 2.0, 0.0, 1.0)
-        fade = fade * fade * (3 - 2 * fade)
         rows = np.repeat(self.here[None], len(t), axis=0)
-        for joint in joints:
-            omega = 2 * np.pi * random.uniform(*BAND, TONES)
-            reach = 0.9 * (self.high[joint] - self.low[joint]) / 2
-            size = np.minimum(np.minimum(reach, PACE * self.fastest[joint] / omega), ACCELERATION / omega**2) / TONES
-            rows[:, joint] += fade * (size * np.sin(np.outer(t, omega) + random.uniform(0, 2 * np.pi, TONES))).sum(1)
+        rows[:, joints] += multisine(t, reach, speed, BAND, random.random((len(joints), 2, TONES)))
         self.rows.append(rows)
         self.here = rows[-1]
         self.pieces.append(f"all joints together, {TONES} sines for each joint, {seconds:g} s")
 
     def motion(self) -> PlannedMotion:
         return PlannedMotion(self.names, self.rate, np.concatenate(self.rows), tuple(self.pieces))
+
+
+def multisine(t: Array, reach: Array, speed: Array, band: tuple[float, float], draw: Array) -> Array:
+    """Way from a middle (K, n) [rad], from rest to rest at even times: of each joint sines with frequencies of a band
+    [Hz], within its reach [rad] and speed [rad/s], (n,) each, and ACCELERATION; by random numbers (n, 2, sines)."""
+    omega = 2 * np.pi * (band[0] + (band[1] - band[0]) * draw[:, 0])
+    size = np.minimum(np.minimum(reach[:, None], speed[:, None] / omega), ACCELERATION / omega**2) / draw.shape[2]
+    fade = np.clip(np.minimum(t, t[-1] + t[1] - t) / FADE_S, 0.0, 1.0)
+    fade = fade * fade * (3 - 2 * fade)
+    return np.asarray(fade[:, None] * (size * np.sin(t[:, None, None] * omega + 2 * np.pi * draw[:, 1])).sum(axis=2))
 
 
 def joints_in_doubt(answer: Path) -> tuple[list[str], list[str]]:
@@ -156,11 +162,8 @@ def save_motion(motion: PlannedMotion, path: Path) -> None:
         raise BadInput(f"{path}: a motion is written as .csv")
     columns = {"t": np.arange(len(motion.target)) / motion.rate}
     columns |= {f"q_cmd_{i + 1}": column for i, column in enumerate(motion.target.T)}
-    try:
-        with open_whole(path) as stream:
-            write_numbers(stream, columns)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error}") from None
+    with writing(path), open_whole(path) as stream:
+        write_numbers(stream, columns)
 
 
 def load_motion(path: Path, arm: ArmFile) -> Array:

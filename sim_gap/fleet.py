@@ -15,6 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel, FiniteFloat, ValidationError
 
+from armlink.content.atomic_file import writing
 from armlink.errors import ArmlinkError, BadInput, BusFault
 from armlink.recording.corrections import AS_IT_IS, Corrections
 from sim_gap.model.known_gains import parse_known_gains
@@ -227,14 +228,11 @@ class Answers:
         self.options = json.loads(json.dumps((options or CaseOptions()).to_json()))
         self.found: dict[str, dict[str, Any]] = {}
         other: set[str] = set()
-        try:
-            with path.open("a+b") as stream:
-                stream.seek(0)
-                whole = stream.read()
-                if whole and not whole.endswith(b"\n"):
-                    stream.write(b"\n")
-        except OSError as error:
-            raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+        with writing(path), path.open("a+b") as stream:
+            stream.seek(0)
+            whole = stream.read()
+            if whole and not whole.endswith(b"\n"):
+                stream.write(b"\n")
         for number, line in enumerate(whole.splitlines(), start=1):
             try:
                 _StoredLine.model_validate_json(line, strict=True)
@@ -254,12 +252,9 @@ class Answers:
 
     def add(self, case: str, answer: dict[str, Any]) -> None:
         """Append a result; raises BadInput if it cannot be written."""
-        try:
-            with self.path.open("a", encoding="utf-8") as stream:
-                entry = {"case": case, "answer": answer} | ({"options": self.options} if self.options else {})
-                stream.write(json.dumps(entry, ensure_ascii=False) + "\n")
-        except OSError as error:
-            raise BadInput(f"{self.path}: cannot be written: {error.strerror}") from None
+        entry = {"case": case, "answer": answer} | ({"options": self.options} if self.options else {})
+        with writing(self.path), self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(entry, ensure_ascii=False) + "\n")
         self.found[case] = answer
 
 

@@ -12,10 +12,9 @@ is judged by the scatter from one diagnosis to the next and not by the intervals
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -61,6 +60,8 @@ def watched_parameters(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 FIRST, LAST = 7, 5
 """Number of diagnoses at the start that are the reference, and at the end that are compared with it."""
+NEEDED = FIRST + LAST + 1
+"""Diagnoses from which on a change can be seen twice running."""
 SURE = 5.0
 """Multiple of the difference's standard deviation from which a parameter has changed, in two diagnoses running."""
 LEAST = {"friction.coulomb": 0.05, "friction.viscous": 0.05, "torque.gain": 0.005, "actuator.gain": 0.005}
@@ -145,7 +146,7 @@ def date_of(case: str) -> datetime | None:
 def fleet_trends(answers: Mapping[str, Mapping[str, Any]]) -> list[Trend]:
     """Changes of parameters over the dated cases of each arm (the first folder of a case's name), latest first.
 
-    An arm with a case without a date, or with fewer than FIRST + LAST + 1 cases, has none.
+    An arm with a case without a date, or with fewer than NEEDED cases, has none.
     """
     series = _series(answers)
     noise = {key: _scatter(one) for key, one in series.items()}
@@ -169,8 +170,7 @@ def needed_recordings(answers: Mapping[str, Mapping[str, Any]]) -> str:
     undated = sorted(case for case in used if date_of(case) is None)
     if undated:
         return f"{undated[0].partition('/')[2]} has no date in its name, such as 2026-10-02, so no change can be dated"
-    needed = FIRST + LAST + 1
-    return f"a change can be found from {needed} recordings on" if len(used) < needed else ""
+    return f"a change can be found from {NEEDED} recordings on" if len(used) < NEEDED else ""
 
 
 def fleet_outliers(answers: Mapping[str, Mapping[str, Any]]) -> list[Outlier]:
@@ -197,38 +197,36 @@ def rows(found: Sequence[Trend | Outlier]) -> list[dict[str, Any]]:
 
 def _series(answers: Mapping[str, Mapping[str, Any]], dated: bool = True) -> dict[Key, _Series]:
     by_arm: dict[str, list[tuple[datetime, Mapping[str, Any]]]] = defaultdict(list)
-    undated = set()
+    undated = {
+        case.split("/")[0] for case, answer in answers.items() if "error" not in answer and date_of(case) is None
+    }
     for case, answer in sorted(answers.items()):
-        arm, date = case.split("/")[0], date_of(case)
-        if "error" in answer:
-            continue
-        undated |= {arm} if date is None else set()
-        by_arm[arm].append((date or datetime.min.replace(tzinfo=UTC), answer))
+        if "error" not in answer:
+            by_arm[case.split("/")[0]].append((date_of(case) or datetime.min.replace(tzinfo=UTC), answer))
     out: dict[Key, _Series] = {}
     for arm, cases in by_arm.items():
-        if dated and (arm in undated or len(cases) < FIRST + LAST + 1):
+        if dated and (arm in undated or len(cases) < NEEDED):
             continue
         cases.sort(key=lambda pair: pair[0])
-        with_watched = [case for case in cases if case[1].get("watched")]
-        if dated and len(with_watched) >= FIRST + LAST + 1:
-            _add(out, arm, with_watched, _watched_values)
-        followed = {key[1] for key in out if key[0] == arm}
-        _add(out, arm, cases, partial(_values, leave=followed))
-    return {key: _without_unclear(one) for key, one in out.items()}
+        watched = [(date, _watched_values(answer)) for date, answer in cases if dated and answer.get("watched")]
+        own = _of_arm(arm, watched) if len(watched) >= NEEDED else {}
+        followed = {effect for _, effect, _, _ in own}
+        out |= own | _of_arm(arm, [(date, _values(answer, followed)) for date, answer in cases])
+    return out
 
 
-Read = Callable[[Mapping[str, Any]], dict[tuple[str, str, str], tuple[float, float, str]]]
+Values = dict[tuple[str, str, str], tuple[float, float, str]]
 """Value, half width and unit of the parameters of an answer, by effect, joint and name."""
 
 
-def _add(out: dict[Key, _Series], arm: str, cases: Sequence[tuple[datetime, Mapping[str, Any]]], read: Read) -> None:
-    dates = [date for date, _ in cases]
-    for k, (_, answer) in enumerate(cases):
-        for key, (value, half, unit) in read(answer).items():
-            if (arm, *key) not in out:
-                out[arm, *key] = _Series(unit, dates, *np.full((2, len(cases)), np.nan))
-            one = out[arm, *key]
-            one.values[k], one.interval[k] = value, half
+def _of_arm(arm: str, answers: Sequence[tuple[datetime, Values]]) -> dict[Key, _Series]:
+    dates, out = [date for date, _ in answers], dict[Key, _Series]()
+    for k, (_, values) in enumerate(answers):
+        for which, (value, half, unit) in values.items():
+            if (arm, *which) not in out:
+                out[arm, *which] = _Series(unit, dates, *np.full((2, len(dates)), np.nan))
+            out[arm, *which].values[k], out[arm, *which].interval[k] = value, half
+    return {key: _without_unclear(one) for key, one in out.items()}
 
 
 def _without_unclear(one: _Series) -> _Series:
@@ -237,7 +235,7 @@ def _without_unclear(one: _Series) -> _Series:
     return one
 
 
-def _watched_values(answer: Mapping[str, Any]) -> dict[tuple[str, str, str], tuple[float, float, str]]:
+def _watched_values(answer: Mapping[str, Any]) -> Values:
     return {
         (one["effect"], one["joint"], one["parameter"]): (
             float(one["value"]),
@@ -248,9 +246,7 @@ def _watched_values(answer: Mapping[str, Any]) -> dict[tuple[str, str, str], tup
     }
 
 
-def _values(
-    answer: Mapping[str, Any], leave: Collection[str] = ()
-) -> dict[tuple[str, str, str], tuple[float, float, str]]:
+def _values(answer: Mapping[str, Any], leave: Collection[str]) -> Values:
     return {
         (cause["effect"], joint, name): (float(one["value"]), float("nan"), one["unit"])
         for cause in (*answer.get("causes", ()), *answer.get("minor", ()))

@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from armlink.errors import BadInput
+
 NO_ROOM_BESIDE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG)
 """Why no file can be made in a folder in which one may be written: such a file is written in place."""
 
@@ -27,6 +29,15 @@ def file_identity(path: Path) -> tuple[int, int] | None:
 def part_of(path: Path) -> Path:
     """Path of the file while it is being written."""
     return path.with_name(path.name + ".part")
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Raises BadInput where a file cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise BadInput(f"{error.filename or path}: cannot be written: {error.strerror or error}") from None
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

@@ -5,6 +5,8 @@ import numpy as np
 from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Rollout
 from sim_gap.position_gap.identify import Identified
+from sim_gap.position_gap.plant import held_parts
+from sim_gap.position_gap.start import controller_name
 from sim_gap.position_gap.training.bands import SHARE
 from sim_gap.position_gap.training.export import Exported, effects_left_out, widened_joints
 from sim_gap.position_gap.training.spread import interval, undecided_scale
@@ -24,7 +26,7 @@ AT_TIMES = 0.01
 def notes(found: Identified) -> list[str]:
     """Notes on the controller, on limits that were not reached, and on effects that the exported model leaves out."""
     names = found.sim.arm.names
-    kind = "position actuators as in the model" if found.nominal_has_controller else found.controller
+    kind = controller_name(found.fit) if found.search.open_controller else "position actuators as in the model"
     out = [
         f"there is no torque channel, so controller ({kind}) and effects are fitted to q_cmd and q, and the gap is in "
         "rad"
@@ -35,7 +37,7 @@ def notes(found: Identified) -> list[str]:
             f"{listed}: positions show only the ratios of gain, friction and inertia of these joints; the scale is "
             "taken from the inertia of the model: to measure the scale, hold a known load or record the current"
         )
-    if any("viscous" in own and "back_emf" not in own for own in found.fit.active):
+    if any("viscous" in (own := found.fit.at(j)) and "back_emf" not in own for j in range(found.sim.n)):
         out.append(
             "viscous friction, back-EMF and velocity feedback have the same effect on positions, so only their sum is "
             "given" + (", as part of the controller" if found.search.open_controller else "")
@@ -88,7 +90,7 @@ def _early(found: Identified) -> list[str]:
     """A note of commands that act before their time, as those of rows with the position of a later row do."""
     early = {}
     for j in range(found.sim.n):
-        if "delay" not in found.fit.active[j]:
+        if "delay" not in found.fit.at(j):
             continue
         value, _, high, _ = interval(found.search, found.fit, found.within, j, "delay")
         if high < 0.0:
@@ -107,9 +109,10 @@ def _early(found: Identified) -> list[str]:
 
 def _held(found: Identified) -> list[str]:
     """A note of what lies outside of the arm and could move by itself."""
-    if not found.held:
+    held = held_parts(found.sim)
+    if not held:
         return []
-    some = ", ".join(found.held[:MOST_NAMED]) + (", …" if len(found.held) > MOST_NAMED else "")
+    some = ", ".join(held[:MOST_NAMED]) + (", …" if len(held) > MOST_NAMED else "")
     told = "these parts of the model do not move and touch nothing, since they are not between --base and --tip"
     return [f"{told}: {some}"]
 

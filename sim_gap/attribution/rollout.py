@@ -15,7 +15,7 @@ from gcomp.arrays import Array
 from sim_gap.attribution.diagnosis import Cause, EffectRollout, Rollout
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import spec_of, with_effects
-from sim_gap.better_model.export import Written, joint_effects, model_files
+from sim_gap.better_model.export import CorrectedText, joint_effects, model_files, module_text
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.model.load import SimModel
 from sim_gap.residuals.preprocess import CHANNELS
@@ -69,7 +69,7 @@ class RollOuts:
             own = forward_effects.Effects(corrected.model, entries, self.sim.arm.names)
             return corrected.model, forward_effects, own
         files = model_files(self.sim, self.estimate, NAME, terms, number, self.laws if terms else (), self.spec, mount)
-        model, module = _compiled(files), _loaded(files)
+        model, module = _compiled(files), _loaded(self.sim, files)
         return model, module, module.Effects(model, module.EFFECTS, module.JOINTS or self.sim.arm.names)
 
 
@@ -103,7 +103,7 @@ def roll_out(
     return Rollout(horizon, before, after, tuple(sorted(out, key=cost)))
 
 
-def _compiled(files: Written) -> Any:
+def _compiled(files: CorrectedText) -> Any:
     """The model from its text; from the same specification if it refers to files beside it."""
     import mujoco
 
@@ -113,10 +113,10 @@ def _compiled(files: Written) -> Any:
         return files.spec.compile()
 
 
-def _loaded(files: Written) -> ModuleType:
+def _loaded(sim: SimModel, files: CorrectedText) -> ModuleType:
     """The module from its text; the one that it is made from if there is none."""
-    if not files.module:
+    if not files.effects:
         return forward_effects
     module = ModuleType("model_effects")
-    exec(compile(files.module, "model_effects.py", "exec"), module.__dict__)
+    exec(compile(module_text(sim, files.effects, NAME), "model_effects.py", "exec"), module.__dict__)
     return module

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from armlink.content.atomic_file import write_whole
-from armlink.errors import BadInput
+from armlink.content.atomic_file import write_whole, writing
 from sim_gap.better_model import forward_effects
 from sim_gap.better_model.corrected_model import (
     add_motors,
@@ -27,18 +26,16 @@ from sim_gap.search.term import Term
 
 
 @dataclass(frozen=True)
-class Written:
-    """The text of a corrected model and of the module beside it."""
+class CorrectedText:
+    """A corrected model as MJCF."""
 
     xml: str
-    module: str
-    """Empty if MJCF holds every effect."""
-    spec: Any
-    """`mujoco.MjSpec` of the model."""
-    lines: list[str]
-    """A line per effect that MJCF cannot hold, and per link that is not as fitted."""
-    effects: list[JointEffect]
-    """Effects that the module holds."""
+    lines: tuple[str, ...]
+    """A line per effect that it cannot hold, and per link that is not as fitted."""
+    effects: tuple[JointEffect, ...] = ()
+    """Those that a module applies beside it."""
+    spec: Any = None
+    """`mujoco.MjSpec` of the model, if it may refer to files beside it."""
 
 
 def model_files(
@@ -50,8 +47,8 @@ def model_files(
     laws: Sequence[JointEffect] = (),
     spec: Any = None,
     mount: float = 0.0,
-) -> Written:
-    """The files of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
+) -> CorrectedText:
+    """The text of the model with the effects of an estimate, or with some of its terms; `name` is the MJCF's.
 
     A body that only some recordings have is left out, except for the one with this `number`, in which it is turned by
     `mount` [rad]. `laws` are torques without a known cause. `spec` is the nominal model's if it has been read before;
@@ -80,9 +77,7 @@ def model_files(
     module = module_path(Path(name)).name
     comment = xml_comment([f"Effects that MJCF cannot hold ({module} applies them):", *lines]) if lines else ""
     effects = [] if estimate is None else joint_effects(sim, estimate, corrected.not_held, corrected.held)
-    effects += laws
-    source = module_text(sim, effects, name) if effects else ""
-    return Written(comment + spec.to_xml(), source, spec, lines, effects)
+    return CorrectedText(comment + spec.to_xml(), tuple(lines), (*effects, *laws), spec)
 
 
 def write_model(
@@ -95,7 +90,7 @@ def write_model(
     if the nominal model did not come from a file or a file cannot be written.
     """
     files = model_files(sim, estimate, path.name, laws=laws)
-    beside = {module_path(path): files.module or None}
+    beside = {module_path(path): module_text(sim, files.effects, path.name) if files.effects else None}
     return write_files(path, sim, files.xml, files.spec.compile, files.lines, beside)
 
 
@@ -111,14 +106,12 @@ def write_files(
     earlier model. Returns a line for all that the file cannot hold, `lines` first. Raises BadInput."""
     if path.suffix == URDF:
         xml, lines = urdf_of(compiled(), urdf_behind(sim.path), lines)
-    try:
+    with writing(path):
         for file, text in {path: xml, **beside}.items():
             if text is None:
                 file.unlink(missing_ok=True)
             else:
                 write_whole(file, text)
-    except OSError as error:
-        raise BadInput(f"{error.filename}: cannot be written: {error.strerror}") from None
     return list(lines)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from armlink.content.atomic_file import open_whole, write_whole
+from armlink.content.atomic_file import open_whole, write_whole, writing
 from armlink.content.printable_text import printable_text
 from armlink.errors import BadInput
 from gcomp.arrays import Array
@@ -78,10 +78,8 @@ def write_entries(
         + f"    from mjlab.actuator import {kind}\n\n"
         + f"    return (\n{mjlab}\n    )\n"
     )
-    try:
+    with writing(path):
         write_whole(path, text)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def steps_of(delay: Array, step: float) -> dict[str, float]:
@@ -211,7 +209,7 @@ def write_rows(rows: Sequence[Mapping[str, float]], path: Path) -> None:
     if path.suffix not in SUFFIXES:
         raise BadInput(f"--out-samples {path}: expected a name that ends in {', '.join(SUFFIXES)}")
     names = list(rows[0]) if rows else []
-    try:
+    with writing(path):
         if path.suffix == ".json":
             text = json.dumps({"schema": "armlink.samples/1", "samples": [dict(row) for row in rows]}, indent=1)
             write_whole(path, text)
@@ -219,11 +217,13 @@ def write_rows(rows: Sequence[Mapping[str, float]], path: Path) -> None:
             lines = [",".join(names), *(",".join(f"{row[name]:.9g}" for name in names) for row in rows)]
             write_whole(path, "\n".join(lines) + "\n")
         else:
-            import pyarrow as pa
-            from pyarrow.parquet import write_table
+            write_parquet(rows, path)
 
-            table = pa.table({name: np.array([row[name] for row in rows]) for name in names})
-            with open_whole(path) as stream:
-                write_table(table, stream)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error.strerror}") from None
+
+def write_parquet(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write a table of rows that have the same columns; raises BadInput."""
+    import pyarrow as pa
+    from pyarrow.parquet import write_table
+
+    with writing(path), open_whole(path) as stream:
+        write_table(pa.Table.from_pylist(list(rows)), stream)

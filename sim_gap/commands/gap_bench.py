@@ -1,47 +1,34 @@
 """Tests the diagnosis on sealed cases of simulated arms."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from armlink.commands.options import Json
+
+
+def _other(help_text: str, **more: Any) -> Any:
+    return typer.Option(help=help_text, rich_help_panel="Other cases", **more)
 
 
 def bench(
     seed: Annotated[int, typer.Option(help="Seed of arms, effects and motions.")] = 1,
     cases: Annotated[int, typer.Option(help="Number of cases.")] = 150,
     effects: Annotated[
-        str,
-        typer.Option(
-            metavar="LOW-HIGH",
-            help="Number of effects in every case; by default none, one or two.",
-            rich_help_panel="Other cases",
-        ),
+        str, _other("Number of effects in every case; by default none, one or two.", metavar="LOW-HIGH")
     ] = "",
     channels: Annotated[
-        str,
-        typer.Option(
-            help="q,q_cmd: cases with position servos and without torques; by default cases with torques.",
-            rich_help_panel="Other cases",
-        ),
+        str, _other("q,q_cmd: cases with position servos and without torques; by default cases with torques.")
     ] = "",
     real: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Diagnose instead the recordings of real arms in this folder; see --known.",
-            rich_help_panel="Other cases",
-        ),
+        _other("Diagnose instead the recordings of real arms in this folder; see --known.", metavar="DIR"),
     ] = None,
     known: Annotated[
-        Path | None,
-        typer.Option(
-            help="YAML file with the known effects of these arms; by default of the published arms.",
-            rich_help_panel="Other cases",
-        ),
+        Path | None, _other("YAML file with the known effects of these arms; by default of the published arms.")
     ] = None,
-    json: Annotated[
-        Path | None, typer.Option(help="Write the score as JSON to this file; for standard output give `-`.")
-    ] = None,
+    json: Json = None,
     out: Annotated[Path | None, typer.Option(help="Store cases, answers and labels in this new folder.")] = None,
     workers: Annotated[int, typer.Option(help="Number of processes.")] = 2,
 ) -> None:

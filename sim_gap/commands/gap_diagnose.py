@@ -5,11 +5,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from armlink.commands.options import reads_recordings
+from armlink.commands.options import Json, reads_recordings
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
+    from rich.table import Table
 
     from armlink.recording.corrections import Corrections
     from sim_gap.attribution.diagnosis import Diagnosis
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
 
 def _about(help_text: str, **more: Any) -> Any:
     return typer.Option(help=help_text, rich_help_panel="About the arm and the recordings", **more)
+
+
+def _training(help_text: str, **more: Any) -> Any:
+    return typer.Option(help=help_text, rich_help_panel="For training in simulation", **more)
 
 
 Base = Annotated[str | None, _about("Body of the model that carries the recorded arm; by default the world.")]
@@ -48,54 +53,34 @@ def diagnose(
     gains: KnownGain = "",
     group: Annotated[
         list[str] | None,
-        typer.Option(
+        _about(
+            "Recordings, also held-out ones, in which the arm carries the same body, such as a payload; may be "
+            "repeated. By default the diagnosis finds these groups.",
             metavar="NAME=REC[,REC…]",
-            help="Recordings, also held-out ones, in which the arm carries the same body, such as a payload; may "
-            "be repeated. By default the diagnosis finds these groups.",
-            rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
-    json: Annotated[
-        Path | None, typer.Option(help="Write the result as JSON to this file; for standard output give `-`.")
-    ] = None,
+    json: Json = None,
     report: Annotated[Path | None, typer.Option(help="Write a self-contained HTML report to this file.")] = None,
     gain: Annotated[
         list[str] | None,
-        typer.Option(
+        _about(
+            "Gain of the position controller in a recording (patterns allowed), in any unit; only needed if there is "
+            "no torque channel and the gain differs between recordings.",
             metavar="REC=VALUE",
-            help="Gain of the position controller in a recording (patterns allowed), in any unit; only needed if "
-            "there is no torque channel and the gain differs between recordings.",
-            rich_help_panel="About the arm and the recordings",
         ),
     ] = None,
     samples: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Write this number of random draws of all parameters, for domain randomisation.",
-            rich_help_panel="For training in simulation",
-        ),
+        int, _training("Write this number of random draws of all parameters, for domain randomisation.", min=0)
     ] = 0,
     out_samples: Annotated[
-        Path | None,
-        typer.Option(
-            help="File for the draws: .csv, .json or .parquet; by default samples.csv.",
-            rich_help_panel="For training in simulation",
-        ),
+        Path | None, _training("File for the draws: .csv, .json or .parquet; by default samples.csv.")
     ] = None,
     out_actuators: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write actuator entries for Isaac Lab and mjlab to this file (.py).",
-            rich_help_panel="For training in simulation",
-        ),
+        Path | None, _training("Write actuator entries for Isaac Lab and mjlab to this file (.py).")
     ] = None,
     physics_step: Annotated[
         float,
-        typer.Option(
-            help="Physics step of the training simulation [s]; the actuator entries count delays in these steps.",
-            rich_help_panel="For training in simulation",
-        ),
+        _training("Physics step of the training simulation [s]; the actuator entries count delays in these steps."),
     ] = 0.005,
     out_model: Annotated[
         Path | None,
@@ -115,7 +100,6 @@ def diagnose(
     from armlink.extras import require_extra
     from armlink.recording.files import load_recordings
     from sim_gap.attribution import diagnose as diagnosis
-    from sim_gap.commands.gap_tables import show
     from sim_gap.model.known_gains import parse_known_gains
     from sim_gap.report.effect_text import sentence
 
@@ -248,3 +232,41 @@ def _write_model(answer: "Diagnosis", path: Path, console: "Console") -> None:
         console.print(f"not in {kind}: {line}", style="yellow")
     if missing and module_path(path).is_file():
         console.print(f"{module_path(path)} applies these effects in a MuJoCo simulation")
+
+
+def show(answer: "Diagnosis", console: "Console") -> None:
+    """Print causes and gap as tables, then the notes."""
+    from rich.table import Column, Table
+
+    if answer.causes:
+        effect = Column("effect", no_wrap=True)
+        headers = "joints", "RMS before", "after", "confidence", "confounded with"
+        table = Table(effect, *headers, title="causes, on held-out data")
+        for cause in answer.causes:
+            joints = f"all {len(answer.names)}" if cause.joints == answer.names else ", ".join(cause.joints)
+            numbers = f"{cause.gap_before:.3g}", f"{cause.gap_after:.3g}", f"{cause.confidence:.2f}"
+            table.add_row(cause.effect, joints, *numbers, ", ".join(cause.confounded_with))
+        console.print(table)
+        console.print(_parameters(answer))
+    table = Table("joint", "noise floor", "before", "after", title=f"gap on {answer.heldout_is}, RMS in {answer.unit}")
+    for j, name in enumerate(answer.names):
+        numbers = answer.noise_floor[j], answer.heldout_before[j], answer.heldout_after[j]
+        table.add_row(name, *(f"{value:.3g}" for value in numbers))
+    console.print(table)
+    for note in answer.notes:
+        console.print(note, style="yellow")
+
+
+def _parameters(answer: "Diagnosis") -> "Table":
+    """The parameters of the causes with their 95 % intervals."""
+    from rich.table import Column, Table
+
+    effect, interval = Column("effect", no_wrap=True), Column("95 % interval", no_wrap=True)
+    table = Table(effect, "joint", "parameter", "value", interval, title="their parameters")
+    for cause in answer.causes:
+        for joint, values in cause.parameters.items():
+            for name, each in values.items():
+                unit = "" if each.unit == "1" else f" ({each.unit})"
+                between = f"{each.low:.3g} to {each.high:.3g}"
+                table.add_row(cause.effect, joint, name + unit, f"{each.value:.4g}", between)
+    return table

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from armlink.commands.options import reads_recordings
+from armlink.commands.options import Json, reads_recordings
 from sim_gap.commands.gap_diagnose import Base, KnownGain, Tip
 
 if TYPE_CHECKING:
@@ -29,10 +29,7 @@ def diagnose_fleet(
     table: Annotated[
         Path | None, typer.Option(help="Also write a table by case and effect to this file (.parquet).")
     ] = None,
-    json_file: Annotated[
-        Path | None,
-        typer.Option("--json", help="Write all results as JSON to this file; for standard output give `-`."),
-    ] = None,
+    json: Json = None,
     base: Base = None,
     tip: Tip = None,
     gains: KnownGain = "",
@@ -46,6 +43,7 @@ def diagnose_fleet(
     from armlink.commands.output import write_json
     from armlink.commands.plain_console import PlainConsole, results
     from armlink.extras import require_extra
+    from sim_gap.better_model.training_files import write_parquet
     from sim_gap.fleet import Answers, CaseOptions, cluster, diagnose_fleet, find_cases, open_to_all
     from sim_gap.fleet import table as table_of
     from sim_gap.trends import fleet_outliers, fleet_trends
@@ -73,15 +71,15 @@ def diagnose_fleet(
                 bars.advance(task)
     found = {case.name: answers.found[case.name] for case in cases}
     rows = table_of(found)
-    out_console = results(json_file)
+    out_console = results(json)
     _show(rows, out_console)
     trends, outliers = rows_of(fleet_trends(found)), rows_of(fleet_outliers(found))
     show_changes(trends, outliers, out_console)
     failed = sum("error" in answer for answer in found.values())
     out_console.print(f"{len(found) - failed} of {len(found)} cases are diagnosed: {answers.path}")
     if table is not None:
-        _write_table(rows, table)
-    write_json(json_file, {"schema": "armlink.gap-fleet/1", "answers": found, "trends": trends, "outliers": outliers})
+        write_parquet(rows, table)
+    write_json(json, {"schema": "armlink.gap-fleet/1", "answers": found, "trends": trends, "outliers": outliers})
     return int(any("error" in answer for answer in found.values()))
 
 
@@ -124,20 +122,6 @@ def show_changes(trends: list[dict[str, Any]], outliers: list[dict[str, Any]], c
         )
 
 
-def _write_table(rows: list[dict[str, Any]], path: Path) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    from armlink.content.atomic_file import open_whole
-    from armlink.errors import BadInput
-
-    try:
-        with open_whole(path) as stream:
-            pq.write_table(pa.Table.from_pylist(rows), stream)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error}") from None
-
-
 UNDATED = datetime.min.replace(tzinfo=UTC)
 
 
@@ -152,12 +136,7 @@ def trend(
             help="File of answers, one JSON line each; recordings that are already in this file are not repeated."
         ),
     ] = None,
-    json_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--json", help="Write the newest answer and the changes as JSON to this file; for standard output give `-`."
-        ),
-    ] = None,
+    json: Json = None,
     base: Base = None,
     tip: Tip = None,
     gains: KnownGain = "",
@@ -175,7 +154,7 @@ def trend(
     from sim_gap.trends import date_of, fleet_trends, needed_recordings, rows
 
     load_compiled(sim)  # what is wrong with it is no answer of a recording
-    console = results(json_file)
+    console = results(json)
     options = CaseOptions(stated, gains, base, tip)
     answers = Answers(out or folder / "answers.jsonl", options)
     _say_other_options(answers, PlainConsole())
@@ -192,7 +171,7 @@ def trend(
     console.print(f"{_count(len(answers.found), 'recording')}: {needed_recordings(answers.found) or changes}")
     newest_answer = answers.found[newest]
     shown = {"case": newest.partition("/")[2], "answer": newest_answer}
-    write_json(json_file, {"schema": "armlink.gap-trend/1", "newest": shown, "trends": trends})
+    write_json(json, {"schema": "armlink.gap-trend/1", "newest": shown, "trends": trends})
     return int("error" in newest_answer)
 
 

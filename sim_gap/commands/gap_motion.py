@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from armlink.commands.options import Arm, OtherBus
+from armlink.commands.options import Arm, Json, OtherBus
 
 
 def plan(
@@ -23,10 +23,7 @@ def plan(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of poses and sines; another seed gives a held-out motion.")
     ] = 0,
-    json_file: Annotated[
-        Path | None,
-        typer.Option("--json", help="Write length and pieces as JSON to this file; for standard output give `-`."),
-    ] = None,
+    json: Json = None,
 ) -> int:
     """Plan motion within the arm's limits that separates effects; nothing moves.
 
@@ -40,7 +37,7 @@ def plan(
     joints, sentences = joints_in_doubt(answer) if answer else ([], [])
     motion = plan_motion(load_arm(arm), [*joints, *(joint or [])], poses, seed)
     save_motion(motion, out)
-    console = results(json_file)
+    console = results(json)
     for sentence in sentences:
         console.print(f"the diagnosis asks for this motion: {sentence}")
     for piece in motion.pieces:
@@ -48,7 +45,7 @@ def plan(
     console.print(f"{out}: {motion.seconds:.0f} s of motion")
     suggest(command_line("gap", "collect", arm, motion=out, out=out.with_suffix(".mcap")))
     write_json(
-        json_file, {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences}
+        json, {"file": str(out), "seconds": motion.seconds, "pieces": list(motion.pieces), "asked_for": sentences}
     )
     return 0
 
@@ -58,10 +55,7 @@ def collect(
     motion: Annotated[Path, typer.Option(help="Motion with columns t and q_cmd_i, as gap plan writes it.")],
     out: Annotated[Path, typer.Option(help="Recording to write (.mcap).")],
     bus: OtherBus = None,
-    json_file: Annotated[
-        Path | None,
-        typer.Option("--json", help="Write rows and seconds as JSON to this file; for standard output give `-`."),
-    ] = None,
+    json: Json = None,
 ) -> int:
     """Move the arm along a planned motion under position control and record every cycle; Ctrl-C stops it safely.
 
@@ -98,7 +92,7 @@ def collect(
         rows = run(link, target, out, lambda k, _: bars.update(task, completed=k) if k % 50 == 0 else None)
         bars.update(task, completed=rows)
         link.disable()
-    results(json_file).print(f"{out}: {rows} rows, {rows / link.rate:.1f} s")
+    results(json).print(f"{out}: {rows} rows, {rows / link.rate:.1f} s")
     suggest(command_line("gap", "diagnose", sim=arm, train=out))
-    write_json(json_file, {"file": str(out), "rows": rows, "seconds": rows / link.rate})
+    write_json(json, {"file": str(out), "rows": rows, "seconds": rows / link.rate})
     return 0

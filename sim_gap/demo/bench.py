@@ -25,11 +25,12 @@ from gcomp.gravity.torque import gravity_torque
 from sim_bus.bus.lock_step import LockStepBus
 from sim_bus.simulated_arm import SimulatedArm
 from sim_bus.truth import Truth
+from sim_gap.experiment import ACCELERATION, multisine
 
-TONES, TONE_BAND_HZ, FADE_S = 3, (0.08, 0.3), 2.0
-"""Number of sines per joint in the recorded motion, their frequencies [Hz], and time over which it begins [s]."""
-RANGE_SHARE, SPEED_SHARE, ACCELERATION = 0.35, 0.6, 1.0
-"""At most: amplitude, as a share of half the range; speed, of max_velocity; [rad/s²]: drives have little to spare."""
+TONES, TONE_BAND_HZ = 3, (0.08, 0.3)
+"""Number of sines per joint in the recorded motion, and their frequencies [Hz]."""
+RANGE_SHARE, SPEED_SHARE = 0.35, 0.6
+"""At most: amplitude, as a share of half the range; speed, of max_velocity."""
 WEAK_SHARE = 0.1
 """Of the arm file's gains, under which joints sag."""
 
@@ -40,13 +41,13 @@ class Bench:
     def __init__(self, arm: ArmFile, seed: int) -> None:
         """A simulated arm with the truth of `seed` on an in-process bus; raises BadInput."""
         self.arm, self.described, self.creeping = arm, gcomp_arm(arm), sweep_motion(arm) == "creep"
+        self.speed = SPEED_SHARE * np.array([joint.max_velocity for joint in arm.require_link().joints])
         self.simulated = SimulatedArm(arm, Truth.draw(arm, seed), seed)
         self.link = Link(arm, LockStepBus(arm=self.simulated))
 
     def travel(self, start: Array, goal: Array) -> None:
         """Bring all joints under position control from `start` to `goal` (n,) [rad]."""
-        speed = np.array([SPEED_SHARE * joint.max_velocity for joint in self.arm.require_link().joints])
-        for target in trajectory(start, goal, speed, np.full(len(goal), ACCELERATION), self.link.period):
+        for target in trajectory(start, goal, self.speed, np.full(len(goal), ACCELERATION), self.link.period):
             self.link.cycle(Command.hold(target))
 
     def sensor_error(self, joint: int) -> tuple[float, float]:
@@ -77,7 +78,10 @@ class Bench:
         progress: Callable[[int, int, str], None],
     ) -> Recording:
         """Every cycle of a motion of its own, positions as the calibration corrects them; kept as MCAP too."""
-        link, rows, targets = self.link, list[Sample](), multisine(self, seconds, seed)
+        link, rows, low, high = self.link, list[Sample](), self.described.lower, self.described.upper
+        t, reach = np.arange(int(seconds * link.rate)) * link.period, RANGE_SHARE * (high - low) / 2
+        draw = np.random.default_rng(seed).random((link.n, 2, TONES))
+        targets = (low + high) / 2 + multisine(t, reach, self.speed, TONE_BAND_HZ, draw)
         self.travel(link.position_sent, targets[0])
         for k, target in enumerate(targets):
             rows.append(link.cycle(Command.hold(target)))
@@ -109,21 +113,6 @@ class Bench:
             away.append(np.abs(np.nanmean(seen, axis=0) - pose))
             link.cycle(Command.hold(np.where(np.isfinite(seen[-1]), seen[-1], pose)))
         return np.asarray(np.mean(away, axis=0))
-
-
-def multisine(bench: Bench, seconds: float, seed: int) -> Array:
-    """Targets (K, n) [rad], one a cycle: each joint its own sum of sines about the middle of its range."""
-    low, high, share = bench.described.lower, bench.described.upper, 1.0 / TONES
-    draw = np.random.default_rng(seed).random((len(low), 2, TONES))
-    omega = 2 * np.pi * (TONE_BAND_HZ[0] + (TONE_BAND_HZ[1] - TONE_BAND_HZ[0]) * draw[:, 0])
-    speed = SPEED_SHARE * np.array([[limits.max_velocity] for limits in bench.arm.require_link().joints]) * share
-    amplitude = (RANGE_SHARE * (high - low) / 2 * share)[:, None]
-    size = np.minimum(amplitude, np.minimum(speed / omega, ACCELERATION * share / omega**2))
-    t = np.arange(int(seconds * bench.link.rate)) * bench.link.period
-    fade = np.clip(t / FADE_S, 0.0, 1.0)
-    fade = fade * fade * (3 - 2 * fade)
-    waves = (size * np.sin(t[:, None, None] * omega + 2 * np.pi * draw[:, 1])).sum(axis=2)
-    return np.asarray((low + high) / 2 + fade[:, None] * waves)
 
 
 def sag_poses(plan: SweepPlan) -> list[Array]:

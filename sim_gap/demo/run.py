@@ -18,6 +18,7 @@ import numpy as np
 from armlink import Recording, calibrate, diagnose, identify, load_arm, sweep, verify
 from armlink.arm_file import MODEL_SUFFIXES, ArmFile
 from armlink.commands.plain_console import first_check, suggest
+from armlink.content.atomic_file import writing
 from armlink.errors import BadInput
 from armlink.extras import has_extra
 from armlink.link.types import Sample
@@ -50,8 +51,8 @@ from sim_gap.demo.account import Account
 from sim_gap.demo.bench import Bench, drifting_joint, sag_poses
 from sim_gap.model.load import compile_model
 from sim_gap.report.effect_text import sentence
+from sim_gap.report.figures import watch_figure
 from sim_gap.report.page import sections as gap_sections
-from sim_gap.report.time_figures import watch_figure
 
 Made = TypeVar("Made")
 BY = "armlink demo"
@@ -104,12 +105,10 @@ def _fresh(out: Path) -> Path:
     data = out / "data"
     if data.exists() and not (data / ".armlink-demo").exists():
         raise BadInput(f"{data} exists and was not written by an earlier demo: choose another folder with --out")
-    try:
+    with writing(out):
         shutil.rmtree(data, ignore_errors=True)
         data.mkdir(parents=True)
         (data / ".armlink-demo").touch()
-    except OSError as error:
-        raise BadInput(f"{out}: cannot be written: {error.strerror}") from None
     return data
 
 

@@ -8,22 +8,12 @@ from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from gcomp.estimate.choice import PRICE, Effect, LinearTerms, choose, price_of, terms_of
-from gcomp.estimate.problem import FREEDOM, linearise
+from gcomp.estimate.problem import linearise
 from gcomp.estimate.solve import cost_of, prior_cost, scale_of
-from sim_gap.position_gap.fit import (
-    INDEPENDENT_S,
-    Layout,
-    LoopFit,
-    Point,
-    batch,
-    evaluate,
-    improve,
-    names_of,
-    residuals,
-)
-from sim_gap.position_gap.links import shared_effects, size_of
-from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, Scales
-from sim_gap.position_gap.windows import Windows, thin_moving
+from sim_gap.position_gap.fit import Group, Layout, LoopFit, LoopSearch, Place, residuals, rms_on
+from sim_gap.position_gap.parameters import EFFECTS, PARAMETERS, shared_effects, size_of
+from sim_gap.position_gap.plant import Point
+from sim_gap.position_gap.windows import Windows, thin
 
 FOLDS = 6
 """Parts of the windows of which each is held out once."""
@@ -44,49 +34,6 @@ LEVELS = {
 }
 """Levels at which a limit is tried: in units of the command's highest speed, of the joint's own torque."""
 Progress = Callable[[str], None]
-Group = tuple[str, tuple[int, ...]]
-"""An effect with the joints that have it; no joints for one of the whole arm."""
-
-
-@dataclass(frozen=True, eq=False)
-class LoopSearch:
-    """Data and nominal parameters of a choice of effects."""
-
-    data: Windows
-    scales: Scales
-    nominal: dict[str, Array]
-    """Parameters of the nominal model, to which one returns that is taken out, (J,) each."""
-    floor: Array
-    """RMS below which nothing can be seen, per joint (J,) [rad]."""
-    excluded: frozenset[str] = frozenset()
-    """Effects that do not take part."""
-    kept: frozenset[str] = frozenset()
-    """Effects that are not taken out."""
-    resting: frozenset[int] = frozenset()
-    """Joints of which nothing is fitted."""
-    open_controller: bool = False
-    """Whether the nominal model has no controller, so that the fitted one is no cause of a gap."""
-
-    def score(self, fit: LoopFit) -> Array:
-        """Half the logarithm of the mean square, times independent samples, per joint (J,); less is better."""
-        assert fit.rms is not None
-        count = self.data.weight.sum(0)
-        mean = (fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0)
-        return np.asarray(0.5 * self.samples * np.log(mean + self.floor**2))
-
-    @property
-    def samples(self) -> Array:
-        """Independent samples of each joint, (J,)."""
-        return np.asarray(self.data.weight.sum((0, 2)) * min(self.data.judged_s / INDEPENDENT_S, 1.0))
-
-    def size_of(self, name: str) -> Array:
-        """Unit of the levels of a limit, (J,): the highest speed, if a joint moves at all, or the usual size."""
-        if name != "slew":
-            return self.scales.of(name)
-        return np.asarray(np.maximum(np.abs(self.data.v).max(axis=(0, 2)), PARAMETERS["slew"].low))
-
-    def improve(self, fit: LoopFit, iterations: int = 5, freedom: float = FREEDOM) -> LoopFit:
-        return improve(self.data, fit, self.scales, self.floor, self.nominal, iterations, freedom)
 
 
 def folds_of(data: Windows) -> NDArray[np.intp]:
@@ -96,18 +43,17 @@ def folds_of(data: Windows) -> NDArray[np.intp]:
     return (np.arange(data.count) * min(FOLDS, data.count) // data.count).astype(np.intp)
 
 
-def candidates_of(search: LoopSearch) -> dict[str, tuple[tuple[int, str], ...]]:
-    """Name of each effect that may act, as `effect#joint` or of the whole arm → its parameters."""
-    out: dict[str, tuple[tuple[int, str], ...]] = {}
-    for effect in EFFECTS.values():
-        if effect.id not in search.excluded:
-            for j in range(search.data.joints):
-                if j not in search.resting and _may_act(search, effect.id, j):
-                    out[f"{effect.id}#{j}"] = tuple((j, name) for name in effect.parameters)
-    for name, parameters in shared_effects(search.data.plant.sim.arm).items():
-        if name.partition("@")[0] not in search.excluded:
-            out[name] = tuple((-1, each) for each in parameters)
-    return out
+def candidates_of(search: LoopSearch) -> list[Group]:
+    """Each effect that may act, at one joint or of the whole arm."""
+    joints = [j for j in range(search.data.joints) if j not in search.resting]
+    own: list[Group] = [(effect, (j,)) for effect in EFFECTS for j in joints if _may_act(search, effect, j)]
+    whole: list[Group] = [(effect, ()) for effect in shared_effects(search.arm)]
+    return [group for group in own + whole if id_of(group) not in search.excluded]
+
+
+def id_of(group: Group) -> str:
+    """The id of an effect, without the link that it is of."""
+    return group[0].partition("@")[0]
 
 
 def _may_act(search: LoopSearch, effect: str, joint: int) -> bool:
@@ -119,29 +65,27 @@ def _may_act(search: LoopSearch, effect: str, joint: int) -> bool:
     return effect != "controller.lag" or bool(nominal["lag"][joint] > 0.0)
 
 
-def chosen_of(search: LoopSearch, fit: LoopFit) -> list[str]:
-    """Names of the effects that a fit has."""
-    return [
-        name
-        for name, places in candidates_of(search).items()
-        if all(each in (fit.active[j] if j >= 0 else fit.shared) for j, each in places)
-    ]
+def chosen_of(search: LoopSearch, fit: LoopFit) -> list[Group]:
+    """The candidates that a fit has."""
+    return [each for each in candidates_of(search) if {*search.places_of(each)} <= {*fit.free}]
 
 
-def with_chosen(search: LoopSearch, fit: LoopFit, names: Sequence[str]) -> LoopFit:
-    """The fit with these effects active and all others as the nominal model has them."""
-    every = candidates_of(search)
-    places = [place for name in names for place in every[name]]
-    active = tuple(tuple(n for j, n in places if j == joint) for joint in range(search.data.joints))
-    shared = tuple(n for j, n in places if j < 0)
+def with_chosen(search: LoopSearch, fit: LoopFit, chosen: Sequence[Group]) -> LoopFit:
+    """The fit with these effects free and all others as the nominal model has them."""
+    free = [place for each in chosen for place in search.places_of(each)]
+    others = [place for each in candidates_of(search) for place in search.places_of(each) if place not in free]
+    return put_back(search, fit, others).freed(free)
+
+
+def put_back(search: LoopSearch, fit: LoopFit, places: Sequence[Place]) -> LoopFit:
+    """The fit without these parameters, which are those of the nominal model."""
     point = {name: values.copy() for name, values in fit.point.items()}
-    for own in every.values():
-        for j, name in own:
-            if j >= 0 and name not in active[j]:
-                point[name][j] = search.nominal[name][j]
-            elif j < 0 and name not in shared:
-                point.pop(name, None)
-    return replace(fit, point=point, active=active, shared=shared, rms=None)
+    for j, name in places:
+        if j >= 0:
+            point[name][j] = search.nominal[name][j]
+        else:
+            point.pop(name, None)
+    return replace(fit, point=point).freed(place for place in fit.free if place not in places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,38 +96,34 @@ class About:
     fit: LoopFit
     layout: Layout
     terms: LinearTerms
-    effects: dict[str, Effect[str]]
+    effects: dict[Group, Effect[Group]]
 
-    def parameters(self, names: Sequence[str]) -> frozenset[int]:
-        return frozenset(k for name in names for k in self.effects[name].parameters)
+    def parameters(self, chosen: Sequence[Group]) -> frozenset[int]:
+        return frozenset(k for each in chosen for k in self.effects[each].parameters)
 
-    def moved(self, names: Sequence[str]) -> LoopFit:
+    def moved(self, chosen: Sequence[Group]) -> LoopFit:
         """The fit with these effects alone, as the linear terms have it."""
-        change = self.terms.fit(self.parameters(names))
+        change = self.terms.fit(self.parameters(chosen))
         theta = self.terms.theta + np.clip(np.nan_to_num(change), -3.0, 3.0)
         point = self.layout.at(theta)
-        return with_chosen(self.search, replace(self.fit, point=point), names)
+        return with_chosen(self.search, replace(self.fit, point=point), chosen)
 
 
 def look_about(
-    search: LoopSearch, fit: LoopFit, names: Container[str] | None = None, levels: Mapping[str, Array] | None = None
+    search: LoopSearch, fit: LoopFit, some: Container[Group] | None = None, levels: Mapping[str, Array] | None = None
 ) -> About:
-    """Derivatives by all candidates, or those named; an effect that is not there by the difference that one of the size
-    at which it is tried makes, a limit by that of its level."""
-    every = candidates_of(search)
-    listed = [name for name in every if names is None or name in names]
-    places = list(dict.fromkeys(place for name in listed for place in every[name]))
-    steps = dict[tuple[int, str], float]()
-    absent = {name for j, name in places if name not in (fit.active[j] if j >= 0 else fit.shared)}
+    """Derivatives by all candidates, or some; by an effect that is not there the difference that one of the size at
+    which it is tried makes, by a limit that of its level."""
+    listed = [each for each in candidates_of(search) if some is None or each in some]
+    places = list(dict.fromkeys(place for each in listed for place in search.places_of(each)))
+    absent = [place for place in places if place not in fit.free]
     if levels is None:
-        levels = {name: best_level(search, fit, name) for name in LEVELS if name in absent}
+        levels = {name: best_level(search, fit, name) for name in LEVELS if name in {name for _, name in absent}}
     point = {name: values.copy() for name, values in fit.point.items()}
-    for j, name in places:
-        there = name in (fit.active[j] if j >= 0 else fit.shared)
-        if there:
-            continue
+    steps = dict[Place, float]()
+    for j, name in absent:
         if j < 0:
-            steps[j, name] = 0.2 * size_of(search.data.plant.sim.arm, name)
+            steps[j, name] = 0.2 * size_of(search.arm, name)
         elif name in LEVELS:
             size = float(search.scales.of(name)[j])
             own = size / float(point[name][j]) if np.isfinite(point[name][j]) else 0.0
@@ -192,25 +132,25 @@ def look_about(
             steps[j, name] = 0.05
         else:
             steps[j, name] = 0.5 if point[name][j] == PARAMETERS[name].neutral else 0.1
-    stuck = [(j, n) for j, n in places if n == "stribeck_velocity"]  # says nothing without the friction that it is of
-    places = [p for p in places if p not in stuck or "stribeck" in fit.active[p[0]]]
-    layout = Layout(search.data, search.scales, point, places)
-    problem = layout.problem(search.nominal, steps, search.floor)
+    # a Stribeck velocity says nothing without the friction that it is of
+    places = [(j, name) for j, name in places if name != "stribeck_velocity" or (j, "stribeck") in fit.free]
+    layout = Layout(search, point, places)
+    problem = layout.problem(steps)
     about = linearise(problem, layout.theta(layout.point), range(len(places)))
     at = {place: k for k, place in enumerate(places)}
-    effects = {}
     samples = search.samples
-    for name in listed:
-        numbers = tuple(at[place] for place in every[name] if place in at)
-        joints = [j for j, _ in every[name]]
-        least = LEAST_FALL * float(samples[joints[0]]) if joints[0] >= 0 else LEAST_FALL * float(samples.mean())
+    effects: dict[Group, Effect[Group]] = {}
+    for group in listed:
+        effect, joints = group
+        numbers = tuple(at[place] for place in search.places_of(group) if place in at)
+        least = LEAST_FALL * float(samples[list(joints)].mean() if joints else samples.mean())
         needs = tuple(
-            f"{need}#{joints[0]}"
-            for need in (EFFECTS[name.partition("#")[0]].needs if joints[0] >= 0 else ())
+            (need, joints)
+            for need in (EFFECTS[effect].needs if joints else ())
             if not active_in(search.nominal, need, joints[0])
         )
-        price = 0.0 if name.partition("#")[0] in OF_EVERY_JOINT else None
-        effects[name] = Effect(name, numbers, needs, least, price)
+        price = 0.0 if effect in OF_EVERY_JOINT else None
+        effects[group] = Effect(group, numbers, needs, least, price)
     return About(search, fit, layout, terms_of(problem, about, folds_of(search.data)), effects)
 
 
@@ -224,8 +164,8 @@ def best_level(search: LoopSearch, fit: LoopFit, name: str) -> Array:
     """The best of some levels of a limit at every joint, (J,): one that is never reached has no slope to follow, and
     one that is always reached leads nowhere."""
     levels = np.minimum(np.array(LEVELS[name])[:, None] * search.size_of(name), fit.point[name])
-    few = thin_moving(search.data, FEW)
-    gaps = residuals(few, batch([{**fit.point, name: level} for level in levels]))
+    few = thin(search.data, FEW, moving=True)
+    gaps = residuals(few, [{**fit.point, name: level} for level in levels])
     squares = np.einsum("ptjw,tjw->pj", gaps**2, few.weight)
     return np.asarray(levels[squares.argmin(axis=0), np.arange(search.data.joints)])
 
@@ -236,8 +176,7 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
     After the first time only those are looked at that were worth their price by themselves or are there.
     """
     names = chosen_of(search, fit)
-    every = candidates_of(search)
-    kept = [n for n in every if n.partition("#")[0] in search.kept]
+    kept = [each for each in candidates_of(search) if each[0] in search.kept]
     looked = {*names, *unexplained_at(search, fit)}
     levels = {name: best_level(search, fit, name) for name in LEVELS}
     best, most = fit, worth(search, fit)
@@ -272,33 +211,26 @@ def select(search: LoopSearch, fit: LoopFit, progress: Progress = lambda text: N
 
 def worth(search: LoopSearch, fit: LoopFit) -> float:
     """Logarithm of the probability of a fit less the price of its parameters, but for a constant."""
-    layout = Layout(search.data, search.scales, fit.point, names_of(fit))
-    problem = layout.problem(search.nominal, {}, search.floor)
-    unlikely = prior_cost(problem, layout.theta(layout.point), search.data.joints).sum()
-    paid = sum(not any(name in EFFECTS[e].parameters for e in OF_EVERY_JOINT) for _, name in layout.names)
+    layout = Layout(search, fit.point, fit.free)
+    unlikely = prior_cost(layout.problem(), layout.theta(layout.point), search.data.joints).sum()
+    paid = sum(not any(name in EFFECTS[e].parameters for e in OF_EVERY_JOINT) for _, name in fit.free)
     return -float(costs_of(search, [fit.point])[0].sum() + unlikely) - PRICE * paid
 
 
 def costs_of(search: LoopSearch, points: Sequence[Point]) -> Array:
     """Negative logarithm of the likelihood of each joint at P points, (P, J), but for a constant."""
-    problem = Layout(search.data, search.scales, points[0], ()).problem(search.nominal, {}, search.floor)
-    left = residuals(search.data, batch(points)).transpose(0, 2, 1, 3).reshape(len(points), search.data.joints, -1)
+    problem = Layout(search, points[0], ()).problem()
+    left = residuals(search.data, points).transpose(0, 2, 1, 3).reshape(len(points), search.data.joints, -1)
     return np.stack([cost_of(problem, each, scale_of(problem, each)) for each in left])
 
 
-def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[str]:
+def unexplained_at(search: LoopSearch, fit: LoopFit) -> list[Group]:
     """Effects of the joints at which a fit leaves more than noise, and of the whole arm if it does anywhere."""
-    fit = fit if fit.rms is not None else evaluate(search.data, fit)
-    assert fit.rms is not None
-    count = search.data.weight.sum(0)
-    rms = np.sqrt((fit.rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0))
-    left = set(np.flatnonzero(rms > QUIET * search.floor).tolist())
-    return [
-        name for name, places in candidates_of(search).items() if (places[0][0] in left if places[0][0] >= 0 else left)
-    ]
+    left = set(np.flatnonzero(rms_on(search.data, fit.point) > QUIET * search.floor).tolist())
+    return [(effect, joints) for effect, joints in candidates_of(search) if left and left >= {*joints}]
 
 
-def promising(about: About, names: Sequence[str]) -> set[str]:
+def promising(about: About, names: Sequence[Group]) -> set[Group]:
     """Effects that would pay beside those there, whatever else does."""
     own = about.parameters(names)
     base = float(about.terms.cost(own).sum())
@@ -312,35 +244,25 @@ def promising(about: About, names: Sequence[str]) -> set[str]:
 def entered(search: LoopSearch, fit: LoopFit) -> LoopFit:
     """The fit with what has just come in and is still neutral at the size at which it is tried."""
     point = {name: values.copy() for name, values in fit.point.items()}
-    for j, own in enumerate(fit.active):
-        for name in own:
-            if name == "stribeck_velocity":
-                continue
-            if point[name][j] == 0.0 and PARAMETERS[name].neutral == 0.0 and name != "delay":
-                point[name][j] = 0.1 * float(search.scales.of(name)[j])
+    for j, name in fit.free:
+        if j >= 0 and point[name][j] == 0.0 and PARAMETERS[name].neutral == 0.0 and name != "delay":
+            point[name][j] = 0.1 * float(search.scales.of(name)[j])
     return replace(fit, point=point)
 
 
 # ---- an effect put into a fit or taken out of it
 
 
-def effect_there(fit: LoopFit, effect: str, joint: int) -> bool:
-    return EFFECTS[effect].parameters[0] in fit.active[joint]
-
-
-def shared_of(fit: LoopFit, search: LoopSearch) -> list[str]:
-    """Effects of the whole arm in a fit."""
-    return [e for e, names in shared_effects(search.data.plant.sim.arm).items() if set(names) & set(fit.shared)]
+def present(search: LoopSearch, fit: LoopFit) -> list[Group]:
+    """Effects that a fit has, each with all its joints."""
+    joints = {e.id: tuple(j for j, name in fit.free if j >= 0 and name == e.parameters[0]) for e in EFFECTS.values()}
+    whole: list[Group] = [(e, ()) for e, names in shared_effects(search.arm).items() if {*names} & {*fit.at(-1)}]
+    return [group for group in joints.items() if group[1]] + whole
 
 
 def groups_of(fit: LoopFit, search: LoopSearch) -> list[Group]:
     """Effects of the fit, without the controller that a model without actuators leaves open."""
-    own = [
-        (effect, tuple(j for j in range(search.data.joints) if effect_there(fit, effect, j)))
-        for effect in EFFECTS
-        if not (search.open_controller and effect in OPEN)
-    ]
-    return [group for group in own if group[1]] + [(effect, ()) for effect in shared_of(fit, search)]
+    return [group for group in present(search, fit) if not (search.open_controller and group[0] in OPEN)]
 
 
 OPEN = frozenset(effect.id for effect in EFFECTS.values() if effect.controller) | {
@@ -350,29 +272,11 @@ OPEN = frozenset(effect.id for effect in EFFECTS.values() if effect.controller) 
 """Effects that a controller has that had to be found: damping may be the servo's."""
 
 
-def without_effect(search: LoopSearch, fit: LoopFit, effect: str, joint: int) -> LoopFit:
-    """The fit without an effect at one joint: its parameters are those of the nominal model."""
-    names = EFFECTS[effect].parameters
-    point = {name: values.copy() for name, values in fit.point.items()}
-    for name in names:
-        point[name][joint] = search.nominal[name][joint]
-    active = list(fit.active)
-    active[joint] = tuple(name for name in active[joint] if name not in names)
-    return replace(fit, point=point, active=tuple(active), rms=None)
-
-
 def without_group(search: LoopSearch, fit: LoopFit, group: Group) -> LoopFit:
-    effect, joints = group
-    if not joints:
-        names = set(shared_effects(search.data.plant.sim.arm)[effect])
-        point = {name: x for name, x in fit.point.items() if name not in names}
-        return replace(fit, point=point, shared=tuple(n for n in fit.shared if n not in names), rms=None)
-    for j in joints:
-        fit = without_effect(search, fit, effect, j)
-    return fit
+    return put_back(search, fit, search.places_of(group))
 
 
-def names_in(group: Group) -> list[str]:
-    """Names of a group among the candidates."""
+def parts_of(group: Group) -> list[Group]:
+    """The candidates that a group consists of."""
     effect, joints = group
-    return [f"{effect}#{j}" for j in joints] or [effect]
+    return [(effect, (j,)) for j in joints] or [group]

@@ -4,20 +4,26 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcomp.arrays import Array
 from gcomp.estimate.problem import FREEDOM, EstimationProblem, FittedParameter, linearise
 from gcomp.estimate.solve import solve
-from sim_gap.position_gap.links import range_of, size_of
+from sim_gap.model.rigid_body import RigidArm
 from sim_gap.position_gap.parameters import (
+    EFFECTS,
     INVERSE,
     LOGARITHMIC,
     PARAMETERS,
     WITH_TORQUE,
     Scales,
     from_coordinate,
+    range_of,
+    shared_effects,
+    size_of,
     to_coordinate,
 )
+from sim_gap.position_gap.plant import Point
 from sim_gap.position_gap.simulation import simulate
 from sim_gap.position_gap.windows import Windows
 
@@ -27,35 +33,90 @@ DIFFERENCE, RELATIVE = 0.05, 0.02
 """Steps of finite differences: in units of the size at which a parameter is tried, and of a logarithm."""
 PRIOR_RELATIVE = 3.0
 """Standard deviation of the logarithm of a gain before any recording."""
-Point = Mapping[str, Array]
-"""Parameter → (J,)."""
+Place = tuple[int, str]
+"""Joint, or −1 for the whole arm, and name of a parameter."""
+Group = tuple[str, tuple[int, ...]]
+"""An effect with the joints that have it; no joints for one of the whole arm."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopFit:
-    """Parameters of all joints, those that were fitted, and what they leave."""
+    """Parameters of all joints, and those that were fitted."""
 
     point: dict[str, Array]
-    active: tuple[tuple[str, ...], ...]
-    """Names fitted at each joint."""
-    shared: tuple[str, ...] = ()
-    """Names of parameters with one value for the whole arm."""
-    rms: Array | None = None
-    """RMS of the residual per joint and window [rad], (J, W)."""
+    free: tuple[Place, ...] = ()
+    """The fitted ones: those of the first joint first, those of the whole arm last."""
+
+    def at(self, joint: int) -> tuple[str, ...]:
+        """Names that were fitted at a joint, or with −1 of the whole arm."""
+        return tuple(name for j, name in self.free if j == joint)
+
+    def freed(self, places: Iterable[Place]) -> "LoopFit":
+        """The same with these places fitted and no others."""
+        free = sorted(dict.fromkeys(places), key=lambda place: (place[0] < 0, place[0]))
+        return replace(self, free=tuple(free))
 
     def with_values(self, **values: Array) -> "LoopFit":
         return replace(self, point={**self.point, **values})
 
 
-def coordinate(fit: LoopFit, scales: Scales, joint: int, name: str) -> float:
-    """A fit's value of a parameter in its own coordinate; `joint` is −1 for the whole arm."""
-    value = float(fit.point[name][max(joint, 0)])
-    return value if joint < 0 else to_coordinate(name, value, float(scales.of(name)[joint]))
+@dataclass(frozen=True, eq=False)
+class LoopSearch:
+    """Data and nominal parameters of a choice of effects."""
+
+    data: Windows
+    scales: Scales
+    nominal: dict[str, Array]
+    """Parameters of the nominal model, to which one returns that is taken out, (J,) each."""
+    floor: Array
+    """RMS below which nothing can be seen, per joint (J,) [rad]."""
+    excluded: frozenset[str] = frozenset()
+    """Effects that do not take part."""
+    kept: frozenset[str] = frozenset()
+    """Effects that are not taken out."""
+    resting: frozenset[int] = frozenset()
+    """Joints of which nothing is fitted."""
+    open_controller: bool = False
+    """Whether the nominal model has no controller, so that the fitted one is no cause of a gap."""
+
+    @property
+    def arm(self) -> RigidArm:
+        return self.data.plant.sim.arm
+
+    def places_of(self, group: Group) -> list[Place]:
+        effect, joints = group
+        if joints:
+            return [(j, name) for j in joints for name in EFFECTS[effect].parameters]
+        return [(-1, name) for name in shared_effects(self.arm)[effect]]
+
+    def score(self, point: Point) -> Array:
+        """Half the logarithm of the mean square, times independent samples, per joint (J,); less is better."""
+        return np.asarray(0.5 * self.samples * np.log(rms_on(self.data, point) ** 2 + self.floor**2))
+
+    @property
+    def samples(self) -> Array:
+        """Independent samples of each joint, (J,)."""
+        return np.asarray(self.data.weight.sum((0, 2)) * min(self.data.judged_s / INDEPENDENT_S, 1.0))
+
+    def size_of(self, name: str) -> Array:
+        """Unit of the levels of a limit, (J,): the highest speed, if a joint moves at all, or the usual size."""
+        if name != "slew":
+            return self.scales.of(name)
+        return np.asarray(np.maximum(np.abs(self.data.v).max(axis=(0, 2)), PARAMETERS["slew"].low))
+
+    def improve(self, fit: LoopFit, iterations: int = 5, freedom: float = FREEDOM) -> LoopFit:
+        """The most probable values of what is free, from a fit on; `freedom` is that of the residuals' distribution."""
+        if not fit.free:
+            return fit
+        layout = Layout(self, fit.point, fit.free)
+        problem = replace(layout.problem(), freedom=freedom)
+        found = solve(problem, layout.theta(layout.point), range(len(fit.free)), iterations)
+        return replace(fit, point=layout.at(found.theta))
 
 
-def residuals(data: Windows, values: Mapping[str, Array]) -> Array:
+def residuals(data: Windows, points: Sequence[Point]) -> Array:
     """Simulated minus measured positions, as far as they count, (P, To, J, W)."""
-    return (simulate(data, values) - data.measured) * (data.weight > 0.0)
+    return (simulate(data, points) - data.measured) * (data.weight > 0.0)
 
 
 def root_mean_squares(data: Windows, residual: Array) -> Array:
@@ -64,63 +125,66 @@ def root_mean_squares(data: Windows, residual: Array) -> Array:
     return np.asarray(np.sqrt(total / np.maximum(data.weight.sum(0), 1.0)))
 
 
-def batch(points: Sequence[Point]) -> dict[str, Array]:
-    """Parameter → (P, J) from points that have the same names."""
-    return {name: np.stack([point[name] for point in points]) for name in points[0]}
+def joint_rms(data: Windows, rms: Array) -> Array:
+    """RMS over all windows of each joint, (J,), from that of each window (J, W)."""
+    count = data.weight.sum(0)
+    return np.asarray(np.sqrt((rms**2 * count).sum(1) / np.maximum(count.sum(1), 1.0)))
 
 
-def evaluate(data: Windows, fit: LoopFit) -> LoopFit:
-    return replace(fit, rms=root_mean_squares(data, residuals(data, batch([fit.point])))[0])
+def rms_on(data: Windows, point: Point) -> Array:
+    """RMS of the position gap of each joint [rad], (J,)."""
+    return joint_rms(data, root_mean_squares(data, residuals(data, [point]))[0])
 
 
 class Layout:
-    """Parameters of joints (joint, name) and of the whole arm (−1, name) in the order of an `EstimationProblem`."""
+    """Parameters of joints and of the whole arm in the order of an `EstimationProblem`."""
 
-    def __init__(self, data: Windows, scales: Scales, point: Point, names: Iterable[tuple[int, str]]) -> None:
-        self.data, self.scales, self.point = data, scales, dict(point)
-        self.names = list(names)
-        for j, name in self.names:
+    def __init__(self, search: LoopSearch, point: Point, places: Sequence[Place]) -> None:
+        self.search, self.point, self.places = search, dict(point), places
+        self.joints = search.data.joints
+        for j, name in places:
             if j < 0:
-                self.point.setdefault(name, np.zeros(data.joints))
+                self.point.setdefault(name, np.zeros(self.joints))
 
     def size(self, j: int, name: str) -> float:
-        return 1.0 if j < 0 else float(self.scales.of(name)[j])
+        return 1.0 if j < 0 else float(self.search.scales.of(name)[j])
 
     def theta(self, point: Point) -> Array:
         """The coordinates of a point, (K,)."""
         return np.array(
             [
                 float(point[name][0]) if j < 0 else to_coordinate(name, float(point[name][j]), self.size(j, name))
-                for j, name in self.names
+                for j, name in self.places
             ]
         )
 
     def at(self, theta: Array) -> dict[str, Array]:
         """The point at coordinates (K,)."""
         point = {name: values.copy() for name, values in self.point.items()}
-        for x, (j, name) in zip(theta, self.names, strict=True):
+        for x, (j, name) in zip(theta, self.places, strict=True):
             if j < 0:
-                point[name] = np.full(self.data.joints, x)
+                point[name] = np.full(self.joints, x)
             else:
                 point[name][j] = from_coordinate(name, np.array(x), np.array(self.size(j, name)))
         return point
 
-    def problem(self, nominal: Point, steps: Mapping[tuple[int, str], float], floor: Array) -> EstimationProblem:
-        parameters = tuple(self._parameter(j, name, nominal, steps.get((j, name))) for j, name in self.names)
-        shape = (self.data.joints, -1)
+    def problem(self, steps: Mapping[Place, float] | None = None) -> EstimationProblem:
+        """The problem of these parameters; `steps` are those of finite differences that are not the usual ones."""
+        data, shape = self.search.data, (self.joints, -1)
+        parameters = tuple(self._parameter(j, name, (steps or {}).get((j, name))) for j, name in self.places)
 
         def predict(thetas: Array) -> Array:
-            left = residuals(self.data, batch([self.at(theta) for theta in thetas]))
+            left = residuals(data, [self.at(theta) for theta in thetas])
             return left.transpose(0, 2, 1, 3).reshape(len(thetas), *shape)
 
-        weight = self.data.weight.transpose(1, 0, 2).reshape(shape) * min(self.data.judged_s / INDEPENDENT_S, 1.0)
-        block = np.broadcast_to(np.arange(self.data.count), (len(self.data.measured), self.data.count)).ravel()
-        return EstimationProblem(parameters, predict, weight, block.astype(np.intp), floor)
+        weight = data.weight.transpose(1, 0, 2).reshape(shape) * min(data.judged_s / INDEPENDENT_S, 1.0)
+        block = np.broadcast_to(np.arange(data.count), (len(data.measured), data.count)).ravel()
+        return EstimationProblem(parameters, predict, weight, block.astype(np.intp), self.search.floor)
 
-    def _parameter(self, j: int, name: str, nominal: Point, step: float | None) -> FittedParameter:
+    def _parameter(self, j: int, name: str, step: float | None) -> FittedParameter:
         if j < 0:
-            low, high = range_of(self.data.plant.sim.arm, name)
-            size = size_of(self.data.plant.sim.arm, name)
+            low, high = range_of(self.search.arm, name)
+            size = size_of(self.search.arm, name)
             return FittedParameter(name, 0.0, 0.5 * max(-low, high), low, high, -1, step or DIFFERENCE * size)
         size = self.size(j, name)
         low, high = PARAMETERS[name].low, PARAMETERS[name].high
@@ -130,51 +194,27 @@ class Layout:
             ends, own, usual = (0.0, size / low), PARAMETERS[name].spread, DIFFERENCE
         else:
             ends, own, usual = (low / size, high / size), PARAMETERS[name].spread, DIFFERENCE
-        return FittedParameter(
-            name, to_coordinate(name, float(nominal[name][j]), size), own, *ends, channel=j, step=step or usual
-        )
+        nominal = to_coordinate(name, float(self.search.nominal[name][j]), size)
+        return FittedParameter(name, nominal, own, *ends, channel=j, step=step or usual)
 
 
-def names_of(fit: LoopFit) -> list[tuple[int, str]]:
-    """Fitted parameters: joint and name, then the whole arm's."""
-    return [(j, name) for j, own in enumerate(fit.active) for name in own] + [(-1, name) for name in fit.shared]
-
-
-def jacobian(
-    data: Windows, fit: LoopFit, scales: Scales, names: Sequence[Sequence[str]], shared: Sequence[str] = ()
-) -> tuple[Array, list[Array]]:
-    """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) in the parameters' own coordinates."""
-    listed = [(j, name) for j, own in enumerate(names) for name in own] + [(-1, name) for name in shared]
-    layout = Layout(data, scales, fit.point, listed)
-    problem, theta = layout.problem(fit.point, {}, np.zeros(data.joints)), layout.theta(layout.point)
-    at = {place: k for k, place in enumerate(listed)}
+def jacobian(search: LoopSearch, point: Point, places: Sequence[Place]) -> tuple[Array, list[Array]]:
+    """Residual now (To, J, W), and per joint its derivatives (K_j + S, To, W) by its own parameters at these places and
+    by those of the whole arm, in their own coordinates."""
+    data, layout = search.data, Layout(search, point, places)
+    problem, theta = layout.problem(), layout.theta(layout.point)
+    at = {place: k for k, place in enumerate(places)}
     parameters = list(problem.parameters)
     for (j, name), k in at.items():
         if name == "kp":
             others = tuple((at[j, each], float(theta[at[j, each]])) for each in WITH_TORQUE if (j, each) in at)
             parameters[k] = replace(parameters[k], along=others)
-    about = linearise(replace(problem, parameters=tuple(parameters)), theta, range(len(listed)))
+    about = linearise(replace(problem, parameters=tuple(parameters)), theta, range(len(places)))
     shape = (len(data.measured), data.count)
     now = about.residual.reshape(data.joints, *shape).transpose(1, 0, 2)
     return now, [x.reshape(len(x), *shape) for x in about.slopes]
 
 
-def improve(
-    data: Windows,
-    fit: LoopFit,
-    scales: Scales,
-    floor: Array,
-    nominal: Point,
-    iterations: int = 6,
-    freedom: float = FREEDOM,
-) -> LoopFit:
-    """The most probable values of what is active, from a fit on; `freedom` is that of the residuals' distribution."""
-    names = names_of(fit)
-    if not names:
-        return evaluate(data, fit)
-    layout = Layout(data, scales, fit.point, names)
-    problem = replace(layout.problem(nominal, {}, floor), freedom=freedom)
-    found = solve(problem, layout.theta(layout.point), range(len(names)), iterations)
-    shape = (data.joints, len(data.measured), data.count)
-    left = found.residual.reshape(shape).transpose(1, 0, 2)
-    return replace(fit, point=layout.at(found.theta), rms=root_mean_squares(data, left))
+def acting(places: Sequence[Place], joint: int) -> NDArray[np.intp]:
+    """Numbers of the parameters that act on a joint: its own and those of the whole arm."""
+    return np.array([k for k, (j, _) in enumerate(places) if j in (joint, -1)], np.intp)

@@ -15,27 +15,31 @@ from sim_gap.model.load import SimModel
 from sim_gap.position_gap.choice import (
     QUIET,
     About,
-    LoopSearch,
     groups_of,
     look_about,
     select,
     without_group,
     worth,
 )
-from sim_gap.position_gap.fit import LoopFit, evaluate
-from sim_gap.position_gap.judge import Stage, rms_on, stages
-from sim_gap.position_gap.links import shared_effects
-from sim_gap.position_gap.parameters import PARAMETERS
-from sim_gap.position_gap.plant import MovedModel, held_parts, nominal_point
+from sim_gap.position_gap.fit import LoopFit, LoopSearch, rms_on
+from sim_gap.position_gap.judge import Stage, stages
+from sim_gap.position_gap.parameters import shared_effects
+from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.sound_arm import SoundGap, split_gap
-from sim_gap.position_gap.start import controller_name, limited_servo_starts, noise_floor, scales_of, starting_fit
+from sim_gap.position_gap.start import limited_servo_starts, noise_floor, scales_of, starting_fit
 from sim_gap.position_gap.training.bands import Band, band
 from sim_gap.position_gap.training.export import Exported, export_fit, export_with_module, native_fit, widen_ranges
-from sim_gap.position_gap.training.jackknife import gaps_left_out, terms_of
 from sim_gap.position_gap.training.replay import nominal, replay_rms
-from sim_gap.position_gap.training.spread import Covariance, covariance, covariance_within, known_before
+from sim_gap.position_gap.training.spread import (
+    Covariance,
+    covariance,
+    covariance_within,
+    gaps_left_out,
+    known_before,
+    terms_of,
+)
 from sim_gap.position_gap.training.unreached_limits import find_unreached
-from sim_gap.position_gap.windows import Windows, thin, thin_moving, windows_of
+from sim_gap.position_gap.windows import Windows, thin, windows_of
 from sim_gap.residuals.residual_set import EXPLAINED
 
 FITTED, JUDGED = 12, 24
@@ -51,8 +55,6 @@ class Identified:
     search: LoopSearch
     fit: LoopFit
     heldout: Windows
-    controller: str
-    nominal_has_controller: bool
     stages: tuple[Stage, ...]
     spread: Covariance
     """Covariance of the parameters within recordings and from one to the next."""
@@ -71,8 +73,6 @@ class Identified:
     found, or none is commanded long enough."""
     moved_before: Array
     """The same along the held-out commands [rad]."""
-    held: tuple[str, ...]
-    """Bodies outside of the arm that are held."""
     recordings: tuple[Recording, ...]
     """Held-out recordings."""
     gains: tuple[float, ...]
@@ -113,53 +113,50 @@ def identify(
     sim = widen_ranges(sim, [*train, *heldout])
     progress("reading the motion")
     plant = MovedModel(sim)
-    own = plant.servos
-    data = thin_moving(windows_of(plant, train, labels[: len(train)], scale[: len(train)]), FITTED)
+    complete = bool(plant.driven.all())
+    data = thin(windows_of(plant, train, labels[: len(train)], scale[: len(train)]), FITTED, moving=True)
     judged = thin(windows_of(plant, heldout, labels[len(train) :], scale[len(train) :]), JUDGED)
     never = frozenset(withhold) | _frozen(sim, data)
     search = LoopSearch(
         data,
         scales_of(data),
-        nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()}),
+        nominal_point(plant),
         noise_floor(data),
         never,
     )
     moved_train = moved = np.full(sim.n, np.nan)
-    if own.complete:
+    if complete:
         moved_train, moved = (
             replay_rms(nominal(sim), some, gain)
             for some, gain in ((train, scale[: len(train)]), (heldout, scale[len(train) :]))
         )
-    search, fit, about = _fitted(search, own.complete, progress)
+    search, fit, about = _fitted(search, complete, progress)
     progress("testing each effect on held-out data")
     margin = _margin(search, fit)
-    split = split_gap(search, judged, margin) if own.complete else None
+    split = split_gap(search, judged, margin) if complete else None
     matters = margin if split is None else np.maximum(margin, 2.0 * split.usual)
     found = tuple(stages(search, fit, about, judged, matters))
-    before = _bare(search, fit, about, own.complete)
+    before = _bare(search, fit, about, complete)
     terms = terms_of(search, fit)
     spread = replace(covariance(search, fit), limits=find_unreached(search, fit))
-    left = gaps_left_out(data, terms, known_before(search, fit, terms.names))
+    left = gaps_left_out(data, terms, known_before(search, fit))
     return Identified(
         sim=sim,
         search=search,
         fit=fit,
         heldout=judged,
-        controller=controller_name(fit),
-        nominal_has_controller=own.complete,
         stages=found,
         spread=spread,
         within=covariance_within(search, fit, terms),
         band=band(search, fit, spread, left, judged),
-        train_before=rms_on(data, before),
-        train_after=rms_on(data, fit),
-        heldout_before=rms_on(judged, before),
-        heldout_after=rms_on(judged, fit),
+        train_before=rms_on(data, before.point),
+        train_after=rms_on(data, fit.point),
+        heldout_before=rms_on(judged, before.point),
+        heldout_after=rms_on(judged, fit.point),
         margin=margin,
         sound=split,
         moved_train=moved_train,
         moved_before=moved,
-        held=tuple(held_parts(sim)),
         recordings=tuple(heldout),
         gains=tuple(scale[len(train) :]),
     )
@@ -167,13 +164,14 @@ def identify(
 
 def _fitted(search: LoopSearch, complete: bool, progress: Callable[[str], None]) -> tuple[LoopSearch, LoopFit, About]:
     """The fit, with the effects that it takes; the nominal model as it is where it leaves nothing."""
-    bare = evaluate(search.data, LoopFit(search.nominal, ((),) * search.data.joints))
-    if complete and bool(np.all(rms_on(search.data, bare) < QUIET * search.floor)):
+    before = rms_on(search.data, search.nominal)
+    if complete and bool(np.all(before < QUIET * search.floor)):
+        bare = LoopFit(search.nominal)
         return search, bare, look_about(search, bare, [])
-    search, fit = starting_fit(search, search.data.plant.servos, progress)
+    search, fit = starting_fit(search, progress)
     best, about = select(search, fit, progress)
-    left = rms_on(search.data, best)
-    unexplained = left > np.maximum(EXPLAINED * rms_on(search.data, bare), QUIET * search.floor)
+    left = rms_on(search.data, best.point)
+    unexplained = left > np.maximum(EXPLAINED * before, QUIET * search.floor)
     unexplained &= ~np.isin(np.arange(search.data.joints), sorted(search.resting))
     if complete and unexplained.any():
         progress("fitting servos with limits as a start")
@@ -213,10 +211,10 @@ def _bare(search: LoopSearch, fit: LoopFit, about: About, complete: bool) -> Loo
     """The nominal model with its own controller, or with that of the fit, fitted again without any effect."""
     if complete:
         own = {name: values.copy() for name, values in search.nominal.items()}
-        return LoopFit(own | {"creep": search.data.plant.creep}, ((),) * search.data.joints)
+        return LoopFit(own | {"creep": search.data.plant.creep})
     for group in groups_of(fit, search):
         fit = without_group(search, fit, group)
-    return search.improve(replace(fit, rms=None), 4)
+    return search.improve(fit, 4)
 
 
 def _frozen(sim: SimModel, data: Windows) -> frozenset[str]:
@@ -236,4 +234,4 @@ def _margin(search: LoopSearch, fit: LoopFit) -> Array:
 
 def columns_of_effect(found: Identified, effect: str) -> tuple[str, ...]:
     """Names of the fitted columns of an effect of the whole arm."""
-    return tuple(n for n in shared_effects(found.sim.arm)[effect] if n in found.fit.shared)
+    return tuple(n for n in shared_effects(found.sim.arm)[effect] if n in found.fit.at(-1))

@@ -1,10 +1,11 @@
-"""Parameters of controller and joint, the effect that each belongs to, and the coordinate in which each is fitted."""
+"""Parameters of controller, joints and whole arm, the effect that each belongs to, and the coordinate of its fit."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from gcomp.arrays import Array
+from sim_gap.model.rigid_body import RigidArm
 
 
 @dataclass(frozen=True)
@@ -116,10 +117,10 @@ class Scales:
 LOGARITHMIC = ("kp", "stribeck_velocity", "gain")
 INVERSE = "limit", "slew"
 """Limits: their inverse is fitted, which is 0 where there is none."""
+ANYTHING = float(np.log(1e3))
+"""Logarithm of the factor to either side of a gain of which nothing is known."""
 LEAST_INVERSE = 1e-3
 """Inverse of a limit, over that of its usual size, below which there is none."""
-FARTHEST = 1.5
-"""Logarithm of the largest factor of one step of a fit."""
 
 
 def to_coordinate(name: str, value: float, size: float) -> float:
@@ -140,19 +141,54 @@ def from_coordinate(name: str, x: Array, size: Array) -> Array:
     return np.clip(value, PARAMETERS[name].low, PARAMETERS[name].high)
 
 
-def step_parameter(
-    name: str, value: float, step: float, scales: Scales, joint: int, farthest: float = FARTHEST
-) -> float:
-    """A parameter's value after a step in its own coordinate, within its bounds.
-
-    `farthest` is the logarithm of the largest factor on a gain.
-    """
+def step_parameter(name: str, value: float, step: float, scales: Scales, joint: int) -> float:
+    """A parameter's value after a step in its own coordinate, within its bounds."""
     size = float(scales.of(name)[joint])
     if name in LOGARITHMIC:
-        step = float(np.clip(step, -farthest, farthest))
+        step = float(np.clip(step, -ANYTHING, ANYTHING))
     return float(from_coordinate(name, np.array(to_coordinate(name, value, size) + step), np.array(size)))
 
 
-def relative_step(name: str, value: float, scales: Scales, joint: int) -> float:
-    """Step in a parameter's own coordinate per relative change of its value."""
-    return 1.0 if name in LOGARITHMIC else to_coordinate(name, value, float(scales.of(name)[joint]))
+# ---- links and base
+
+UNIT = {"mass": "kg", "x": "kg·m", "y": "kg·m", "z": "kg·m", "angle": "rad", "angle_1": "rad", "angle_2": "rad"}
+REACH = 0.1
+"""Length beyond the last joint [m]; a model does not tell how long the last link is."""
+LIGHTEST = 0.5
+"""Mass of an arm [kg] that is counted at least: models without masses are about."""
+LARGEST_TURN = 0.35
+"""Largest error of a zero or of the base's tilt [rad]."""
+
+
+def shared_effects(arm: RigidArm) -> dict[str, tuple[str, ...]]:
+    """Effects with one set of parameters for the whole arm → names of these."""
+    effects = {"link.payload": tuple(f"payload.{part}" for part in ("mass", "x", "y", "z"))}
+    for link, name in enumerate(arm.names):
+        effects[f"link.mass_moment@{name}"] = tuple(f"moment{link}.{axis}" for axis in "xyz")
+        effects[f"position.offset@{name}"] = (f"zero{link}.angle",)
+    effects["base.tilt"] = ("tilt.angle_1", "tilt.angle_2")
+    return effects
+
+
+def range_of(arm: RigidArm, name: str) -> tuple[float, float]:
+    """Lowest and highest value that an arm can have; wide, but on the arm's own scale.
+
+    Without them a mass moment of some hundred times the arm's own can stand against a spring as stiff: both cancel
+    along the recorded motion, and the simulation breaks loose along any other.
+    """
+    total = max(float(arm.inertial[:, 0].sum()), LIGHTEST)
+    length = float(np.linalg.norm(arm.offset, axis=1).sum() + REACH)
+    if UNIT[name.partition(".")[2]] == "rad":
+        return -LARGEST_TURN, LARGEST_TURN
+    if name == "payload.mass":
+        return -float(arm.inertial[-1, 0]), total
+    if name.startswith("moment"):  # as far as the link's own mass may be moved
+        most = max(float(arm.inertial[int(name.split(".")[0][6:]), 0]), 0.1 * total) * length
+        return -most, most
+    return -total * length, total * length
+
+
+def size_of(arm: RigidArm, name: str) -> float:
+    """Size at which a parameter is tried."""
+    low, high = range_of(arm, name)
+    return 0.1 * min(-low, high) if -low > 1e-9 else 0.1 * high

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcomp.arrays import Array
+from gcomp.arrays import Array, Mask
 from sim_gap.better_model.corrected_model import body_parameters, set_body
 from sim_gap.better_model.native_drives import resting_command
 from sim_gap.effects.base import tilt_gravity
 from sim_gap.effects.link import point_mass
 from sim_gap.model.load import SimModel, linear_part
 from sim_gap.model.solver_friction import creep_speeds, solver_parameters
-from sim_gap.position_gap.pieces import Piece
+from sim_gap.position_gap.parameters import PARAMETERS
 
 LOCKED = 1e6
 """Armature of what is held [kg·m² or kg], which is put back after each step: within a step it moves by next to
@@ -29,44 +29,62 @@ nothing."""
 LOCKED_TOLERANCE = 1e-16
 """Tolerance of MuJoCo's solver beside what is held: it is relative to the inertia of all, and with MuJoCo's usual 1e-8
 the arm of two joints in `tests/sim_gap/position_gap/test_plant.py` rests 4 mrad off, with this 0.3 µrad."""
-Values = Mapping[str, Array]
-"""Parameter → (P, J) of P hypotheses; one of the whole arm has the same value at each joint."""
-FILTERS = 2, 3
-"""MuJoCo's codes of actuators that filter their input (`mjDYN_FILTER`, `mjDYN_FILTEREXACT`)."""
+Point = Mapping[str, Array]
+"""Parameter → (J,); one of the whole arm has the same value at each joint."""
 SPEED_S = 0.01
 """Time over which the derivative of a command is taken [s]."""
 
 
 @dataclass(frozen=True, eq=False)
-class Servos:
-    """Controller of the model's own position actuators, (J,) each; NaN gains at a joint without one."""
+class Piece:
+    """A part of a recording without a break: commands as they were held from row to row."""
 
-    actuator: NDArray[np.intp]
-    """Number of each joint's actuator, or −1."""
-    kp: Array
-    kv: Array
-    ki: Array
-    limit: Array
-    slew: Array
-    delay: Array
-    lag: Array
-    """Time constant of the filter of its command [s]; 0 without one."""
+    ends: Array
+    """Times at which each command begins, and the last ends [s], (K + 1,)."""
+    area: Array
+    """Integral of the command up to each of them [rad·s], (K + 1, n)."""
+    served: Mask
+    """Whether each row is commanded, (K, n)."""
+    position: Array
+    """Position at the beginning, (n,) [rad]."""
+    asked: Array
+    """Torque that gravity and springs ask for there, (n,) [N·m]."""
+    rests: Mask
+    """Whether each joint rests there, (n,)."""
+
+    def command(self, edges: Array, delay: Array, earlier: Array) -> Array:
+        """Mean command between the times `edges` (T + 1,), each joint's later by its `delay` (n,) [s]; (T, n).
+
+        `earlier` is the command before the first row, (n,).
+        """
+        made = [np.interp(edges - late, self.ends, column) for late, column in zip(delay, self.area.T, strict=True)]
+        # after the last row the last command holds
+        outside = [
+            np.minimum(edges - late - self.ends[0], 0.0) * first + np.maximum(edges - late - self.ends[-1], 0.0) * last
+            for late, first, last in zip(delay, earlier, self.held[1], strict=True)
+        ]
+        return np.asarray(np.diff(np.column_stack(made) + np.column_stack(outside), axis=0) / np.diff(edges)[:, None])
 
     @property
-    def complete(self) -> bool:
-        return bool(np.isfinite(self.kp).all())
+    def held(self) -> tuple[Array, Array]:
+        """First and last command, (n,) each."""
+        rates = np.diff(self.area, axis=0) / np.diff(self.ends)[:, None]
+        return rates[0], rates[-1]
+
+    def served_at(self, times: Array) -> Mask:
+        """Whether each joint is commanded at each time, (T, n)."""
+        rows = np.searchsorted(self.ends, times + 1e-9, side="right") - 1
+        return np.asarray(self.served[np.clip(rows, 0, len(self.served) - 1)])
 
 
-def servos_of(sim: SimModel) -> Servos:
-    """Gains, limits and delays of the model's position actuators, PID ones among them."""
+def servos_of(sim: SimModel) -> tuple[NDArray[np.intp], dict[str, Array]]:
+    """Number of the position actuator, PID ones among them, of each joint, or −1, and the parameters of all, (J,) each:
+    gains, limits, delays, and time constants of the filters of their commands, as of no servo where there is none."""
     import mujoco
 
     model: Any = sim.mujoco_model
-    n = sim.n
-    zero, none = np.zeros(n), np.full(n, np.inf)
-    own = Servos(
-        np.full(n, -1), np.full(n, np.nan), zero.copy(), zero.copy(), none.copy(), none.copy(), zero.copy(), zero.copy()
-    )
+    actuator, own = np.full(sim.n, -1), {name: np.zeros(sim.n) for name in ("kp", "kv", "ki", "delay", "lag")}
+    own |= {name: np.full(sim.n, np.inf) for name in ("limit", "slew")}
     joints = {int(joint): j for j, joint in enumerate(sim.joints)}
     for i in range(model.nu):
         j = joints.get(int(model.actuator_trnid[i, 0]))
@@ -75,19 +93,19 @@ def servos_of(sim: SimModel) -> Servos:
         if j is None or not is_joint or not affine or model.actuator_biasprm[i, 1] >= 0.0:
             continue
         gear = float(model.actuator_gear[i, 0])
-        own.actuator[j] = i
-        own.kp[j], own.kv[j] = -model.actuator_biasprm[i, 1] * gear**2, -model.actuator_biasprm[i, 2] * gear**2
+        actuator[j] = i
+        own["kp"][j], own["kv"][j] = (-model.actuator_biasprm[i, k] * gear**2 for k in (1, 2))
         if model.actuator_forcelimited[i]:
-            own.limit[j] = float(np.abs(model.actuator_forcerange[i]).max()) * abs(gear)
+            own["limit"][j] = float(np.abs(model.actuator_forcerange[i]).max()) * abs(gear)
         if model.jnt_actfrclimited[sim.joints[j]]:  # as URDF states it, for all actuators of a joint
-            own.limit[j] = min(own.limit[j], float(np.abs(model.jnt_actfrcrange[sim.joints[j]]).max()))
+            own["limit"][j] = min(own["limit"][j], float(np.abs(model.jnt_actfrcrange[sim.joints[j]]).max()))
         if model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_PID:
-            own.ki[j], slew = model.actuator_gainprm[i, 0] * gear**2, float(model.actuator_dynprm[i, 1])
-            own.slew[j] = slew / abs(gear) if slew > 0.0 else np.inf
-        own.delay[j] = model.actuator_delay[i]
-        if model.actuator_dyntype[i] in FILTERS:
-            own.lag[j] = model.actuator_dynprm[i, 0]
-    return own
+            own["ki"][j], slew = model.actuator_gainprm[i, 0] * gear**2, float(model.actuator_dynprm[i, 1])
+            own["slew"][j] = slew / abs(gear) if slew > 0.0 else np.inf
+        own["delay"][j] = model.actuator_delay[i]
+        if model.actuator_dyntype[i] in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
+            own["lag"][j] = model.actuator_dynprm[i, 0]
+    return actuator, own
 
 
 def held_model(sim: SimModel) -> Any:
@@ -162,7 +180,7 @@ class MovedModel:
     def __init__(self, sim: SimModel) -> None:
         import mujoco
 
-        self.sim, self.servos = sim, servos_of(sim)
+        self.sim, (self.actuator, self.servo) = sim, servos_of(sim)
         self.model = held_model(sim)
         joints = list(sim.joints)
         self.joints, self.n, self.dt = joints, sim.n, float(self.model.opt.timestep)
@@ -170,12 +188,12 @@ class MovedModel:
         self.bodies = self.model.jnt_bodyid[joints]
         self.held = HeldParts.of(self.model, joints)
         self._widen_ranges()
-        self.driven = self.servos.actuator >= 0
-        self.controls = self.model.actuator_ctrladr[self.servos.actuator[self.driven]]
+        self.driven = self.actuator >= 0
+        self.controls = self.model.actuator_ctrladr[self.actuator[self.driven]]
         self.gear = np.ones(sim.n)
-        self.gear[self.driven] = self.model.actuator_gear[self.servos.actuator[self.driven], 0]
+        self.gear[self.driven] = self.model.actuator_gear[self.actuator[self.driven], 0]
         self.pid = np.zeros(sim.n, bool)
-        drives = self.servos.actuator[self.driven]
+        drives = self.actuator[self.driven]
         self.pid[self.driven] = self.model.actuator_dyntype[drives] == mujoco.mjtDyn.mjDYN_PID
         self.creep = creep_speeds(self.model, self.dofs)
         shares = self.model.body_gravcomp[self.carried()]
@@ -198,7 +216,7 @@ class MovedModel:
         for j, joint in enumerate(self.joints):
             if model.jnt_limited[joint]:
                 wider = (ranges[j, 0] < model.jnt_range[joint, 0]) | (ranges[j, 1] > model.jnt_range[joint, 1])
-                i = self.servos.actuator[j]
+                i = self.actuator[j]
                 model.jnt_range[joint] = ranges[j]
                 if wider and i >= 0 and model.actuator_ctrllimited[i]:
                     gear = float(model.actuator_gear[i, 0])
@@ -208,15 +226,15 @@ class MovedModel:
 
     # ---- the model with other parameters
 
-    def changed(self, point: Mapping[str, Array]) -> Any:
+    def changed(self, point: Point) -> Any:
         """A copy of the model with parameters (J,)."""
-        model, own = copy(self.model), self.servos
+        model, own = copy(self.model), self.servo
         brake = np.minimum(point["kv"], point["viscous"])
         inner = brake + point["back_emf"] + point["kd"] * point["gain"]
         stiff = point["kp"] * point["gain"]
         damping, stiffness = linear_part(model.dof_damping, model.nv), linear_part(model.jnt_stiffness, model.njnt)
         for j in range(self.n):
-            joint, dof, i = self.joints[j], self.dofs[j], self.servos.actuator[j]
+            joint, dof, i = self.joints[j], self.dofs[j], self.actuator[j]
             damping[dof] = point["viscous"][j] - brake[j] + (0.0 if self.driven[j] else inner[j])
             stiffness[joint] = point["spring"][j] + (0.0 if self.driven[j] else stiff[j])
             model.qpos_spring[self.places[j]] = 0.0
@@ -227,13 +245,13 @@ class MovedModel:
                 model.actuator_biasprm[i, 1], model.actuator_biasprm[i, 2] = -stiff[j] / gear**2, -inner[j] / gear**2
                 if self.pid[j]:
                     model.actuator_gainprm[i, 0] = point["ki"][j] * point["gain"][j] / gear**2
-                    model.actuator_dynprm[i, 1] = point["slew"][j] * abs(gear) if own.slew[j] < np.inf else 0.0
+                    model.actuator_dynprm[i, 1] = point["slew"][j] * abs(gear) if own["slew"][j] < np.inf else 0.0
                 else:
                     model.actuator_gainprm[i, 0] = stiff[j] / gear**2
-                if own.lag[j] > 0.0:
+                if own["lag"][j] > 0.0:
                     model.actuator_dynprm[i, 0] = max(point["lag"][j], self.dt)
                 limit = point["limit"][j] * point["gain"][j]
-                if np.isfinite(limit) and (limit != own.limit[j]):
+                if np.isfinite(limit) and (limit != own["limit"][j]):
                     model.actuator_forcelimited[i] = 1
                     model.actuator_forcerange[i] = np.array([-limit, limit]) / abs(gear)
                     model.jnt_actfrcrange[joint] = np.maximum(np.abs(model.jnt_actfrcrange[joint]), limit) * [-1, 1]
@@ -261,7 +279,7 @@ class MovedModel:
                 out.add(body)
         return sorted(out)
 
-    def _change_links(self, model: Any, point: Mapping[str, Array]) -> None:
+    def _change_links(self, model: Any, point: Point) -> None:
         for link in range(self.n):
             angle = float(point[f"zero{link}.angle"][0]) if f"zero{link}.angle" in point else 0.0
             model.qpos0[self.places[link]] -= angle
@@ -279,7 +297,7 @@ class MovedModel:
 
     # ---- commands
 
-    def earlier_command(self, piece: Piece, point: Mapping[str, Array], scale: float) -> Array:
+    def earlier_command(self, piece: Piece, point: Point, scale: float) -> Array:
         """Command before a piece, (J,) [rad]: its first, or of a joint that rests the nearest under which it stays."""
         asked = np.where(point["ki"] > 0.0, 0.0, piece.asked * (1.0 - point["feed"]) + point["offset"])
         stiffness = np.maximum(point["kp"] * point["gain"] * scale, 1e-9)
@@ -287,14 +305,12 @@ class MovedModel:
         first, _ = piece.held
         return np.where(piece.rests, resting_command(first, piece.position, asked, friction, stiffness), first)
 
-    def commands(
-        self, piece: Piece, begin: float, steps: int, point: Mapping[str, Array], scale: float, earlier: Array
-    ) -> Array:
+    def commands(self, piece: Piece, begin: float, steps: int, point: Point, scale: float, earlier: Array) -> Array:
         """Input of each servo at each step of a window, (steps, J) [rad]; `earlier` is that before the piece."""
-        late = point["delay"] - self.servos.delay
+        late = point["delay"] - self.servo["delay"]
         edges: Array = begin + self.dt * np.arange(steps + 1, dtype=float)
         given = piece.command(edges, late, earlier)
-        most = np.where(self.pid & np.isfinite(self.servos.slew), np.inf, point["slew"]) * self.dt
+        most = np.where(self.pid & np.isfinite(self.servo["slew"]), np.inf, point["slew"]) * self.dt
         if np.isfinite(most).any():
             given = follow(given, earlier if begin == 0.0 else given[0], most)
         ahead = point["kd"] / np.maximum(point["kp"] * scale, 1e-9)
@@ -329,20 +345,11 @@ def silent() -> Iterator[None]:
         mujoco.set_mju_user_warning(None)
 
 
-def nominal_point(plant: MovedModel, neutral: Mapping[str, float]) -> dict[str, Array]:
+def nominal_point(plant: MovedModel) -> dict[str, Array]:
     """Parameters of the nominal model at every joint, neutral where it says nothing."""
-    arm, own, one = plant.sim.arm, plant.servos, np.ones(plant.n)
-    point = {name: value * one for name, value in neutral.items()}
-    point |= {"coulomb": arm.frictionloss.copy(), "armature": arm.armature.copy()}
-    point["viscous"] = arm.damping + np.where(np.isfinite(own.kp), own.kv, 0.0)
-    point["kp"] = np.where(np.isfinite(own.kp), own.kp, 1.0)
-    point["kv"] = np.where(np.isfinite(own.kp), own.kv, 0.0)
-    point |= {
-        "ki": own.ki.copy(),
-        "limit": own.limit.copy(),
-        "slew": own.slew.copy(),
-        "delay": own.delay.copy(),
-        "lag": own.lag.copy(),
-    }
+    arm, one = plant.sim.arm, np.ones(plant.n)
+    point = {name: p.neutral * one for name, p in PARAMETERS.items()} | {n: x.copy() for n, x in plant.servo.items()}
+    point["kp"] = np.where(plant.driven, point["kp"], 1.0)
+    point |= {"coulomb": arm.frictionloss.copy(), "armature": arm.armature.copy(), "viscous": arm.damping + point["kv"]}
     point["spring"], point["offset"] = arm.stiffness.copy(), -arm.stiffness * arm.rest
     return point | {"creep": plant.creep.copy(), "feed": plant.compensated * one}

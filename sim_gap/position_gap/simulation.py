@@ -1,6 +1,6 @@
 """Windows of recorded motion, simulated from the parameters of a hypothesis; laws that MuJoCo lacks at each step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from itertools import pairwise
 from typing import Any
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gcomp.arrays import Array
 from sim_gap.better_model.native_drives import hold
 from sim_gap.model.load import linear_part
-from sim_gap.position_gap.plant import MovedModel, Values, silent
+from sim_gap.position_gap.plant import MovedModel, Point, silent
 from sim_gap.position_gap.windows import Windows
 
 WORLDS = 32
@@ -22,24 +22,22 @@ SAME_RAD = 1e-9
 """Difference of two commands that rounding makes [rad]."""
 
 
-def simulate(data: Windows, values: Values) -> Array:
+def simulate(data: Windows, points: Sequence[Point]) -> Array:
     """Positions at the times of comparison for P hypotheses [rad], (P, To, J, W)."""
-    count = max(len(x) for x in values.values())
-    out = np.empty((count, *data.measured.shape))
+    out = np.empty((len(points), *data.measured.shape))
     lawful: list[tuple[int, World]] = []
 
     def run(least: int) -> None:
         while len(lawful) > least:
             together = lawful[:WORLDS]
             del lawful[:WORLDS]
-            run_with_laws(data.plant, [world for _, world in together])
+            run_with_laws([world for _, world in together])
             for p, world in together:
                 out[p, ..., world.w] = world.positions()
 
     with silent():
-        for p in range(count):
-            point = {name: x[p if len(x) > 1 else 0] for name, x in values.items()}
-            for world in _worlds(data.plant, data, point):
+        for p, point in enumerate(points):
+            for world in _worlds(data, point):
                 if world.laws or not world.served.all():
                     lawful.append((p, world))
                 else:
@@ -50,20 +48,20 @@ def simulate(data: Windows, values: Values) -> Array:
     return out
 
 
-def _worlds(plant: MovedModel, data: Windows, point: Mapping[str, Array]) -> "list[World]":
+def _worlds(data: Windows, point: Point) -> "list[World]":
     """The windows of one hypothesis."""
     models = {
-        float(scale): plant.changed({**point, **{name: point[name] * scale for name in ("kp", "kd", "ki")}})
+        float(scale): data.plant.changed({**point, **{name: point[name] * scale for name in ("kp", "kd", "ki")}})
         for scale in np.unique(data.scale)
     }
-    return [World(plant, models[float(data.scale[w])], data, w, point) for w in range(data.count)]
+    return [World(models[float(data.scale[w])], data, w, point) for w in range(data.count)]
 
 
 class World:
     """One window of one hypothesis."""
 
-    def __init__(self, plant: MovedModel, model: Any, data: Windows, w: int, point: Mapping[str, Array]) -> None:
-        self.plant, self.model, self.data, self.w, self.point = plant, model, data, w, point
+    def __init__(self, model: Any, data: Windows, w: int, point: Point) -> None:
+        self.plant, self.model, self.data, self.w, self.point = (plant := data.plant), model, data, w, point
         self.piece, self.scale, self.at = data.pieces[data.piece[w]], float(data.scale[w]), data.at[:, w]
         self.steps = int(np.ceil(self.at.max() / plant.dt - 1e-6)) + 1
         self.earlier = plant.earlier_command(self.piece, point, self.scale)
@@ -122,7 +120,7 @@ class World:
 
         plant, data, w = self.plant, self.data, self.w
         mujoco.mj_resetData(model, d)
-        drives = plant.servos.actuator[plant.driven].tolist()
+        drives = plant.actuator[plant.driven].tolist()
         if len(drives) and model.na + int(model.actuator_history[drives, 0].sum()):
             d.qpos[plant.places] = data.first[:, w]
             before = self.given[0] if data.begin[w] > 0.0 else self.earlier
@@ -151,11 +149,12 @@ class World:
         return np.asarray((asked / self.point["gain"] - self.point["kp"] * error) / ki + self.data.error_sum[:, self.w])
 
 
-def run_with_laws(plant: MovedModel, worlds: Sequence[World]) -> None:
+def run_with_laws(worlds: Sequence[World]) -> None:
     """Move some worlds together, and evaluate the laws at each step for all of them at once, (W, n)."""
     import mujoco
 
-    dofs, places, drives, dt = plant.dofs, plant.places, plant.servos.actuator[plant.driven], plant.dt
+    plant = worlds[0].plant
+    dofs, places, drives, dt = plant.dofs, plant.places, plant.actuator[plant.driven], plant.dt
     laws = {law for world in worlds for law in world.laws}
     point = {name: np.stack([world.point[name] for world in worlds]) for name in worlds[0].point}
     friction, held = bool({"stribeck", "load"} & {*laws}), bool(plant.held.places.size)
@@ -264,7 +263,7 @@ def _slice_of(index: NDArray[np.intp]) -> Any:
 _READ = ("qpos", "qvel", "qfrc_smooth", "qfrc_bias", "qfrc_constraint", "qacc", "qfrc_gravcomp")
 
 
-def laws_of(point: Mapping[str, Array], plant: MovedModel) -> set[str]:
+def laws_of(point: Point, plant: MovedModel) -> set[str]:
     """Names of the parameters of a point that act by a law at each step."""
     found = {name for name in ("dead", "stribeck", "load") if np.any(point[name] != 0.0)}
     if np.any(point["feed"] != plant.compensated):

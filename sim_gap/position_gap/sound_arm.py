@@ -5,17 +5,14 @@ each, with a known standard deviation. Their most probable values given the trai
 make of the gap; what they leave, and how improbable they are, says whether there is more to it.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, jacobian
-from sim_gap.position_gap.judge import rms_on
-from sim_gap.position_gap.links import shared_names
-from sim_gap.position_gap.parameters import step_parameter
+from sim_gap.position_gap.fit import Layout, LoopSearch, Place, acting, jacobian, rms_on
 from sim_gap.position_gap.windows import Windows
 
 ERROR = 0.01
@@ -45,41 +42,39 @@ class SoundGap:
     """Whether a sound arm may have these errors, and they leave nothing that matters."""
 
 
-def errors_of(search: LoopSearch) -> list[dict[str, float]]:
+def errors_of(search: LoopSearch) -> dict[Place, float]:
     """Standard deviation of each parameter of a sound arm in its own coordinate, of joints and links."""
-    data, nominal, scales = search.data, search.nominal, search.scales
+    nominal, scales = search.nominal, search.scales
     friction = np.minimum(FRICTION_NM, FRICTION_SHARE * scales.torque)
     deviation = {
         "viscous": ERROR * nominal["viscous"],
         "coulomb": np.hypot(ERROR * nominal["coulomb"], friction),
         "armature": ERROR * scales.inertia,
-        "delay": np.full(data.joints, np.hypot(LATE_S, APART_S)),
+        "delay": np.full_like(friction, np.hypot(LATE_S, APART_S)),
     }
-    own = [
-        {"kp": ERROR, **{name: float(x[j] / scales.of(name)[j]) for name, x in deviation.items() if x[j] > 0.0}}
-        for j in range(data.joints)
-    ]
-    arm = data.plant.sim.arm
-    moments = ERROR * np.linalg.norm(arm.inertial[:, 1:4], axis=1)
-    links = {f"moment{link}.{axis}": float(moments[link]) for link in range(data.joints) for axis in "xyz"}
-    return [*own, {name: size for name, size in links.items() if name in shared_names(arm)}]
+    out: dict[Place, float] = {}
+    for j in range(search.data.joints):
+        out[j, "kp"] = ERROR
+        out |= {(j, name): float(x[j] / scales.of(name)[j]) for name, x in deviation.items() if x[j] > 0.0}
+    moments = ERROR * np.linalg.norm(search.arm.inertial[:, 1:4], axis=1)
+    return out | {(-1, f"moment{link}.{axis}"): size for link, size in enumerate(moments.tolist()) for axis in "xyz"}
 
 
 def split_gap(search: LoopSearch, heldout: Windows, margin: Array) -> SoundGap:
     """The gap of the nominal model of `search`, split; `margin` is the RMS that counts as one at each joint, (J,)."""
     sizes = errors_of(search)
-    deviations = np.array([size for each in sizes for size in each.values()])
     usually = _correlation(sizes)
     prior = np.linalg.inv(usually)
-    gaps, changes = _weighed(search, _fit(search, sizes, np.zeros(deviations.size)), sizes, deviations)
+    gaps, changes = _weighed(search, sizes)
     usual = np.array([np.linalg.norm(x) for x in changes])
-    normal, right = prior.copy(), np.zeros(deviations.size)
+    normal, right = prior.copy(), np.zeros(len(sizes))
     for gap, x, samples, least in zip(gaps, changes, search.samples, margin, strict=True):
         normal += samples / least**2 * x @ x.T
         right -= samples / least**2 * x @ gap
     spread = np.asarray(np.linalg.inv(normal))
     errors = spread @ right
-    found, other = _fit(search, sizes, errors), replace(search, data=heldout)
+    layout, other = Layout(search, search.nominal, [*sizes]), replace(search, data=heldout)
+    found = layout.at(layout.theta(layout.point) + np.array([*sizes.values()]) * errors)
     pairs = [(rms_on(each.data, found) / margin, each.samples) for each in (search, other)]
     small = [bool(np.all(left**2 * samples < _rare(samples))) for left, samples in pairs]
     explained = all(small) and probable(errors, usually, spread)
@@ -103,38 +98,23 @@ def _rare(count: Array | float) -> Array:
     return np.asarray(chi2.ppf(PROBABLE, count))
 
 
-def _correlation(sizes: list[dict[str, float]]) -> Array:
+def _correlation(sizes: Mapping[Place, float]) -> Array:
     """Correlation of the errors, (K, K): commands are late at all joints alike."""
-    late = np.array([name == "delay" for each in sizes for name in each], float)
+    late = np.array([name == "delay" for _, name in sizes], float)
     share = LATE_S**2 / (LATE_S**2 + APART_S**2)
     return np.asarray(np.diag(1.0 - share * late) + share * np.outer(late, late))
 
 
-def _fit(search: LoopSearch, sizes: list[dict[str, float]], errors: Array) -> LoopFit:
-    """The nominal model with errors, in standard deviations."""
-    point = {name: values.copy() for name, values in search.nominal.items()}
-    left = iter(errors)
-    for j, own in enumerate(sizes[:-1]):
-        for name, size in own.items():
-            point[name][j] = step_parameter(name, point[name][j], size * next(left), search.scales, j)
-    for name, size in sizes[-1].items():
-        point[name] = np.full(search.data.joints, size * next(left))
-    return LoopFit(point, ((),) * search.data.joints)
-
-
-def _weighed(
-    search: LoopSearch, fit: LoopFit, sizes: list[dict[str, float]], deviations: Array
-) -> tuple[list[Array], list[Array]]:
-    """Of each joint the gap of a fit (N,) and its change by one standard deviation of each parameter (K, N), such that
-    their norms are RMS values [rad]."""
-    data = search.data
-    now, slopes = jacobian(data, fit, search.scales, [tuple(own) for own in sizes[:-1]], tuple(sizes[-1]))
-    starts = np.concatenate([[0], np.cumsum([len(own) for own in sizes])])
+def _weighed(search: LoopSearch, sizes: Mapping[Place, float]) -> tuple[list[Array], list[Array]]:
+    """The nominal model's gap at each joint (N,) and its changes by a standard deviation of each parameter (K, N), such
+    that their norms are RMS values [rad]."""
+    data, places, deviations = search.data, [*sizes], np.array([*sizes.values()])
+    now, slopes = jacobian(search, search.nominal, places)
     gaps, changes = [], []
     for j, slope in enumerate(slopes):
         count = np.sqrt(max(float(data.weight[:, j].sum()), 1.0))
-        change = np.zeros((deviations.size, now[:, j].size))
-        change[[*range(starts[j], starts[j + 1]), *range(starts[-2], starts[-1])]] = slope.reshape(len(slope), -1)
+        change = np.zeros((len(places), now[:, j].size))
+        change[acting(places, j)] = slope.reshape(len(slope), -1)
         gaps.append(now[:, j].ravel() / count)
         changes.append(change * deviations[:, None] / count)
     return gaps, changes

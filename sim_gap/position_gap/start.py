@@ -9,11 +9,10 @@ from scipy.stats import qmc
 from gcomp.arrays import Array, Mask
 from gcomp.estimate.choice import PRICE
 from gcomp.estimate.problem import NORMAL
-from sim_gap.position_gap.choice import FEW, LoopSearch, Progress, costs_of
-from sim_gap.position_gap.fit import LoopFit, batch, residuals
+from sim_gap.position_gap.choice import FEW, Progress, costs_of
+from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 from sim_gap.position_gap.parameters import Scales
-from sim_gap.position_gap.plant import Servos
-from sim_gap.position_gap.windows import Windows, thin_moving
+from sim_gap.position_gap.windows import Windows, thin
 
 GAINS = 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0
 """Gains that are tried, over that of the model."""
@@ -74,41 +73,39 @@ def noise_floor(data: Windows) -> Array:
     return np.asarray(np.maximum(np.sqrt(np.mean(data.noise**2, axis=1)), LEAST_FLOOR))
 
 
-def starting_fit(search: LoopSearch, own: Servos, progress: Progress) -> tuple[LoopSearch, LoopFit]:
+def starting_fit(search: LoopSearch, progress: Progress) -> tuple[LoopSearch, LoopFit]:
     """The search with what rests left out, and a fit of gain, Coulomb and viscous friction at every other joint.
 
     Where the model has position actuators and moves as the arm does, the fit begins there.
     """
     progress("fitting gains and friction as a start")
-    at_rest = rests(search.data)
+    at_rest, complete = rests(search.data), bool(search.data.plant.driven.all())
     search = replace(search, resting=frozenset(np.flatnonzero(at_rest).tolist()))
-    if not own.complete:
-        search = replace(search, nominal=_holding(search, own), open_controller=True)
+    if not complete:
+        search = replace(search, nominal=_holding(search), open_controller=True)
         search = replace(search, excluded=search.excluded | {"actuator.gain"})
-    few = replace(search, data=thin_moving(search.data, FEW))
-    points = _points(few, own)
-    gaps = residuals(few.data, batch(points))
+    few = replace(search, data=thin(search.data, FEW, moving=True))
+    points = _points(few)
+    gaps = residuals(few.data, points)
     costs = np.einsum("ptjw,tjw->pj", np.minimum(np.abs(gaps), 1.0) ** 2, few.data.weight)
     best = costs.argmin(0)
     point = {name: np.array([points[b][name][j] for j, b in enumerate(best)]) for name in points[0]}
     names = ("kp", "viscous", "coulomb")
     # a joint that swings with its servo off shows friction and inertia against gravity, and only both together
-    free = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2)).tolist()
-    active = tuple(
-        () if rest else (*names, "armature") if swings else names for rest, swings in zip(at_rest, free, strict=True)
-    )
-    kept = {"controller.stiffness"} if not own.complete else set()
-    search = replace(search, kept=frozenset(kept))
+    swings = np.any((search.data.served < 0.5) & (search.data.weight > 0.0), axis=(0, 2))
+    moving = np.flatnonzero(~at_rest).tolist()
+    free = [(j, name) for j in moving for name in (*names, *(("armature",) if swings[j] else ()))]
+    search = replace(search, kept=frozenset(() if complete else ("controller.stiffness",)))
     few = replace(few, nominal=search.nominal)
     # all rows count at first: far from the arm's motion a robust fit would take the motion for outliers
-    fit = few.improve(LoopFit(point, active), 5, NORMAL)
+    fit = few.improve(LoopFit(point, tuple(free)), 5, NORMAL)
     if np.any(search.nominal["creep"] > 0.0):
         rest = {"creep": np.zeros(search.data.joints)}
         at_rest_fit = few.improve(fit.with_values(**rest), 4, NORMAL)
         # gears hold what rests: a model's solver that lets it creep is no statement about the arm
-        if float((few.score(at_rest_fit) - few.score(fit)).sum()) < PRICE:
+        if float((few.score(at_rest_fit.point) - few.score(fit.point)).sum()) < PRICE:
             search, fit = replace(search, nominal={**search.nominal, **rest}), at_rest_fit
-    return search, replace(fit, rms=None)
+    return search, fit
 
 
 def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[LoopFit]:
@@ -116,16 +113,14 @@ def limited_servo_starts(search: LoopSearch, fit: LoopFit, where: Mask) -> list[
 
     A saturated servo hides its gain and its lag, so that no step from one without limits leads there.
     """
-    few = replace(search, data=thin_moving(search.data, FEW))
+    few = replace(search, data=thin(search.data, FEW, moving=True))
     drawn = _drawn_servos(few, fit, where)
     names = [name for name in SERVO_RANGES if name != "lag" or search.nominal["lag"].any()]
-    active = tuple(
-        tuple(dict.fromkeys((*own, *names))) if tried else own for own, tried in zip(fit.active, where, strict=True)
-    )
+    free = [*fit.free, *((j, name) for j in np.flatnonzero(where).tolist() for name in names)]
     starts = []
     for best in costs_of(few, drawn).argsort(axis=0)[:BEST_SERVOS]:
         point = {name: np.array([drawn[b][name][j] for j, b in enumerate(best)]) for name in fit.point}
-        starts.append(replace(few.improve(LoopFit(point, active, fit.shared), 5), rms=None))
+        starts.append(few.improve(LoopFit(point).freed(free), 5))
     return starts
 
 
@@ -150,16 +145,16 @@ def _drawn_servos(search: LoopSearch, fit: LoopFit, where: Mask) -> list[dict[st
     return points
 
 
-def _points(search: LoopSearch, own: Servos) -> list[dict[str, Array]]:
+def _points(search: LoopSearch) -> list[dict[str, Array]]:
     """Points that are tried: the nominal model, and gains with least frictions."""
-    nominal, scales = search.nominal, search.scales
-    centre = np.where(np.isfinite(own.kp), nominal["kp"], scales.inertia)
+    nominal, driven = search.nominal, search.data.plant.driven
+    centre = np.where(driven, nominal["kp"], search.scales.inertia)
     tries = np.where(
-        np.isfinite(own.kp),
+        driven,
         np.array(GAINS)[:, None],
         (2.0 * np.pi * np.array(FREQUENCIES_HZ)[:, None]) ** 2,
     )
-    points = [nominal] if own.complete else []
+    points = [nominal] if driven.all() else []
     for factor, stuck in product(tries, FRICTIONS):
         kp = np.maximum(centre * factor, 1e-3)
         point = {name: values.copy() for name, values in nominal.items()}
@@ -198,9 +193,9 @@ def rests(data: Windows) -> Mask:
     return np.asarray((on & told).any(axis=(0, 2)) & (commanded < RESTS_RAD) & ~(free >= RESTS_RAD))
 
 
-def _holding(search: LoopSearch, own: Servos) -> dict[str, Array]:
+def _holding(search: LoopSearch) -> dict[str, Array]:
     """The nominal values, with a controller at joints (J,) that have none: critically damped, and stiff."""
-    held, missing = dict(search.nominal), ~np.isfinite(own.kp)
+    held, missing = dict(search.nominal), ~search.data.plant.driven
     frequency = 2.0 * np.pi * HOLDS_HZ
     held["kp"] = np.where(missing, search.scales.inertia * frequency**2, held["kp"])
     held["viscous"] = np.where(missing, 2.0 * search.scales.inertia * frequency, held["viscous"])
@@ -210,6 +205,6 @@ def _holding(search: LoopSearch, own: Servos) -> dict[str, Array]:
 
 def controller_name(fit: LoopFit) -> str:
     """The controller that was found: P, PD, PI, PID, with feed-forward or without."""
-    names = {name for own in fit.active for name in own}
+    names = {name for _, name in fit.free}
     kind = "P" + "I" * ("ki" in names) + "D" * ("kd" in names)
     return kind + " with feed-forward" * ("feed" in names)

@@ -16,8 +16,7 @@ from armlink.errors import BadInput
 from armlink.recording.recording import Recording, slice_rows
 from gcomp.arrays import Array
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.pieces import Piece
-from sim_gap.position_gap.plant import MovedModel
+from sim_gap.position_gap.plant import MovedModel, Piece
 from sim_gap.residuals.preprocess import low_pass
 
 WINDOW_S, WARM_S = 3.0, 1.0
@@ -297,14 +296,9 @@ def as_many(data: Windows, count: int) -> int:
     return max(count, round(count * WINDOW_S * data.count / max(float(seconds), WINDOW_S)))
 
 
-def thin(data: Windows, count: int) -> Windows:
-    """As much of the windows as `count` whole ones, evenly spread over the recordings."""
-    count = as_many(data, count)
-    return data if data.count <= count else choose_windows(data, _even(data.count, count))
-
-
-def thin_moving(data: Windows, count: int) -> Windows:
-    """The same, and for each joint that moves less in these than elsewhere the windows of its most and fastest motion.
+def thin(data: Windows, count: int, moving: bool = False) -> Windows:
+    """As much of the windows as `count` whole ones, spread evenly over the recordings; with `moving` the windows of the
+    most and fastest motion too, of each joint that moves less in these than elsewhere.
 
     Of a joint that rests in all windows anything fits: no gain, and any friction. Of one that is slow in all of them
     nothing follows for fast motion.
@@ -312,17 +306,13 @@ def thin_moving(data: Windows, count: int) -> Windows:
     count = as_many(data, count)
     if data.count <= count:
         return data
-    chosen = _even(data.count, count)
+    chosen = np.unique(np.linspace(0, data.count - 1, count).round().astype(np.intp))
     counts = data.weight.sum(0) > 0.0
     mean, most = np.sqrt(np.mean(data.v**2, axis=0)) * counts, np.abs(data.v).max(0) * counts
-    for speed, share in ((mean, MOVES), (most, FAST)):
+    for speed, share in ((mean, MOVES), (most, FAST)) if moving else ():
         rests = speed[:, chosen].max(1) < share * speed.max(1)
         chosen = np.unique([*chosen, *speed[rests].argmax(1)])
     return choose_windows(data, chosen)
-
-
-def _even(total: int, count: int) -> NDArray[np.intp]:
-    return np.unique(np.linspace(0, total - 1, count).round().astype(np.intp))
 
 
 def choose_windows(data: Windows, chosen: NDArray[np.intp]) -> Windows:

@@ -1,5 +1,6 @@
 """The diagnosis as sections of a report: verdict, causes, gap before and after, figures of the residuals."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from armlink.effect_catalogue import CATALOGUE
@@ -8,11 +9,16 @@ from calib.report.page import html_of, paragraph, paragraphs, render, verdict_li
 from calib.report.tables import ReportTable
 from sim_gap.attribution.diagnosis import Cause, Diagnosis
 from sim_gap.position_gap.identify import Identified
-from sim_gap.report.cause_figures import cause_figure, law_figure
 from sim_gap.report.effect_text import CHANNEL_WORDS, WORDS, advice, parameter_rows, sentence
-from sim_gap.report.figures import gap_bars, residual_panels, rollout_bars
-from sim_gap.report.motion_figure import motion_sections
-from sim_gap.report.time_figures import torque_over_time
+from sim_gap.report.figures import (
+    cause_figure,
+    gap_bars,
+    law_figure,
+    motion_figure,
+    residual_panels,
+    rollout_bars,
+    torque_over_time,
+)
 
 PARAMETERS = {
     "N·m": "Fitted parameters, each as a difference to the value of the model.",
@@ -28,7 +34,7 @@ def sections(answer: Diagnosis) -> list[Section]:
     """Sections for a separate page or for a part of another report."""
     out = [_verdict(answer), _gap(answer)]
     if isinstance(answer.internals, Identified):
-        out += motion_sections(answer.internals, answer.causes)
+        out += _motion(answer.internals, answer.causes)
     elif answer.internals is not None:
         out += [*_over_time(answer), *_causes(answer), *_laws(answer), *_residuals(answer)]
     return out
@@ -104,8 +110,16 @@ def _gap(answer: Diagnosis) -> Section:
     return Section("Gap before and after", paragraph(text), figures, [ReportTable(header, rows)])
 
 
+def _motion(found: Identified, causes: Sequence[Cause]) -> list[Section]:
+    figure = motion_figure(found, causes)
+    text = (
+        "The command, the measured motion, and simulations that run free along the command, on held-out data. Click a "
+        "name to hide or show its curve; “without” leaves one effect out of the corrected model."
+    )
+    return [] if figure is None else [Section("Motion of every joint", paragraph(text), [figure])]
+
+
 def _over_time(answer: Diagnosis) -> list[Section]:
-    """Measured, nominal and corrected torque of every joint."""
     layout, out = answer.internals.heldout.layout, []
     for channel in filter(None, (layout.sensor, layout.motor)):
         nominal = (

@@ -22,9 +22,9 @@ from armlink.recording.recording import slice_rows
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.better_model.native_drives import hold
 from sim_gap.position_gap.identify import Identified
-from sim_gap.position_gap.training.draws import draw
 from sim_gap.position_gap.training.position_files import export_batched
 from sim_gap.position_gap.training.replay import OPENING_S, Simulated, actuator_of, commanded_rows, replay
+from sim_gap.position_gap.training.spread import draw
 
 AGREE = 0.05
 """Largest difference of the RMS gap to the measured position between both simulators, over all joints."""

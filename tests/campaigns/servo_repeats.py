@@ -30,9 +30,8 @@ from servo_arm import model_text, record, written
 from armlink.recording.files import load_recording
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.diagnosis import Diagnosis
-from sim_gap.position_gap.fit import LoopFit, evaluate
-from sim_gap.position_gap.judge import joint_rms
-from sim_gap.position_gap.training.draws import draw
+from sim_gap.position_gap.fit import rms_on
+from sim_gap.position_gap.training.spread import draw
 
 HELD, APART = (0.85, 0.95), 0.9
 DRAWS = 100
@@ -90,7 +89,7 @@ def drawn(answer: Diagnosis) -> np.ndarray:
             else:
                 point[label][:] = value
         points.append(point)
-    left = np.stack([joint_rms(data, evaluate(data, LoopFit(point, ())).rms) for point in [found.fit.point, *points]])
+    left = np.stack([rms_on(data, point) for point in [found.fit.point, *points]])
     return np.quantile(left[1:] / left[0], [0.5, 0.9], axis=0)
 
 

@@ -8,9 +8,7 @@ import numpy as np
 
 from armlink.recording.recording import Recording
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit
-from sim_gap.position_gap.parameters import PARAMETERS
+from sim_gap.position_gap.fit import LoopFit, LoopSearch
 from sim_gap.position_gap.plant import MovedModel, nominal_point
 from sim_gap.position_gap.start import scales_of
 from sim_gap.position_gap.windows import windows_of
@@ -117,14 +115,19 @@ def fitted(*friction: float, weightless: bool = False) -> tuple[LoopSearch, Loop
     made = [record(text(x), seed, 21.0) for seed, x in enumerate(friction, start=1)]
     search = search_on(text(0.2), made)
     names = ("kp", "coulomb", "viscous")
-    return search, search.improve(LoopFit(search.nominal, (names, names)))
+    return search, search.improve(LoopFit(search.nominal).freed(at_both(*names)))
+
+
+def at_both(*names: str) -> list[tuple[int, str]]:
+    """Places of these parameters at both joints."""
+    return [(j, name) for j in (0, 1) for name in names]
 
 
 def search_on(text: str, recordings: Sequence[Recording], floor: float = 3e-4) -> LoopSearch:
     """Recordings beside a model, of which effects may be chosen; with a noise `floor` [rad]."""
     plant = MovedModel(load_model(mujoco.MjModel.from_xml_string(text)))
     data = windows_of(plant, recordings, [f"run {k}" for k in range(len(recordings))])
-    point = nominal_point(plant, {name: p.neutral for name, p in PARAMETERS.items()})
+    point = nominal_point(plant)
     return LoopSearch(data, scales_of(data), point, np.full(data.joints, floor))
 
 

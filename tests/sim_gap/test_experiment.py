@@ -11,7 +11,18 @@ from armlink.errors import BadInput
 from armlink.link.link import Link
 from armlink.recording.files import load_recording
 from calib.arm.kinematics import gcomp_arm
-from sim_gap.experiment import LONGEST, SPEEDS, _Shape, collect, joints_in_doubt, load_motion, plan_motion, save_motion
+from sim_gap.experiment import (
+    ACCELERATION,
+    LONGEST,
+    SPEEDS,
+    _Shape,
+    collect,
+    joints_in_doubt,
+    load_motion,
+    multisine,
+    plan_motion,
+    save_motion,
+)
 
 
 @pytest.mark.parametrize("name", ["sarcos", "parallel6"])
@@ -115,3 +126,25 @@ def test_the_arm_follows_and_every_cycle_is_recorded(tmp_path: Path) -> None:
     assert np.abs(recording.position - target).max() < 0.05
     assert recording.torque is not None
     assert np.isfinite(recording.torque).all()
+
+
+def waves(reach: tuple[float, float], speed: tuple[float, float], seed: int) -> tuple[np.ndarray, ...]:
+    """Position, velocity and acceleration of two joints over a minute, where the sines are at their full size."""
+    draw = np.random.default_rng(seed).random((2, 2, 3))
+    q = multisine(np.arange(12_000) / 200.0, np.array(reach), np.array(speed), (0.08, 0.3), draw)[1000:-1000]
+    v = np.diff(q, axis=0) * 200.0
+    return q, v, np.diff(v, axis=0) * 200.0
+
+
+def test_sines_keep_reach_speed_and_acceleration() -> None:
+    q, v, a = waves((0.35, 0.9), (0.12, 4.8), 1)
+    assert (np.abs(q) <= [0.35 + 1e-9, 0.9 + 1e-9]).all()
+    assert (np.abs(v) <= [0.12 + 1e-6, 4.8 + 1e-6]).all()
+    assert np.abs(a).max() <= ACCELERATION + 1e-6
+    assert (np.ptp(q, axis=0) > 0.05).all()
+
+
+def test_sines_use_the_acceleration_that_they_may() -> None:
+    """On a joint with reach and speed in plenty; where the sines meet, in the course of a minute."""
+    _, _, a = waves((0.35, 30.0), (0.6, 30.0), 3)
+    assert 0.95 * ACCELERATION < np.abs(a[:, 1]).max() <= ACCELERATION + 1e-6

@@ -8,17 +8,14 @@ hold more than its share, whichever is true: it is narrowed to what holds its sh
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, batch, jacobian, root_mean_squares
-from sim_gap.position_gap.judge import joint_rms
+from sim_gap.position_gap.fit import LoopFit, LoopSearch, jacobian, joint_rms, root_mean_squares
 from sim_gap.position_gap.simulation import simulate
-from sim_gap.position_gap.training.jackknife import recordings_or_thirds
-from sim_gap.position_gap.training.spread import Covariance
+from sim_gap.position_gap.training.spread import Covariance, recordings_or_thirds
 from sim_gap.position_gap.training.unreached_limits import LIMITS, Unreached
 from sim_gap.position_gap.windows import Windows
 
@@ -63,7 +60,7 @@ def band(search: LoopSearch, fit: LoopFit, spread: Covariance, left: Array, held
     if data.of_one_recording:
         wider *= 1.0 + (OTHER_MOTION - 1.0) * _lasting(left, data.weight) ** 2
     reach = factor * wider * np.sqrt((size**2 * data.weight).sum((0, 2)) / np.maximum(data.weight.sum((0, 2)), 1.0))
-    about = simulate(heldout, batch([fit.point, *_with_limits(fit, spread.limits)]))
+    about = simulate(heldout, [fit.point, *_with_limits(fit, spread.limits)])
     unit = wider[:, None] * np.sqrt(_variance(search, fit, spread, heldout) + unexplained[:, None] ** 2)
     for j in range(data.joints) if len(about) > 1 else ():
         gaps = (left[:, j] / size[:, j])[data.weight[:, j] > 0.0]
@@ -126,8 +123,7 @@ def _variance(search: LoopSearch, fit: LoopFit, spread: Covariance, data: Window
 
     It is linear, so that parameters of which only ratios are known leave nothing open where they move nothing.
     """
-    active = tuple(tuple(name for j, name in spread.names if j == joint) for joint in range(data.joints))
-    _, slopes = jacobian(data, fit, search.scales, active, fit.shared)
+    _, slopes = jacobian(replace(search, data=data), fit.point, spread.names)
     each = [np.einsum("atw,ab,btw->tw", x, spread.of_joint(j), x) for j, x in enumerate(slopes)]
     return np.stack(each, axis=1)
 

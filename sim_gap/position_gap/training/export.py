@@ -5,7 +5,7 @@ applies it. A model that stops where the arm was seen to go on cannot follow it:
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,13 @@ import numpy as np
 from armlink.recording.recording import Recording
 from gcomp.arrays import Array, Mask
 from sim_gap.better_model.corrected_model import spec_of, write_changes
+from sim_gap.better_model.export import CorrectedText
 from sim_gap.better_model.forward_effects import JointEffect
 from sim_gap.better_model.native_drives import LONGEST_STEP_S, put_delay
 from sim_gap.better_model.urdf import xml_comment
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.choice import LoopSearch, effect_there, without_effect, without_group
-from sim_gap.position_gap.fit import LoopFit
-from sim_gap.position_gap.links import shared_effects
+from sim_gap.position_gap.choice import id_of, present, without_group
+from sim_gap.position_gap.fit import Group, LoopFit, LoopSearch
 from sim_gap.position_gap.parameters import EFFECTS
 from sim_gap.position_gap.plant import MovedModel
 
@@ -74,28 +74,16 @@ WRITTEN = frozenset({*NATIVE, *IN_MODULE})
 
 
 @dataclass(frozen=True)
-class Exported:
-    """A corrected model: its text, and a line per effect that it cannot hold."""
-
-    xml: str
-    lines: tuple[str, ...]
-    fit: LoopFit
+class Exported(CorrectedText):
+    fit: LoopFit = field(kw_only=True)
     """Parameters that it was written with."""
-    effects: tuple[JointEffect, ...] = ()
-    """Those that a module applies beside it."""
 
 
 def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE) -> LoopFit:
     """The fit with what a simulator holds alone, the rest fitted around it again."""
     bare = fit
-    for effect in EFFECTS:
-        if effect in held:
-            continue
-        for j in range(search.data.joints):
-            if effect_there(fit, effect, j):
-                bare = without_effect(search, bare, effect, j)
-    for effect in _shared_beside(search, fit, held):
-        bare = without_group(search, bare, (effect, ()))
+    for group in _not_held(search, fit, held):
+        bare = without_group(search, bare, group)
     share = compensation(search, fit)
     if share is None:
         share = np.full(search.data.joints, search.data.plant.compensated)
@@ -104,19 +92,17 @@ def native_fit(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE)
     dry = fit.point["stribeck"] * ("friction.stribeck" not in held) + loaded * ("friction.load" not in held)
     bare = bare.with_values(coulomb=np.maximum(bare.point["coulomb"], fit.point["coulomb"] + dry))
     # a PID actuator, which holds slew limit and integral part, has no filter: a delay takes its place
-    unfiltered = (search.data.plant.servos.lag > 0.0) & needs_pid(bare, held)
+    unfiltered = (search.data.plant.servo["lag"] > 0.0) & needs_pid(bare, held)
     late = bare.point["delay"] + np.where(unfiltered, bare.point["lag"], 0.0)
     bare = bare.with_values(lag=np.where(unfiltered, 0.0, bare.point["lag"]), delay=late)
-    again = [("coulomb", "viscous", "delay") if lost else ("coulomb", "viscous") for lost in unfiltered]
-    wanted = [
-        (*(n for n in own if n != "lag" or not lost), *(n for n in more if n not in own))
-        for own, more, lost in zip(bare.active, again, unfiltered, strict=True)
-    ]
-    changed = (bare.active, bare.shared) != (fit.active, fit.shared) or bool(unfiltered.any())
+    changed = bare.free != fit.free or bool(unfiltered.any())
     changed = changed or bool(np.any(fit.point["kd"] != 0.0) or np.any(fit.point["feed"] != share))
     if not changed:
         return fit
-    return search.improve(replace(bare, active=tuple(wanted), rms=None), 3)
+    free = [(j, name) for j, name in bare.free if name != "lag" or not unfiltered[j]]
+    for j, lost in enumerate(unfiltered):
+        free += [(j, "coulomb"), (j, "viscous"), *([(j, "delay")] if lost else [])]
+    return search.improve(bare.freed(free), 3)
 
 
 def needs_pid(fit: LoopFit, held: Collection[str] = NATIVE) -> Mask:
@@ -128,7 +114,7 @@ def needs_pid(fit: LoopFit, held: Collection[str] = NATIVE) -> Mask:
 def compensation(search: LoopSearch, fit: LoopFit) -> Array | None:
     """Share of gravity that the controller makes up for, the same at all joints that feel it, (J,); None if it differs,
     which no body's `gravcomp` holds."""
-    arm, share = search.data.plant.sim.arm, fit.point["feed"]
+    arm, share = search.arm, fit.point["feed"]
     q = search.data.first.T
     feels = np.abs(arm.torque(q, 0.0 * q, 0.0 * q)).max(0) > FELT_NM
     if not feels.any() or np.ptp(share[feels]) > ALIKE:
@@ -138,17 +124,11 @@ def compensation(search: LoopSearch, fit: LoopFit) -> Array | None:
 
 def effects_left_out(search: LoopSearch, fit: LoopFit, held: Collection[str] = NATIVE) -> list[str]:
     """Effects of a fit that a simulator which has those `held` lacks, with their joints."""
-    names = search.data.plant.sim.arm.names
-    return sorted(
-        {effect.replace("@", " ") for effect in _shared_beside(search, fit, held)}
-        | {
-            f"{effect} {name}"
-            for effect in EFFECTS
-            for j, name in enumerate(names)
-            if effect not in held and effect_there(fit, effect, j)
-            if effect != "controller.feed_forward" or compensation(search, fit) is None
-        }
-    )
+    out: list[str] = []
+    for effect, joints in _not_held(search, fit, held):
+        if effect != "controller.feed_forward" or compensation(search, fit) is None:
+            out += [f"{effect} {search.arm.names[j]}" for j in joints] or [effect.replace("@", " ")]
+    return sorted(out)
 
 
 def export_fit(
@@ -172,12 +152,12 @@ def export_fit(
     spec.compile()
     head = "These effects are left out, since MJCF has no field for them (the other effects were fitted without them):"
     comment = xml_comment([head, *left]) if left else ""
-    return Exported(comment + spec.to_xml(), tuple(left), native)
+    return Exported(comment + spec.to_xml(), tuple(left), fit=native)
 
 
 def export_with_module(sim: SimModel, search: LoopSearch, fit: LoopFit) -> Exported | None:
     """MJCF that is to be used with a module for friction that MJCF cannot hold; None if there is no such friction."""
-    if not any(effect_there(fit, effect, j) for effect in IN_MODULE for j in range(sim.n)):
+    if not {effect for effect, _ in present(search, fit)} & {*IN_MODULE}:
         return None
     return export_beside_module(sim, search, fit, native_fit(search, fit, WRITTEN))
 
@@ -185,23 +165,16 @@ def export_with_module(sim: SimModel, search: LoopSearch, fit: LoopFit) -> Expor
 def export_beside_module(sim: SimModel, search: LoopSearch, fit: LoopFit, native: LoopFit) -> Exported:
     """MJCF of a native fit, with the effects that a module applies beside it and those of the whole fit left out."""
     effects: list[JointEffect] = []
-    for effect in IN_MODULE:
-        own = EFFECTS[effect]
-        for j in range(sim.n):
-            if effect_there(native, effect, j):
-                pairs = zip(own.reported, own.parameters, strict=True)
-                values = {called: float(native.point[name][j]) for called, name in pairs}
-                effects.append((effect, sim.arm.names[j], values))
+    for effect, joints in present(search, native):
+        for j in joints if effect in IN_MODULE else ():
+            pairs = zip(EFFECTS[effect].reported, EFFECTS[effect].parameters, strict=True)
+            values = {called: float(native.point[name][j]) for called, name in pairs}
+            effects.append((effect, sim.arm.names[j], values))
     return replace(export_fit(sim, search, fit, native, WRITTEN), effects=tuple(effects))
 
 
-def _shared_beside(search: LoopSearch, fit: LoopFit, held: Collection[str]) -> list[str]:
-    """Effects of the whole arm in a fit that are not among those held."""
-    return [
-        effect
-        for effect, names in shared_effects(search.data.plant.sim.arm).items()
-        if effect.partition("@")[0] not in held and {*names} & {*fit.shared}
-    ]
+def _not_held(search: LoopSearch, fit: LoopFit, held: Collection[str]) -> list[Group]:
+    return [group for group in present(search, fit) if id_of(group) not in held]
 
 
 def _set_actuator(spec: Any, plant: MovedModel, model: Any, fit: LoopFit, j: int) -> None:
@@ -209,7 +182,7 @@ def _set_actuator(spec: Any, plant: MovedModel, model: Any, fit: LoopFit, j: int
     or where only a PID one holds what was found."""
     import mujoco
 
-    joint, i = spec.joints[plant.joints[j]].name, int(plant.servos.actuator[j])
+    joint, i = spec.joints[plant.joints[j]].name, int(plant.actuator[j])
     old = [a for a in spec.actuators if a.target == joint and a.trntype == mujoco.mjtTrn.mjTRN_JOINT]
     point = {name: float(value[j]) for name, value in fit.point.items() if len(value) == plant.n}
     optional = {"ki": point["ki"] * point["gain"], "slewmax": point["slew"]}
@@ -237,5 +210,5 @@ def _set_actuator(spec: Any, plant: MovedModel, model: Any, fit: LoopFit, j: int
             made.forcelimited, made.forcerange = 1, [-limit, limit]
     if i >= 0 and model.actuator_ctrllimited[i]:
         made.ctrllimited, made.ctrlrange = 1, model.actuator_ctrlrange[i]
-    if not kept or point["delay"] != plant.servos.delay[j]:
+    if not kept or point["delay"] != plant.servo["delay"][j]:
         put_delay(made, point["delay"])

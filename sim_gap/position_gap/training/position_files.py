@@ -10,10 +10,10 @@ from gcomp.arrays import Array
 from sim_gap.better_model.export import module_path, module_text, write_files
 from sim_gap.better_model.training_files import Row, steps_of, write_entries, write_rows
 from sim_gap.better_model.urdf import URDF, xml_comment
-from sim_gap.position_gap.choice import effect_there
+from sim_gap.position_gap.choice import present
 from sim_gap.position_gap.identify import Identified
-from sim_gap.position_gap.training.draws import draw
 from sim_gap.position_gap.training.export import BATCHED, NATIVE, Exported, effects_left_out, export_fit, native_fit
+from sim_gap.position_gap.training.spread import draw
 
 DELAY_DRAWS = 400
 """Draws of the parameters from which the range of a delay is taken."""
@@ -57,7 +57,7 @@ def _beside(found: Identified, path: Path) -> dict[Path, str | None]:
 def export_batched(found: Identified) -> Exported | None:
     """The corrected model without PID actuators, fitted again without them; None if it has none."""
     native = found.native
-    if not any(effect_there(native, effect, j) for effect in set(NATIVE) - BATCHED for j in range(found.sim.n)):
+    if not {effect for effect, _ in present(found.search, native)} & ({*NATIVE} - BATCHED):
         return None
     bare = native_fit(found.search, native, BATCHED)
     return export_fit(found.sim, found.search, found.fit, bare, BATCHED)

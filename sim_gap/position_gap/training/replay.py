@@ -12,7 +12,8 @@ from gcomp.arrays import Array, Mask
 from sim_gap.better_model.forward_effects import Effects
 from sim_gap.better_model.native_drives import hold
 from sim_gap.model.load import SimModel
-from sim_gap.position_gap.choice import Group, LoopSearch, without_group
+from sim_gap.position_gap.choice import without_group
+from sim_gap.position_gap.fit import Group, LoopSearch
 from sim_gap.position_gap.plant import HeldParts, held_model, silent
 from sim_gap.position_gap.training.export import Exported, export_beside_module
 from sim_gap.position_gap.windows import LEAST_S, pieces_of

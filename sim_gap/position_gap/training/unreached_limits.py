@@ -11,14 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gcomp.arrays import Array
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, Point, batch, residuals, root_mean_squares
+from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 
 HEADROOM = 10.0
 """Ratio of the highest level of the prior to the least that the training motion admits: recordings use between a tenth
 and all of what a drive can do."""
-COUNT = 20
-"""Levels of the prior."""
 ABOVE = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """Levels that are tried, over what the training motion asks for: commands are held from row to row, so that a limit of
 their speed shows far above it."""
@@ -34,12 +31,12 @@ class Unreached:
 
     joint: int
     name: str
-    levels: Array
-    """Where it may lie, rising by a common factor (L,)."""
-    weights: Array
-    """Probability of each (L,)."""
     least: float
     """Lowest level that the training motion admits."""
+
+    @property
+    def most(self) -> float:
+        return HEADROOM * self.least
 
 
 def find_unreached(search: LoopSearch, fit: LoopFit) -> tuple[Unreached, ...]:
@@ -52,8 +49,7 @@ def find_unreached(search: LoopSearch, fit: LoopFit) -> tuple[Unreached, ...]:
             least = float(admitted[j])
             if np.isfinite(fit.point[name][j]) or effect in search.excluded or j in search.resting or least <= 0.0:
                 continue
-            levels = np.geomspace(least, HEADROOM * least, COUNT)
-            out.append(Unreached(j, name, levels, np.full(COUNT, 1.0 / COUNT), least))
+            out.append(Unreached(j, name, least))
     return tuple(out)
 
 
@@ -62,15 +58,11 @@ def _least_admitted(search: LoopSearch, fit: LoopFit, name: str, asked: Array) -
     levels = np.array(ABOVE)[:, None] * np.maximum(asked, 1e-9)
     joints = np.arange(len(asked))
 
-    def score(point: Point) -> Array:
-        left = residuals(search.data, batch([point]))
-        return search.score(LoopFit(dict(point), fit.active, rms=root_mean_squares(search.data, left)[0]))
-
-    bare = score(fit.point)
+    bare = search.score(fit.point)
     low, high = np.zeros(len(asked), int), np.full(len(asked), len(ABOVE) - 1)  # the highest is admitted in any case
     while np.any(low < high):
         middle = (low + high) // 2
-        costly = score({**fit.point, name: levels[middle, joints]}) - bare >= COSTS
+        costly = search.score({**fit.point, name: levels[middle, joints]}) - bare >= COSTS
         low, high = np.where(costly & (low < high), middle + 1, low), np.where(costly, high, middle)
     return np.where(asked > 0.0, levels[low, joints], 0.0)
 
@@ -78,7 +70,7 @@ def _least_admitted(search: LoopSearch, fit: LoopFit, name: str, asked: Array) -
 def _torques(search: LoopSearch, fit: LoopFit) -> Array:
     """Torque that each servo is asked for along the training motion, (J,) [N·m]."""
     data, point = search.data, fit.point
-    error = data.error - residuals(data, batch([point]))[0]
+    error = data.error - residuals(data, [point])[0]
     kp, inner = (point[name][:, None] for name in ("kp", "kv"))
     damping = np.minimum(inner, point["viscous"][:, None]) + point["kd"][:, None]
     return _highest(search, np.abs(kp * error * data.scale - damping * data.v))
@@ -104,13 +96,8 @@ def _highest(search: LoopSearch, values: Array) -> Array:
 
 
 def draw_limits(limits: Sequence[Unreached], count: int, random: np.random.Generator) -> list[Array]:
-    """Draws of each limit, (count,): levels by their weights, spread evenly over the factor between two."""
-    out = []
-    for each in limits:
-        ratio = float(each.levels[1] / each.levels[0])
-        at = random.choice(each.levels, size=count, p=each.weights)
-        out.append(np.asarray(at * ratio ** random.uniform(-0.5, 0.5, count)))
-    return out
+    """Draws of each limit, (count,)."""
+    return [np.asarray(each.least * HEADROOM ** random.uniform(size=count)) for each in limits]
 
 
 def describe(limits: Sequence[Unreached], names: Sequence[str]) -> str:

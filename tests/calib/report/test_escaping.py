@@ -7,6 +7,7 @@ import plotly.graph_objects as graph
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plotly.offline import get_plotlyjs_version
 
 import calib.report.page as report_page
 from calib.report.page import ReportSection, bullets, html_of, paragraph, paragraphs, render, verdict_line
@@ -66,9 +67,11 @@ def page_with(name: str, folder: Path) -> Tags:
 
 
 @pytest.fixture(autouse=True)
-def _without_plotly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its script has four megabytes, and is the same in every page."""
-    monkeypatch.setattr("plotly.offline.get_plotlyjs", lambda: "/* plotly */")
+def _without_plotly(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Its script has a megabyte, and is the same in every page."""
+    script = folder / "plotly.js"
+    script.write_text("/* plotly */")
+    monkeypatch.setattr(report_page, "SCRIPT", script)
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +96,12 @@ def test_a_page_has_the_same_tags_whatever_names_are_on_it(folder: Path) -> None
 @pytest.mark.parametrize("name", ["<x-evil>", "a & b", "{{ 7 * 7 }}"])
 def test_a_name_reads_as_it_is(name: str, folder: Path) -> None:
     assert name in page_with(name, folder).texts
+
+
+def test_the_page_has_the_script_of_the_plotly_that_makes_its_figures() -> None:
+    script = Path(report_page.__file__).with_name("plotly-basic.min.js").read_text(encoding="utf-8")
+    assert script.splitlines()[1] == f"* plotly.js (basic - minified) v{get_plotlyjs_version()}"
+    assert len(script) < 1_300_000
 
 
 def test_texts_of_figures_are_escaped_for_plotly_too() -> None:

@@ -9,7 +9,7 @@ from wrong_arms import Wrong, model, record
 from sim_gap.attribution.diagnose import diagnose
 from sim_gap.attribution.residual_laws import as_effects
 from sim_gap.better_model.forward_effects import Effects
-from sim_gap.report.cause_figures import law_figure
+from sim_gap.report.figures import law_figure
 
 FRICTION = [f"friction.{name}" for name in ("coulomb", "viscous", "stribeck", "asymmetric", "load")]
 WARM_NM, WARM_S = 1.5, 12.0

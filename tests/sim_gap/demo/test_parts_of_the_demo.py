@@ -1,4 +1,4 @@
-"""Parts of the demo that need no simulated arm: its motion, the joint that drifts, its summary."""
+"""Parts of the demo that need no simulated arm: the joint that drifts, its summary."""
 
 from types import SimpleNamespace
 
@@ -6,33 +6,8 @@ import numpy as np
 import pytest
 
 from sim_gap.demo.account import Account
-from sim_gap.demo.bench import ACCELERATION, RANGE_SHARE, SPEED_SHARE, drifting_joint, multisine
+from sim_gap.demo.bench import drifting_joint
 from sim_gap.demo.run import BY, Demo
-
-
-def motion(low: float, high: float, speeds: tuple[float, float], seed: int) -> tuple[np.ndarray, ...]:
-    """Position, velocity and acceleration of two joints over a minute, once it is at its full size."""
-    link = SimpleNamespace(rate=200.0, period=0.005)
-    limits = [SimpleNamespace(max_velocity=speed) for speed in speeds]
-    arm = SimpleNamespace(require_link=lambda: SimpleNamespace(joints=limits))
-    described = SimpleNamespace(n=2, lower=np.array([-1.0, low]), upper=np.array([1.0, high]))
-    q = multisine(SimpleNamespace(arm=arm, described=described, link=link), 60.0, seed)[1000:]
-    v = np.diff(q, axis=0) * link.rate
-    return q, v, np.diff(v, axis=0) * link.rate
-
-
-def test_its_motion_keeps_range_speed_and_acceleration() -> None:
-    q, v, a = motion(-3.0, 2.0, (0.2, 8.0), 1)
-    assert (np.abs(q - [0.0, -0.5]) <= RANGE_SHARE * np.array([1.0, 2.5]) + 1e-9).all()
-    assert (np.abs(v) <= SPEED_SHARE * np.array([0.2, 8.0]) + 1e-6).all()
-    assert np.abs(a).max() <= ACCELERATION + 1e-6
-    assert (np.ptp(q, axis=0) > 0.05).all()
-
-
-def test_its_motion_uses_the_acceleration_that_it_may() -> None:
-    """On a joint with range and speed in plenty; where the sines meet, in the course of a minute."""
-    _, _, a = motion(-90.0, 90.0, (1.0, 50.0), 3)
-    assert 0.95 * ACCELERATION < np.abs(a[:, 1]).max() <= ACCELERATION + 1e-6
 
 
 @pytest.mark.parametrize(

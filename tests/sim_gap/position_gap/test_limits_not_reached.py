@@ -4,15 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from servo_arm import model_text, record, search_on
+from servo_arm import at_both, model_text, record, search_on
 
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit
+from sim_gap.position_gap.fit import LoopFit, LoopSearch
 from sim_gap.position_gap.training import bands, unreached_limits
 from sim_gap.position_gap.training.bands import band
-from sim_gap.position_gap.training.draws import draw
-from sim_gap.position_gap.training.jackknife import gaps_left_out, terms_of
-from sim_gap.position_gap.training.spread import covariance, known_before
+from sim_gap.position_gap.training.spread import covariance, draw, gaps_left_out, known_before, terms_of
 
 GAIN, FASTER = 15.0, 2.0
 TEXT = model_text(kp=GAIN, friction=0.2)
@@ -22,12 +19,12 @@ FOUND = ("kp", "coulomb", "viscous")
 def of(text: str) -> tuple[LoopSearch, LoopFit]:
     """Search and fit of a training recording of the arm without limits."""
     search = search_on(text, [record(TEXT, 1, 14.0)])
-    return search, search.improve(LoopFit(search.nominal, (FOUND, FOUND)))
+    return search, search.improve(LoopFit(search.nominal).freed(at_both(*FOUND)))
 
 
 def left_out(search: LoopSearch, fit: LoopFit) -> np.ndarray:
     terms = terms_of(search, fit)
-    return gaps_left_out(search.data, terms, known_before(search, fit, terms.names))
+    return gaps_left_out(search.data, terms, known_before(search, fit))
 
 
 @pytest.fixture(scope="module")

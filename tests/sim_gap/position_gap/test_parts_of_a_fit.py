@@ -6,19 +6,19 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
-from servo_arm import model_text, record, search_on
+from servo_arm import at_both, model_text, record, search_on
 
 from armlink.recording.recording import Recording
 from sim_gap.better_model.corrected_model import body_parameters, set_body
 from sim_gap.position_gap import choice as edits
+from sim_gap.position_gap import fit as fitting
 from sim_gap.position_gap.choice import best_level, look_about, select
-from sim_gap.position_gap.fit import LoopFit, batch, coordinate, evaluate, jacobian, residuals
+from sim_gap.position_gap.fit import LoopFit, jacobian, residuals, rms_on
 from sim_gap.position_gap.identify import _frozen
-from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.parameters import PARAMETERS, Scales, step_parameter
 from sim_gap.position_gap.training import export, position_files, spread
 from sim_gap.position_gap.training import replay as replays
-from sim_gap.position_gap.windows import choose_windows, thin_moving
+from sim_gap.position_gap.windows import choose_windows, thin
 
 TEXT = model_text(kp=15.0, friction=0.2)
 
@@ -39,38 +39,26 @@ def test_what_nothing_can_show_is_left_out(gravity: float, off: bool, frozen: se
     assert _frozen(sim, SimpleNamespace(served=served)) == frozen
 
 
-def test_a_coefficient_of_the_whole_arm_is_one_and_a_joints_is_in_its_own_scale() -> None:
-    fit = SimpleNamespace(point={"tilt.x": np.array([0.03]), "coulomb": np.array([0.5, 0.8])})
-    search = SimpleNamespace(scales=SimpleNamespace(of=lambda name: np.array([0.1, 0.2])))
-    assert coordinate(fit, search.scales, -1, "tilt.x") == 0.03
-    assert coordinate(fit, search.scales, 1, "coulomb") == pytest.approx(4.0)
-
-
 def test_an_effect_of_the_whole_arm_is_taken_out_by_its_own_names(monkeypatch) -> None:
-    monkeypatch.setattr(edits, "shared_effects", lambda arm: {"base.tilt": ("tilt.x", "tilt.y"), "other": ("z",)})
+    monkeypatch.setattr(fitting, "shared_effects", lambda arm: {"base.tilt": ("tilt.x", "tilt.y"), "other": ("z",)})
     names = ("tilt.x", "tilt.y", "z")
-    fit = LoopFit({name: np.array([0.3]) for name in (*names, "kp")}, ((),), names)
-    bare = edits.without_group(
-        SimpleNamespace(data=SimpleNamespace(plant=SimpleNamespace(sim=SimpleNamespace(arm=None)))),
-        fit,
-        ("base.tilt", ()),
-    )
+    fit = LoopFit({name: np.array([0.3]) for name in (*names, "kp")}, tuple((-1, name) for name in names))
+    arm = SimpleNamespace(plant=SimpleNamespace(sim=SimpleNamespace(arm=None)))
+    bare = edits.without_group(fitting.LoopSearch(arm, None, {}, np.zeros(1)), fit, ("base.tilt", ()))
     assert {name: float(x[0]) for name, x in bare.point.items()} == {"z": 0.3, "kp": 0.3}
-    assert bare.shared == ("z",)
+    assert bare.free == ((-1, "z"),)
 
 
 def test_of_one_motion_what_is_left_of_the_way_to_the_command_is_what_another_may_show(monkeypatch) -> None:
     """A twentieth of it at the first joint, nothing at the second, half at the third, of which no more is unknown than
     of what a model states; nothing where several recordings show it."""
-    monkeypatch.setattr(spread, "rms_on", lambda data, fit: np.array([0.001, 0.0, 0.01]))
-    fit = LoopFit(
-        {"kp": np.array([15.0, 10.0, 5.0]), "coulomb": np.array([0.3, 0.2, 0.1])}, (("kp", "coulomb"), ("kp",))
-    )
+    monkeypatch.setattr(spread, "rms_on", lambda data, point: np.array([0.001, 0.0, 0.01]))
+    fit = LoopFit({"kp": np.array([15.0, 10.0, 5.0]), "coulomb": np.array([0.3, 0.2, 0.1])})
     torque, one = np.full(3, 0.5), np.ones(3)
     scales = Scales(torque, one, one, np.full(3, 0.02))
-    search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True), scales=scales)
+    search = SimpleNamespace(data=SimpleNamespace(of_one_recording=True, joints=3), scales=scales)
     share = 0.05 * spread.OTHERWISE
-    found = np.diag(spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp"), (2, "kp")]))
+    found = spread._of_one_motion(search, fit, [(0, "kp"), (0, "coulomb"), (1, "kp"), (2, "kp")])
     coulomb = share * 0.3 / scales.of("coulomb")[0]
     np.testing.assert_allclose(found, [share**2, coulomb**2, 0.0, spread.STATED**2])
     two = SimpleNamespace(data=SimpleNamespace(of_one_recording=False), scales=scales)
@@ -114,14 +102,13 @@ def test_friction_that_a_simulator_cannot_hold_is_added_to_coulombs(monkeypatch)
         "delay": 0.0,
         "lag": 0.0,
     }
-    fit = LoopFit({name: np.array([value]) for name, value in own.items()}, (("coulomb", "stribeck", "load"),))
-    servos = SimpleNamespace(lag=nothing)
-    plant = SimpleNamespace(compensated=0.0, servos=servos, sim=SimpleNamespace(arm=SimpleNamespace(names=())))
+    fit = LoopFit({name: np.array([value]) for name, value in own.items()})
+    fit = fit.freed([(0, "coulomb"), (0, "stribeck"), (0, "stribeck_velocity"), (0, "load")])
+    plant = SimpleNamespace(compensated=0.0, servo={"lag": nothing}, sim=SimpleNamespace(arm=SimpleNamespace(names=())))
     data = SimpleNamespace(joints=1, torque=np.full((5, 1, 2), 4.0), plant=plant)
     monkeypatch.setattr(export, "compensation", lambda search, fit: None)
-    search = SimpleNamespace(
-        data=data, nominal=dict.fromkeys(own, nothing), scales=None, improve=lambda fit, iterations: fit
-    )
+    monkeypatch.setattr(fitting.LoopSearch, "improve", lambda search, fit, iterations: fit)
+    search = fitting.LoopSearch(data, None, dict.fromkeys(own, nothing), nothing)
     held = export.native_fit(search, fit)
     assert held.point["coulomb"] == pytest.approx([0.2 + 0.3 + 0.4])
     assert held.point["stribeck"] == held.point["load"] == 0.0
@@ -137,9 +124,8 @@ def test_the_opening_of_a_replay_is_not_judged(monkeypatch) -> None:
 
 def test_slopes_are_those_of_the_residual() -> None:
     search = search_on(TEXT, [record(TEXT, 1, 14.0)])
-    fit = LoopFit(search.nominal, (("kp", "viscous"), ("kp", "viscous")))
-    now, slopes = jacobian(search.data, fit, search.scales, fit.active)
-    change = residuals(search.data, batch([{**fit.point, "kp": fit.point["kp"] * np.exp(0.03)}]))[0] - now
+    now, slopes = jacobian(search, search.nominal, at_both("kp", "viscous"))
+    change = residuals(search.data, [{**search.nominal, "kp": search.nominal["kp"] * np.exp(0.03)}])[0] - now
     for j in range(2):
         expected = 0.03 * slopes[j][0]
         assert np.linalg.norm(change[:, j] - expected) < 0.2 * np.linalg.norm(expected)
@@ -149,7 +135,7 @@ def test_a_parameter_at_its_highest_value_has_a_slope_too() -> None:
     """Else a fit that has come there never leaves, and its interval would be nothing."""
     search = search_on(TEXT, [record(TEXT, 1, 8.0)])
     point = {**search.nominal, "load": np.full(2, PARAMETERS["load"].high)}
-    _, slopes = jacobian(search.data, LoopFit(point, (("load",), ("load",))), search.scales, (("load",), ("load",)))
+    _, slopes = jacobian(search, point, at_both("load"))
     assert all(np.linalg.norm(slope) > 0.0 for slope in slopes)
 
 
@@ -162,9 +148,9 @@ def test_a_joint_that_moves_in_few_windows_moves_in_one_that_is_fitted() -> None
     still[7] = 0.0
     speed = many.v.copy()
     speed[:, 1] *= 0.1 * still + (1.0 - still)
-    assert thin_moving(replace(many, v=speed), 4).recording.tolist() == [0, 7, 13, 26, 39]
-    assert thin_moving(many, 4).recording.tolist() == [0, 13, 26, 39]
-    assert thin_moving(many, count) is many
+    assert thin(replace(many, v=speed), 4, moving=True).recording.tolist() == [0, 7, 13, 26, 39]
+    assert thin(many, 4, moving=True).recording.tolist() == [0, 13, 26, 39]
+    assert thin(many, count, moving=True) is many
 
 
 def test_a_limit_is_tried_at_the_level_that_fits() -> None:
@@ -172,7 +158,7 @@ def test_a_limit_is_tried_at_the_level_that_fits() -> None:
     weightless = TEXT.replace("<option ", '<option gravity="0 0 0" ')
     real = weightless.replace('<position name="shoulder"', '<position forcerange="-0.45 0.45" name="shoulder"')
     search = search_on(weightless, [record(real, 2, 14.0)])
-    level = best_level(search, LoopFit(search.nominal, ((), ())), "limit")
+    level = best_level(search, LoopFit(search.nominal), "limit")
     assert level[0] == pytest.approx(0.45, rel=0.4)
 
 
@@ -194,23 +180,22 @@ def test_a_limit_is_fitted_by_its_inverse_and_none_is_nothing() -> None:
 @pytest.mark.parametrize(
     ("change", "effects"),
     [
-        (lambda text: text.replace('kp="15.0"', 'kp="11.0"', 1), {"controller.stiffness#0"}),
-        (lambda text: text.replace('damping="0.8"', 'damping="1.4"', 1), {"friction.viscous#0"}),
+        (lambda text: text.replace('kp="15.0"', 'kp="11.0"', 1), {("controller.stiffness", (0,))}),
+        (lambda text: text.replace('damping="0.8"', 'damping="1.4"', 1), {("friction.viscous", (0,))}),
         (
             lambda text: text.replace("<option ", '<option gravity="1.5 0 -9.7" '),
-            {"base.tilt", "position.offset@shoulder"},  # the same, of an arm whose joints are parallel
+            {("base.tilt", ()), ("position.offset@shoulder", ())},  # the same, of an arm whose joints are parallel
         ),
     ],
     ids=["gain", "damping", "tilt"],
 )
-def test_what_differs_alone_is_chosen_alone(change, effects: set[str]) -> None:
+def test_what_differs_alone_is_chosen_alone(change, effects: set[fitting.Group]) -> None:
     """From the model as it is, of all effects of joints and arm."""
     real = change(TEXT)
     search = search_on(TEXT, [record(real, seed, 14.0) for seed in (1, 2)])
     search = replace(search, excluded=frozenset({"actuator.back_emf"}))  # no servo is ever off
-    bare = evaluate(search.data, LoopFit(search.nominal, ((), ())))
-    fit, _ = select(search, bare)
-    assert (rms_on(search.data, fit) < 1.5e-3).all()
+    fit, _ = select(search, LoopFit(search.nominal))
+    assert (rms_on(search.data, fit.point) < 1.5e-3).all()
     assert len(edits.chosen_of(search, fit)) == 1
     assert effects >= {*edits.chosen_of(search, fit)}
 
@@ -218,7 +203,7 @@ def test_what_differs_alone_is_chosen_alone(change, effects: set[str]) -> None:
 def test_what_needs_coulomb_friction_needs_it_where_the_model_has_none() -> None:
     search = search_on(TEXT, [record(TEXT, 1, 8.0)])
     search = replace(search, nominal={**search.nominal, "coulomb": np.array([0.2, 0.0])})
-    names = ["friction.asymmetric#0", "friction.asymmetric#1"]
-    about = look_about(search, evaluate(search.data, LoopFit(search.nominal, ((), ()))), names)
+    names = [("friction.asymmetric", (0,)), ("friction.asymmetric", (1,))]
+    about = look_about(search, LoopFit(search.nominal), names)
     assert about.effects[names[0]].needs == ()
-    assert about.effects[names[1]].needs == ("friction.coulomb#1",)
+    assert about.effects[names[1]].needs == (("friction.coulomb", (1,)),)

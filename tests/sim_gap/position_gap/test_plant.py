@@ -9,9 +9,7 @@ from servo_arm import model_text, record, search_on
 
 from armlink.recording.recording import Recording
 from sim_gap.model.load import load_model
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, evaluate
-from sim_gap.position_gap.judge import rms_on
+from sim_gap.position_gap.fit import LoopSearch, rms_on
 from sim_gap.position_gap.plant import HeldParts, MovedModel, held_model, held_parts, servos_of
 from sim_gap.position_gap.windows import pieces_of
 
@@ -23,7 +21,7 @@ TEXT = model_text(kp=15.0, friction=0.2)
 def left(search: LoopSearch, **values: object) -> np.ndarray:
     """RMS that the nominal model leaves with other values, (J,) [rad]."""
     point = {**search.nominal, **{name: np.broadcast_to(x, 2).astype(float) for name, x in values.items()}}
-    return rms_on(search.data, evaluate(search.data, LoopFit(point, ((), ()))))
+    return rms_on(search.data, point)
 
 
 def pid(text: str) -> str:
@@ -146,9 +144,9 @@ def test_a_models_own_pid_and_delay_are_its_controllers() -> None:
     servo = spec.actuator("elbow")
     servo.set_to_pid(kp=3.0, ki=2.0, kv=0.25, slewmax=8.0, ctrlspec=1)
     servo.gear[0], servo.delay, servo.nsample = 2.0, 0.012, 8
-    own = servos_of(load_model(spec.compile()))
-    assert own.complete
-    shoulder, elbow = np.transpose([own.kp, own.kv, own.ki, own.limit, own.slew, own.delay])
+    actuator, own = servos_of(load_model(spec.compile()))
+    assert actuator.tolist() == [0, 1]
+    shoulder, elbow = np.transpose([own[name] for name in ("kp", "kv", "ki", "limit", "slew", "delay")])
     np.testing.assert_allclose(elbow, [12.0, 1.0, 8.0, np.inf, 4.0, 0.012])
     assert (shoulder[1:] == [0.0, 0.0, np.inf, np.inf, 0.0]).all()
 
@@ -157,8 +155,8 @@ def test_the_efforts_that_a_urdf_states_limit_its_servos() -> None:
     text = model_text(kp=40.0, friction=0.0, limits=(3.0, 3.0)).replace(
         '<joint name="elbow"', '<joint name="elbow" actuatorfrcrange="-2 2"'
     )
-    own = servos_of(load_model(mujoco.MjModel.from_xml_string(text)))
-    assert own.limit.tolist() == [3.0, 2.0]
+    _, own = servos_of(load_model(mujoco.MjModel.from_xml_string(text)))
+    assert own["limit"].tolist() == [3.0, 2.0]
 
 
 def joined(*parts: Recording, gap: float) -> Recording:
@@ -198,5 +196,5 @@ def test_a_model_without_servos_is_driven_through_springs() -> None:
     """The same motion as with servos of that gain and damping."""
     bare = TEXT.partition("<actuator>")[0] + "</mujoco>"
     search = search_on(bare, [record(TEXT, 1, 12.0)])
-    assert not MovedModel(load_model(mujoco.MjModel.from_xml_string(bare))).servos.complete
+    assert not MovedModel(load_model(mujoco.MjModel.from_xml_string(bare))).driven.any()
     assert (left(search, kp=15.0) < 2.2 * READ).all()

@@ -18,7 +18,6 @@ from sim_gap.attribution.position_notes import _beyond, _faster, _released
 from sim_gap.position_gap.identify import gain_scales
 from sim_gap.position_gap.training.bands import band
 from sim_gap.position_gap.training.export import export_with_module
-from sim_gap.position_gap.training.jackknife import gaps_left_out, terms_of
 from sim_gap.position_gap.training.position_files import (
     batch_path,
     export_batched,
@@ -27,8 +26,8 @@ from sim_gap.position_gap.training.position_files import (
     write_samples,
 )
 from sim_gap.position_gap.training.replay import Simulated, replay_rms
-from sim_gap.position_gap.training.spread import known_before
-from sim_gap.report.motion_figure import motion_figure
+from sim_gap.position_gap.training.spread import gaps_left_out, known_before, terms_of
+from sim_gap.report.figures import motion_figure
 from sim_gap.report.page import write_report
 
 REAL = model_text(kp=15.0, friction=0.25)
@@ -150,7 +149,7 @@ def test_a_model_with_a_slew_limit_is_written_without_pid_too(answer, tmp_path: 
     """MuJoCo Warp runs no PID actuator."""
     found = answer.internals
     limited = found.native.with_values(slew=np.array([1.5, np.inf]))
-    limited = replace(limited, active=(("kp", "slew", "coulomb", "viscous"), limited.active[1]))
+    limited = limited.freed([(0, "kp"), (0, "slew"), (0, "coulomb"), (0, "viscous"), *((1, n) for n in limited.at(1))])
     changed = replace(found)
     vars(changed)["native"] = limited
     other = export_batched(changed)
@@ -163,7 +162,7 @@ def test_a_model_with_a_slew_limit_is_written_without_pid_too(answer, tmp_path: 
 def test_a_module_is_written_with_its_model_and_removed_with_it(answer, tmp_path: Path) -> None:
     found = answer.internals
     rubs = found.fit.with_values(load=np.array([0.3, 0.0]))
-    rubs = replace(rubs, active=((*rubs.active[0], "load"), rubs.active[1]))
+    rubs = rubs.freed([*rubs.free, (0, "load")])
     beside = export_with_module(found.sim, found.search, rubs)
     changed = replace(found)
     vars(changed)["beside"] = beside
@@ -230,7 +229,7 @@ def test_the_band_holds_its_share_of_other_motion(answer) -> None:
     assert np.mean(told["holds"]) <= 0.98
     found = answer.internals
     terms = terms_of(found.search, found.fit)
-    left = gaps_left_out(found.search.data, terms, known_before(found.search, found.fit, terms.names))
+    left = gaps_left_out(found.search.data, terms, known_before(found.search, found.fit))
     known = band(found.search, found.fit, replace(found.spread, limits=()), left, found.heldout)
     assert ((known.width > 0.0) & (known.width < 0.03 * answer.heldout_before)).all()
     assert all(1.0 < width / own < 25.0 for width, own in zip(told["half_width"], known.width, strict=True))

@@ -38,7 +38,7 @@ def still(recording: Recording) -> Recording:
 @pytest.mark.long
 def test_its_values_are_the_models_and_a_note_says_so(answer: Diagnosis) -> None:
     fit = answer.internals.fit
-    assert fit.active[1] == ()
+    assert fit.at(1) == ()
     assert fit.point["kp"][1] == MODEL_GAIN
     assert fit.point["coulomb"][1] == 0.0
     assert all("elbow" not in joint for cause in answer.causes for joint in cause.joints)
@@ -66,7 +66,7 @@ def test_a_joint_rests_by_its_command_and_one_without_a_command_does_not() -> No
 def test_the_other_joint_is_told_as_well_as_if_there_were_no_such(answer: Diagnosis) -> None:
     fit = answer.internals.fit
     assert fit.point["kp"][0] == pytest.approx(GAIN, rel=0.02)
-    assert fit.shared == ()
+    assert fit.at(-1) == ()
     assert answer.heldout_after[0] < 0.03 * answer.heldout_before[0]
     assert np.isfinite(answer.band.width).all()
 
@@ -84,10 +84,10 @@ def test_a_model_without_servos_gets_one_that_holds_the_resting_joint_and_moves_
     bare = text[: text.index("<actuator>")] + "</mujoco>"
     search = search_on(bare.replace('frictionloss="0.15"', ""), [still(record(text, 1, 18.0))])
     search = replace(search, excluded=frozenset({"actuator.back_emf"}))
-    search, fit = starting_fit(search, search.data.plant.servos, lambda text: None)
+    search, fit = starting_fit(search, lambda text: None)
     assert search.resting == {1}
     assert search.open_controller
-    assert fit.active[1] == ()
+    assert fit.at(1) == ()
     inertia = search.scales.inertia[1]
     assert np.sqrt(fit.point["kp"][1] / inertia) / (2.0 * np.pi) == pytest.approx(HOLDS_HZ)
     assert fit.point["viscous"][1] == pytest.approx(2.0 * np.sqrt(fit.point["kp"][1] * inertia))

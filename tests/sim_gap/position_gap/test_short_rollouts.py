@@ -9,8 +9,7 @@ from servo_arm import search_on, weight_text
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.diagnose import diagnose
-from sim_gap.position_gap.fit import LoopFit
-from sim_gap.position_gap.judge import rms_on
+from sim_gap.position_gap.fit import rms_on
 from sim_gap.position_gap.plant import follow
 
 FILTERED = '<position name="servo" joint="servo" kp="25" kv="{kv}" timeconst="{lag}" forcerange="-{limit} {limit}"/>'
@@ -37,7 +36,7 @@ def test_a_models_own_steps_leave_nothing(lag: float) -> None:
     )
     search = search_on(text, [roll_out(text, size, 1.0) for size in (0.4, -0.7, 1.1)])
     held_by_friction = 0.3 / 25.0
-    assert rms_on(search.data, LoopFit(search.nominal, ((),))) == pytest.approx(0.0, abs=held_by_friction)
+    assert rms_on(search.data, search.nominal) == pytest.approx(0.0, abs=held_by_friction)
 
 
 def test_a_command_within_the_limit_of_its_change_is_followed_and_another_at_the_limit() -> None:

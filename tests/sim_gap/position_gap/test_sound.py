@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from servo_arm import model_text, record, search_on
 
-from sim_gap.position_gap.fit import LoopFit, evaluate
+from sim_gap.position_gap.fit import LoopFit, rms_on
 from sim_gap.position_gap.identify import _margin
-from sim_gap.position_gap.judge import rms_on
 from sim_gap.position_gap.sound_arm import probable, split_gap
 from sim_gap.position_gap.start import noise_floor
 
@@ -17,9 +16,9 @@ def split(real: str):
     """The gap of the nominal model against an arm, split, with its margin and the RMS that it has [rad]."""
     search, other = (search_on(NOMINAL, [record(real, seed, 26.0)]) for seed in (1, 2))
     search = replace(search, floor=noise_floor(search.data))
-    fit = evaluate(search.data, LoopFit(search.nominal, ((),) * 2))
+    fit = LoopFit(search.nominal)
     margin = _margin(search, fit)
-    return split_gap(search, other.data, margin), margin, rms_on(search.data, fit)
+    return split_gap(search, other.data, margin), margin, rms_on(search.data, fit.point)
 
 
 def test_errors_of_a_hundredth_are_those_of_a_sound_arm() -> None:

@@ -4,15 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from servo_arm import JOINTS, fitted
+from servo_arm import JOINTS, at_both, fitted
 
 from sim_gap.position_gap import sound_arm
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit, batch, residuals
+from sim_gap.position_gap.fit import LoopFit, LoopSearch, residuals
 from sim_gap.position_gap.training import spread
-from sim_gap.position_gap.training.draws import draw
-from sim_gap.position_gap.training.jackknife import WindowTerms, jackknifed, terms_of
-from sim_gap.position_gap.training.spread import Covariance, covariance, covariance_within, interval
+from sim_gap.position_gap.training.spread import (
+    Covariance,
+    WindowTerms,
+    covariance,
+    covariance_within,
+    draw,
+    interval,
+    jackknifed,
+    terms_of,
+)
 
 FRICTION = 0.15, 0.35
 
@@ -99,7 +105,7 @@ def test_draws_of_an_undecided_scale_move_the_arm_as_the_fit_does(weightless) ->
             for name in ("kp", "coulomb", "viscous", "armature")
         }
         points.append({**fit.point, **own})
-    gaps = residuals(search.data, batch([fit.point, *points]))
+    gaps = residuals(search.data, [fit.point, *points])
     moved = np.sqrt(np.mean((gaps[1:] - gaps[0]) ** 2, axis=(1, 2, 3)))
     assert np.median(moved) < 0.001
 
@@ -112,7 +118,7 @@ def test_no_draw_moves_the_arm_further_than_it_may(several) -> None:
 
     def moved(rows: list[dict[str, float]]) -> np.ndarray:
         points = [{**fit.point, "delay": np.array([row["shoulder.delay"], fit.point["delay"][1]])} for row in rows]
-        gaps = residuals(search.data, batch([fit.point, *points]))[:, :, 0]
+        gaps = residuals(search.data, [fit.point, *points])[:, :, 0]
         return np.sqrt(np.mean((gaps[1:] - gaps[0]) ** 2, axis=(1, 2)))
 
     assert np.median(moved(free)) > 0.02
@@ -126,7 +132,7 @@ def test_no_draw_moves_the_arm_further_than_it_may(several) -> None:
 def test_a_value_that_the_model_states_is_open_where_a_gain_rests_on_it(weightless) -> None:
     """Without damping among the effects its value sets the gain's scale, and no recording has measured it."""
     search, fit = weightless
-    some = replace(fit, active=(("kp", "coulomb"), ("kp", "coulomb")))
+    some = fit.freed(at_both("kp", "coulomb"))
     found = covariance(search, some)
     assert (0, "viscous") in found.names
     assert (deviations(found, "kp") > 3.0 * deviations(within(search, some), "kp")).all()
@@ -134,7 +140,7 @@ def test_a_value_that_the_model_states_is_open_where_a_gain_rests_on_it(weightle
 
 def test_of_a_payload_the_centre_is_told_and_not_the_moment() -> None:
     """Of 0.4 ± 0.02 kg and 0.08 ± 0.002 kg·m independent of it: 0.2 m, and relative deviations add in squares."""
-    fit = LoopFit({"payload.mass": np.array([0.4]), "payload.x": np.array([0.08])}, (), ("payload.mass", "payload.x"))
+    fit = LoopFit({"payload.mass": np.array([0.4]), "payload.x": np.array([0.08])})
     found = Covariance([(-1, "payload.mass"), (-1, "payload.x")], np.diag([0.02**2, 0.002**2]))
     centre, low, high, unit = spread.payload_centre(fit, found, "payload.x")
     assert (centre, unit) == (pytest.approx(0.2), "m")
@@ -147,7 +153,7 @@ def test_a_payload_is_no_surer_than_the_masses_of_the_model(several) -> None:
     search, fit = several
     names = ("payload.mass", "payload.x", "payload.z")
     point = {**fit.point, **{name: np.zeros(2) for name in names}}
-    found = covariance(search, replace(fit, point=point, shared=names))
+    found = covariance(search, replace(fit, point=point).freed([*fit.free, *((-1, name) for name in names)]))
     assert [name for j, name in found.names if j < 0] == list(names)
     own = float(np.linalg.norm(search.data.plant.sim.arm.inertial[-1, 1:4]))
     at = found.names.index((-1, "payload.x"))
@@ -157,8 +163,7 @@ def test_a_payload_is_no_surer_than_the_masses_of_the_model(several) -> None:
 def test_what_a_sound_arm_may_have_beside_an_effect_widens_its_interval(several) -> None:
     """Friction alone is fitted to an arm whose gain is 3 % off: what the gain takes up is open."""
     search, fit = several
-    stiffer = replace(fit, point={**fit.point, "kp": 1.03 * fit.point["kp"]}, active=(("coulomb",), ("coulomb",)))
-    some = search.improve(stiffer)
+    some = search.improve(fit.with_values(kp=1.03 * fit.point["kp"]).freed(at_both("coulomb")))
     for joint in (0, 1):
         wide, own = covariance(search, some), within(search, some)
         assert deviations(wide, "coulomb")[joint] > deviations(own, "coulomb")[joint]

@@ -7,14 +7,13 @@ from types import ModuleType, SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
-from servo_arm import model_text, record, search_on, written
+from servo_arm import at_both, model_text, record, search_on, written
 
 from armlink.recording.recording import Recording
 from sim_gap.attribution.position_notes import _ranges
 from sim_gap.better_model.export import module_text
 from sim_gap.model.load import SimModel, load_model
-from sim_gap.position_gap.choice import LoopSearch
-from sim_gap.position_gap.fit import LoopFit
+from sim_gap.position_gap.fit import LoopFit, LoopSearch
 from sim_gap.position_gap.training.export import (
     IN_MODULE,
     Exported,
@@ -36,8 +35,8 @@ def made(tmp_path_factory) -> tuple[SimModel, LoopSearch, LoopFit]:
     """An arm whose gears rub under load, and the fit that knows it."""
     sim = load_model(written(tmp_path_factory.mktemp("arm"), TEXT))
     search = search_on(TEXT, [record(TEXT, seed, 14.0, load=LOAD) for seed in (1, 2)])
-    known = ("kp", "coulomb", "viscous", "load")
-    return sim, search, search.improve(LoopFit({**search.nominal, "load": np.full(2, 0.1)}, (known, known)), 4)
+    known = at_both("kp", "coulomb", "viscous", "load")
+    return sim, search, search.improve(LoopFit({**search.nominal, "load": np.full(2, 0.1)}).freed(known), 4)
 
 
 def loaded(sim: SimModel, beside: Exported) -> Simulated:
@@ -70,7 +69,7 @@ def test_the_module_holds_friction_under_load_that_the_model_alone_cannot(made) 
 
 def test_the_model_with_a_module_says_what_neither_holds(made) -> None:
     sim, search, fit = made
-    fed = replace(fit.with_values(feed=np.array([0.2, 0.0])), active=((*fit.active[0], "feed"), fit.active[1]))
+    fed = fit.with_values(feed=np.array([0.2, 0.0])).freed([*fit.free, (0, "feed")])
     beside = export_with_module(sim, search, fed)
     assert beside.lines == ("controller.feed_forward shoulder",)
     assert "controller.feed_forward shoulder" in beside.xml
@@ -86,7 +85,7 @@ def test_the_replay_leaves_the_model_and_mujoco_as_they_were(made) -> None:
 
 def test_a_fit_without_such_friction_needs_no_module(made) -> None:
     sim, search, fit = made
-    bare = replace(fit.with_values(load=np.zeros(2)), active=(("kp", "coulomb", "viscous"),) * 2)
+    bare = fit.with_values(load=np.zeros(2)).freed(at_both("kp", "coulomb", "viscous"))
     assert export_with_module(sim, search, bare) is None
     assert set(IN_MODULE) == {"friction.stribeck", "friction.load", "friction.asymmetric"}
 
