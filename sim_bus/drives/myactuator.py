@@ -42,6 +42,8 @@ class MyActuatorDrive(SimulatedDrive):
         """Targets [N·m], [rad], [rad/s]; integral term of the position loop [N·m]."""
         self._most_speed = math.inf
         """[rad/s]."""
+        self._was = (0.0, motor.position, 0.0)
+        """When a step of the arm ended [s], the position then, and the mean speed in it."""
 
     # ---- bus
 
@@ -111,6 +113,17 @@ class MyActuatorDrive(SimulatedDrive):
     def _angle(self) -> bytes:
         counts = round(self.told().position / self.scale("position") / CENTIDEGREE)
         return struct.pack("<Ii", 0x92, max(-0x7FFFFFFF, min(0x7FFFFFFF, counts)))
+
+    @property
+    def speed(self) -> float:
+        """The mean of a step, in which its many cycles follow a target that stands still, not that of its end."""
+        return self._was[2]
+
+    def pass_time(self, now: float) -> None:
+        super().pass_time(now)
+        then, before, _ = self._was
+        if now > then:
+            self._was = (now, self.motor.position, (self.motor.position - before) / (now - then))
 
     # ---- loops
 
