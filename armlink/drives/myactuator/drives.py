@@ -33,7 +33,7 @@ POLLED = (RmdCommand.ERROR, RmdCommand.RUNTIME)
 CLOCK_TOLERANCE = 1000
 """A time since the start that is further off than this since it was last told is that of a drive that has restarted
 [ms]: how late a reply may come to a host that stood still."""
-LOADED = 0.05
+LOADED = 0.02
 """A torque above this share of its limit shows whether the drive still makes it."""
 FOLLOWS = 0.5
 """A drive that makes less than this share of the torque that it made before does not follow any more."""
@@ -351,6 +351,6 @@ def find_drives(bus: SearchedBus) -> list[FoundDrive]:
     return found
 
 
-SEARCH = Discovery("model (B5h) of ids 1 to 32", find_drives, ("canopen", "cubemars", "damiao", "moteus", "odrive"))
+SEARCH = Discovery("model (B5h) of ids 1 to 32", find_drives, ("canopen", "damiao", "moteus", "odrive"))
 SUMMARY = "MyActuator RMD-X with V3 drives (protocol V3.4 to V4.2)"
 FAMILY = Family("myactuator", TRAITS, MyActuatorSettings, MyActuatorDrives, discovery=SEARCH, summary=SUMMARY)
