@@ -69,7 +69,7 @@ class MyActuatorDrive(SimulatedDrive):
             self.tell(lambda: self._reply(self._state(command)), READINGS)
         elif command == 0x92:
             self.tell(lambda: self._reply(self._angle()), ("position",))
-        elif command in (0x80, 0x81):
+        elif command in (0x77, 0x78, 0x80, 0x81):  # it has no brake to release or to lock
             self._obey(command, data)
             self._reply(data)
         elif command in KEPT or command == 0xB3:
@@ -135,7 +135,7 @@ class MyActuatorDrive(SimulatedDrive):
         """Only without an error; a loop is entered by its command alone."""
         if command == 0x80:
             self._leave()
-        elif command == 0x9C or self.error or (command == 0x81 and not self.mode):
+        elif command in (0x77, 0x78, 0x9C) or self.error or (command == 0x81 and not self.mode):
             return
         elif command == 0xA1:
             current = struct.unpack_from("<h", data, 4)[0] * CENTIAMPERE
