@@ -32,7 +32,7 @@ class MyActuatorDrive(SimulatedDrive):
         self.address: int = settings.id
         self.constant: float = settings.constant
         self.model = (settings.model or "X8S2V10").replace("-", "")[:7]
-        self.timeout = settings.timeout_ms / 1000
+        self.timeout: float = settings.timeout_ms / 1000
         """[s]; 0: none."""
         self.mode, self.stalled, self.started = NO_LOOP, False, 0.0
         self._gains = motor.tuned

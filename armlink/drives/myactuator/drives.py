@@ -316,7 +316,7 @@ def _watched(settings: MyActuatorSettings) -> str:
     if settings.timeout_ms:
         return (
             f"the time-out of {settings.timeout_ms} ms is taken from the arm file: it cannot be read over CAN, so "
-            "`armlink check` measures whether it acts"
+            "check what the drive does in silence"
         )
     store = frames.timeout_command(100).hex().upper()
     return (
