@@ -11,6 +11,7 @@ from sim_bus.drives.moteus import MoteusDrive
 from sim_bus.drives.motor import Motor
 from sim_bus.drives.myactuator import MyActuatorDrive
 from sim_bus.drives.odrive import ODriveAxis
+from sim_bus.drives.piper import build as build_piper
 from sim_bus.drives.robstride import RobStrideDrive
 from sim_bus.drives.simulated_drive import Front, SimulatedDrive
 
@@ -30,6 +31,7 @@ FAMILIES: dict[str, Build] = {
     "moteus": _each(MoteusDrive),
     "odrive": _each(ODriveAxis),
     "myactuator": _each(MyActuatorDrive),
+    "piper": build_piper,
 }
 """Families that are simulated here, besides canopen."""
 GROUP = "armlink.simulated_drives"

@@ -168,16 +168,17 @@ class MyActuatorDrive(SimulatedDrive):
         elif self.mode != NO_LOOP:
             self._target += self._speed * duration * (self.mode == SPEED_LOOP)
             error, speed = self._target - motor.position, motor.velocity
-            wanted = (kp * error + self._integral) / kd
-            if abs(wanted) <= self._most_speed:
-                integral = self._integral + ki * error * duration
-                self._integral = max(-self._limit, min(self._limit, integral))
+            wanted = kp * error / kd
+            pace = max(-self._most_speed, min(self._most_speed, wanted))
+            change = ki * error if pace == wanted else kp * (pace - speed)
+            self._integral = max(-self._limit, min(self._limit, self._integral + change * duration))
+            if pace == wanted:
                 motor.impede(kp, kd, self._target, 0.0, self._integral, self._limit)
             else:
                 # so near to its speed that its torque does not saturate: a drive runs its loop many times in a step
                 reach = self._limit / kd / 2
-                wanted = max(speed - reach, min(speed + reach, math.copysign(self._most_speed, wanted)))
-                motor.impede(0.0, kd, 0.0, wanted, 0.0, self._limit)
+                pace = max(speed - reach, min(speed + reach, pace))
+                motor.impede(0.0, kd, 0.0, pace, self._integral, self._limit)
 
     # ---- faults
 
